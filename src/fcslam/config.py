@@ -1,0 +1,86 @@
+"""Typed configuration: load, check, dump. Each room owns its model; units stand in the field names."""
+
+import difflib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from fcslam.errors import ConfigError
+
+
+class Settings(BaseModel):
+    """Base of every room's settings: frozen, no unknown keys, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+SettingsType = TypeVar("SettingsType", bound=Settings)
+
+
+def load(kind: type[SettingsType], path: Path) -> SettingsType:
+    """Read a YAML file over the defaults of ``kind``.
+
+    Raises:
+        ConfigError: the file cannot be read, is no mapping, or has a key or value that does not belong.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not valid YAML ({_one_line(error)})") from error
+    if content is None:
+        content = {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected a mapping of keys; `fcslam config dump` prints a complete one")
+    return parse(kind, content, str(path))
+
+
+def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> SettingsType:
+    """Check ``content`` against ``kind``; ``where`` names its origin in messages.
+
+    Raises:
+        ConfigError: a key or a value does not belong; an unknown key is answered with the nearest known one.
+    """
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise ConfigError(f"{where}: unknown key '{key}'{_nearest(kind, first['loc'])}") from error
+        raise ConfigError(f"{where}: {key}: {first['msg']} (given: {first['input']!r})") from error
+
+
+def dump(settings: Settings) -> str:
+    """Complete YAML of ``settings``, each key under the comment that describes it."""
+    return "\n".join(_lines(settings, indent=0)) + "\n"
+
+
+def _lines(settings: Settings, indent: int) -> list[str]:
+    pad = "  " * indent
+    lines: list[str] = []
+    for name, field in type(settings).model_fields.items():
+        value = getattr(settings, name)
+        if field.description:
+            lines.append(f"{pad}# {field.description}")
+        if isinstance(value, Settings):
+            lines += [f"{pad}{name}:", *_lines(value, indent + 1)]
+        else:
+            lines.append(f"{pad}{yaml.safe_dump({name: value}, default_flow_style=None).strip()}")
+    return lines
+
+
+def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:
+    """A hint that names the known key nearest to the unknown one at ``loc``."""
+    model: Any = kind
+    for part in loc[:-1]:
+        model = model.model_fields[str(part)].annotation
+    near = difflib.get_close_matches(str(loc[-1]), list(model.model_fields), n=1, cutoff=0.5)
+    return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(model.model_fields)}"
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

@@ -1,0 +1,38 @@
+"""The exception tree.
+
+    FcslamError
+    ├── InputError            something the user gave is wrong: one line says what, where, what to do (exit code 2)
+    │   ├── SourceError       a recording cannot be read
+    │   ├── ConfigError       a configuration file or key is wrong
+    │   ├── OutputError       the output folder cannot be used
+    │   └── EvaluationError   a reference file or a run folder cannot be evaluated
+    └── PacketError           bytes received are not a packet that may be trusted
+"""
+
+
+class FcslamError(Exception):
+    """Everything that fcslam raises on purpose."""
+
+
+class InputError(FcslamError):
+    """Something the user gave is wrong; the message says what, where and what to do."""
+
+
+class SourceError(InputError):
+    """A recording cannot be read."""
+
+
+class ConfigError(InputError):
+    """A configuration file or one of its keys is wrong."""
+
+
+class OutputError(InputError):
+    """The output folder cannot be used."""
+
+
+class EvaluationError(InputError):
+    """A reference file or a run folder cannot be evaluated."""
+
+
+class PacketError(FcslamError):
+    """Bytes received are not a packet that may be trusted; the message says why."""

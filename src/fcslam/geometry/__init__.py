@@ -1,0 +1,1 @@
+"""Rigid motions of the plane and the alignments of point sets."""

@@ -1,0 +1,95 @@
+"""The group SE(2) of rigid motions of the plane, on plain arrays.
+
+A pose is ``(x, y, theta)`` in metres and radians, shape (..., 3), float64. ``T_a_b`` takes coordinates in b to a,
+so ``compose(T_a_b, T_b_c)`` is ``T_a_c``. Every function broadcasts over the leading dimensions.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+IDENTITY: Array = np.zeros(3)
+IDENTITY.setflags(write=False)
+
+
+def wrap_angle(angle_rad: ArrayLike) -> Any:
+    """Angle in [-pi, pi), the same direction as ``angle_rad``; shape kept."""
+    return (np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
+    """``T_a_c``, shape (..., 3)."""
+    a, b = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_b_c, dtype=np.float64)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
+    y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
+    return np.stack(np.broadcast_arrays(x, y, wrap_angle(a[..., 2] + b[..., 2])), axis=-1)
+
+
+def inverse(T_a_b: ArrayLike) -> Array:
+    """``T_b_a``, shape (..., 3)."""
+    a = np.asarray(T_a_b, dtype=np.float64)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = -cos * a[..., 0] - sin * a[..., 1]
+    y = sin * a[..., 0] - cos * a[..., 1]
+    return np.stack((x, y, wrap_angle(-a[..., 2])), axis=-1)
+
+
+def between(T_a_b: ArrayLike, T_a_c: ArrayLike) -> Array:
+    """``T_b_c = T_a_b^-1 T_a_c``, shape (..., 3)."""
+    return compose(inverse(T_a_b), T_a_c)
+
+
+def transform(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
+    """Points (..., N, 2) given in b, in the coordinates of a; the pose has shape (..., 3)."""
+    pose, points = np.asarray(T_a_b, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
+    cos, sin = np.cos(pose[..., 2:3]), np.sin(pose[..., 2:3])
+    x = pose[..., 0:1] + cos * points[..., 0] - sin * points[..., 1]
+    y = pose[..., 1:2] + sin * points[..., 0] + cos * points[..., 1]
+    return np.stack((x, y), axis=-1)
+
+
+def exp(tangent: ArrayLike) -> Array:
+    """Exponential map of the twist (v_x, v_y, omega), shape (..., 3)."""
+    v = np.asarray(tangent, dtype=np.float64)
+    omega = v[..., 2]
+    a, b = _sinc_terms(omega)
+    return np.stack((a * v[..., 0] - b * v[..., 1], b * v[..., 0] + a * v[..., 1], wrap_angle(omega)), axis=-1)
+
+
+def log(T_a_b: ArrayLike) -> Array:
+    """Twist (v_x, v_y, omega) whose exponential is the pose; |omega| <= pi; shape (..., 3)."""
+    pose = np.asarray(T_a_b, dtype=np.float64)
+    omega = wrap_angle(pose[..., 2])
+    a, b = _sinc_terms(omega)
+    scale = a * a + b * b
+    vx = (a * pose[..., 0] + b * pose[..., 1]) / scale
+    vy = (-b * pose[..., 0] + a * pose[..., 1]) / scale
+    return np.stack((vx, vy, omega), axis=-1)
+
+
+def adjoint(T_a_b: ArrayLike) -> Array:
+    """Matrix Ad with ``T exp(v) T^-1 = exp(Ad v)``, shape (..., 3, 3)."""
+    pose = np.asarray(T_a_b, dtype=np.float64)
+    cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    zero, one = np.zeros_like(cos), np.ones_like(cos)
+    rows = ((cos, -sin, pose[..., 1]), (sin, cos, -pose[..., 0]), (zero, zero, one))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def relative(poses: ArrayLike) -> Array:
+    """Motions between consecutive poses of a chain: (N, 3) to (N - 1, 3)."""
+    chain = np.asarray(poses, dtype=np.float64)
+    return between(chain[:-1], chain[1:])
+
+
+def _sinc_terms(omega: Array) -> tuple[Array, Array]:
+    """``sin(w)/w`` and ``(1 - cos(w))/w``, by their series near zero."""
+    small = np.abs(omega) < 1e-5
+    safe = np.where(small, 1.0, omega)
+    a = np.where(small, 1.0 - omega * omega / 6.0, np.sin(safe) / safe)
+    b = np.where(small, omega / 2.0, (1.0 - np.cos(safe)) / safe)
+    return a, b

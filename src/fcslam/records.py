@@ -1,0 +1,168 @@
+"""Frozen records that cross the borders between rooms. Arrays in them are read-only.
+
+Poses are (x, y, theta) in metres and radians; ``T_a_b`` takes coordinates in b to a. Coordinate frames as in ROS
+REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recording's own clock.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+Ranges = NDArray[np.float32]
+Codes = NDArray[np.uint8]
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+CODE_BYTES = 32
+"""A binary descriptor is 256 bits, packed."""
+
+
+def frozen(array: ArrayLike, dtype: type[Scalar] = np.float64) -> NDArray[Scalar]:  # type: ignore[assignment]
+    """A read-only array of ``dtype``; copied only if it has to be."""
+    result: NDArray[Scalar] = np.asarray(array, dtype=dtype)
+    if result.flags.writeable:
+        result = result.copy()
+        result.setflags(write=False)
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class LaserModel:
+    """Geometry of one 2D LiDAR, constant over a recording."""
+
+    beam_count: int
+    angle_min_rad: float
+    angle_increment_rad: float
+    max_range_m: float
+    """A range at or above it means that nothing was hit."""
+    T_base_laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def angles_rad(self) -> FloatArray:
+        """Beam directions in ``laser``, shape (beam_count,)."""
+        return self.angle_min_rad + self.angle_increment_rad * np.arange(self.beam_count, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """One reading of the wheel odometry."""
+
+    stamp: float
+    T_odom_base: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LaserScan:
+    """One revolution of a 2D LiDAR with the odometry at its stamp."""
+
+    stamp: float
+    ranges_m: Ranges
+    """Shape (beam_count,). NaN: invalid; at or above ``laser.max_range_m`` (or inf): nothing was hit."""
+    laser: LaserModel
+    T_odom_base: FloatArray
+
+
+SensorRecord = LaserScan | Odometry
+
+
+class KeyscanId(NamedTuple):
+    """A keyscan of the fleet."""
+
+    robot: str
+    number: int
+    """Counts the robot's keyscans from 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Keyscan:
+    """A scan that carries the pose graph and the map."""
+
+    id: KeyscanId
+    stamp: float
+    ranges_m: Ranges
+    """As in LaserScan, but an invalid or missing return is 0."""
+
+
+class ConstraintKind(StrEnum):
+    """Where a constraint between two keyscans of one robot comes from."""
+
+    ODOMETRY = "odometry"
+    CLOSURE = "closure"
+
+
+@dataclass(frozen=True, slots=True)
+class Constraint:
+    """A measured motion between two keyscans of one robot."""
+
+    robot: str
+    i: int
+    j: int
+    kind: ConstraintKind
+    T_i_j: FloatArray
+    """Pose of keyscan j's base in keyscan i's base, shape (3,)."""
+    information: FloatArray
+    """Inverse covariance of T_i_j in the tangent space at T_i_j (x, y, theta of base j), shape (3, 3)."""
+
+
+class Channel(StrEnum):
+    """Which sensor a place's descriptors come from; words of different channels are never compared."""
+
+    LIDAR = "lidar"
+    CAMERA = "camera"
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """One channel of one keyscan: binary descriptors with where each was seen."""
+
+    id: KeyscanId
+    channel: Channel
+    detector_version: str
+    first: int
+    """Number of the first keyscan of the submap it was seen in."""
+    last: int
+    """Index of the last one (inclusive)."""
+    keypoints: NDArray[np.float32]
+    """Shape (N, 2): metres in the keyscan's base (lidar)."""
+    descriptors: Codes
+    """Shape (N, 32)."""
+
+
+class ClosureStatus(StrEnum):
+    """How far a closure has come; three different things and two ways to end."""
+
+    CANDIDATE = "candidate"
+    VERIFIED = "verified"
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+    REVOKED = "revoked"
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosure:
+    """The claim that two keyscans saw the same place."""
+
+    i: KeyscanId
+    j: KeyscanId
+    channel: Channel
+    similarity: float
+    """In [0, 1]."""
+    T_i_j: FloatArray
+    information: FloatArray
+    status: ClosureStatus
+    reason: str
+    informative: bool = True
+    """Whether the match fixes the pose in every direction (a bare corridor does not)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What the cloud tells a robot: where its odometry's origin lies in the fleet's map."""
+
+    robot: str
+    version: int
+    map_index: int
+    T_map_odom: FloatArray
