@@ -1,0 +1,22 @@
+"""Recordings in, sensor records out: ``open_source(path)`` knows every format."""
+
+from fcslam.sources.carmen_writer import write_carmen
+from fcslam.sources.faults import Fault, Faults, Tally
+from fcslam.sources.opening import FORMATS, Format, open_source
+from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
+from fcslam.sources.split import split
+
+__all__ = [
+    "FORMATS",
+    "WHOLE",
+    "Fault",
+    "Faults",
+    "Format",
+    "ScanRange",
+    "Source",
+    "Survey",
+    "Tally",
+    "open_source",
+    "split",
+    "write_carmen",
+]

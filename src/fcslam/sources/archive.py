@@ -1,0 +1,87 @@
+"""Log files as lines of bytes, whether compressed or not."""
+
+import bz2
+import gzip
+import lzma
+import re
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from io import BufferedReader
+from pathlib import Path
+from typing import BinaryIO, cast
+
+from fcslam.errors import SourceError
+
+MAX_LINE_BYTES = 1 << 20
+"""A longer line is read in pieces, so that a file without line ends cannot fill the memory."""
+
+_HEAD_BYTES = 1 << 16
+_BUFFER_BYTES = 1 << 17
+_LOG_SUFFIX = re.compile(r"\.(gz|xz|bz2|clf|log|txt|carmen|bag|mcap|db3)$", re.IGNORECASE)
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
+
+
+def robot_name(path: Path) -> str:
+    """The file's name without log suffixes, fit for file names: ``intel.clf.xz`` gives ``intel``."""
+    stem = path.name
+    while match := _LOG_SUFFIX.search(stem):
+        stem = stem[: match.start()]
+    return _UNSAFE.sub("_", stem).strip(".") or "robot"
+
+
+def head(path: Path) -> bytes:
+    """The first 64 KiB, decompressed.
+
+    Raises:
+        SourceError: the file is missing, empty or damaged, or is no file.
+    """
+    with _reported(path), _open(path) as stream:
+        content = stream.read(_HEAD_BYTES)
+    if not content:
+        raise SourceError(f"{path}: the file is empty; give a recording with laser scans")
+    return content
+
+
+def numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Lines with their numbers, counted from 1, decompressed on the way.
+
+    Raises:
+        SourceError: the file cannot be read to its end.
+    """
+    with _reported(path), _open(path) as stream:
+        yield from enumerate(iter(partial(stream.readline, MAX_LINE_BYTES), b""), start=1)
+
+
+def _open(path: Path) -> BinaryIO:
+    """Open by the first bytes: a name may lie about the compression."""
+    with path.open("rb") as raw:
+        magic = raw.read(6)
+    if magic.startswith(b"\x1f\x8b"):
+        return _buffered(gzip.open(path))
+    if magic.startswith(b"\xfd7zXZ\x00"):
+        return _buffered(lzma.open(path))
+    if magic.startswith(b"BZh"):
+        return _buffered(bz2.open(path))
+    return path.open("rb", buffering=_BUFFER_BYTES)
+
+
+def _buffered(stream: gzip.GzipFile | lzma.LZMAFile | bz2.BZ2File) -> BinaryIO:
+    """Lines of a compressed file are read several times faster through a buffer written in C."""
+    return BufferedReader(cast("BinaryIO", stream), _BUFFER_BYTES)  # type: ignore[type-var]
+
+
+@contextmanager
+def _reported(path: Path) -> Iterator[None]:
+    """Turn what the system and the archive modules raise into one clear line."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise SourceError(f"{path}: no such file; check the path of the recording") from error
+    except IsADirectoryError as error:
+        raise SourceError(f"{path}: is a folder; give the recording's file in it") from error
+    except (EOFError, lzma.LZMAError, zlib.error, gzip.BadGzipFile) as error:
+        raise SourceError(f"{path}: the archive is truncated or damaged ({error}); copy it again") from error
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: cannot be read ({error}); check the file and its permissions") from error

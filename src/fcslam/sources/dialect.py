@@ -1,0 +1,87 @@
+"""The lines that a text log is made of, whatever its dialect."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import isfinite
+from typing import NamedTuple
+
+from fcslam.sources.pose import Pose
+
+_MAX_COORDINATE = 1e7
+"""Metres or radians; a larger pose is damage."""
+
+
+class StatedLaser(NamedTuple):
+    """The geometry that a scan line itself states; radians and metres."""
+
+    angle_min_rad: float
+    angle_increment_rad: float
+    max_range_m: float
+
+
+class ScanLine(NamedTuple):
+    """One scan, its ranges still as text."""
+
+    stamp: float
+    T_odom_base: Pose
+    T_odom_laser: Pose
+    beam_count: int
+    range_text: bytes
+    stated: StatedLaser | None = None
+
+
+class OdometryLine(NamedTuple):
+    """One reading of the odometry."""
+
+    stamp: float
+    T_odom_base: Pose
+
+
+class ParameterLine(NamedTuple):
+    """A setting of the robot that made the log."""
+
+    name: str
+    value: str
+
+
+Line = ScanLine | OdometryLine | ParameterLine
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """How one kind of text log is read."""
+
+    name: str
+    recognises: Callable[[bytes], bool]
+    """Whether a log that starts with these bytes is of this kind."""
+    parse: Callable[[bytes], Line | None]
+    """A line's content; None: nothing of interest. Raises ValueError for a broken line. Ranges stay text."""
+    metres_per_range_unit: float = 1.0
+
+
+def pose_of(tokens: list[bytes], metres_per_unit: float = 1.0) -> Pose:
+    """(x, y, theta) from three tokens; raises ValueError when they are no sane pose."""
+    x, y, theta = map(float, tokens)
+    if not (abs(x) < _MAX_COORDINATE and abs(y) < _MAX_COORDINATE and abs(theta) < _MAX_COORDINATE):
+        raise ValueError("no sane pose")
+    return x * metres_per_unit, y * metres_per_unit, theta
+
+
+def stamp_of(token: bytes) -> float:
+    """Seconds; raises ValueError when it is no finite number."""
+    stamp = float(token)
+    if not isfinite(stamp):
+        raise ValueError("no finite stamp")
+    return stamp
+
+
+def check_beams(range_text: bytes, beam_count: int) -> None:
+    """Raise ValueError unless ``range_text`` holds ``beam_count`` words, at least two, none with foreign letters."""
+    single_spaced = range_text.count(b" ") + 1 == beam_count
+    if beam_count < 2 or not (single_spaced or len(range_text.split()) == beam_count):
+        raise ValueError("not as many ranges as stated")
+    if range_text.translate(None, _NUMBER_LETTERS):
+        raise ValueError("a range is no number")
+
+
+_NUMBER_LETTERS = b"0123456789.+-eEinfatyINFATY \t"
