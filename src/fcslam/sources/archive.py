@@ -14,7 +14,7 @@ from typing import BinaryIO, cast
 
 from fcslam.errors import SourceError
 
-MAX_LINE_BYTES = 1 << 20
+MAX_LINE_BYTES = 1 << 18
 """A longer line is read in pieces, so that a file without line ends cannot fill the memory."""
 
 _HEAD_BYTES = 1 << 16

@@ -32,7 +32,9 @@ SICK_TYPES = (0, 1)
 """Values of ROBOTLASER1's ``type`` that mean a SICK LMS or PLS."""
 
 _MESSAGE = re.compile(rb"\s*(#|$|[A-Z][A-Z0-9_-]*(?=\s|$))")
-_KNOWN = re.compile(rb"^(#.*CARMEN|(PARAM|SYNC|ODOM|[FR]LASER|RAWLASER\d|ROBOTLASER\d|NEFF|TRUEPOS)\s)", re.MULTILINE)
+_KNOWN = re.compile(
+    rb"^[ \t]*(#.*CARMEN|(PARAM|SYNC|ODOM|[FR]LASER|RAWLASER\d|ROBOTLASER\d|NEFF|TRUEPOS)\s)", re.MULTILINE
+)
 
 
 def _parse(line: bytes) -> Line | None:

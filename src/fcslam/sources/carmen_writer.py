@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
-from typing import IO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
         OutputError: the file cannot be written.
     """
     try:
-        with closing(_create(path)) as stream:
+        with path.open("wb") as file, closing(_compressed(file, path.suffix)) as stream:
             stream.write(_HEADER.encode())
             for record in records:
                 stream.write((_line(record) + "\n").encode())
@@ -43,16 +43,16 @@ def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
         raise OutputError(f"{path}: cannot be written ({error}); choose another folder") from error
 
 
-def _create(path: Path) -> IO[bytes]:
-    match path.suffix:
+def _compressed(file: BinaryIO, suffix: str) -> BinaryIO | gzip.GzipFile | lzma.LZMAFile | bz2.BZ2File:
+    match suffix:
         case ".gz":
-            return gzip.GzipFile(path, "wb", mtime=0)  # type: ignore[return-value]
+            return gzip.GzipFile("", "wb", fileobj=file, mtime=0)
         case ".xz":
-            return lzma.open(path, "wb")
+            return lzma.LZMAFile(file, "wb")
         case ".bz2":
-            return bz2.open(path, "wb")
+            return bz2.BZ2File(file, "wb")
         case _:
-            return path.open("wb")
+            return file
 
 
 def _line(record: SensorRecord) -> str:

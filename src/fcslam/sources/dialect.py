@@ -9,6 +9,7 @@ from fcslam.sources.pose import Pose
 
 _MAX_COORDINATE = 1e7
 """Metres or radians; a larger pose is damage."""
+_NUMBER_LETTERS = b"0123456789.+-eEinfatyINFATY \t"
 
 
 class StatedLaser(NamedTuple):
@@ -82,6 +83,3 @@ def check_beams(range_text: bytes, beam_count: int) -> None:
         raise ValueError("not as many ranges as stated")
     if range_text.translate(None, _NUMBER_LETTERS):
         raise ValueError("a range is no number")
-
-
-_NUMBER_LETTERS = b"0123456789.+-eEinfatyINFATY \t"

@@ -67,4 +67,4 @@ class Audit:
 
 def _describe(kind: Fault, tally: Tally) -> str:
     largest = f", largest {tally.largest_s:.3g} s" if tally.largest_s else ""
-    return f"{tally.count} {kind} (first: line {tally.first_line}{largest})"
+    return f"{kind}: {tally.count} (first: line {tally.first_line}{largest})"

@@ -44,7 +44,7 @@ def open_source(path: Path) -> Source:
     for kind in FORMATS:
         if kind.recognises(path, content):
             return kind.open(path)
-    known = ", ".join(kind.name for kind in FORMATS)
+    known = " or ".join(kind.name for kind in FORMATS)
     if path.is_dir():
         raise SourceError(f"{path}: is a folder and no recording; give the file of a recording ({known})")
     raise SourceError(f"{path}: no recording of a known format (it starts with {content[:16]!r}); give a {known}")

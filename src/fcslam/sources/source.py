@@ -40,7 +40,7 @@ class Survey:
 
 
 class Source(Protocol):
-    """A recording of one robot."""
+    """A recording of one robot. A shallow copy can be read side by side with the original."""
 
     @property
     def name(self) -> str:

@@ -3,9 +3,9 @@
 What is tolerated, counted and reported, and what is refused:
 
 - Clocks of one robot disagree by up to a second (the Intel log: 631 steps back, largest 0.9 s): scans stay in file
-  order, which is the order that the odometry makes sense in. A scan more than 2 s before the one before it is
-  misplaced and skipped; when there are more than 1 % of them, two recordings were put together, which is refused.
-  So is a log in which more than half of the steps go back.
+  order, which is the order that the odometry makes sense in. A scan more than 2 s before both scans before it is
+  misplaced and skipped (both: one of them may carry a damaged stamp, far ahead). When more than 1 % are misplaced,
+  two recordings were put together, which is refused. So is a log in which more than half of the steps go back.
 - A scan with another beam count than the rest is skipped; more than 1 % of them are a change of sensor: refused.
 - Equal stamps are kept: some logs were printed with too few digits, or without a clock.
 - A log of ten scans or more in which neither the scans' poses nor odometry messages ever change has no odometry:
@@ -134,7 +134,7 @@ class ScanGate:
     def __init__(self, beam_count: int, audit: Audit) -> None:
         self._beam_count = beam_count
         self._audit = audit
-        self._previous = -inf
+        self._previous = self._before_previous = -inf
 
     def admits(self, number: int, scan: ScanLine) -> bool:
         """Whether the scan on line ``number`` is one of the log's."""
@@ -142,14 +142,14 @@ class ScanGate:
             self._audit.add(Fault.BEAM_COUNT, number)
             return False
         step_back_s = self._previous - scan.stamp
-        if step_back_s > MAX_STEP_BACK_S:
+        if min(self._previous, self._before_previous) - scan.stamp > MAX_STEP_BACK_S:
             self._audit.add(Fault.MISPLACED_SCAN, number, step_s=step_back_s)
             return False
         if step_back_s > 0.0:
             self._audit.add(Fault.TIME_REVERSAL, number, step_s=step_back_s)
         elif step_back_s == 0.0:
             self._audit.add(Fault.REPEATED_STAMP, number)
-        self._previous = scan.stamp
+        self._before_previous, self._previous = self._previous, scan.stamp
         return True
 
 

@@ -1,0 +1,242 @@
+import gzip
+import lzma
+import tracemalloc
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from carmen_text import BEAMS, drive, flaser, odom, pose_at, save, scans_of
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fcslam.errors import SourceError
+from fcslam.sources import Fault, Tally, open_source
+
+
+def refusal(path):
+    """The message that refuses ``path`` before any record is read."""
+    with pytest.raises(SourceError) as caught:
+        open_source(path).survey()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    assert ";" in message, "says nothing on what to do"
+    return message
+
+
+def written(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "empty"),
+        (gzip.compress(b""), "empty"),
+        (b"#ROSBAG V2.0\nE\x00\x00\x00", "known format"),
+        (bytes(range(256)) * 300, "known format"),
+        (b"\x00" * 5000, "known format"),
+        (b"It was a dark and stormy night\n", "known format"),
+        (b"\x1f\x8b\x08\x00garbage", "truncated or damaged"),
+        (b"\xfd7zXZ\x00garbage", "truncated or damaged"),
+        (b"BZh9garbage", "cannot be read"),
+    ],
+)
+def test_what_is_no_recording_is_refused(tmp_path, content, reason):
+    assert reason in refusal(written(tmp_path / "run.clf", content))
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    assert "no such file" in refusal(tmp_path / "missing.clf")
+    assert "folder" in refusal(tmp_path)
+    assert "cannot be read" in refusal(save(tmp_path / "run.log", drive(2)) / "inside.log")
+
+
+@pytest.mark.parametrize("compress", [gzip.compress, lzma.compress])
+@pytest.mark.parametrize("kept", [0.2, 0.9, 0.999])
+def test_a_truncated_archive_is_refused_wherever_it_ends(tmp_path, compress, kept):
+    archive = compress("\n".join(drive(2000)).encode())
+    path = written(tmp_path / "run.clf.gz", archive[: int(len(archive) * kept)])
+    assert "truncated" in refusal(path)
+
+
+def test_a_log_without_laser_scans_is_refused(tmp_path):
+    assert "no laser scan" in refusal(save(tmp_path / "run.log", [odom(k, pose_at(k)) for k in range(30)]))
+
+
+def test_a_log_without_odometry_is_refused(tmp_path):
+    standing = [flaser(k, (1, 2, 0)) for k in range(30)]
+    assert "no odometry" in refusal(save(tmp_path / "run.log", standing))
+    assert "no odometry" in refusal(save(tmp_path / "both.log", [*standing, *(odom(k, (0, 0, 0)) for k in range(9))]))
+    assert open_source(save(tmp_path / "short.log", standing[:9])).survey().scan_count == 9
+
+
+def test_a_change_of_the_beam_count_is_refused_with_its_line(tmp_path):
+    message = refusal(save(tmp_path / "run.log", drive(30) + drive(30, start_stamp=200, beams=9)))
+    assert "line 62" in message
+    assert "beam count changes" in message
+
+
+def test_two_recordings_put_together_are_refused_with_the_line(tmp_path):
+    message = refusal(save(tmp_path / "run.log", drive(300) + drive(300)))
+    assert "line 602" in message
+    assert "59.8 s" in message
+
+
+def test_a_reversed_log_is_refused(tmp_path):
+    assert "backwards" in refusal(save(tmp_path / "run.log", drive(50)[::-1]))
+
+
+def test_a_log_of_mostly_damaged_lines_is_refused(tmp_path):
+    assert "damaged" in refusal(save(tmp_path / "run.log", drive(12) + ["??!"] * 30))
+
+
+DAMAGED_SCANS = {
+    "cut": lambda line: line[:40],
+    "one range lost": lambda line: line.replace(" 1.0", "", 1),
+    "a range is a word": lambda line: line.replace(" 1.0 ", " one ", 1),
+    "a range has two points": lambda line: line.replace(" 1.0 ", " 1.0.0 ", 1),
+    "wrong count": lambda line: line.replace(f"FLASER {BEAMS}", "FLASER 77"),
+    "negative count": lambda line: line.replace(f"FLASER {BEAMS}", f"FLASER -{BEAMS}"),
+    "count is no number": lambda line: line.replace(f"FLASER {BEAMS}", "FLASER many"),
+    "huge count": lambda line: line.replace(f"FLASER {BEAMS}", "FLASER " + "9" * 5000),
+    "pose is nan": lambda line: " ".join([*line.split()[:-9], "nan", *line.split()[-8:]]),
+    "pose is far off": lambda line: " ".join([*line.split()[:-9], "1e30", *line.split()[-8:]]),
+    "stamp is infinite": lambda line: " ".join([*line.split()[:-3], "inf", "robot", "0"]),
+    "binary": lambda _: "\x00\x7f\x01" * 20,
+    "name lost": lambda line: line[7:],
+    "only the name": lambda _: "FLASER",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED_SCANS.values(), ids=DAMAGED_SCANS)
+@pytest.mark.parametrize("where", [0, 7, 19])
+def test_one_broken_line_is_skipped_counted_and_located(tmp_path, damage, where):
+    lines = [flaser(step, pose_at(step)) for step in range(20)]
+    lines[where] = damage(lines[where])
+    source = open_source(save(tmp_path / "run.log", ["# CARMEN Logfile", *lines]))
+    stamps = [scan.stamp for scan in scans_of(source)]
+    assert stamps == [step for step in range(20) if step != where]
+    assert source.faults[Fault.BROKEN_LINE] == Tally(1, where + 2)
+    assert f"broken lines skipped: 1 (first: line {where + 2})" in str(source.faults)
+
+
+def test_a_few_misfits_are_skipped_and_counted(tmp_path):
+    lines = drive(200)
+    lines[101] = flaser(120.0, pose_at(50), ranges=(1.0,) * 5)
+    lines[301] = flaser(3.0, pose_at(150))
+    source = open_source(save(tmp_path / "run.log", lines))
+    assert len(scans_of(source)) == source.survey().scan_count == 198
+    assert source.faults[Fault.BEAM_COUNT] == Tally(1, 102)
+    assert source.faults[Fault.MISPLACED_SCAN].first_line == 302
+    assert source.survey().faults.tallies == source.faults.tallies
+
+
+def test_small_steps_back_in_time_are_kept_in_file_order(tmp_path):
+    stamps = [0.0, 1.0, 0.5, 2.0, 2.0, 1.1, 3.0]
+    source = open_source(save(tmp_path / "run.log", [flaser(t, pose_at(k)) for k, t in enumerate(stamps)]))
+    assert [scan.stamp for scan in scans_of(source)] == stamps
+    assert source.survey().duration_s == 3.0
+    assert source.faults[Fault.TIME_REVERSAL].count == 2
+    assert source.faults[Fault.TIME_REVERSAL].largest_s == pytest.approx(0.9)
+    assert source.faults[Fault.REPEATED_STAMP] == Tally(1, 5)
+
+
+def test_one_stamp_far_ahead_does_not_cost_the_scans_behind_it(tmp_path):
+    stamps = [*range(50), 9000, *range(51, 100)]
+    source = open_source(save(tmp_path / "run.log", [flaser(t, pose_at(k)) for k, t in enumerate(stamps)]))
+    assert [scan.stamp for scan in scans_of(source)] == stamps
+    assert source.faults[Fault.TIME_REVERSAL] == Tally(1, 52, 9000 - 51)
+
+
+def test_a_log_without_a_clock_is_read(tmp_path):
+    source = open_source(save(tmp_path / "run.log", [flaser(0, pose_at(k)) for k in range(30)]))
+    assert len(scans_of(source)) == 30
+    assert source.survey().duration_s == 0.0
+    assert source.faults[Fault.REPEATED_STAMP].count == 29
+
+
+def test_bad_ranges_become_nan_and_are_counted(tmp_path):
+    ranges = ("1.0", "nan", "-0.5", "inf", "-inf", "0", "81.9", "1e300")
+    source = open_source(save(tmp_path / "run.log", [flaser(k, pose_at(k), ranges=ranges) for k in range(2)]))
+    first = scans_of(source)[0].ranges_m
+    np.testing.assert_array_equal(np.isnan(first), [False, True, True, True, True, False, False, False])
+    assert np.isfinite(first[[0, 5, 6, 7]]).all()
+    assert first[7] > 50.0
+    assert source.faults[Fault.NON_FINITE_RANGE] == Tally(6, 1)
+    assert source.faults[Fault.NEGATIVE_RANGE] == Tally(2, 1)
+
+
+def test_faults_belong_to_the_latest_pass(tmp_path):
+    lines = drive(20)
+    lines[7] = "???"
+    source = open_source(save(tmp_path / "run.log", lines))
+    for _ in range(2):
+        assert len(scans_of(source)) == 19
+        assert source.faults[Fault.BROKEN_LINE].count == 1
+    assert bool(source.faults)
+    assert source.faults[Fault.NEGATIVE_RANGE] == Tally()
+
+
+def test_a_file_without_line_ends_does_not_fill_the_memory(tmp_path):
+    path = written(tmp_path / "run.log.gz", gzip.compress(b"FLASER 180 " + b"1.0 " * 5_000_000, compresslevel=1))
+    tracemalloc.start()
+    refusal(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10 << 20
+
+
+def survives(path):
+    """Reads or refuses; anything else is an error of the reader."""
+    with suppress(SourceError):
+        source = open_source(path)
+        count = source.survey().scan_count
+        assert sum(1 for _ in scans_of(source)) <= count
+
+
+fuzz = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+magic = st.sampled_from(
+    [b"", b"\x1f\x8b\x08", b"\xfd7zXZ\x00", b"BZh9", b"FLASER 2 ", b"L 1 2 3 4 5 6 7 8 9 ", b"O 1 2 3 4\n"]
+)
+
+
+@fuzz
+@given(magic, st.binary(max_size=300))
+def test_random_bytes_never_break_the_reader(tmp_path, start, content):
+    survives(written(tmp_path / "run.log", start + content))
+
+
+words = st.one_of(
+    st.sampled_from(
+        ["FLASER", "ODOM", "ROBOTLASER1", "PARAM", "L", "O", "#", "2", "3", "0", "-1", "nan", "inf", "1e400"]
+    ),
+    st.floats().map(str),
+    st.integers().map(str),
+)
+
+
+@fuzz
+@given(st.lists(st.lists(words, max_size=30).map(" ".join), max_size=12))
+def test_random_words_never_break_the_reader(tmp_path, lines):
+    survives(save(tmp_path / "run.log", ["ODOM 0 0 0 0 0 0 0 h 0", *lines]))
+
+
+@fuzz
+@given(st.data())
+def test_a_spliced_log_never_breaks_the_reader(tmp_path, data):
+    log = "\n".join(drive(6)).encode()
+    start = data.draw(st.integers(0, len(log)))
+    end = data.draw(st.integers(start, len(log)))
+    survives(written(tmp_path / "run.log", log[:start] + data.draw(st.binary(max_size=20)) + log[end:]))
+
+
+@fuzz
+@given(st.data())
+def test_a_flipped_archive_never_breaks_the_reader(tmp_path, data):
+    compress = data.draw(st.sampled_from([gzip.compress, lzma.compress]))
+    archive = bytearray(compress("\n".join(drive(30)).encode()))
+    archive[data.draw(st.integers(6, len(archive) - 1))] ^= data.draw(st.integers(1, 255))
+    survives(written(tmp_path / "run.clf.xz", bytes(archive)))

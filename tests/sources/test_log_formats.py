@@ -1,0 +1,210 @@
+import bz2
+import gzip
+import lzma
+import math
+import tracemalloc
+
+import numpy as np
+import pytest
+from carmen_text import BEAMS, drive, flaser, odom, only_scans, pose_at, robotlaser, save, scans_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fcslam.geometry import se2
+from fcslam.records import LaserScan, Odometry
+from fcslam.sources import ScanRange, open_source
+
+
+def test_every_message_becomes_its_record_in_file_order(tmp_path):
+    lines = ["# CARMEN Logfile", "PARAM robot_width 0.5 host 0", *drive(3), "SYNC mark 1 host 0", "", "RLASER 1 2 3"]
+    source = open_source(save(tmp_path / "run.log", lines))
+    records = list(source.records())
+    assert [type(record) for record in records] == [Odometry, LaserScan] * 3
+    assert [record.stamp for record in records] == pytest.approx([99.95, 100.0, 100.15, 100.2, 100.35, 100.4])
+    np.testing.assert_array_equal([record.T_odom_base for record in records[::2]], [pose_at(k) for k in range(3)])
+    np.testing.assert_allclose(records[3].ranges_m, 1.01 + 0.1 * np.arange(BEAMS), rtol=1e-6)
+    assert records[3].ranges_m.dtype == np.float32
+    assert not records[3].ranges_m.flags.writeable
+    assert not records[3].T_odom_base.flags.writeable
+    assert not source.faults
+
+
+@pytest.mark.parametrize("compress", [bytes, gzip.compress, lzma.compress, bz2.compress])
+@pytest.mark.parametrize("name", ["run.clf", "run.clf.xz", "run.log.gz"])
+def test_content_decides_the_compression(tmp_path, compress, name):
+    path = tmp_path / name
+    path.write_bytes(compress("\n".join(drive(5)).encode()))
+    source = open_source(path)
+    assert source.name == "run"
+    assert len(scans_of(source)) == source.survey().scan_count == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "robot"),
+    [
+        ("intel.clf.xz", "intel"),
+        ("acapulco-corrected.log.gz", "acapulco-corrected"),
+        ("ual_2014_05_23.CLF.XZ", "ual_2014_05_23"),
+        ("my robot.log", "my_robot"),
+        ("v1.2.log", "v1.2"),
+        (".log", "robot"),
+    ],
+)
+def test_the_robot_is_named_after_the_file(tmp_path, name, robot):
+    assert open_source(save(tmp_path / name, drive(2))).name == robot
+
+
+def test_survey_tells_what_the_records_hold(tmp_path):
+    source = open_source(save(tmp_path / "run.log", drive(40)))
+    survey, scans = source.survey(), scans_of(source)
+    poses = np.array([scan.T_odom_base for scan in scans])
+    assert survey.scan_count == 40
+    assert survey.beam_count == BEAMS
+    assert survey.duration_s == pytest.approx(scans[-1].stamp - scans[0].stamp)
+    assert survey.path_length_m == pytest.approx(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).sum())
+    assert all(scan.laser is survey.laser for scan in scans)
+
+
+@pytest.mark.parametrize(
+    "messy", [lambda line: line.replace(" ", "\t"), lambda line: f"  {line.replace(' ', '  ')} \r"]
+)
+def test_white_space_does_not_matter(tmp_path, messy):
+    tidy = list(open_source(save(tmp_path / "tidy.log", drive(4))).records())
+    untidy = list(open_source(save(tmp_path / "untidy.log", map(messy, drive(4)))).records())
+    for one, other in zip(tidy, untidy, strict=True):
+        assert one.stamp == other.stamp
+        np.testing.assert_array_equal(one.T_odom_base, other.T_odom_base)
+
+
+@pytest.mark.parametrize(
+    ("beams", "first_deg", "step_deg"),
+    [
+        (180, -90, 1.0),
+        (181, -90, 1.0),
+        (360, -90, 0.5),
+        (361, -90, 0.5),
+        (401, -50, 0.25),
+        (541, -135, 0.5),
+        (1081, -135, 0.25),
+        (90, -90, 2.0),
+    ],
+)
+def test_the_beam_count_decides_the_angles_of_flaser(tmp_path, beams, first_deg, step_deg):
+    laser = open_source(save(tmp_path / "run.log", drive(2, beams=beams))).survey().laser
+    angles_deg = np.degrees(laser.angles_rad())
+    assert angles_deg[0] == pytest.approx(first_deg)
+    np.testing.assert_allclose(np.diff(angles_deg), step_deg)
+    assert angles_deg[beams // 2] == pytest.approx(0.0, abs=1e-9)
+    assert laser.max_range_m == 50.0
+
+
+@pytest.mark.parametrize(
+    ("resolution", "fov", "span_deg"),
+    [("1.0", "6.283185", 359), ("1.0", "360", 359), ("0.5", "180", 179.5), ("1.0", "180", 179.5), ("x", "nan", 179.5)],
+)
+def test_parameters_state_the_field_of_view_where_they_fit_the_count(tmp_path, resolution, fov, span_deg):
+    parameters = [f"PARAM laser_front_laser_resolution {resolution} h 0", f"PARAM laser_front_laser_fov {fov} h 0"]
+    laser = open_source(save(tmp_path / "run.log", [*parameters, *drive(2, beams=360)])).survey().laser
+    assert np.degrees(np.ptp(laser.angles_rad())) == pytest.approx(span_deg)
+
+
+@pytest.mark.parametrize(("kind", "max_range_m"), [(0, 50.0), (2, 81.0)])
+@pytest.mark.parametrize("remissions", [(), (5, 6, 7)])
+def test_robotlaser_states_its_geometry(tmp_path, kind, max_range_m, remissions):
+    config = (kind, -2.0, 4.0, 2.0, 81.0, 0.01, 0)
+    lines = [robotlaser(k, pose_at(k), config, (1.5, 2.5, 3.5), remissions) for k in range(3)]
+    source = open_source(save(tmp_path / "run.log", lines))
+    laser = source.survey().laser
+    np.testing.assert_allclose(laser.angles_rad(), [-2.0, 0.0, 2.0])
+    assert laser.max_range_m == max_range_m
+    scans = scans_of(source)
+    assert [scan.stamp for scan in scans] == [0.0, 1.0, 2.0]
+    np.testing.assert_array_equal(scans[2].T_odom_base, pose_at(2))
+    np.testing.assert_array_equal(scans[2].ranges_m, [1.5, 2.5, 3.5])
+
+
+def test_a_stated_geometry_goes_before_a_guessed_one(tmp_path):
+    config = (3, -0.5, 1.0, 0.5, 20.0, 0, 0)
+    lines = [flaser(0, pose_at(0), ranges=(1, 2, 3)), robotlaser(1, pose_at(1), config, (1, 2, 3))]
+    survey = open_source(save(tmp_path / "run.log", lines)).survey()
+    assert survey.scan_count == 2
+    assert survey.laser.max_range_m == 20.0
+
+
+mountings = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3))
+
+
+@settings(max_examples=25, deadline=None)
+@given(mountings)
+def test_both_poses_of_the_scans_say_where_the_laser_sits(tmp_path_factory, mounting):
+    mounting = tuple(round(value, 3) for value in mounting)
+    lines = ["PARAM robot_frontlaser_offset 0.3 h 0"]
+    for step in range(5):
+        laser = tuple(f"{value:.6f}" for value in se2.compose(pose_at(step), mounting))
+        lines.append(flaser(step, pose_at(step), laser))
+    found = open_source(save(tmp_path_factory.mktemp("log") / "run.log", lines)).survey().laser.T_base_laser
+    expected = mounting if any(mounting) else (0.3, 0.0, 0.0)
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_the_parameter_says_where_the_laser_sits_if_the_poses_do_not(tmp_path):
+    parameter = "PARAM robot_frontlaser_offset -0.04 host 0"
+    same_pose_twice = save(tmp_path / "same.log", [parameter, *drive(5)])
+    corrected = [flaser(k, pose_at(k), (1.0 + k, 2.0 * k, 0.0)) for k in range(20)]
+    one_corrected = save(tmp_path / "corrected.log", [parameter, *corrected])
+    for path in (same_pose_twice, one_corrected):
+        assert open_source(path).survey().laser.T_base_laser == (-0.04, 0.0, 0.0)
+
+
+def test_cmu_logs_are_read_in_metres(tmp_path):
+    lines = []
+    for step in range(4):
+        x, y, theta = 100.0 * step, 50.0, 0.5
+        laser = (x + 25 * math.cos(theta), y + 25 * math.sin(theta), theta)
+        lines.append(f"L {x} {y} {theta} {laser[0]:.6f} {laser[1]:.6f} {laser[2]} {' '.join(['250'] * 180)} {step}.5")
+        lines.append(f"O {x} {y} {theta} {step}.6")
+    source = open_source(save(tmp_path / "wean.txt", lines))
+    records = list(source.records())
+    laser = source.survey().laser
+    assert laser.T_base_laser == pytest.approx((0.25, 0.0, 0.0))
+    assert np.degrees(laser.angle_min_rad) == pytest.approx(-90)
+    np.testing.assert_allclose(records[2].T_odom_base, (1.0, 0.5, 0.5))
+    np.testing.assert_allclose(records[3].T_odom_base, (1.0, 0.5, 0.5))
+    np.testing.assert_allclose(records[2].ranges_m, 2.5)
+    assert [record.stamp for record in records[:2]] == [0.5, 0.6]
+    assert not source.faults
+
+
+def test_scans_without_poses_take_that_of_the_odometry_before_them(tmp_path):
+    lines = []
+    for step in range(12):
+        lines += [odom(step, pose_at(step)), flaser(step + 0.5, (0, 0, 0))]
+    source = open_source(save(tmp_path / "run.log", lines))
+    poses = [scan.T_odom_base for scan in scans_of(source)]
+    np.testing.assert_array_equal(poses, [pose_at(step) for step in range(12)])
+    steps = np.diff([pose_at(step)[:2] for step in range(12)], axis=0)
+    assert source.survey().path_length_m == pytest.approx(np.linalg.norm(steps, axis=1).sum())
+
+
+def test_a_range_of_scans_can_be_read_alone(tmp_path):
+    source = open_source(save(tmp_path / "run.log", drive(10)))
+    everything = scans_of(source)
+    for first, end in [(0, 3), (4, 9), (9, None), (10, None), (3, 3)]:
+        part = only_scans(source.records(ScanRange(first, end)))
+        assert [scan.stamp for scan in part] == [scan.stamp for scan in everything[first:end]]
+        assert source.survey(ScanRange(first, end)).scan_count == len(part)
+
+
+def test_memory_does_not_depend_on_the_length(tmp_path):
+    def peak_bytes(scans):
+        source = open_source(save(tmp_path / f"{scans}.log", drive(scans, beams=90)))
+        tracemalloc.start()
+        source.survey()
+        for _ in source.records():
+            pass
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    peak_bytes(10)
+    assert peak_bytes(3000) < 1.2 * peak_bytes(300) + 20_000
