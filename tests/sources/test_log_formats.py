@@ -195,6 +195,15 @@ def test_a_range_of_scans_can_be_read_alone(tmp_path):
         assert source.survey(ScanRange(first, end)).scan_count == len(part)
 
 
+@pytest.mark.parametrize("cut", [1, 4, 9])
+def test_two_ranges_make_the_whole(tmp_path, cut):
+    source = open_source(save(tmp_path / "run.log", drive(10)))
+    parts = [*source.records(ScanRange(0, cut)), *source.records(ScanRange(cut))]
+    assert [(type(record), record.stamp) for record in parts] == [
+        (type(record), record.stamp) for record in source.records()
+    ]
+
+
 def test_memory_does_not_depend_on_the_length(tmp_path):
     def peak_bytes(scans):
         source = open_source(save(tmp_path / f"{scans}.log", drive(scans, beams=90)))
