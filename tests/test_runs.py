@@ -115,7 +115,7 @@ def test_the_working_folder_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError, MemoryError])
-@pytest.mark.parametrize("step", ["write_tum", "_metrics_json", "_replace"])
+@pytest.mark.parametrize("step", ["write_tum", "metrics_json", "_replace"])
 def test_an_interrupted_writer_leaves_the_place_as_it_was(tmp_path, run, monkeypatch, failure, step):
     write_run(Run((trajectory("first"),)), tmp_path / "run")
 

@@ -134,7 +134,7 @@ def write_run(run: Run, path: Path, force: bool = False) -> None:
             write_tum(_tum_path(folder, trajectory.robot), trajectory.stamps, trajectory.T_map_base)
         _write_csv(folder / ROBOTS, _ROBOT_COLUMNS, map(_robot_fields, run.trajectories))
         _write_csv(folder / CLOSURES, _CLOSURE_COLUMNS, map(_closure_fields, run.closures))
-        (folder / METRICS).write_text(_metrics_json(run.metrics), encoding="utf-8")
+        (folder / METRICS).write_text(metrics_json(run.metrics), encoding="utf-8")
         (folder / CONFIG).write_text(run.config_yaml, encoding="utf-8")
         (folder / POSE_GRAPH).write_text(run.pose_graph_g2o, encoding="utf-8")
         for name, content in run.map_files.items():
@@ -266,7 +266,7 @@ def _read_closure(row: dict[str, str]) -> ClosureRow:
     )
 
 
-def _metrics_json(metrics: Iterable[Metric]) -> str:
+def metrics_json(metrics: Iterable[Metric]) -> str:
     """JSON has no NaN: a metric without a value is null."""
     rows = [
         {"name": metric.name, "value": metric.value if math.isfinite(metric.value) else None, "unit": metric.unit}
