@@ -39,6 +39,11 @@ def test_every_command_has_an_example(command, capsys):
     assert f"Example: fcslam {' '.join(command)}" in capsys.readouterr().out
 
 
+def test_arguments_are_explained(capsys):
+    main(["evaluate", "relations", "--help"])
+    assert "The run folder to measure." in capsys.readouterr().out
+
+
 def test_no_command_is_help(capsys):
     main([])
     shown = capsys.readouterr()
