@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 EXTRAS ?= dev
 VENV := .venv
 BIN := $(VENV)/bin
-INSTALLED := $(VENV)/.installed
+INSTALLED := $(VENV)/.installed-$(EXTRAS)
 DEMO ?= demo
 
 .PHONY: help install demo test test-system check bench proto

@@ -26,7 +26,7 @@ def run():
         ClosureStatus.REJECTED, 'outside the cluster, "3 of 7"',
     )  # fmt: skip
     return Run(
-        trajectories=(trajectory(), trajectory("b-2", 1, count=1, seed=1), trajectory("empty", 2, count=0)),
+        trajectories=(trajectory(), trajectory("b-2", 1, count=1, seed=1), trajectory("étage.0", 2, count=0)),
         closures=(closure,),
         metrics=(Metric("uplink", 4.5, "kB/s"), Metric("error", float("nan"), "m")),
         config_yaml="seed: 1\n",

@@ -34,7 +34,7 @@ METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
 _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
 _CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", "reason"]
-_SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+_SAFE_NAME = re.compile(r"\w[\w.-]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +116,17 @@ def prepare_output(path: Path, force: bool = False) -> Path:
     return place
 
 
+def check_names(names: Iterable[str]) -> None:
+    """Check, before the long work, that robots' names can be file names.
+
+    Raises:
+        OutputError: one cannot.
+    """
+    for name in names:
+        if not _SAFE_NAME.fullmatch(name):
+            raise OutputError(f"{name!r} cannot be a file name; use letters, digits, '_', '-' and '.'")
+
+
 def is_run_folder(path: Path) -> bool:
     """Whether ``path`` has the two entries that every run folder has."""
     return (path / ROBOTS).is_file() and (path / TRAJECTORIES).is_dir()
@@ -127,7 +138,7 @@ def write_run(run: Run, path: Path, force: bool = False) -> None:
     Raises:
         OutputError: as in ``prepare_output``, a name cannot be a file's, or writing fails.
     """
-    _check_names([trajectory.robot for trajectory in run.trajectories] + list(run.map_files))
+    check_names([trajectory.robot for trajectory in run.trajectories] + list(run.map_files))
     with _staged(prepare_output(path, force)) as folder:
         (folder / TRAJECTORIES).mkdir()
         for trajectory in run.trajectories:
@@ -223,12 +234,6 @@ def _replace(place: Path, staging: Path, retired: Path) -> None:
         if retired.exists():
             retired.rename(place)
         raise
-
-
-def _check_names(names: Iterable[str]) -> None:
-    for name in names:
-        if not _SAFE_NAME.fullmatch(name):
-            raise OutputError(f"{name!r} cannot be a file name; use letters, digits, '_', '-' and '.'")
 
 
 def _tum_path(folder: Path, robot: str) -> Path:
