@@ -106,14 +106,14 @@ def test_a_stamp_that_two_robots_share_is_not_guessed():
 def test_selection_across_robots_gap_and_unusable_count():
     stamps = np.array([0.0, 10.0, 30.0, 60.0, 100.0])
     table = PoseTable.of(stamps, np.zeros((5, 3)), robots=[0, 0, 1, 1, 2], maps=[0, 0, 0, 0, 1])
-    pairs = np.array([[0, 10], [10, 30], [0, 30], [60, 0], [60, 100], [0, 999]], dtype=float)
-    relations = Relations(pairs, np.zeros((6, 3)))
-    assert len(select(relations, table)) == 6
-    assert len(select(relations, table, minimum_gap_s=20.0)) == 4
+    pairs = np.array([[0, 10], [10, 30], [0, 30], [60, 0], [60, 100], [0, 999], [100, 999]], dtype=float)
+    relations = Relations(pairs, np.zeros((7, 3)))
+    assert len(select(relations, table)) == 7
+    assert len(select(relations, table, minimum_gap_s=20.0)) == 5
     across = select(relations, table, minimum_gap_s=20.0, across_robots=True)
-    assert across.stamps.tolist() == [[0, 30], [60, 0], [60, 100], [0, 999]]
+    assert across.stamps.tolist() == [[0, 30], [60, 0], [60, 100], [0, 999], [100, 999]]
     errors = relation_errors(across, table)
-    assert (errors.used, errors.total) == (2, 4)
+    assert (errors.used, errors.total) == (2, 5)
 
 
 def test_robots_in_separate_maps_leave_nothing_usable_and_no_number():

@@ -160,6 +160,19 @@ def test_heading_noise_grows_with_the_square_root_of_the_way():
     assert np.std(headings[:, 160]) == pytest.approx(0.04, rel=0.15)
 
 
+@pytest.mark.parametrize(
+    ("bias", "turn_share", "travel_share"), [("scale_bias", 1.0, 0.0), ("veer_bias_rad_m", 0.0, 1.0)]
+)
+def test_biases_grow_with_what_causes_them(bias, turn_share, travel_share):
+    turning = np.column_stack((np.zeros((101, 2)), np.linspace(0.0, 3.0, 101)))
+    driving = np.column_stack((np.linspace(0.0, 3.0, 101), np.zeros((101, 2))))
+    settings, rng = NO_DRIFT.model_copy(update={bias: 0.01}), np.random.default_rng(6)
+    for truth, share in ((turning, turn_share), (driving, travel_share)):
+        wrong = np.array([drift(truth, settings, rng)[:, 2] - truth[:, 2] for _ in range(400)])
+        assert np.std(wrong[:, 100]) == pytest.approx(share * 0.03, rel=0.15, abs=1e-12)
+        np.testing.assert_allclose(wrong[:, 50], wrong[:, 100] / 2.0, atol=1e-9)
+
+
 def test_default_odometry_is_bad_enough_to_need_a_map(fleet):
     for robot in fleet.robots:
         end = se2.between(se2.between(robot.T_building_base[0], robot.T_building_base[-1]), robot.T_odom_base[-1])
