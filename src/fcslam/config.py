@@ -1,6 +1,7 @@
 """Typed configuration: load, check, dump. Each room owns its model; units stand in the field names."""
 
 import difflib
+import math
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -62,6 +63,7 @@ def dump(settings: Settings) -> str:
 def _lines(settings: Settings, indent: int) -> list[str]:
     pad = "  " * indent
     lines: list[str] = []
+    plain = settings.model_dump(mode="json")
     for name, field in type(settings).model_fields.items():
         value = getattr(settings, name)
         if field.description:
@@ -69,8 +71,14 @@ def _lines(settings: Settings, indent: int) -> list[str]:
         if isinstance(value, Settings):
             lines += [f"{pad}{name}:", *_lines(value, indent + 1)]
         else:
-            lines.append(f"{pad}{yaml.safe_dump({name: value}, default_flow_style=None).strip()}")
+            lines.append(f"{pad}{name}: {_flow(plain[name])}")
     return lines
+
+
+def _flow(value: Any) -> str:
+    """YAML of one value on one line."""
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
+    return text.removesuffix("\n...\n").strip()
 
 
 def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:

@@ -1,0 +1,67 @@
+"""The command line: one module a command. What a command needs is imported when it runs, so that help is quick."""
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import click
+import typer
+
+import fcslam
+from fcslam.cli import config, evaluate
+from fcslam.errors import FcslamError
+
+BAD_INPUT, INTERRUPTED = 2, 130
+"""Exit codes: 2 for what the user can mend, 130 as a shell says it for Ctrl-C."""
+
+app = typer.Typer(
+    name="fcslam",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.add_typer(config.app, name="config")
+app.add_typer(evaluate.app, name="evaluate")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command that ``arguments`` (or the process's own) name, and return its exit code.
+
+    What the user can mend is one line on stderr, never a traceback.
+    """
+    try:
+        code = app(arguments, standalone_mode=False) or 0
+    except FcslamError as error:
+        return _fail(str(error), BAD_INPUT)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        code = INTERRUPTED
+    # typer itself turns Ctrl-C into this code
+    return _fail("interrupted", code) if code == INTERRUPTED else int(code)
+
+
+def _fail(message: str, code: int) -> int:
+    typer.echo(f"fcslam: {' '.join(message.split())}", err=True)
+    return code
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"fcslam {fcslam.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _fcslam(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Several robots map one building together: one map, every robot's trajectory in it."""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""The relations metric over run folders."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.errors import EvaluationError, OutputError
+from fcslam.metrics.relations import (
+    ACROSS_ROBOTS_GAP_S,
+    PoseTable,
+    RelationErrors,
+    read_relations,
+    relation_errors,
+    select,
+)
+from fcslam.runs import Metric, Run, metrics_json, open_run
+
+
+@dataclass(frozen=True, slots=True)
+class RelationsQuestion:
+    """Which relations are asked for."""
+
+    across_robots: bool = False
+    """Only those whose two stamps belong to different robots."""
+    minimum_gap_s: float | None = None
+    """Only those whose stamps lie further apart; if not said, 20 s across robots and everything otherwise."""
+    parts: Path | None = None
+    """Run folder that says which stamp belongs to which robot, if not the evaluated one: so that one robot's run is
+    measured by the same relations as the run of several that share its recording."""
+
+    @property
+    def gap_s(self) -> float:
+        """The gap that applies."""
+        if self.minimum_gap_s is not None:
+            return self.minimum_gap_s
+        return ACROSS_ROBOTS_GAP_S if self.across_robots else 0.0
+
+
+def evaluate_relations(run: Path, relations: Path, question: RelationsQuestion) -> RelationErrors:
+    """Errors of the run folder ``run`` against the file ``relations``.
+
+    Raises:
+        EvaluationError: one of them cannot be read, no relation is asked for, or none names a stamp of the run.
+    """
+    reference = read_relations(relations)
+    poses = pose_table(open_run(run))
+    robots = poses if question.parts is None else pose_table(open_run(question.parts))
+    selected = select(reference, robots, question.gap_s, question.across_robots)
+    if not len(selected):
+        which = "between different robots" if question.across_robots else "in it"
+        raise EvaluationError(f"{relations}: no relation {which} spans more than {question.gap_s:g} s")
+    return relation_errors(selected, poses)
+
+
+def pose_table(run: Run) -> PoseTable:
+    """All poses of ``run`` in one table; robots are numbered in the run's order."""
+    if not run.trajectories:
+        return PoseTable.of([], np.empty((0, 3)))
+    counts = [len(trajectory.stamps) for trajectory in run.trajectories]
+    return PoseTable.of(
+        np.concatenate([trajectory.stamps for trajectory in run.trajectories]),
+        np.concatenate([trajectory.T_map_base for trajectory in run.trajectories]),
+        robots=np.repeat(np.arange(len(counts)), counts),
+        maps=np.repeat([trajectory.map_index for trajectory in run.trajectories], counts),
+    )
+
+
+def relation_metrics(errors: RelationErrors) -> tuple[Metric, ...]:
+    """The errors as named numbers."""
+    spreads = (("translation", errors.translation, "m"), ("rotation", errors.rotation, "deg"))
+    return (
+        *(
+            Metric(f"{name}_error_{which}", value, unit)
+            for name, spread, unit in spreads
+            for which, value in (("mean", spread.mean), ("std", spread.std), ("max", spread.maximum))
+        ),
+        Metric("relations_used", errors.used, "relations"),
+        Metric("relations_total", errors.total, "relations"),
+    )
+
+
+def write_metrics(metrics: tuple[Metric, ...], path: Path) -> None:
+    """Write ``metrics`` as JSON if ``path`` ends in ``.json``, else as CSV with the columns name, value, unit.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            if path.suffix == ".json":
+                file.write(metrics_json(metrics))
+            else:
+                rows = [(metric.name, f"{metric.value:.9g}", metric.unit) for metric in metrics]
+                csv.writer(file, lineterminator="\n").writerows([("name", "value", "unit"), *rows])
+    except OSError as error:
+        raise OutputError(f"{path}: cannot write the table ({error})") from error

@@ -1,0 +1,130 @@
+"""The command line: help with examples, numbers, and one clear line with exit code 2 for bad input."""
+
+import os
+import signal
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from fcslam import __version__, cli
+from fcslam.cli import main
+from fcslam.config import Settings
+from fcslam.runs import RobotTrajectory, Run, write_run
+
+
+@pytest.fixture
+def run_and_relations(tmp_path, monkeypatch):
+    """Two robots that stand 1 m apart, one relation that says 1.25 m, one that nothing answers; in an own folder."""
+    monkeypatch.chdir(tmp_path)
+    trajectories = [
+        RobotTrajectory(f"r{k}", 0, np.array([100.0 * k]), np.array([[float(k), 0.0, 0.0]])) for k in (0, 1)
+    ]
+    write_run(Run(tuple(trajectories)), tmp_path / "run")
+    (tmp_path / "relations").write_text("0 100 1.25 0 0 0 0 0\n0 999 0 0 0 0 0 0\n")
+    return str(tmp_path / "run"), str(tmp_path / "relations")
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"fcslam {__version__}\n"
+
+
+@pytest.mark.parametrize("command", [["config", "dump"], ["evaluate", "relations"]])
+def test_every_command_has_an_example(command, capsys):
+    assert main([*command, "--help"]) == 0
+    assert f"Example: fcslam {' '.join(command)}" in capsys.readouterr().out
+
+
+def test_arguments_are_explained(capsys):
+    main(["evaluate", "relations", "--help"])
+    assert "The run folder to measure." in capsys.readouterr().out
+
+
+def test_no_command_is_help(capsys):
+    main([])
+    shown = capsys.readouterr()
+    assert "evaluate" in shown.out + shown.err
+
+
+def test_config_dump_prints_the_mission_configuration(capsys, monkeypatch):
+    class MissionConfig(Settings):
+        seed: int = Field(default=7, description="of everything random")
+
+    mission = types.ModuleType("fcslam.mission")
+    mission.MissionConfig = MissionConfig
+    monkeypatch.setitem(sys.modules, "fcslam.mission", mission)
+    assert main(["config", "dump"]) == 0
+    assert capsys.readouterr().out == "# of everything random\nseed: 7\n"
+
+
+def test_relations_table(run_and_relations, capsys, tmp_path):
+    assert main(["evaluate", "relations", *run_and_relations, "--csv", str(tmp_path / "table.csv")]) == 0
+    out = capsys.readouterr().out
+    assert "0.2500" in out
+    assert "1 of 2 relations used" in out
+    assert (tmp_path / "table.csv").read_text().startswith("name,value,unit\ntranslation_error_mean,0.25,m\n")
+
+
+def test_relations_across_robots_with_the_parts_of_another_run(run_and_relations, capsys):
+    run, relations = run_and_relations
+    assert main(["evaluate", "relations", run, relations, "--across-robots", "--parts", run, "--gap-s", "50"]) == 0
+    assert "1 of 2 relations across robots used" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing", "{relations}"], "missing: no run folder"),
+        (["{run}", "missing"], "missing: cannot read the relations"),
+        (["{run}", "{run}"], "cannot read the relations"),
+        (["{run}", "{relations}", "--parts", "missing"], "missing: no run folder"),
+        (["{run}", "{relations}", "--gap-s", "5000"], "spans more than 5000 s"),
+        (["{run}", "{relations}", "--csv", "missing/table.csv"], "cannot write the table"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(run_and_relations, capsys, arguments, message):
+    names = dict(zip(("{run}", "{relations}"), run_and_relations, strict=True))
+    assert main(["evaluate", "relations", *(names.get(argument, argument) for argument in arguments)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("fcslam: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["mapp"], ["--nonsense"], ["evaluate", "relations"], ["evaluate", "relations", "a", "b", "--gap-s", "x"]],
+)
+def test_wrong_usage_is_exit_code_2_without_a_traceback(capsys, arguments):
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert error.strip()
+
+
+def test_faults_of_the_program_are_not_hidden(monkeypatch):
+    def broken(*_arguments, **_options):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(cli, "app", broken)
+    with pytest.raises(ZeroDivisionError):
+        main(["--version"])
+
+
+def test_ctrl_c_is_one_line_and_130(tmp_path):
+    """The installed entry point, interrupted while it waits for the relations on a pipe that nobody writes."""
+    write_run(Run(()), tmp_path / "run")
+    os.mkfifo(tmp_path / "relations")
+    program = "import sys; from fcslam.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "evaluate", "relations", "run", "relations"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        pipe = os.open(tmp_path / "relations", os.O_WRONLY)  # returns once the command has opened its end
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=20)
+        os.close(pipe)
+    assert process.returncode == 130
+    assert error.strip() == "fcslam: interrupted"

@@ -1,0 +1,147 @@
+"""Rooms import only rooms below them, and `import fcslam` is light."""
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "src" / "fcslam"
+
+# From the ground up. A room may import itself and every room that stands before it.
+ROOMS = [
+    "errors",
+    "records",
+    "config",
+    "geometry",
+    "metrics",
+    "runs",
+    "sources",
+    "graph",
+    "lidar",
+    "features",
+    "places",
+    "wire",
+    "robot",
+    "cloud",
+    "learning",
+    "federated",
+    "simulation",
+    "mission",
+    "evaluation",
+    "dashboard",
+    "bridges",
+    "cli",
+]
+
+# Rooms that may see less than what stands before them: the last room that each may import.
+CEILINGS = {"learning": "features", "simulation": "sources"}
+
+HEAVY = ["torch", "flwr", "mujoco", "matplotlib", "fastapi", "gtsam", "cv2", "numba", "scipy"]
+
+
+def room_of(module: str) -> str:
+    """Room of a dotted module name; empty for the package itself."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def allowed(room: str) -> set[str]:
+    """Rooms that ``room`` may import, the package's own __init__ (its version) included."""
+    ceiling = ROOMS.index(CEILINGS[room]) + 1 if room in CEILINGS else ROOMS.index(room)
+    return {"", room, *ROOMS[:ceiling]}
+
+
+def imported_modules(tree: ast.AST, package: list[str]) -> Iterator[str]:
+    """Every fcslam module imported anywhere in ``tree``, inside functions and type-checking blocks too."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            origin = ".".join([*base, *([node.module] if node.module else [])])
+            # `from fcslam import runs` names a room, `from fcslam.runs import Run` does not: both begin with the room.
+            names = [f"{origin}.{alias.name}" for alias in node.names] if origin == "fcslam" else [origin]
+        else:
+            continue
+        yield from (name for name in names if name.split(".")[0] == "fcslam" and not name.endswith(".__version__"))
+
+
+def violations(source: str, path: Path) -> list[str]:
+    parts = ["fcslam", *path.with_suffix("").parts]
+    room = "" if path.name == "__init__.py" and len(parts) == 2 else parts[1]
+    package = parts[:-1]
+    seen = {room_of(module) for module in imported_modules(ast.parse(source), package)}
+    may = allowed(room) if room else {"", "errors", "records"}
+    return [f"{path}: {room or 'fcslam'} imports {other}" for other in sorted(seen - may)]
+
+
+def test_every_room_is_known():
+    rooms = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert rooms - {"__init__"} <= set(ROOMS)
+
+
+def test_rooms_import_only_rooms_below():
+    found = [
+        violation
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for violation in violations(path.read_text(encoding="utf-8"), path.relative_to(PACKAGE))
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("room", "line", "refused"),
+    [
+        ("geometry/se2.py", "import fcslam.cli", True),
+        ("geometry/se2.py", "from fcslam import cli", True),
+        ("geometry/se2.py", "def late():\n    from fcslam.lidar.grid import Grid", True),
+        ("geometry/se2.py", "from ..lidar import grid", True),
+        ("geometry/se2.py", "from .alignment import align", False),
+        ("graph/g2o.py", "from fcslam.sources import open_source", False),
+        ("sources/carmen.py", "from fcslam.graph import pose_graph", True),
+        ("learning/trainer.py", "from fcslam.features import codes", False),
+        ("learning/trainer.py", "from fcslam.cloud import fleet", True),
+        ("simulation/world.py", "from fcslam.sources import write_carmen", False),
+        ("simulation/world.py", "from fcslam.graph import optimizer", True),
+        ("mission.py", "from fcslam.evaluation import relations", True),
+        ("cli/map.py", "from fcslam import __version__, mission", False),
+        ("__init__.py", "from fcslam.mission import run", True),
+    ],
+)
+def test_the_rule_itself(room, line, refused):
+    assert bool(violations(line, Path(room))) is refused
+
+
+def probe(statement: str, folder: Path) -> dict[str, object]:
+    """Import time and what was loaded, from a fresh interpreter in an empty folder."""
+    program = [
+        "import json, sys, time",
+        f"sys.path.insert(0, {str(PACKAGE.parent)!r})",
+        "start = time.perf_counter()",
+        statement,
+        "spent = time.perf_counter() - start",
+        f"heavy = [name for name in {HEAVY!r} if name in sys.modules]",
+        "print(json.dumps({'s': spent, 'heavy': heavy}))",
+    ]
+    result = subprocess.run(
+        [sys.executable, "-I", "-B", "-c", "\n".join(program)],
+        cwd=folder,
+        env={"HOME": str(folder), "XDG_CACHE_HOME": str(folder)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert result.stderr == ""
+    answer: dict[str, object] = json.loads(result.stdout)
+    return answer
+
+
+@pytest.mark.parametrize("statement", ["import fcslam", "import fcslam.cli"])
+def test_import_is_light_and_writes_nothing(statement, tmp_path):
+    answers = [probe(statement, tmp_path) for _ in range(3)]
+    assert answers[0]["heavy"] == []
+    assert min(answer["s"] for answer in answers) < 0.5
+    assert list(tmp_path.iterdir()) == []

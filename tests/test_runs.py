@@ -1,0 +1,199 @@
+"""The run folder: what is written is read back, and nothing half written ever looks whole."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fcslam import runs
+from fcslam.errors import EvaluationError, OutputError
+from fcslam.geometry import se2
+from fcslam.records import Channel, ClosureStatus
+from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, open_run, prepare_output, write_run
+
+
+def trajectory(robot="robot_1", map_index=0, count=40, seed=0):
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack((rng.normal(0.0, 30.0, (count, 2)), rng.uniform(-np.pi, np.pi, count)))
+    return RobotTrajectory(robot, map_index, 976052857.337530 + np.sort(rng.uniform(0, 100, count)), poses)
+
+
+@pytest.fixture
+def run():
+    closure = ClosureRow(
+        "robot_1", 976052857.33753, "b-2", 976052999.5, Channel.LIDAR, 0.25, np.array([1.0, -2.5, 3.0]),
+        ClosureStatus.REJECTED, 'outside the cluster, "3 of 7"',
+    )  # fmt: skip
+    return Run(
+        trajectories=(trajectory(), trajectory("b-2", 1, count=1, seed=1), trajectory("étage.0", 2, count=0)),
+        closures=(closure,),
+        metrics=(Metric("uplink", 4.5, "kB/s"), Metric("error", float("nan"), "m")),
+        config_yaml="seed: 1\n",
+        pose_graph_g2o="VERTEX_SE2 0 0 0 0\n",
+        map_files={"map.pgm": b"P5\x00\xff", "map_1.yaml": b"image: map_1.pgm\n"},
+    )
+
+
+def hidden(folder):
+    return [entry.name for entry in folder.iterdir() if entry.name.startswith(".")]
+
+
+def test_what_is_written_is_read_back(tmp_path, run):
+    write_run(run, tmp_path / "deep" / "run")
+    back = open_run(tmp_path / "deep" / "run")
+    for given, read in zip(run.trajectories, back.trajectories, strict=True):
+        assert (given.robot, given.map_index, len(given.stamps)) == (read.robot, read.map_index, len(read.stamps))
+        np.testing.assert_allclose(read.stamps, given.stamps, atol=1e-6, rtol=0)
+        np.testing.assert_allclose(se2.between(given.T_map_base, read.T_map_base), 0.0, atol=1e-7)
+    closure, given = back.closures[0], run.closures[0]
+    np.testing.assert_allclose(closure.T_i_j, given.T_i_j, atol=1e-6)
+    for name in ("robot_i", "stamp_i", "robot_j", "stamp_j", "channel", "similarity", "status", "reason"):
+        assert getattr(closure, name) == getattr(given, name)
+    assert back.metrics[0] == run.metrics[0]
+    assert np.isnan(back.metrics[1].value)
+    assert (back.config_yaml, back.pose_graph_g2o) == (run.config_yaml, run.pose_graph_g2o)
+    assert dict(back.map_files) == dict(run.map_files)
+
+
+def test_tables_have_the_columns_promised(tmp_path, run):
+    write_run(run, tmp_path / "run")
+    robots = (tmp_path / "run" / "robots.csv").read_text().splitlines()
+    assert robots[0] == "robot,map,path_length_m,scans"
+    assert robots[2] == "b-2,1,0.000,1"
+    closures = (tmp_path / "run" / "closures.csv").read_text().splitlines()
+    assert closures[0] == "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason"
+    line = (tmp_path / "run" / "trajectories" / "robot_1.tum").read_text().splitlines()[0].split()
+    assert line[3:6] == ["0", "0", "0"]
+    assert [len(line[i].split(".")[1]) for i in (0, 1, 2, 6, 7)] == [9] * 5
+
+
+def test_path_length_is_that_of_the_polygon():
+    square = RobotTrajectory(
+        "r", 0, np.arange(5.0), np.array([[0, 0, 0], [3, 0, 1], [3, 4, 2], [0, 4, 3], [0, 0, 0.0]])
+    )
+    assert square.path_length_m == 14.0
+
+
+def test_a_second_run_needs_force_and_leaves_nothing_of_the_first(tmp_path, run):
+    write_run(run, tmp_path / "run")
+    with pytest.raises(OutputError, match="--force"):
+        write_run(run, tmp_path / "run")
+    write_run(Run((trajectory("other"),)), tmp_path / "run", force=True)
+    assert [t.robot for t in open_run(tmp_path / "run").trajectories] == ["other"]
+    assert not (tmp_path / "run" / "map.pgm").exists()
+    assert hidden(tmp_path) == []
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_folder_that_is_no_run_is_never_replaced(tmp_path, run, force):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
+    with pytest.raises(OutputError, match="no run folder"):
+        write_run(run, tmp_path / "thesis", force=force)
+    assert (tmp_path / "thesis" / "chapter1.tex").read_text() == "years of work"
+
+
+def test_an_empty_folder_may_be_used(tmp_path, run):
+    (tmp_path / "run").mkdir()
+    write_run(run, tmp_path / "run")
+    assert len(open_run(tmp_path / "run").trajectories) == 3
+
+
+@pytest.mark.parametrize("where", ["file", "file/below", "/", "/proc/nowhere/run"])
+def test_impossible_places_are_refused_in_one_line(tmp_path, where):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError) as caught:
+        prepare_output(tmp_path / where, force=True)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_working_folder_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match="inside it"):
+        prepare_output(Path("."))
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError, MemoryError])
+@pytest.mark.parametrize("step", ["write_tum", "metrics_json", "_replace"])
+def test_an_interrupted_writer_leaves_the_place_as_it_was(tmp_path, run, monkeypatch, failure, step):
+    write_run(Run((trajectory("first"),)), tmp_path / "run")
+
+    def interrupted(*_arguments):
+        raise failure
+
+    monkeypatch.setattr(runs, step, interrupted)
+    for place in ("run", "fresh"):
+        with pytest.raises(OutputError if failure is OSError else failure):
+            write_run(run, tmp_path / place, force=True)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
+    assert [t.robot for t in open_run(tmp_path / "run").trajectories] == ["first"]
+
+
+def test_the_old_run_comes_back_if_the_last_rename_fails(tmp_path, run, monkeypatch):
+    write_run(Run((trajectory("first"),)), tmp_path / "run")
+    rename = Path.rename
+
+    def failing(self, target):
+        if self.name.endswith(".partial"):
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(KeyboardInterrupt):
+        write_run(run, tmp_path / "run", force=True)
+    assert [t.robot for t in open_run(tmp_path / "run").trajectories] == ["first"]
+    assert hidden(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["", "..", ".hidden", "a/b", "../../etc/passwd", "a\nb", "-"])
+def test_names_that_are_no_file_names_are_refused(tmp_path, name):
+    with pytest.raises(OutputError, match="file name"):
+        write_run(Run((trajectory(name),)), tmp_path / "run")
+    with pytest.raises(OutputError, match="file name"):
+        write_run(Run((), map_files={name: b""}), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_folder_has_the_permissions_of_any_new_folder(tmp_path, run):
+    (tmp_path / "other").mkdir()
+    write_run(run, tmp_path / "run")
+    assert os.stat(tmp_path / "run").st_mode == os.stat(tmp_path / "other").st_mode
+
+
+def test_what_is_no_run_folder_is_refused(tmp_path):
+    for path in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(EvaluationError, match="no run folder"):
+            open_run(path)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("trajectories/robot_1.tum", "1 2 3\n", "8"),
+        ("trajectories/robot_1.tum", "1 2 3 0 0 0 0 nan\n", "not finite"),
+        ("trajectories/robot_1.tum", "1 2 3 0 0 0 0 x\n", "robot_1.tum"),
+        ("trajectories/robot_1.tum", None, "robot_1.tum"),
+        ("robots.csv", "robot,map\nrobot_1,0\n", "line 2"),
+        ("robots.csv", "robot,map,path_length_m,scans\n../../x,0,1,1\n", "no robot's name"),
+        ("robots.csv", "robot,map,path_length_m,scans\nrobot_1,zero,1,1\n", "zero"),
+        ("closures.csv", "robot_i\nrobot_1\n", "closures.csv, line 2"),
+        ("closures.csv", None, "closures.csv"),
+        ("metrics.json", "{", "broken"),
+        ("metrics.json", '{"a": 1}', "metrics.json"),
+        ("metrics.json", "[3]", "metrics.json"),
+        ("config.yaml", None, "config.yaml"),
+        ("robots.csv", "\x00\xff", "broken"),
+        ("robots.csv", "robot,map,path_length_m,scans\n" + "x" * 200_000 + ",0,1,1\n", "broken"),
+    ],
+)
+def test_a_broken_run_folder_is_refused_in_one_line(tmp_path, run, file, content, message):
+    write_run(run, tmp_path / "run")
+    path = tmp_path / "run" / file
+    if content is None:
+        path.unlink()
+    else:
+        path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(EvaluationError, match=message) as caught:
+        open_run(tmp_path / "run")
+    assert "\n" not in str(caught.value)
