@@ -1,0 +1,208 @@
+"""Correlative scan matching (Karto) as branch and bound (Hess et al., ICRA 2016): the global search behind Gauss-Newton.
+
+The field is drawn as a likelihood grid; each level of a pyramid holds the maximum over windows of 2^h cells, so one
+look-up bounds a whole square of shifts from above, and only squares that can still win are opened.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.lidar.field import SurfelField
+from fcslam.lidar.scan import PointScan
+from fcslam.records import FloatArray
+
+
+class SearchConfig(Settings):
+    """Correlative search by branch and bound."""
+
+    cell_m: float = Field(default=0.1, gt=0, description="cell of the likelihood grid")
+    smear_m: float = Field(default=0.1, gt=0, description="standard deviation of the likelihood around a surface")
+    levels: int = Field(default=6, ge=1, le=10, description="levels of the pyramid; the coarsest step is 2^(levels - 1)")
+    points: int = Field(default=120, gt=0, description="at most this many points are scored")
+    distance_penalty: float = Field(default=0.2, ge=0, lt=1, description="score lost at the edge of the window (Karto)")
+    angle_penalty: float = Field(default=0.1, ge=0, lt=1, description="score lost at the largest turn (Karto)")
+
+
+@dataclass(frozen=True, slots=True)
+class SearchWindow:
+    """Shifts of +- ``radius_m`` and turns of +- ``angle_rad`` around the guess."""
+
+    radius_m: float
+    angle_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class SearchResult:
+    """The best pose of a search."""
+
+    T_field_base: FloatArray
+    score: float
+    """Mean likelihood of the points, in [0, 1], without the penalty."""
+
+
+@dataclass(frozen=True, slots=True)
+class LikelihoodPyramid:
+    """Likelihood of a surface in each cell, 0..255, and its maxima over growing windows."""
+
+    levels: NDArray[np.uint8]
+    """Shape (levels, H, W)."""
+    corner: FloatArray
+    cell_m: float
+
+
+def likelihood_pyramid(
+    field: SurfelField, T_field_guess: FloatArray, half_side_m: float, config: SearchConfig
+) -> LikelihoodPyramid:
+    """Draw the surfaces around the guess that face it (Karto's visibility filter) and build the pyramid."""
+    size = int(np.ceil(2.0 * half_side_m / config.cell_m)) + 1
+    corner = np.asarray(T_field_guess[:2]) - half_side_m
+    base = _draw(field.points, field.normals, T_field_guess, corner, size, config.cell_m, config.smear_m)
+    return LikelihoodPyramid(_pyramid(base, config.levels), corner, config.cell_m)
+
+
+def search(
+    scan: PointScan, field: SurfelField, T_field_guess: FloatArray, window: SearchWindow, config: SearchConfig
+) -> SearchResult:
+    """Best pose of the scan in the window around the guess, to half a cell and half an angle step."""
+    thinned = scan.thinned(config.cell_m, config.points)
+    reach = float(np.max(np.hypot(*thinned.points.T), initial=1.0))
+    half_side = min(reach, 25.0) + window.radius_m + config.cell_m
+    pyramid = likelihood_pyramid(field, T_field_guess, half_side, config)
+    return search_pyramid(thinned, pyramid, T_field_guess, window, config)
+
+
+def search_pyramid(
+    scan: PointScan, pyramid: LikelihoodPyramid, T_field_guess: FloatArray, window: SearchWindow, config: SearchConfig
+) -> SearchResult:
+    """As ``search``, on a pyramid that stands already."""
+    reach = float(np.quantile(np.hypot(*scan.points.T), 0.9)) if len(scan) else 1.0
+    step_rad = 2.0 * np.arcsin(min(0.5, 0.5 * pyramid.cell_m / max(reach, 1.0)))
+    turns = int(np.ceil(window.angle_rad / step_rad))
+    shifts = int(np.ceil(window.radius_m / pyramid.cell_m))
+    pose, score = _branch_and_bound(
+        scan.points, pyramid.levels, pyramid.corner, pyramid.cell_m, np.asarray(T_field_guess, dtype=np.float64),
+        shifts, turns, step_rad, config.distance_penalty, config.angle_penalty,
+    )  # fmt: skip
+    return SearchResult(pose, score)
+
+
+@njit(cache=True)
+def _draw(points, normals, viewpoint, corner, size, cell, smear):  # type: ignore[no-untyped-def]
+    grid = np.zeros((size, size), np.uint8)
+    half = int(np.ceil(2.5 * smear / cell))
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        if normals[i, 0] * (viewpoint[0] - x) + normals[i, 1] * (viewpoint[1] - y) < 0.0:
+            continue
+        cx, cy = int(np.floor((x - corner[0]) / cell)), int(np.floor((y - corner[1]) / cell))
+        for gy in range(max(0, cy - half), min(size, cy + half + 1)):
+            dy = corner[1] + (gy + 0.5) * cell - y
+            for gx in range(max(0, cx - half), min(size, cx + half + 1)):
+                dx = corner[0] + (gx + 0.5) * cell - x
+                value = np.uint8(255.0 * np.exp(-0.5 * (dx * dx + dy * dy) / (smear * smear)))
+                if value > grid[gy, gx]:
+                    grid[gy, gx] = value
+    return grid
+
+
+@njit(cache=True)
+def _pyramid(base, count):  # type: ignore[no-untyped-def]
+    """Level h at (y, x) is the maximum of ``base`` over [y, y + 2^h) x [x, x + 2^h)."""
+    levels = np.empty((count, base.shape[0], base.shape[1]), np.uint8)
+    levels[0] = base
+    rows, columns = base.shape
+    for h in range(1, count):
+        half = 1 << (h - 1)
+        lower, upper = levels[h - 1], levels[h]
+        for y in range(rows):
+            y2 = min(y + half, rows - 1)
+            for x in range(columns):
+                x2 = min(x + half, columns - 1)
+                upper[y, x] = max(max(lower[y, x], lower[y, x2]), max(lower[y2, x], lower[y2, x2]))
+    return levels
+
+
+@njit(cache=True)
+def _bound(cells, level, sx, sy):  # type: ignore[no-untyped-def]
+    """Sum of likelihoods of the points shifted by (sx, sy) cells; cells off the grid count nothing."""
+    total = 0
+    rows, columns = level.shape
+    for i in range(len(cells)):
+        x, y = cells[i, 0] + sx, cells[i, 1] + sy
+        if x >= 0 and y >= 0 and x < columns and y < rows:
+            total += level[y, x]
+    return total
+
+
+@njit(cache=True)
+def _cells_of(points, pose, corner, cell, turn):  # type: ignore[no-untyped-def]
+    cos, sin = np.cos(pose[2] + turn), np.sin(pose[2] + turn)
+    cells = np.empty((len(points), 2), np.int64)
+    for i in range(len(points)):
+        x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
+        y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
+        cells[i, 0] = int(np.floor((x - corner[0]) / cell))
+        cells[i, 1] = int(np.floor((y - corner[1]) / cell))
+    return cells
+
+
+@njit(cache=True)
+def _penalty(near, shifts, turn, turns, distance_penalty, angle_penalty):  # type: ignore[no-untyped-def]
+    """Least penalty factor of a square of shifts whose nearest squared distance is ``near``."""
+    away = distance_penalty * min(1.0, near / max(1, shifts * shifts))
+    return (1.0 - away) * (1.0 - angle_penalty * (turn / max(1, turns)) ** 2)
+
+
+@njit(cache=True)
+def _nearest(low, high):  # type: ignore[no-untyped-def]
+    if low > 0:
+        return low
+    return -high if high < 0 else 0
+
+
+@njit(cache=True)
+def _branch_and_bound(  # type: ignore[no-untyped-def]
+    points, levels, corner, cell, guess, shifts, turns, step, distance_penalty, angle_penalty
+):
+    n = max(1, len(points))
+    top = len(levels) - 1
+    while top > 0 and (1 << top) > shifts + 1:
+        top -= 1
+    width = 1 << top
+    best, best_raw = -1.0, 0.0
+    best_pose = guess.copy()
+    stack = np.empty((4 * (top + 2), 3), np.int64)
+    # Small turns first: a good early score closes most of the rest.
+    for order in range(2 * turns + 1):
+        turn = (order + 1) // 2 if order % 2 else -(order // 2)
+        cells = _cells_of(points, guess, corner, cell, turn * step)
+        for y0 in range(-shifts, shifts + 1, width):
+            for x0 in range(-shifts, shifts + 1, width):
+                stack[0] = (x0, y0, top)
+                size = 1
+                while size > 0:
+                    size -= 1
+                    sx, sy, h = stack[size, 0], stack[size, 1], stack[size, 2]
+                    nx, ny = _nearest(sx, sx + (1 << h) - 1), _nearest(sy, sy + (1 << h) - 1)
+                    raw = _bound(cells, levels[h], sx, sy) / (255.0 * n)
+                    near = nx * nx + ny * ny
+                    score = raw * _penalty(near, shifts, turn, turns, distance_penalty, angle_penalty)
+                    if score <= best:
+                        continue
+                    if h == 0:
+                        best, best_raw = score, raw
+                        best_pose[0] = guess[0] + sx * cell
+                        best_pose[1] = guess[1] + sy * cell
+                        best_pose[2] = guess[2] + turn * step
+                        continue
+                    half = 1 << (h - 1)
+                    for k in range(4):
+                        stack[size] = (sx + half * (k & 1), sy + half * (k >> 1), h - 1)
+                        size += 1
+    best_pose[2] = (best_pose[2] + np.pi) % (2.0 * np.pi) - np.pi
+    return best_pose, best_raw

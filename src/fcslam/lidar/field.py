@@ -1,0 +1,192 @@
+"""The surfaces seen so far, and for every place near them the nearest one: a labelled distance field.
+
+Surfaces are *surfels*: running means of returns that fell together, with a normal towards the robot. A sparse grid of
+tiles stores in each cell the nearest surfel, so the distance to the map is exact (no interpolation) and costs one
+look-up. Tiles exist only near surfaces: memory follows what was seen, not the range squared.
+"""
+
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fcslam.geometry import se2
+from fcslam.lidar.scan import PointScan
+from fcslam.records import FloatArray
+
+CELL_M: Final = 0.05
+TILE: Final = 32
+"""Cells along one side of a tile."""
+REACH_M: Final = 0.5
+"""Cells farther than this from every surfel hold none."""
+MERGE_M: Final = 0.05
+"""A return this close to a surfel that faces the same way joins it."""
+MEAN_OVER: Final = 30.0
+"""A surfel forgets beyond this many returns, so it can follow its surface."""
+TABLE: Final = 256
+"""Tiles along one side of the field: 409.6 m, more than any submap with any laser."""
+EMPTY: Final = -1
+
+_REACH_CELLS = int(round(REACH_M / CELL_M))
+
+
+class SurfelField:
+    """Nearest-surfel field around an origin, in the coordinates of its submap."""
+
+    def __init__(self, origin_xy: FloatArray) -> None:
+        self.corner = np.asarray(origin_xy[:2], dtype=np.float64) - 0.5 * TABLE * TILE * CELL_M
+        self.table = np.full((TABLE, TABLE), EMPTY, np.int32)
+        self.labels = np.full((64, TILE, TILE), EMPTY, np.int32)
+        self.surfels = np.zeros((1024, 5))
+        self.used = np.zeros(2, np.int64)  # tiles, surfels
+
+    def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
+        """Add a scan seen from ``T_field_base``."""
+        done = 0
+        while True:
+            done = _insert(
+                scan.points, scan.normals, T_field_base, done,
+                self.corner, self.table, self.labels, self.surfels, self.used,
+            )  # fmt: skip
+            if done == len(scan):
+                return
+            self._grow()
+
+    @property
+    def points(self) -> FloatArray:
+        """Positions of the surfels, shape (N, 2)."""
+        return self.surfels[: self.used[1], :2]
+
+    @property
+    def normals(self) -> FloatArray:
+        """Unit normals of the surfels, (0, 0) where unknown, shape (N, 2)."""
+        normals: FloatArray = self.surfels[: self.used[1], 2:4]
+        return normals
+
+    def as_scan(self) -> PointScan:
+        """All surfels as one scan in the field's coordinates."""
+        return PointScan(self.points.copy(), self.normals.copy())
+
+    def nearest(self, points: FloatArray) -> NDArray[np.int32]:
+        """Label of the surfel nearest to the cell of each point, or ``EMPTY``; shape (N,)."""
+        labels: NDArray[np.int32] = _labels_at(points, self.corner, self.table, self.labels)
+        return labels
+
+    def transformed_copy(self) -> "SurfelField":
+        """A field of the same surfels with storage cut to what is used (for keeping)."""
+        copy = SurfelField.__new__(SurfelField)
+        copy.corner, copy.table = self.corner, self.table
+        copy.labels = self.labels[: self.used[0]].copy()
+        copy.surfels = self.surfels[: self.used[1]].copy()
+        copy.used = self.used.copy()
+        return copy
+
+    def _grow(self) -> None:
+        if len(self.labels) - self.used[0] < 9:
+            self.labels = np.concatenate([self.labels, np.full_like(self.labels, EMPTY)])
+        if self.used[1] == len(self.surfels):
+            self.surfels = np.concatenate([self.surfels, np.zeros_like(self.surfels)])
+
+
+@njit(cache=True)
+def label_at(x, y, corner, table, labels):  # type: ignore[no-untyped-def]
+    """Surfel nearest to the cell of (x, y), or EMPTY."""
+    cx = int(np.floor((x - corner[0]) / CELL_M))
+    cy = int(np.floor((y - corner[1]) / CELL_M))
+    tx, ty = cx // TILE, cy // TILE
+    if tx < 0 or ty < 0 or tx >= table.shape[1] or ty >= table.shape[0]:
+        return EMPTY
+    tile = table[ty, tx]
+    if tile == EMPTY:
+        return EMPTY
+    return labels[tile, cy - ty * TILE, cx - tx * TILE]
+
+
+@njit(cache=True)
+def _labels_at(points, corner, table, labels):  # type: ignore[no-untyped-def]
+    result = np.empty(len(points), np.int32)
+    for i in range(len(points)):
+        result[i] = label_at(points[i, 0], points[i, 1], corner, table, labels)
+    return result
+
+
+@njit(cache=True)
+def _insert(points, normals, T, start, corner, table, labels, surfels, used):  # type: ignore[no-untyped-def]
+    """Insert returns from ``start`` on; returns how many are done when all are, or when storage must grow."""
+    cos, sin = np.cos(T[2]), np.sin(T[2])
+    for i in range(start, len(points)):
+        x = T[0] + cos * points[i, 0] - sin * points[i, 1]
+        y = T[1] + sin * points[i, 0] + cos * points[i, 1]
+        nx = cos * normals[i, 0] - sin * normals[i, 1]
+        ny = sin * normals[i, 0] + cos * normals[i, 1]
+        if _merge(x, y, nx, ny, label_at(x, y, corner, table, labels), surfels):
+            continue
+        if used[1] == len(surfels) or len(labels) - used[0] < 9:
+            return i
+        surfels[used[1]] = (x, y, nx, ny, 1.0)
+        _spread(x, y, used[1], corner, table, labels, surfels, used)
+        used[1] += 1
+    return len(points)
+
+
+@njit(cache=True)
+def _merge(x, y, nx, ny, label, surfels):  # type: ignore[no-untyped-def]
+    """Join a return to its surfel if it is near and does not face away; whether it did."""
+    if label == EMPTY:
+        return False
+    s = surfels[label]
+    dx, dy = x - s[0], y - s[1]
+    facing = nx * s[2] + ny * s[3]
+    if dx * dx + dy * dy > MERGE_M * MERGE_M or facing < 0.0:
+        return False
+    s[4] = min(s[4] + 1.0, MEAN_OVER)
+    gain = 1.0 / s[4]
+    s[0] += gain * dx
+    s[1] += gain * dy
+    mx, my = s[2] + gain * (nx - s[2]), s[3] + gain * (ny - s[3])
+    if s[2] == 0.0 and s[3] == 0.0:
+        mx, my = nx, ny
+    elif nx == 0.0 and ny == 0.0:
+        mx, my = s[2], s[3]
+    length = np.hypot(mx, my)
+    if length > 0.0:
+        s[2] = mx / length
+        s[3] = my / length
+    return True
+
+
+@njit(cache=True)
+def _spread(x, y, label, corner, table, labels, surfels, used):  # type: ignore[no-untyped-def]
+    """Give the surfel every cell within reach that has no nearer one."""
+    cx = int(np.floor((x - corner[0]) / CELL_M))
+    cy = int(np.floor((y - corner[1]) / CELL_M))
+    side = table.shape[0] * TILE
+    if cx < _REACH_CELLS or cy < _REACH_CELLS or cx >= side - _REACH_CELLS or cy >= side - _REACH_CELLS:
+        return
+    for gy in range(cy - _REACH_CELLS, cy + _REACH_CELLS + 1):
+        py = corner[1] + (gy + 0.5) * CELL_M
+        for gx in range(cx - _REACH_CELLS, cx + _REACH_CELLS + 1):
+            px = corner[0] + (gx + 0.5) * CELL_M
+            d2 = (px - x) ** 2 + (py - y) ** 2
+            if d2 > REACH_M * REACH_M:
+                continue
+            tx, ty = gx // TILE, gy // TILE
+            tile = table[ty, tx]
+            if tile == EMPTY:
+                tile = used[0]
+                table[ty, tx] = tile
+                labels[tile] = EMPTY
+                used[0] += 1
+            row, column = gy - ty * TILE, gx - tx * TILE
+            old = labels[tile, row, column]
+            if old == EMPTY or (px - surfels[old, 0]) ** 2 + (py - surfels[old, 1]) ** 2 > d2:
+                labels[tile, row, column] = label
+
+
+def field_of(scans: list[tuple[PointScan, FloatArray]]) -> SurfelField:
+    """Field of scans given with their poses in the field's coordinates, around the first of them."""
+    field = SurfelField(scans[0][1] if scans else se2.IDENTITY)
+    for scan, T_field_base in scans:
+        field.insert(scan, T_field_base)
+    return field

@@ -1,0 +1,167 @@
+"""Scan matching: Gauss-Newton on the distances of a scan's points to the nearest surfels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.lidar.field import EMPTY, SurfelField, label_at
+from fcslam.lidar.scan import PointScan
+from fcslam.records import FloatArray
+
+
+class MatchingConfig(Settings):
+    """Gauss-Newton scan matching."""
+
+    iterations: int = Field(default=20, gt=0, description="at most this many Gauss-Newton steps")
+    wide_scale_m: float = Field(default=0.30, gt=0, description="scale of the robust loss at the first step")
+    narrow_scale_m: float = Field(default=0.06, gt=0, description="scale of the robust loss at the end")
+    point_sigma_m: float = Field(
+        default=0.03, gt=0, description="standard deviation of one point's distance; wide, as neighbours err together"
+    )
+    explained_m: float = Field(default=0.10, gt=0, description="a point this close to its surface is explained")
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMatch:
+    """Where a scan lies in a field."""
+
+    T_field_base: FloatArray
+    information: FloatArray
+    """Of the points alone, without the prior; (x, y in the field, theta), shape (3, 3)."""
+    explained: float
+    """Share of the scan's points that lie on a surface."""
+    known: float
+    """Share of the scan's points that fall near any surface."""
+
+
+def match_scan(
+    scan: PointScan,
+    field: SurfelField,
+    T_field_guess: FloatArray,
+    prior_information: FloatArray,
+    config: MatchingConfig,
+) -> ScanMatch:
+    """Pose that minimises the robust distances to the field, held by a prior at the guess.
+
+    ``prior_information``: (3, 3), of (x, y, theta) in the field's coordinates; zeros for none.
+    """
+    pose, information, explained, known = _match(
+        scan.points, scan.normals, T_field_guess, prior_information,
+        field.corner, field.table, field.labels, field.surfels,
+        config.iterations, config.wide_scale_m, config.narrow_scale_m, config.point_sigma_m, config.explained_m,
+    )  # fmt: skip
+    return ScanMatch(pose, information, explained, known)
+
+
+@njit(cache=True)
+def _match(  # type: ignore[no-untyped-def]
+    points, normals, guess, prior, corner, table, labels, surfels, iterations, wide, narrow, sigma, explained_m
+):
+    pose = guess.copy()
+    scale = wide
+    converged = False
+    for _ in range(iterations):
+        H, g = _normal_equations(points, normals, pose, corner, table, labels, surfels, scale)
+        A = H / (sigma * sigma) + prior
+        b = g / (sigma * sigma)
+        offset = pose - guess
+        offset[2] = (offset[2] + np.pi) % (2.0 * np.pi) - np.pi
+        for r in range(3):
+            b[r] += prior[r, 0] * offset[0] + prior[r, 1] * offset[1] + prior[r, 2] * offset[2]
+            A[r, r] += 1e-6
+        step = -np.linalg.solve(A, b)
+        pose += step
+        small = abs(step[0]) + abs(step[1]) < 2e-4 and abs(step[2]) < 1e-4
+        if small and scale <= narrow:
+            converged = True
+            break
+        scale = max(narrow, scale * (0.35 if small else 0.6))
+    if not converged:
+        scale = narrow
+    pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
+    H, g = _normal_equations(points, normals, pose, corner, table, labels, surfels, narrow)
+    explained, known = _explained(points, normals, pose, corner, table, labels, surfels, explained_m)
+    return pose, H / (sigma * sigma), explained, known
+
+
+@njit(cache=True)
+def _normal_equations(points, normals, pose, corner, table, labels, surfels, scale):  # type: ignore[no-untyped-def]
+    """Point-to-line where the surface has a normal, point-to-point elsewhere; Geman-McClure weights."""
+    H = np.zeros((3, 3))
+    g = np.zeros(3)
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    c2 = scale * scale
+    for i in range(len(points)):
+        rx = cos * points[i, 0] - sin * points[i, 1]
+        ry = sin * points[i, 0] + cos * points[i, 1]
+        x, y = pose[0] + rx, pose[1] + ry
+        label = label_at(x, y, corner, table, labels)
+        if label == EMPTY:
+            continue
+        s = surfels[label]
+        dx, dy = x - s[0], y - s[1]
+        nx, ny = s[2], s[3]
+        mx = cos * normals[i, 0] - sin * normals[i, 1]
+        my = sin * normals[i, 0] + cos * normals[i, 1]
+        if nx * mx + ny * my < -0.1:  # the two sides of a thin wall do not attract each other
+            continue
+        d2 = dx * dx + dy * dy
+        if nx == 0.0 and ny == 0.0:
+            nx, ny = mx, my
+        if nx == 0.0 and ny == 0.0:
+            w = 0.5 * (c2 / (c2 + d2)) ** 2
+            _add(H, g, w, 1.0, 0.0, -ry, dx)
+            _add(H, g, w, 0.0, 1.0, rx, dy)
+        else:
+            e = nx * dx + ny * dy
+            along2 = max(0.0, d2 - e * e)
+            w = (c2 / (c2 + e * e + 0.25 * along2)) ** 2
+            _add(H, g, w, nx, ny, ny * rx - nx * ry, e)
+    return H, g
+
+
+@njit(cache=True)
+def _add(H, g, w, jx, jy, jt, e):  # type: ignore[no-untyped-def]
+    H[0, 0] += w * jx * jx
+    H[0, 1] += w * jx * jy
+    H[0, 2] += w * jx * jt
+    H[1, 1] += w * jy * jy
+    H[1, 2] += w * jy * jt
+    H[2, 2] += w * jt * jt
+    H[1, 0] = H[0, 1]
+    H[2, 0] = H[0, 2]
+    H[2, 1] = H[1, 2]
+    g[0] += w * jx * e
+    g[1] += w * jy * e
+    g[2] += w * jt * e
+
+
+@njit(cache=True)
+def _explained(points, normals, pose, corner, table, labels, surfels, limit):  # type: ignore[no-untyped-def]
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    explained = known = 0
+    for i in range(len(points)):
+        x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
+        y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
+        label = label_at(x, y, corner, table, labels)
+        if label == EMPTY:
+            continue
+        known += 1
+        s = surfels[label]
+        mx = cos * normals[i, 0] - sin * normals[i, 1]
+        my = sin * normals[i, 0] + cos * normals[i, 1]
+        if s[2] * mx + s[3] * my < -0.1:
+            continue
+        dx, dy = x - s[0], y - s[1]
+        d = abs(s[2] * dx + s[3] * dy)
+        if s[2] == 0.0 and s[3] == 0.0:
+            d = np.hypot(dx, dy)
+        elif dx * dx + dy * dy > 9.0 * limit * limit:
+            continue
+        if d < limit:
+            explained += 1
+    n = max(1, len(points))
+    return explained / n, known / n

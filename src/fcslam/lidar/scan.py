@@ -1,0 +1,126 @@
+"""One scan as points with normals in the robot's base."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from fcslam.records import FloatArray, LaserModel, Ranges
+
+NORMAL_REACH = 3
+"""Neighbours on each side that a normal is fitted to."""
+MINIMUM_GAP_M = 0.15
+"""Neighbouring returns closer than this lie on one surface, whatever the angle between their beams."""
+GAP_PER_SPACING = 3.0
+"""Neighbouring returns closer than this many beam spacings lie on one surface."""
+LINE_TOLERANCE_M = 0.05
+"""A normal is kept only if its neighbours lie this close to the fitted line (standard deviation)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointScan:
+    """Valid returns of one scan in ``base``."""
+
+    points: FloatArray
+    """Shape (N, 2), metres."""
+    normals: FloatArray
+    """Shape (N, 2): unit vectors towards the laser; (0, 0) where the surface is not a line."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def thinned(self, spacing_m: float, limit: int) -> "PointScan":
+        """Every return at least ``spacing_m`` from the one kept before, at most ``limit`` of them."""
+        keep = _thin(self.points, spacing_m)
+        if len(keep) > limit:
+            keep = keep[np.linspace(0, len(keep) - 1, limit).astype(np.int64)]
+        return PointScan(self.points[keep], self.normals[keep])
+
+
+def point_scan(ranges_m: Ranges, laser: LaserModel) -> PointScan:
+    """Points and normals of the valid returns (0 < range < maximum, finite)."""
+    return PointScan(*_project(ranges_m, laser.angles_rad(), laser.max_range_m, np.array(laser.T_base_laser)))
+
+
+@njit(cache=True)
+def _project(ranges, angles, max_range, T_base_laser):  # type: ignore[no-untyped-def]
+    count = len(ranges)
+    kept = np.empty(count, np.int64)
+    xy = np.empty((count, 2))
+    n = 0
+    cos, sin = np.cos(T_base_laser[2]), np.sin(T_base_laser[2])
+    for i in range(count):
+        r = ranges[i]
+        if r > 0.0 and r < max_range:  # false for NaN
+            x, y = r * np.cos(angles[i]), r * np.sin(angles[i])
+            xy[n, 0] = T_base_laser[0] + cos * x - sin * y
+            xy[n, 1] = T_base_laser[1] + sin * x + cos * y
+            kept[n] = i
+            n += 1
+    points = xy[:n].copy()
+    normals = np.zeros((n, 2))
+    spacing = abs(angles[1] - angles[0]) if count > 1 else 0.0
+    for k in range(n):
+        _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals)
+    return points, normals
+
+
+@njit(cache=True)
+def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # type: ignore[no-untyped-def]
+    """Total least squares through the neighbours of return k on the same surface; facing the laser."""
+    first = last = k
+    while first > 0 and k - first < NORMAL_REACH and _connected(points, kept, ranges, spacing, first - 1):
+        first -= 1
+    while last < len(points) - 1 and last - k < NORMAL_REACH and _connected(points, kept, ranges, spacing, last):
+        last += 1
+    m = last - first + 1
+    if m < 3:
+        return
+    mx = my = 0.0
+    for i in range(first, last + 1):
+        mx += points[i, 0]
+        my += points[i, 1]
+    mx /= m
+    my /= m
+    sxx = sxy = syy = 0.0
+    for i in range(first, last + 1):
+        dx, dy = points[i, 0] - mx, points[i, 1] - my
+        sxx += dx * dx
+        sxy += dx * dy
+        syy += dy * dy
+    half = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)  # direction of the line
+    nx, ny = -np.sin(half), np.cos(half)
+    across = (nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy) / m
+    along = (sxx + syy) / m - across
+    if across > LINE_TOLERANCE_M**2 or across > 0.1 * along:
+        return
+    if nx * (T_base_laser[0] - points[k, 0]) + ny * (T_base_laser[1] - points[k, 1]) < 0.0:
+        nx, ny = -nx, -ny
+    normals[k, 0] = nx
+    normals[k, 1] = ny
+
+
+@njit(cache=True)
+def _connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def]
+    """Whether returns i and i + 1 lie on one surface."""
+    if kept[i + 1] - kept[i] > 2:
+        return False
+    dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+    nearer = min(ranges[kept[i]], ranges[kept[i + 1]])
+    limit = max(MINIMUM_GAP_M, GAP_PER_SPACING * nearer * spacing)
+    return dx * dx + dy * dy < limit * limit
+
+
+@njit(cache=True)
+def _thin(points, spacing):  # type: ignore[no-untyped-def]
+    keep = np.empty(len(points), np.int64)
+    n = 0
+    for i in range(len(points)):
+        if n > 0:
+            dx = points[i, 0] - points[keep[n - 1], 0]
+            dy = points[i, 1] - points[keep[n - 1], 1]
+            if dx * dx + dy * dy < spacing * spacing:
+                continue
+        keep[n] = i
+        n += 1
+    return keep[:n]
