@@ -1,0 +1,87 @@
+"""Rigid alignment of matched points of the plane.
+
+Two matched places fix the frame of one map in another (FC-SLAM, section III.C, eqs. 5 and 6). Eq. (6) as printed,
+``x' = -D R D x`` with the translation D on both sides of R, is no rigid map between two frames: its homogeneous
+coordinate is -1, and with it divided out the translation counts twice. The corrected form is ``x' = D R x``.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fcslam.geometry.se2 import Array
+
+_DEGENERATE = 1e-12
+"""Squared spread of points, relative to their squared coordinates, below which they are one point."""
+
+
+def rotation_eq5(alpha_rad: float) -> Array:
+    """The paper's homogeneous rotation, shape (3, 3); with its signs it turns by ``-alpha_rad``."""
+    cos, sin = np.cos(alpha_rad), np.sin(alpha_rad)
+    return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])  # eq. (5)
+
+
+def two_point_alignment(points_a: ArrayLike, points_b: ArrayLike) -> Array:
+    """``T_a_b`` from two matched points, the paper's eqs. (5) and (6) in their corrected form.
+
+    Points are (2, 2), metres: row k of both is the same place in a (the paper's x') and in b (its x). Where the two
+    pairs are not equally far apart, the midpoints coincide.
+
+    Raises:
+        ValueError: the points have another shape, are not finite, or the two of one frame coincide.
+    """
+    a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
+    if a.shape != (2, 2) or b.shape != (2, 2):
+        raise ValueError(f"two matched points have shape (2, 2), not {a.shape} and {b.shape}")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ValueError("matched points must be finite")
+    if _coincide(a) or _coincide(b):
+        raise ValueError("two coincident points determine no rotation")
+    side_a, side_b = a[1] - a[0], b[1] - b[0]
+    alpha = np.arctan2(side_b[1], side_b[0]) - np.arctan2(side_a[1], side_a[0])
+    R = rotation_eq5(alpha)[:2, :2]
+    # eq. (6), corrected: x' = R x + (dx, dy)
+    dx, dy = a.mean(axis=0) - R @ b.mean(axis=0)
+    return np.array([dx, dy, np.arctan2(R[1, 0], R[0, 0])])
+
+
+def n_point_alignment(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLike | None = None) -> Array:
+    """Least-squares ``T_a_b`` over matched points, in closed form.
+
+    Minimises ``sum w |a - T_a_b b|^2`` (Umeyama 1991 without scale; in the plane the rotation is the angle of one
+    complex sum). Points are (..., N, 2), weights (..., N) and not negative; the result is (..., 3). Where the points
+    determine no rotation (all coincide, fewer than two with weight) the pose is NaN.
+
+    Raises:
+        ValueError: the shapes do not belong together, or a weight is negative.
+    """
+    a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
+    if a.shape != b.shape or a.ndim < 2 or a.shape[-1] != 2:
+        raise ValueError(f"matched points have one shape (..., N, 2), not {a.shape} and {b.shape}")
+    w = np.ones(a.shape[:-1]) if weights is None else np.asarray(weights, dtype=np.float64)
+    if w.shape[-1:] != a.shape[-2:-1]:
+        raise ValueError(f"weights have shape {w.shape}, the points {a.shape}")
+    if (w < 0.0).any():
+        raise ValueError("weights must not be negative")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return _align(_complex(a), _complex(b), w)
+
+
+def _align(a: Array, b: Array, w: Array) -> Array:
+    """Pose (..., 3) that moves the complex points b onto a, weighted; NaN where it is not determined."""
+    total = w.sum(axis=-1, keepdims=True)
+    mean_a, mean_b = (w * a).sum(axis=-1, keepdims=True) / total, (w * b).sum(axis=-1, keepdims=True) / total
+    turn = (w * (a - mean_a) * np.conj(b - mean_b)).sum(axis=-1)
+    scale = (w * (np.abs(a) ** 2 + np.abs(b) ** 2)).sum(axis=-1)
+    theta = np.angle(turn)
+    shift = mean_a[..., 0] - np.exp(1j * theta) * mean_b[..., 0]
+    pose = np.stack((shift.real, shift.imag, theta), axis=-1)
+    return np.where((np.abs(turn) > _DEGENERATE * scale)[..., None], pose, np.nan)
+
+
+def _complex(points: Array) -> Array:
+    return points[..., 0] + 1j * points[..., 1]
+
+
+def _coincide(points: Array) -> bool:
+    side = points[1] - points[0]
+    return bool(side @ side <= _DEGENERATE * (points * points).sum())

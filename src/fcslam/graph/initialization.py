@@ -1,0 +1,78 @@
+"""Initial poses of a graph without a good estimate: chordal relaxation, two sparse linear systems.
+
+Rotations as complex numbers of any length minimise ``sum k |u_j - u_i e^(i theta_ij)|^2``; translations follow with
+the rotations held (Carlone et al., ICRA 2015, in the plane). GTSAM's LAGO does the same work but takes only diagonal
+information, one component at a time.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import splu
+
+from fcslam.geometry import se2
+from fcslam.graph.pose_graph import PoseGraph, anchors
+from fcslam.records import FloatArray
+
+_SPREAD = 1e4
+"""Edges count between 1/_SPREAD and _SPREAD times the median one, so that the linear systems stay well conditioned."""
+
+_Complex = NDArray[np.complex128]
+
+
+def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray:
+    """Poses (N, 3) near the optimum of the graph's edges, from no estimate at all.
+
+    Each connected component keeps the initial pose of its first variable. ``weights`` (E,) in [0, 1] scale the edges;
+    one of weight 0 is left out (``~graph.arrays().robust`` places the variables by odometry alone).
+    """
+    edges = graph.arrays()
+    scale = np.ones(len(edges.i)) if weights is None else np.asarray(weights, dtype=np.float64)
+    kept = scale > 0.0
+    start = graph.poses()
+    if not kept.any():
+        return start
+    i, j, T_i_j, scale = edges.i[kept], edges.j[kept], edges.T_i_j[kept], scale[kept]
+    fixed = anchors(graph.components(kept))
+    information = edges.information[kept]
+    k_heading = np.sqrt(scale * _moderate(information[:, 2, 2]))
+    k_position = np.sqrt(scale * _moderate(0.5 * (information[:, 0, 0] + information[:, 1, 1])))
+
+    turn = np.exp(1j * T_i_j[:, 2])
+    heading = np.angle(_least_squares((i, j), k_heading, turn, 0.0 * turn, (fixed, np.exp(1j * start[fixed, 2]))))
+    step = np.exp(1j * heading[i]) * (T_i_j[:, 0] + 1j * T_i_j[:, 1])
+    origin = start[fixed, 0] + 1j * start[fixed, 1]
+    position = _least_squares((i, j), k_position, np.ones_like(turn), step, (fixed, origin))
+    poses = np.stack((position.real, position.imag, se2.wrap_angle(heading)), axis=-1)
+    poses[fixed] = start[fixed]
+    return poses
+
+
+def _moderate(information: FloatArray) -> FloatArray:
+    middle = np.median(information)
+    return np.clip(information, middle / _SPREAD, middle * _SPREAD)
+
+
+def _least_squares(
+    ends: tuple[NDArray[np.int64], NDArray[np.int64]],
+    k: FloatArray,
+    turn: _Complex,
+    step: _Complex,
+    fixed: tuple[NDArray[np.int64], _Complex],
+) -> _Complex:
+    """The z with least ``sum |k (z_j - turn z_i - step)|^2``, each component's gauge set by its ``fixed`` value."""
+    (i, j), (anchor, value) = ends, fixed
+    edge_row = np.arange(len(i))
+    anchor_row = len(i) + np.arange(len(anchor))
+    rows = np.concatenate((edge_row, edge_row, anchor_row))
+    columns = np.concatenate((j, i, anchor))
+    entries = np.concatenate((k.astype(complex), -k * turn, np.full(len(anchor), k.max(), dtype=complex)))
+    size = int(columns.max()) + 1
+    A = csr_array((entries, (rows, columns)), shape=(len(i) + len(anchor), size))
+    b = np.concatenate((k * step, k.max() * value))
+    adjoint = A.conj().T
+    solver = splu(
+        (adjoint @ A).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    solution: _Complex = solver.solve(adjoint @ b)
+    return solution

@@ -1,0 +1,202 @@
+"""Optimal poses of a pose graph: Levenberg-Marquardt (GTSAM), and graduated non-convexity against false closures.
+
+Gauge: each connected component keeps the initial pose of its first variable.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+from scipy.stats import chi2 as chi2_distribution
+
+from fcslam.config import Settings
+from fcslam.graph.factors import FactorCache, Loss, from_values, to_values
+from fcslam.graph.pose_graph import PoseGraph
+from fcslam.records import FloatArray, frozen
+
+_TOLERANCE = 1e-6
+_UNTIL_CONVERGED = 100
+_BINARY = 1e-4
+"""Distance from 0 or 1 at which a weight is decided."""
+_POLISH_ROUNDS = 10
+
+
+class GncSettings(Settings):
+    """Graduated non-convexity."""
+
+    inlier_probability: float = Field(
+        0.99, gt=0.0, lt=1.0, description="A true closure passes the chi-square test with this probability"
+    )
+    control_step: float = Field(1.4, gt=1.0, description="Factor by which the loss sharpens from step to step")
+    first_iterations: int = Field(5, ge=1, description="Solver iterations with every closure, before the first step")
+    step_iterations: int = Field(1, ge=1, description="Solver iterations in each step")
+    maximum_steps: int = Field(100, ge=1, description="Steps after which undecided closures are decided as they are")
+
+
+@dataclass(frozen=True, slots=True)
+class SolveStats:
+    """How a solve went."""
+
+    iterations: int
+    """Solver iterations, of all steps together."""
+    initial_cost: float
+    """Half the sum of the edges' losses at the initial poses."""
+    final_cost: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Optimised poses and what each edge counted for."""
+
+    poses: FloatArray
+    """Shape (N, 3)."""
+    weights: FloatArray
+    """Shape (E,), in [0, 1]; 1 for odometry."""
+    stats: SolveStats
+
+
+def optimize(
+    graph: PoseGraph, initial: ArrayLike | None = None, *, loss: Loss = Loss.SQUARED, factors: FactorCache | None = None
+) -> Solution:
+    """Levenberg-Marquardt from ``initial`` (N, 3), by default the graph's own poses.
+
+    ``factors``: a cache kept by the caller makes repeated solves of a growing graph cheaper.
+
+    Raises:
+        ValueError: ``initial`` does not fit the graph, or ``factors`` belong to another one.
+    """
+    start, cache = _start(graph, initial), _cache(graph, factors)
+    if not graph.edges:
+        return _solution(graph, start, np.ones(0), SolveStats(0, 0.0, 0.0))
+    problem, values = cache.robust(loss, start), to_values(start)
+    result, iterations = _levenberg_marquardt(problem, values, _UNTIL_CONVERGED)
+    poses = from_values(result)
+    robust = graph.arrays().robust
+    weights = loss.weights(graph.chi2(poses)[robust])
+    return _solution(graph, poses, weights, SolveStats(iterations, problem.error(values), problem.error(result)))
+
+
+def optimize_gnc(
+    graph: PoseGraph,
+    initial: ArrayLike | None = None,
+    *,
+    settings: GncSettings | None = None,
+    factors: FactorCache | None = None,
+) -> Solution:
+    """Poses under the truncated squared loss on closures: each ends at weight 1 (true) or 0 (false).
+
+    Graduated non-convexity (Yang et al., RA-L 2020, truncated least squares, eqs. 12-14); odometry is known to be
+    true. ``initial`` and ``factors`` as in :func:`optimize`; ``initial`` should be the odometry or better.
+
+    The steps run here, around GTSAM's solver, and not in ``gtsam.GncLMOptimizer``: that one starts every step again
+    from the initial poses and solves it to the end, while one warm iteration a step decides as well
+    (``benchmarks`` of both: m3500 with 100 random false loops 1.5 to 2.5 s against 16 to 38 s).
+
+    Raises:
+        ValueError: as :func:`optimize`.
+    """
+    chosen = settings or GncSettings()
+    start, cache = _start(graph, initial), _cache(graph, factors)
+    robust = graph.arrays().robust
+    if not graph.edges:
+        return _solution(graph, start, np.ones(0), SolveStats(0, 0.0, 0.0))
+    limit = float(chi2_distribution.ppf(chosen.inlier_probability, 3))
+    steps = _Steps(cache, to_values(start))
+    steps.solve(np.ones(int(robust.sum())), chosen.first_iterations)
+    _graduate(steps, limit, chosen)
+    weights = _polish(steps, limit)
+    poses = from_values(steps.values)
+    stats = SolveStats(
+        steps.iterations, _truncated(graph.chi2(start), robust, limit), _truncated(graph.chi2(poses), robust, limit)
+    )
+    return _solution(graph, poses, weights, stats)
+
+
+class _Steps:
+    """The state of a solve in steps: current values, weights by which they were found, iterations so far."""
+
+    def __init__(self, cache: FactorCache, values: Any) -> None:
+        self.cache, self.values, self.iterations = cache, values, 0
+        self._robust = cache.graph.arrays().robust
+
+    def solve(self, weights: FloatArray, iterations: int) -> None:
+        problem = self.cache.squared(weights, from_values(self.values))
+        self.values, used = _levenberg_marquardt(problem, self.values, iterations)
+        self.iterations += used
+
+    def chi2(self) -> FloatArray:
+        """Of the closures."""
+        chi2: FloatArray = self.cache.graph.chi2(from_values(self.values))[self._robust]
+        return chi2
+
+
+def _graduate(steps: _Steps, limit: float, settings: GncSettings) -> None:
+    """Sharpen the loss from almost squared to truncated, an iteration or so at a time."""
+    chi2 = steps.chi2()
+    largest = chi2.max(initial=0.0)
+    if largest <= limit:
+        return
+    mu = limit / (2.0 * largest - limit)
+    for _ in range(settings.maximum_steps):
+        weights = _truncated_weights(chi2, limit, mu)
+        if np.all((weights < _BINARY) | (weights > 1.0 - _BINARY)):
+            return
+        steps.solve(weights, settings.step_iterations)
+        chi2 = steps.chi2()
+        mu *= settings.control_step
+
+
+def _polish(steps: _Steps, limit: float) -> FloatArray:
+    """Alternate solve and decision until no decision changes; returns the last weights solved with."""
+    weights = (steps.chi2() <= limit).astype(np.float64)
+    for _ in range(_POLISH_ROUNDS):
+        steps.solve(weights, _UNTIL_CONVERGED)
+        decided = (steps.chi2() <= limit).astype(np.float64)
+        if np.array_equal(decided, weights):
+            break
+        weights = decided
+    return weights
+
+
+def _truncated_weights(chi2: FloatArray, limit: float, mu: float) -> FloatArray:
+    """Weights of the surrogate of the truncated squared loss at ``mu`` (Yang et al. 2020, eq. 14)."""
+    with np.errstate(divide="ignore"):
+        between = np.sqrt(limit * mu * (mu + 1.0) / chi2) - mu
+    return np.clip(between, 0.0, 1.0)
+
+
+def _truncated(chi2: FloatArray, robust: ArrayLike, limit: float) -> float:
+    return 0.5 * float(np.where(robust, np.minimum(chi2, limit), chi2).sum())
+
+
+def _levenberg_marquardt(problem: Any, values: Any, iterations: int) -> tuple[Any, int]:
+    """GTSAM's solver; returns the values and the iterations used."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(_TOLERANCE)
+    parameters.setAbsoluteErrorTol(_TOLERANCE)
+    solver = gtsam.LevenbergMarquardtOptimizer(problem, values, parameters)
+    result = solver.optimize()
+    return result, int(solver.iterations())
+
+
+def _start(graph: PoseGraph, initial: ArrayLike | None) -> FloatArray:
+    poses = graph.poses() if initial is None else np.array(initial, dtype=np.float64)
+    if poses.shape != (len(graph), 3) or not np.isfinite(poses).all():
+        raise ValueError(f"initial poses must be finite and of shape ({len(graph)}, 3), not {poses.shape}")
+    return poses
+
+
+def _cache(graph: PoseGraph, factors: FactorCache | None) -> FactorCache:
+    if factors is not None and factors.graph is not graph:
+        raise ValueError("the factors belong to another pose graph")
+    return factors or FactorCache(graph)
+
+
+def _solution(graph: PoseGraph, poses: FloatArray, closure_weights: FloatArray, stats: SolveStats) -> Solution:
+    weights = np.ones(len(graph.edges))
+    weights[graph.arrays().robust] = closure_weights
+    return Solution(frozen(poses), frozen(weights), stats)

@@ -1,0 +1,166 @@
+"""A pose graph in the plane: variables numbered from 0, measured motions between them. It only grows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from fcslam.geometry import se2
+from fcslam.records import FloatArray, frozen
+
+_ASYMMETRY = 1e-6
+"""Relative asymmetry of an information matrix that rounding may explain."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """A measured motion between two variables.
+
+    Raises:
+        ValueError: the variables are not two, a number is not finite, or the information is no symmetric positive
+            definite matrix (rounding aside, which is repaired).
+    """
+
+    i: int
+    j: int
+    T_i_j: FloatArray
+    """Pose of j in i, shape (3,)."""
+    information: FloatArray
+    """Inverse covariance of T_i_j in the tangent space at T_i_j (x, y, theta of j), shape (3, 3)."""
+    robust: bool
+    """Whether it may be false (a closure); odometry is trusted."""
+
+    def __post_init__(self) -> None:
+        where = f"edge {self.i} -> {self.j}"
+        if self.i == self.j or min(self.i, self.j) < 0:
+            raise ValueError(f"{where}: connects two different variables, numbered from 0")
+        object.__setattr__(self, "T_i_j", frozen(_checked(self.T_i_j, (3,), f"{where}: T_i_j")))
+        object.__setattr__(self, "information", frozen(_positive_definite(self.information, where)))
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeArrays:
+    """All edges of a graph, one row each."""
+
+    i: NDArray[np.int64]
+    j: NDArray[np.int64]
+    T_i_j: FloatArray
+    information: FloatArray
+    robust: NDArray[np.bool_]
+
+
+class PoseGraph:
+    """Variables with initial poses, shape (N, 3), and edges between them; append-only."""
+
+    def __init__(self, poses: ArrayLike = (), edges: Sequence[Edge] = ()) -> None:
+        self._poses: list[FloatArray] = []
+        self._edges: list[Edge] = []
+        self._arrays = _stack([])
+        for pose in np.asarray(poses, dtype=np.float64).reshape(-1, 3):
+            self.add_variable(pose)
+        for edge in edges:
+            self.add_edge(edge)
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @property
+    def edges(self) -> Sequence[Edge]:
+        """In the order in which they were added."""
+        return self._edges
+
+    def add_variable(self, pose: ArrayLike) -> int:
+        """Append a variable with its initial pose (3,); returns its number.
+
+        Raises:
+            ValueError: the pose is not three finite numbers.
+        """
+        self._poses.append(frozen(_checked(pose, (3,), f"variable {len(self)}")))
+        return len(self._poses) - 1
+
+    def add_edge(self, edge: Edge) -> int:
+        """Append an edge; returns its number.
+
+        Raises:
+            ValueError: it names a variable that the graph does not have.
+        """
+        if max(edge.i, edge.j) >= len(self):
+            raise ValueError(f"edge {edge.i} -> {edge.j}: the graph has variables 0 to {len(self) - 1}")
+        self._edges.append(edge)
+        return len(self._edges) - 1
+
+    def poses(self) -> FloatArray:
+        """Initial poses, shape (N, 3)."""
+        return np.array(self._poses, dtype=np.float64).reshape(-1, 3)
+
+    def arrays(self) -> EdgeArrays:
+        """The edges as arrays; only those added since the last call are converted."""
+        known = len(self._arrays.i)
+        if known < len(self._edges):
+            old, new = self._arrays, _stack(self._edges[known:])
+            self._arrays = EdgeArrays(
+                i=np.concatenate((old.i, new.i)),
+                j=np.concatenate((old.j, new.j)),
+                T_i_j=np.concatenate((old.T_i_j, new.T_i_j)),
+                information=np.concatenate((old.information, new.information)),
+                robust=np.concatenate((old.robust, new.robust)),
+            )
+        return self._arrays
+
+    def chi2(self, poses: ArrayLike | None = None) -> FloatArray:
+        """Squared Mahalanobis length of every edge's residual at ``poses`` (N, 3), by default the initial ones."""
+        x = self.poses() if poses is None else np.asarray(poses, dtype=np.float64)
+        edges = self.arrays()
+        residual = se2.between(edges.T_i_j, se2.between(x[edges.i], x[edges.j]))
+        return np.einsum("ea,eab,eb->e", residual, edges.information, residual)
+
+    def components(self, kept: ArrayLike | None = None) -> NDArray[np.int64]:
+        """Number of each variable's connected component, shape (N,), counted in the order of first variables.
+
+        ``kept`` (E,) marks the edges that connect; by default all do.
+        """
+        edges = self.arrays()
+        mask = np.ones(len(edges.i), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)
+        i, j = edges.i[mask], edges.j[mask]
+        links = coo_array((np.ones(len(i)), (i, j)), shape=(len(self), len(self)))
+        labels = connected_components(links, directed=False)[1] if len(self) else np.zeros(0)
+        first, number = np.unique(labels, return_index=True)[1], np.empty(len(np.unique(labels)), dtype=np.int64)
+        number[np.argsort(first)] = np.arange(len(first))
+        return number[labels.astype(np.int64)]
+
+
+def anchors(components: NDArray[np.int64]) -> NDArray[np.int64]:
+    """First variable of each component, shape (C,)."""
+    return np.unique(components, return_index=True)[1].astype(np.int64)
+
+
+def _stack(edges: Sequence[Edge]) -> EdgeArrays:
+    return EdgeArrays(
+        i=np.array([edge.i for edge in edges], dtype=np.int64),
+        j=np.array([edge.j for edge in edges], dtype=np.int64),
+        T_i_j=np.array([edge.T_i_j for edge in edges], dtype=np.float64).reshape(-1, 3),
+        information=np.array([edge.information for edge in edges], dtype=np.float64).reshape(-1, 3, 3),
+        robust=np.array([edge.robust for edge in edges], dtype=bool),
+    )
+
+
+def _checked(values: ArrayLike, shape: tuple[int, ...], what: str) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{what} must be finite numbers of shape {shape}, not {array.tolist()}")
+    return array
+
+
+def _positive_definite(information: ArrayLike, where: str) -> FloatArray:
+    matrix = _checked(information, (3, 3), f"{where}: information")
+    if np.abs(matrix - matrix.T).max() > _ASYMMETRY * np.abs(matrix).max():
+        raise ValueError(f"{where}: information is not symmetric: {matrix.tolist()}")
+    symmetric = 0.5 * (matrix + matrix.T)
+    try:
+        np.linalg.cholesky(symmetric)
+    except np.linalg.LinAlgError:
+        raise ValueError(f"{where}: information is not positive definite: {matrix.tolist()}") from None
+    return symmetric
