@@ -22,7 +22,9 @@ class SearchConfig(Settings):
 
     cell_m: float = Field(default=0.1, gt=0, description="cell of the likelihood grid")
     smear_m: float = Field(default=0.1, gt=0, description="standard deviation of the likelihood around a surface")
-    levels: int = Field(default=6, ge=1, le=10, description="levels of the pyramid; the coarsest step is 2^(levels - 1)")
+    levels: int = Field(
+        default=6, ge=1, le=10, description="levels of the pyramid; the coarsest step is 2^(levels - 1)"
+    )
     points: int = Field(default=120, gt=0, description="at most this many points are scored")
     distance_penalty: float = Field(default=0.2, ge=0, lt=1, description="score lost at the edge of the window (Karto)")
     angle_penalty: float = Field(default=0.1, ge=0, lt=1, description="score lost at the largest turn (Karto)")

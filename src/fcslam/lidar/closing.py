@@ -1,0 +1,176 @@
+"""Loop closing inside one robot: the submap around a keyscan is compared with earlier ones that may show the same place.
+
+How far the estimate may be off grows with the shortest path through the pose graph (odometry and accepted closures),
+not with time: after a closure the search is narrow again. A wide search is branch and bound over the whole window.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from fcslam.config import Settings
+from fcslam.geometry import se2
+from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
+from fcslam.lidar.submap import Submap
+from fcslam.lidar.verification import Verification, VerificationConfig, verify
+from fcslam.records import FloatArray
+
+
+class ClosingConfig(Settings):
+    """Loop closing inside one robot."""
+
+    gap_m: float = Field(default=12.0, gt=0, description="travel that must lie between two submaps to be compared")
+    sight_m: float = Field(default=8.0, gt=0, description="anchors farther apart than this share too little sight")
+    candidates: int = Field(default=4, gt=0, description="earlier visits compared with one submap")
+    drift: float = Field(default=0.03, gt=0, description="drift allowed for, per metre of path through the graph")
+    drift_rad_m: float = Field(default=0.006, gt=0, description="the same in heading")
+    widest_m: float = Field(default=15.0, gt=0, description="half side of the widest search")
+    widest_rad: float = Field(default=0.7, gt=0, description="half angle of the widest search")
+    least_score: float = Field(default=0.5, ge=0, le=1, description="likelihood a search must reach")
+
+
+@dataclass(frozen=True, slots=True)
+class Anchored:
+    """A submap with where it hangs in the pose graph."""
+
+    keyscan: int
+    travel_m: float
+    """Path length up to the anchor."""
+    submap: Submap
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """A verified closure between the anchors of two submaps (indices into the closer's list)."""
+
+    earlier: int
+    later: int
+    check: Verification
+    innovation: FloatArray
+    """How far the measurement lies from the prediction (x, y, theta)."""
+    slack_m: float
+    """Drift allowed for when it was found."""
+
+
+class LoopCloser:
+    """Collects a robot's submaps and says which closures hold."""
+
+    def __init__(self, config: ClosingConfig, search_config: SearchConfig, verification: VerificationConfig) -> None:
+        self._config = config
+        self._search = search_config
+        self._verification = verification
+        self.places: list[Anchored] = []
+        self._accepted: list[Closure] = []
+        self._pending: list[Closure] = []
+
+    @property
+    def has_closures(self) -> bool:
+        """Whether any closure was accepted."""
+        return bool(self._accepted)
+
+    def add(self, place: Anchored, poses: FloatArray) -> list[Closure]:
+        """Take in the next submap; closures that hold now (of it, and of earlier ones it supports).
+
+        ``poses``: T_map_base of every keyscan so far, shape (N, 3).
+        """
+        self.places.append(place)
+        later = len(self.places) - 1
+        paths = self._paths_from(later)
+        anchors = poses[[p.keyscan for p in self.places]]
+        found = [
+            closure
+            for earlier in self._candidates(later, anchors, paths)
+            if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
+        ]
+        return self._judge(found, anchors)
+
+    def _paths_from(self, later: int) -> FloatArray:
+        """Shortest path through the graph from one submap to every other, metres, shape (P,)."""
+        n = len(self.places)
+        travel = np.array([p.travel_m for p in self.places])
+        rows = [*range(n - 1), *(c.earlier for c in self._accepted)]
+        columns = [*range(1, n), *(c.later for c in self._accepted)]
+        lengths = [*(np.diff(travel) + 1e-3), *(1.0 for _ in self._accepted)]
+        links = coo_array((lengths, (rows, columns)), shape=(n, n)).tocsr()
+        paths: FloatArray = dijkstra(links, directed=False, indices=later)
+        return paths
+
+    def _slack(self, path_m: float) -> tuple[float, float]:
+        config = self._config
+        return (
+            min(config.widest_m, 0.3 + config.drift * path_m),
+            min(config.widest_rad, 0.05 + config.drift_rad_m * path_m),
+        )
+
+    def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
+        """The nearest submap of each earlier visit to the neighbourhood, nearest visits first."""
+        travel = np.array([p.travel_m for p in self.places])
+        distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
+        slack = np.array([self._slack(path)[0] for path in paths])
+        near = (travel[later] - travel > self._config.gap_m) & (distance < self._config.sight_m + slack)
+        indices = np.flatnonzero(near)
+        if not len(indices):
+            return []
+        visits = np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
+        best = [int(visit[np.argmin(distance[visit])]) for visit in visits]
+        best.sort(key=lambda k: distance[k])
+        return best[: self._config.candidates]
+
+    def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> Closure | None:
+        a, b = self.places[earlier].submap, self.places[later].submap
+        predicted = se2.between(anchors[earlier], anchors[later])
+        radius, angle = self._slack(path_m)
+        guess = predicted
+        if radius > 0.6:
+            window = SearchWindow(radius, angle)
+            result = search(b.surface, a.field, predicted, window, self._search)
+            if result.score < self._config.least_score:
+                return None
+            guess = result.T_field_base
+        check = verify(a, b, guess, self._verification)
+        innovation = se2.between(predicted, check.T_a_b)
+        off = np.hypot(innovation[0], innovation[1])
+        if not check.loose or off > radius + 0.3 or abs(innovation[2]) > angle + 0.1:
+            return None
+        return Closure(earlier, later, check, innovation, radius)
+
+    def _judge(self, found: list[Closure], anchors: FloatArray) -> list[Closure]:
+        """Closures near their prediction hold at once; others wait until enough of them agree."""
+        sure = [c for c in found if c.slack_m < 0.8 or (c.check.strict and self._is_plain(c))]
+        self._pending += [c for c in found if c not in sure and c.check.strict]
+        self._pending = [c for c in self._pending if self.places[-1].travel_m - self.places[c.later].travel_m < 60.0]
+        cluster = self._cluster(anchors)
+        sure += cluster
+        self._pending = [c for c in self._pending if c not in cluster]
+        self._accepted += sure
+        return sure
+
+    def _is_plain(self, closure: Closure) -> bool:
+        """A wide closure that stands alone: informative, rich, and close to where it was expected."""
+        off = float(np.hypot(closure.innovation[0], closure.innovation[1]))
+        worse = closure.check.worse
+        return closure.check.informative and off < 0.3 * closure.slack_m + 0.2 and worse.overlap > 0.4
+
+    def _cluster(self, anchors: FloatArray) -> list[Closure]:
+        """The largest set of pending closures that agree with the newest one, if there are enough."""
+        if not self._pending:
+            return []
+        newest = self._pending[-1]
+        agreeing = [c for c in self._pending if self._agree(c, newest, anchors)]
+        spread = np.ptp([self.places[c.later].travel_m for c in agreeing])
+        if len(agreeing) >= 3 and spread >= 3.0 and any(c.check.informative for c in agreeing):
+            return agreeing
+        return []
+
+    def _agree(self, a: Closure, b: Closure, anchors: FloatArray) -> bool:
+        """Whether going round both closures and the estimates between their ends leads back to the start."""
+        earlier = se2.between(anchors[a.earlier], anchors[b.earlier])
+        later = se2.between(anchors[a.later], anchors[b.later])
+        round_trip = se2.compose(se2.compose(a.check.T_a_b, later), se2.inverse(b.check.T_a_b))
+        rest = se2.between(earlier, round_trip)
+        path = abs(self.places[a.later].travel_m - self.places[b.later].travel_m)
+        path += float(np.hypot(earlier[0], earlier[1]))
+        return bool(np.hypot(rest[0], rest[1]) < 0.25 + 0.02 * path and abs(rest[2]) < 0.05 + 0.002 * path)

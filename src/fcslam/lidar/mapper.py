@@ -1,0 +1,216 @@
+"""The robot's LiDAR SLAM (Karto class): every scan tracked, keyscans in a pose graph, loops closed between submaps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.geometry import se2
+from fcslam.graph.factors import FactorCache
+from fcslam.graph.optimizer import Loss, optimize, optimize_gnc
+from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.lidar.closing import Anchored, Closure, ClosingConfig, LoopCloser
+from fcslam.lidar.correlative import SearchConfig
+from fcslam.lidar.scan import PointScan
+from fcslam.lidar.submap import build_submap
+from fcslam.lidar.tracker import ScanTracker, Tracked, TrackerConfig
+from fcslam.lidar.verification import VerificationConfig
+from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, KeyscanId, LaserScan, Ranges, frozen
+
+
+class KeyscanConfig(Settings):
+    """Which scans carry the pose graph and the map, and the submaps around them."""
+
+    minimum_travel_distance_m: float = Field(default=0.25, gt=0, description="a keyscan at least this often")
+    minimum_travel_heading_rad: float = Field(default=0.25, gt=0, description="or after this turn")
+    submap_every_m: float = Field(default=2.0, gt=0, description="travel between the anchors of submaps")
+    submap_reach_m: float = Field(default=5.0, gt=0, description="travel before and after the anchor in a submap")
+
+
+class LidarConfig(Settings):
+    """The LiDAR front end."""
+
+    keyscans: KeyscanConfig = Field(default=KeyscanConfig(), description="keyscans and submaps")
+    tracker: TrackerConfig = Field(default=TrackerConfig(), description="scan-to-submap tracking")
+    closing: ClosingConfig = Field(default=ClosingConfig(), description="loop closing inside one robot")
+    search: SearchConfig = Field(default=SearchConfig(), description="correlative search of loop closing")
+    verification: VerificationConfig = Field(default=VerificationConfig(), description="verification of closures")
+
+
+@dataclass(frozen=True, slots=True)
+class ScanPose:
+    """Where a raw scan was, relative to the keyscan before it."""
+
+    stamp: float
+    keyscan: int
+    T_keyscan_base: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceWindow:
+    """A submap is complete: its anchor and the keyscans it is made of (last inclusive)."""
+
+    anchor: int
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one scan brought."""
+
+    pose: ScanPose
+    keyscan: Keyscan | None = None
+    constraints: tuple[Constraint, ...] = ()
+    place: PlaceWindow | None = None
+
+
+class Mapper:
+    """One robot's SLAM on its own; poses are in its ``map``, which starts at its first keyscan's odometry pose."""
+
+    def __init__(self, robot: str, config: LidarConfig) -> None:
+        self.robot = robot
+        self._config = config
+        self._tracker = ScanTracker(config.tracker)
+        self._closer = LoopCloser(config.closing, config.search, config.verification)
+        self._graph = PoseGraph()
+        self._factors = FactorCache(self._graph)
+        self._poses: list[FloatArray] = []  # T_map_base of each keyscan, optimised
+        self._local: list[FloatArray] = []  # T_local_base of each keyscan, smooth
+        self._travel: list[float] = []
+        self._points: dict[int, PointScan] = {}
+        self._next_anchor_m = 0.0
+        self._unsolved = 0
+
+    def process(self, scan: LaserScan) -> Step:
+        """Take in the next scan."""
+        tracked = self._tracker.track(scan)
+        if not self._is_keyscan(tracked):
+            return Step(self._scan_pose(scan.stamp, tracked))
+        keyscan, odometry = self._add_keyscan(scan, tracked)
+        window = self._complete_window()
+        closures = self._close_loops(window) if window else ()
+        return Step(self._scan_pose(scan.stamp, tracked), keyscan, (*odometry, *closures), window)
+
+    def finish(self) -> list[tuple[PlaceWindow, tuple[Constraint, ...]]]:
+        """Submaps still open at the end of the recording, with the closures they bring."""
+        rest = []
+        while window := self._complete_window(at_end=True):
+            rest.append((window, self._close_loops(window)))
+        return rest
+
+    def optimized(self) -> FloatArray:
+        """T_map_base of every keyscan after a robust solve (GNC), shape (N, 3)."""
+        if self._closer.has_closures:
+            self._poses = list(optimize_gnc(self._graph, self._poses, factors=self._factors).poses)
+        return np.array(self._poses).reshape(-1, 3)
+
+    @property
+    def travel_m(self) -> float:
+        """Path length so far."""
+        return self._travel[-1] if self._travel else 0.0
+
+    def _is_keyscan(self, tracked: Tracked) -> bool:
+        if tracked.scan is None:
+            return False
+        if not self._local:
+            return True
+        motion = se2.between(self._local[-1], tracked.T_local_base)
+        gate = self._config.keyscans
+        return bool(
+            np.hypot(motion[0], motion[1]) >= gate.minimum_travel_distance_m
+            or abs(motion[2]) >= gate.minimum_travel_heading_rad
+        )
+
+    def _scan_pose(self, stamp: float, tracked: Tracked) -> ScanPose:
+        number = len(self._local) - 1
+        return ScanPose(stamp, number, se2.between(self._local[number], tracked.T_local_base))
+
+    def _add_keyscan(self, scan: LaserScan, tracked: Tracked) -> tuple[Keyscan, tuple[Constraint, ...]]:
+        """New variable of the pose graph, tied to the keyscan before it."""
+        assert tracked.scan is not None
+        number = len(self._local)
+        self._tracker.insert(tracked.scan, tracked.T_local_base)
+        self._points[number] = tracked.scan
+        keyscan = Keyscan(KeyscanId(self.robot, number), scan.stamp, _clean(scan.ranges_m, scan.laser.max_range_m))
+        if number == 0:
+            start = np.array(scan.T_odom_base)
+            self._local.append(tracked.T_local_base)
+            self._poses.append(start)
+            self._travel.append(0.0)
+            self._graph.add_variable(start)
+            return keyscan, ()
+        motion = se2.between(self._local[-1], tracked.T_local_base)
+        constraint = Constraint(
+            self.robot, number - 1, number, ConstraintKind.ODOMETRY, frozen(motion),
+            frozen(motion_information(motion, tracked)),
+        )  # fmt: skip
+        self._local.append(tracked.T_local_base)
+        self._poses.append(se2.compose(self._poses[-1], motion))
+        self._travel.append(self._travel[-1] + float(np.hypot(motion[0], motion[1])))
+        self._graph.add_variable(self._poses[-1])
+        self._graph.add_edge(Edge(number - 1, number, constraint.T_i_j, constraint.information, robust=False))
+        return keyscan, (constraint,)
+
+    def _complete_window(self, at_end: bool = False) -> PlaceWindow | None:
+        """The next submap, once the robot is far enough past its anchor."""
+        gate = self._config.keyscans
+        travel = np.array(self._travel)
+        anchor = int(np.searchsorted(travel, self._next_anchor_m))
+        if anchor == len(travel) or (not at_end and travel[-1] < travel[anchor] + gate.submap_reach_m):
+            return None
+        self._next_anchor_m = travel[anchor] + gate.submap_every_m
+        first = int(np.searchsorted(travel, travel[anchor] - gate.submap_reach_m))
+        last = int(np.searchsorted(travel, travel[anchor] + gate.submap_reach_m, side="right")) - 1
+        return PlaceWindow(anchor, first, last)
+
+    def _close_loops(self, window: PlaceWindow) -> tuple[Constraint, ...]:
+        """Compare the new submap with earlier ones; what holds becomes constraints."""
+        anchor = self._local[window.anchor]
+        scans = [(self._points[k], se2.between(anchor, self._local[k])) for k in range(window.first, window.last + 1)]
+        for number in [k for k in self._points if k < window.first]:
+            del self._points[number]
+        place = Anchored(window.anchor, self._travel[window.anchor], build_submap(scans))
+        closures = self._closer.add(place, np.array(self._poses))
+        constraints = tuple(self._constraint(closure) for closure in closures)
+        for c in constraints:
+            self._graph.add_edge(Edge(c.i, c.j, c.T_i_j, c.information, robust=True))
+        self._optimize_if_needed(closures)
+        return constraints
+
+    def _constraint(self, closure: Closure) -> Constraint:
+        places = self._closer.places
+        return Constraint(
+            self.robot, places[closure.earlier].keyscan, places[closure.later].keyscan, ConstraintKind.CLOSURE,
+            frozen(closure.check.T_a_b), frozen(closure.check.information),
+        )  # fmt: skip
+
+    def _optimize_if_needed(self, closures: list[Closure]) -> None:
+        """Solve at once when a closure says that the estimate is off, else only now and then."""
+        self._unsolved += len(closures)
+        off = max((float(np.hypot(c.innovation[0], c.innovation[1])) for c in closures), default=0.0)
+        if self._unsolved >= 20 or off > 0.15:
+            self._poses = list(optimize(self._graph, self._poses, loss=Loss.CAUCHY, factors=self._factors).poses)
+            self._unsolved = 0
+
+
+def motion_information(motion: FloatArray, tracked: Tracked) -> FloatArray:
+    """Information of the motion between two keyscans, in the coordinates of the later one, shape (3, 3).
+
+    Neighbouring points err together, so they count a tenth; odometry holds what they leave open (along a corridor).
+    """
+    moved, turned = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
+    cos, sin = np.cos(tracked.T_local_base[2]), np.sin(tracked.T_local_base[2])
+    turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+    odometry = np.diag(((0.01 + 0.1 * moved) ** -2, (0.01 + 0.1 * moved) ** -2, (0.005 + 0.1 * turned) ** -2))
+    covariance = np.linalg.inv(0.1 * turn.T @ tracked.information @ turn + odometry)
+    floor = np.diag(((0.003 + 0.01 * moved) ** 2, (0.003 + 0.01 * moved) ** 2, (0.001 + 0.01 * turned) ** 2))
+    information = np.linalg.inv(covariance + floor)
+    return np.asarray(0.5 * (information + information.T))
+
+
+def _clean(ranges_m: Ranges, max_range_m: float) -> Ranges:
+    """Ranges of a keyscan: what is no return becomes 0."""
+    valid = np.isfinite(ranges_m) & (ranges_m > 0.0) & (ranges_m < max_range_m)
+    return frozen(np.where(valid, ranges_m, 0.0), np.float32)

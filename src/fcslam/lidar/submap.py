@@ -1,0 +1,162 @@
+"""A submap: the surfaces and the free space that the keyscans around one keyscan saw, in that keyscan's base."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fcslam.lidar.field import EMPTY, SurfelField, field_of, label_at
+from fcslam.lidar.scan import PointScan
+from fcslam.records import FloatArray
+
+FREE_CELL_M: Final = 0.1
+FREE_MARGIN_M: Final = 0.2
+"""A beam clears the cells up to this far before its end."""
+RADIUS_M: Final = 30.0
+"""Surfaces and free space farther than this from the anchor are left out: distant ones are seen too sparsely."""
+SPACING_M: Final = 0.1
+"""Surfaces are compared at points this far apart."""
+
+
+@dataclass(frozen=True, slots=True)
+class FreeSpace:
+    """Cells that beams passed through."""
+
+    cells: NDArray[np.bool_]
+    """Shape (H, W), row = y."""
+    corner: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Submap:
+    """What was seen around an anchor keyscan; everything in the anchor's base."""
+
+    field: SurfelField
+    surface: PointScan
+    """The surfels, about 0.1 m apart."""
+    free: FreeSpace
+
+
+def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
+    """Submap of scans given with their poses in the anchor's base (T_anchor_base)."""
+    near = [(_near(scan, pose), pose) for scan, pose in scans]
+    field = field_of(near)
+    points, normals = _spaced(field.points, field.normals)
+    return Submap(field.transformed_copy(), PointScan(points, normals), _free_space(near, points))
+
+
+def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
+    """The returns within the radius of the anchor (measured from the robot: the window is short)."""
+    limit = max(1.0, RADIUS_M - float(np.hypot(T_anchor_base[0], T_anchor_base[1])))
+    inside = scan.points[:, 0] ** 2 + scan.points[:, 1] ** 2 < limit * limit
+    return PointScan(scan.points[inside], scan.normals[inside])
+
+
+def _free_space(scans: Sequence[tuple[PointScan, FloatArray]], surface: FloatArray) -> FreeSpace:
+    poses = np.array([pose for _, pose in scans]).reshape(-1, 3)
+    around = np.concatenate([surface, poses[:, :2]]) if len(surface) else poses[:, :2]
+    corner = around.min(axis=0) - FREE_CELL_M
+    columns, rows = np.ceil((around.max(axis=0) - corner) / FREE_CELL_M).astype(np.int64) + 1
+    cells = np.zeros((rows, columns), np.bool_)
+    for scan, pose in scans:
+        _clear(scan.points, pose, corner, cells)
+    return FreeSpace(cells, corner)
+
+
+@njit(cache=True)
+def _clear(points, T, corner, cells):  # type: ignore[no-untyped-def]
+    """Mark the cells between the robot and each return, short of the return itself."""
+    cos, sin = np.cos(T[2]), np.sin(T[2])
+    rows, columns = cells.shape
+    for i in range(len(points)):
+        dx = cos * points[i, 0] - sin * points[i, 1]
+        dy = sin * points[i, 0] + cos * points[i, 1]
+        length = np.hypot(dx, dy)
+        steps = int((length - FREE_MARGIN_M) / FREE_CELL_M)
+        if steps <= 0:
+            continue
+        ux, uy = dx / length, dy / length
+        for k in range(steps + 1):
+            x = int((T[0] + k * FREE_CELL_M * ux - corner[0]) / FREE_CELL_M)
+            y = int((T[1] + k * FREE_CELL_M * uy - corner[1]) / FREE_CELL_M)
+            if x >= 0 and y >= 0 and x < columns and y < rows:
+                cells[y, x] = True
+
+
+def _spaced(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """First surfel of each cell of ``SPACING_M``."""
+    cells = np.floor(points / SPACING_M).astype(np.int64)
+    _, first = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)
+    first.sort()
+    return points[first], normals[first]
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """How well a submap, laid on another, agrees with what the other saw."""
+
+    explained: float
+    """Share of the points in known area that lie on a surface facing the same way."""
+    violation: float
+    """Share of the points in known area that lie in the other's free space, well away from any surface."""
+    count: int
+    """Explained points."""
+    overlap: float
+    """Share of all points that fall into known area."""
+    normal_tensor: FloatArray
+    """Sum of n n^T over the explained points, shape (2, 2): its small eigenvalue says how well the match is fixed."""
+
+    @property
+    def weakest(self) -> float:
+        """Smaller eigenvalue of the normal tensor."""
+        return float(np.linalg.eigvalsh(self.normal_tensor)[0])
+
+
+def agreement(query: Submap, target: Submap, T_target_query: FloatArray) -> Agreement:
+    """Agreement of ``query`` with ``target`` when its anchor lies at ``T_target_query``."""
+    known, explained, violating, tensor = _agreement(
+        query.surface.points, query.surface.normals, T_target_query,
+        target.field.corner, target.field.table, target.field.labels, target.field.surfels,
+        target.free.cells, target.free.corner,
+    )  # fmt: skip
+    total = max(1, len(query.surface))
+    return Agreement(explained / max(1, known), violating / max(1, known), explained, known / total, tensor)
+
+
+EXPLAINED_M: Final = 0.15
+VIOLATION_M: Final = 0.30
+
+
+@njit(cache=True)
+def _agreement(points, normals, T, corner, table, labels, surfels, free, free_corner):  # type: ignore[no-untyped-def]
+    cos, sin = np.cos(T[2]), np.sin(T[2])
+    known = explained = violating = 0
+    tensor = np.zeros((2, 2))
+    for i in range(len(points)):
+        x = T[0] + cos * points[i, 0] - sin * points[i, 1]
+        y = T[1] + sin * points[i, 0] + cos * points[i, 1]
+        mx = cos * normals[i, 0] - sin * normals[i, 1]
+        my = sin * normals[i, 0] + cos * normals[i, 1]
+        label = label_at(x, y, corner, table, labels)
+        distance = 10.0
+        if label != EMPTY:
+            s = surfels[label]
+            if s[2] * mx + s[3] * my > -0.1:
+                distance = np.hypot(x - s[0], y - s[1])
+        if distance < EXPLAINED_M:
+            known += 1
+            explained += 1
+            tensor[0, 0] += mx * mx
+            tensor[0, 1] += mx * my
+            tensor[1, 1] += my * my
+            continue
+        cx, cy = int(np.floor((x - free_corner[0]) / FREE_CELL_M)), int(np.floor((y - free_corner[1]) / FREE_CELL_M))
+        if cx >= 0 and cy >= 0 and cx < free.shape[1] and cy < free.shape[0] and free[cy, cx]:
+            known += 1
+            if distance > VIOLATION_M:
+                violating += 1
+    tensor[1, 0] = tensor[0, 1]
+    return known, explained, violating, tensor

@@ -1,0 +1,122 @@
+"""Where is the robot in the submap around it? Every scan is matched; odometry only starts and steadies the match."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.geometry import se2
+from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
+from fcslam.lidar.field import SurfelField
+from fcslam.lidar.matching import MatchingConfig, ScanMatch, match_scan
+from fcslam.lidar.scan import PointScan, point_scan
+from fcslam.records import FloatArray, LaserScan
+
+
+class TrackerConfig(Settings):
+    """Scan-to-submap tracking."""
+
+    still_m: float = Field(default=0.005, ge=0, description="a robot that moved less since the last match stands still")
+    still_rad: float = Field(default=0.003, ge=0, description="and turned less")
+    point_spacing_m: float = Field(default=0.05, gt=0, description="points of a scan are matched this far apart")
+    point_limit: int = Field(default=180, gt=10, description="at most this many points of a scan are matched")
+    buffer_keyscans: int = Field(default=60, ge=4, description="keyscans in a full running buffer")
+    supported: float = Field(default=0.30, ge=0, le=1, description="a match that explains less is not believed")
+    doubtful: float = Field(default=0.75, ge=0, le=1, description="explaining less of the known area starts a search")
+    search_radius_m: float = Field(default=1.0, gt=0, description="half side of that correlative search")
+    search_angle_rad: float = Field(default=0.5, gt=0, description="half angle of that correlative search")
+    step_m: float = Field(default=0.20, gt=0, description="so does a match this far from odometry")
+    step_rad: float = Field(default=0.07, gt=0, description="or turned this much from it")
+    matching: MatchingConfig = Field(default=MatchingConfig(), description="Gauss-Newton scan matching")
+    search: SearchConfig = Field(default=SearchConfig(), description="correlative search by branch and bound")
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """One scan's pose in the tracker's own smooth frame."""
+
+    T_local_base: FloatArray
+    information: FloatArray
+    """Of the scan's points, in the local frame; zeros if the pose is odometry's."""
+    scan: PointScan | None
+    """The scan's points; None if the robot stands still and nothing had to be computed."""
+
+
+class ScanTracker:
+    """Tracks one robot in a running buffer of keyscans (Karto), kept as two overlapping surfel fields.
+
+    The older field is matched against; when it is full it goes and the younger one, half full, takes its place. So a
+    scan always sees between half and a full buffer, and nothing has to be removed from a field.
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self._config = config
+        self._fields: list[tuple[SurfelField, int]] = []
+        self._T_local_base = np.zeros(3)
+        self._T_odom_base: FloatArray | None = None
+        self._moved_m = 0.0
+        self._turned_rad = 0.0
+
+    def track(self, scan: LaserScan) -> Tracked:
+        """Pose of the next scan."""
+        T_local_guess = self._predict(scan)
+        if self._fields and self._moved_m < self._config.still_m and self._turned_rad < self._config.still_rad:
+            self._T_local_base = T_local_guess
+            return Tracked(T_local_guess, np.zeros((3, 3)), None)
+        points = point_scan(scan.ranges_m, scan.laser)
+        match = self._match(points, T_local_guess) if self._fields else None
+        self._moved_m = self._turned_rad = 0.0
+        if match is None:
+            self._T_local_base = T_local_guess
+            return Tracked(T_local_guess, np.zeros((3, 3)), points)
+        self._T_local_base = match.T_field_base
+        return Tracked(match.T_field_base, match.information, points)
+
+    def insert(self, points: PointScan, T_local_base: FloatArray) -> None:
+        """Add a keyscan to the running buffer."""
+        if not self._fields or (len(self._fields) == 1 and self._fields[0][1] >= self._config.buffer_keyscans // 2):
+            self._fields.append((SurfelField(T_local_base), 0))
+        elif self._fields[0][1] >= self._config.buffer_keyscans:
+            self._fields = [self._fields[1], (SurfelField(T_local_base), 0)]
+        for field, _ in self._fields:
+            field.insert(points, T_local_base)
+        self._fields = [(field, count + 1) for field, count in self._fields]
+
+    def _predict(self, scan: LaserScan) -> FloatArray:
+        """The last pose carried on by odometry."""
+        last = scan.T_odom_base if self._T_odom_base is None else self._T_odom_base
+        motion = se2.between(last, scan.T_odom_base)
+        self._T_odom_base = scan.T_odom_base
+        self._moved_m += float(np.hypot(motion[0], motion[1]))
+        self._turned_rad += abs(float(motion[2]))
+        return se2.compose(self._T_local_base, motion)
+
+    def _match(self, points: PointScan, T_local_guess: FloatArray) -> ScanMatch | None:
+        """Gauss-Newton from the guess; correlative search where that is doubtful; None if nothing supports a match."""
+        config, field = self._config, self._fields[0][0]
+        thinned = points.thinned(config.point_spacing_m, config.point_limit)
+        prior = odometry_information(self._moved_m, self._turned_rad)
+        match = match_scan(thinned, field, T_local_guess, prior, config.matching)
+        if self._is_doubtful(match, T_local_guess):
+            window = SearchWindow(config.search_radius_m, config.search_angle_rad)
+            found = search(points, field, T_local_guess, window, config.search)
+            other = match_scan(thinned, field, found.T_field_base, np.zeros((3, 3)), config.matching)
+            if other.explained > match.explained + 0.05:
+                match = other
+        return match if match.explained >= config.supported else None
+
+    def _is_doubtful(self, match: ScanMatch, T_local_guess: FloatArray) -> bool:
+        step = se2.between(T_local_guess, match.T_field_base)
+        return bool(
+            match.explained < self._config.doubtful * match.known
+            or np.hypot(step[0], step[1]) > self._config.step_m
+            or abs(step[2]) > self._config.step_rad
+        )
+
+
+def odometry_information(moved_m: float, turned_rad: float) -> FloatArray:
+    """Weak trust in wheel odometry over a short motion, shape (3, 3): wheels may slip by a third of the way."""
+    sigma_m = 0.02 + 0.3 * moved_m + 0.05 * turned_rad
+    sigma_rad = 0.02 + 0.2 * turned_rad + 0.05 * moved_m
+    return np.diag((sigma_m**-2, sigma_m**-2, sigma_rad**-2))

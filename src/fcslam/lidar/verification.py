@@ -1,0 +1,110 @@
+"""Do two submaps show the same place, and how do they lie to each other? Geometry decides, and it may say no."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.geometry import se2
+from fcslam.lidar.matching import MatchingConfig, match_scan
+from fcslam.lidar.submap import Agreement, Submap, agreement
+from fcslam.records import FloatArray
+
+NO_PRIOR = np.zeros((3, 3))
+_ALIGNMENT = MatchingConfig(wide_scale_m=0.4)
+
+
+class Gate(Settings):
+    """What a pair of submaps has to show to count as the same place."""
+
+    explained: float = Field(ge=0, le=1, description="least share of points in known area that lie on a surface")
+    violation: float = Field(ge=0, le=1, description="largest share of points in the other's free space")
+    count: int = Field(default=250, ge=0, description="least number of explained points, 0.1 m apart")
+    overlap: float = Field(default=0.25, ge=0, le=1, description="least share of points in known area")
+
+
+class VerificationConfig(Settings):
+    """Two-way verification of closures between submaps."""
+
+    strict: Gate = Field(default=Gate(explained=0.80, violation=0.05), description="gate without a prediction")
+    loose: Gate = Field(default=Gate(explained=0.70, violation=0.10), description="gate where a closure is predicted")
+    informative: float = Field(
+        default=30.0, ge=0, description="least small eigenvalue of the normal tensor: below, it may be a corridor"
+    )
+    symmetry_m: float = Field(default=0.15, gt=0, description="both directions of the alignment agree this closely")
+    symmetry_rad: float = Field(default=0.03, gt=0, description="and turn alike to this")
+    closure_sigma_m: float = Field(default=0.03, gt=0, description="error of a closure that no point count removes")
+    closure_sigma_rad: float = Field(default=0.006, gt=0, description="the same of its heading")
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """The outcome of laying submap b on submap a."""
+
+    T_a_b: FloatArray
+    information: FloatArray
+    """Of T_a_b, in the coordinates of b, shape (3, 3)."""
+    worse: Agreement
+    """The less convincing of the two directions."""
+    strict: bool
+    loose: bool
+    informative: bool
+    reason: str
+    """Why it is not more, in words; empty if strict and informative."""
+
+
+def verify(a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig) -> Verification:
+    """Align both ways by Gauss-Newton from the guess, then judge by the worse side."""
+    forward = match_scan(b.surface, a.field, T_a_b_guess, NO_PRIOR, _ALIGNMENT)
+    backward = match_scan(a.surface, b.field, se2.inverse(forward.T_field_base), NO_PRIOR, _ALIGNMENT)
+    T_a_b, T_a_b_back = forward.T_field_base, se2.inverse(backward.T_field_base)
+    gap = se2.between(T_a_b, T_a_b_back)
+    T_a_b = se2.compose(T_a_b, 0.5 * gap)
+    sides = agreement(b, a, T_a_b), agreement(a, b, se2.inverse(T_a_b))
+    worse = min(sides, key=lambda side: side.explained - side.violation)
+    worse = Agreement(
+        worse.explained,
+        max(side.violation for side in sides),
+        min(side.count for side in sides),
+        max(side.overlap for side in sides),
+        worse.normal_tensor,
+    )
+    symmetric = np.hypot(gap[0], gap[1]) < config.symmetry_m and abs(gap[2]) < config.symmetry_rad
+    informative = worse.weakest >= config.informative
+    strict_reason = _shortfall(worse, config.strict)
+    loose_reason = _shortfall(worse, config.loose)
+    reason = strict_reason or ("" if informative else "fixed in one direction only, as in a corridor")
+    return Verification(
+        T_a_b=T_a_b,
+        information=_information(forward.information, T_a_b, config),
+        worse=worse,
+        strict=symmetric and not strict_reason,
+        loose=symmetric and not loose_reason,
+        informative=informative,
+        reason=reason if symmetric else "the two directions of the alignment disagree",
+    )
+
+
+def _shortfall(found: Agreement, gate: Gate) -> str:
+    """The first condition of the gate that is not met, in words."""
+    if found.explained < gate.explained:
+        return f"only {found.explained:.2f} explained"
+    if found.violation > gate.violation:
+        return f"{found.violation:.2f} in free space"
+    if found.count < gate.count:
+        return f"only {found.count} points explained"
+    if found.overlap < gate.overlap:
+        return f"overlap of {found.overlap:.2f}"
+    return ""
+
+
+def _information(points: FloatArray, T_a_b: FloatArray, config: VerificationConfig) -> FloatArray:
+    """Points' information turned into b's coordinates, with the floor that neighbouring points share."""
+    turn = np.eye(3)
+    cos, sin = np.cos(T_a_b[2]), np.sin(T_a_b[2])
+    turn[:2, :2] = ((cos, -sin), (sin, cos))
+    covariance = np.linalg.inv(turn.T @ points @ turn + np.diag((1e-3, 1e-3, 1e-3)))
+    floor = np.diag((config.closure_sigma_m**2, config.closure_sigma_m**2, config.closure_sigma_rad**2))
+    information = np.linalg.inv(covariance + floor)
+    return np.asarray(0.5 * (information + information.T))
