@@ -96,9 +96,10 @@ def _check_information(information: FloatArray) -> None:
     """Symmetric and, in units of its own standard deviations and as rounded, clearly positive definite."""
     _check_shape(information, (3, 3), "constraint: information")
     sent = unpack_information(pack_information(information))
+    _require(bool(np.isfinite(sent).all()), "constraint: information is not finite")
     diagonal = sent.diagonal()
     bounded = bool(((diagonal >= MINIMUM_INFORMATION) & (diagonal <= MAXIMUM_INFORMATION)).all())
-    _require(bounded, f"constraint: information not in [{MINIMUM_INFORMATION:g}, {MAXIMUM_INFORMATION:g}]")
+    _require(bounded, "constraint: a diagonal element of information is not in [2^-20, 2^40]")
     deviation = 1.0 / np.sqrt(diagonal)
     scale = deviation * deviation[:, np.newaxis]
     symmetric = bool((np.abs(information - sent) * scale <= 1e-6).all())

@@ -26,9 +26,9 @@ BYTES_PER_KEYPOINT = 4
 
 MAXIMUM_COORDINATE_M = 1e6
 MAXIMUM_LASER_RANGE_M = 1e3
-MAXIMUM_INFORMATION = 1e12
-"""A standard deviation of 1 micrometre or 1 microradian."""
-MINIMUM_INFORMATION = 1e-6
+MAXIMUM_INFORMATION = 2.0**40
+"""A standard deviation of 1 micrometre or 1 microradian; a power of two, so float32 keeps it."""
+MINIMUM_INFORMATION = 2.0**-20
 """A standard deviation of 1 km or 1000 rad. Both bounds hold for the diagonal."""
 MINIMUM_CORRELATION_EIGENVALUE = 1e-6
 """Well above the rounding of float32: what is positive definite here stays so."""
