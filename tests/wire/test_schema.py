@@ -95,7 +95,10 @@ def test_no_field_is_longer_than_listed(name):
 @pytest.mark.parametrize("name", [name for name, field in FIELDS.items() if field.type == field.TYPE_BYTES])
 @pytest.mark.parametrize("image", ["raw", "jpeg"])
 def test_no_field_of_bytes_takes_an_image(name, image):
-    """Not even the smallest camera image, raw (160 x 120 grey) or compressed (noise with a JPEG's head)."""
+    """Not even the smallest camera image, raw (160 x 120 grey) or compressed (noise with a JPEG's head).
+
+    Put in as it is: descriptors without their keypoints are refused. Bytes dressed up as a place would pass.
+    """
     noise = np.random.default_rng(0).integers(0, 256, 160 * 120, np.uint8).tobytes()
     data = noise if image == "raw" else b"\xff\xd8\xff\xe0" + noise[:6000]
     message = pb.Packet.FromString(filled(name, 0))
