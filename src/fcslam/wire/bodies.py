@@ -1,0 +1,189 @@
+"""Each record as its protobuf message: writing and reading stand side by side."""
+
+from collections.abc import Callable
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf.message import Message
+
+from fcslam.errors import PacketError
+from fcslam.records import (
+    CODE_BYTES,
+    Channel,
+    Constraint,
+    ConstraintKind,
+    Correction,
+    FloatArray,
+    Keyscan,
+    KeyscanId,
+    LaserModel,
+    Place,
+    frozen,
+)
+from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.limits import BYTES_PER_KEYPOINT, MAXIMUM_KEYPOINTS
+from fcslam.wire.messages import Acknowledgement, Hello, Kind
+from fcslam.wire.quantisation import (
+    dequantise,
+    pack_information,
+    pack_keypoints,
+    pack_ranges,
+    quantise,
+    unpack_information,
+    unpack_keypoints,
+    unpack_ranges,
+)
+
+_CHANNELS = {Channel.LIDAR: pb.CHANNEL_LIDAR, Channel.CAMERA: pb.CHANNEL_CAMERA}
+_CONSTRAINT_KINDS = {
+    ConstraintKind.ODOMETRY: pb.CONSTRAINT_KIND_ODOMETRY,
+    ConstraintKind.CLOSURE: pb.CONSTRAINT_KIND_CLOSURE,
+}
+_CHANNEL_OF_CODE = {int(code): channel for channel, code in _CHANNELS.items()}
+_CONSTRAINT_KIND_OF_CODE = {int(code): kind for kind, code in _CONSTRAINT_KINDS.items()}
+
+
+def _write_hello(hello: Hello) -> pb.Hello:
+    laser = hello.laser
+    return pb.Hello(
+        beam_count=laser.beam_count,
+        angle_min_rad=laser.angle_min_rad,
+        angle_increment_rad=laser.angle_increment_rad,
+        max_range_m=laser.max_range_m,
+        t_base_laser=_write_pose(frozen(laser.T_base_laser)),
+        detectors=[
+            pb.Detector(channel=code, version=hello.detector_versions[channel])
+            for channel, code in _CHANNELS.items()
+            if channel in hello.detector_versions
+        ],
+    )
+
+
+def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
+    x, y, theta = _read_pose(message, "t_base_laser").tolist()
+    laser = LaserModel(
+        message.beam_count, message.angle_min_rad, message.angle_increment_rad, message.max_range_m, (x, y, theta)
+    )
+    codes = [detector.channel for detector in message.detectors]
+    if codes != sorted(set(codes)):
+        raise PacketError("hello: detectors are not in ascending order of their channels")
+    versions = {_read_channel(detector.channel): detector.version for detector in message.detectors}
+    return Hello(envelope.robot, envelope.epoch, laser, MappingProxyType(versions))
+
+
+def _write_keyscan(keyscan: Keyscan) -> pb.Keyscan:
+    return pb.Keyscan(number=keyscan.id.number, stamp=keyscan.stamp, ranges=pack_ranges(quantise(keyscan.ranges_m)))
+
+
+def _read_keyscan(message: pb.Keyscan, envelope: pb.Packet) -> Keyscan:
+    ranges = dequantise(unpack_ranges(message.ranges))
+    return Keyscan(KeyscanId(envelope.robot, message.number), message.stamp, ranges)
+
+
+def _write_constraint(constraint: Constraint) -> pb.Constraint:
+    return pb.Constraint(
+        i=constraint.i,
+        j=constraint.j,
+        kind=_CONSTRAINT_KINDS[constraint.kind],
+        t_i_j=_write_pose(constraint.T_i_j),
+        information=pack_information(constraint.information),
+    )
+
+
+def _read_constraint(message: pb.Constraint, envelope: pb.Packet) -> Constraint:
+    kind = _CONSTRAINT_KIND_OF_CODE.get(message.kind)
+    if kind is None:
+        raise PacketError(f"constraint: kind {message.kind} is unknown")
+    if len(message.information) != 6:
+        raise PacketError(f"constraint: information has {len(message.information)} numbers, not 6")
+    information = unpack_information(message.information)
+    return Constraint(envelope.robot, message.i, message.j, kind, _read_pose(message, "t_i_j"), information)
+
+
+def _write_place(place: Place) -> pb.Place:
+    return pb.Place(
+        number=place.id.number,
+        channel=_CHANNELS[place.channel],
+        detector_version=place.detector_version,
+        first=place.first,
+        last=place.last,
+        keypoints=pack_keypoints(place.keypoints),
+        descriptors=place.descriptors.tobytes(),
+    )
+
+
+def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
+    count, rest = divmod(len(message.descriptors), CODE_BYTES)
+    if rest:
+        raise PacketError(f"place: {len(message.descriptors)} bytes of descriptors, not {CODE_BYTES} for each")
+    if count > MAXIMUM_KEYPOINTS:
+        raise PacketError(f"place: {count} descriptors, at most {MAXIMUM_KEYPOINTS}")
+    if len(message.keypoints) != BYTES_PER_KEYPOINT * count:
+        raise PacketError(f"place: {len(message.keypoints)} bytes of keypoints for {count} descriptors")
+    return Place(
+        KeyscanId(envelope.robot, message.number),
+        _read_channel(message.channel),
+        message.detector_version,
+        message.first,
+        message.last,
+        unpack_keypoints(message.keypoints),
+        np.frombuffer(message.descriptors, dtype=np.uint8).reshape(count, CODE_BYTES),
+    )
+
+
+def _write_correction(correction: Correction) -> pb.Correction:
+    return pb.Correction(
+        version=correction.version, map_index=correction.map_index, t_map_odom=_write_pose(correction.T_map_odom)
+    )
+
+
+def _read_correction(message: pb.Correction, envelope: pb.Packet) -> Correction:
+    return Correction(envelope.robot, message.version, message.map_index, _read_pose(message, "t_map_odom"))
+
+
+def _write_acknowledgement(acknowledgement: Acknowledgement) -> pb.Acknowledgement:
+    return pb.Acknowledgement(epoch=acknowledgement.epoch, sequence=acknowledgement.sequence)
+
+
+def _read_acknowledgement(message: pb.Acknowledgement, envelope: pb.Packet) -> Acknowledgement:
+    return Acknowledgement(envelope.robot, message.epoch, message.sequence)
+
+
+def _write_pose(pose: FloatArray) -> pb.Pose:
+    x, y, theta = pose.tolist()
+    return pb.Pose(x_m=x, y_m=y, theta_rad=theta)
+
+
+def _read_pose(message: Message, field: str) -> FloatArray:
+    """An absent pose is no identity: it is refused."""
+    if not message.HasField(field):
+        raise PacketError(f"{message.DESCRIPTOR.name.lower()}: {field} is missing")
+    pose: pb.Pose = getattr(message, field)
+    return frozen((pose.x_m, pose.y_m, pose.theta_rad))
+
+
+def _read_channel(code: int) -> Channel:
+    channel = _CHANNEL_OF_CODE.get(code)
+    if channel is None:
+        raise PacketError(f"channel {code} is unknown")
+    return channel
+
+
+class Codec(NamedTuple):
+    """How one kind of record is written and read; reading takes the robot and the epoch from the envelope."""
+
+    type: type
+    write: Callable[[Any], Message]
+    read: Callable[[Any, pb.Packet], Any]
+
+
+CODECS = {
+    Kind.HELLO: Codec(Hello, _write_hello, _read_hello),
+    Kind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan),
+    Kind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint),
+    Kind.PLACE: Codec(Place, _write_place, _read_place),
+    Kind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
+    Kind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
+}
+CODEC_OF_TYPE = {codec.type: (kind, codec) for kind, codec in CODECS.items()}

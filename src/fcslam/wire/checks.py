@@ -1,0 +1,166 @@
+"""Which packets may be trusted: the same checks before writing and after reading."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.errors import PacketError
+from fcslam.records import CODE_BYTES, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
+from fcslam.wire.limits import (
+    MAXIMUM_BEAMS,
+    MAXIMUM_COORDINATE_M,
+    MAXIMUM_INFORMATION,
+    MAXIMUM_KEYPOINTS,
+    MAXIMUM_LASER_RANGE_M,
+    MAXIMUM_NUMBER,
+    MAXIMUM_SEQUENCE,
+    MINIMUM_CORRELATION_EIGENVALUE,
+    MINIMUM_INFORMATION,
+    NAME,
+)
+from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet
+from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise, unpack_information
+
+FULL_TURN_RAD = 2.0 * math.pi
+
+
+def check(packet: Packet) -> None:
+    """Refuse what breaks a limit or a promise of the format.
+
+    Raises:
+        PacketError: with the reason.
+    """
+    check_name(packet.robot, "robot")
+    _check_count(packet.epoch, "epoch", MAXIMUM_SEQUENCE)
+    _check_count(packet.sequence, "sequence", MAXIMUM_SEQUENCE)
+    _require(math.isfinite(packet.time), "time is not finite")
+    robot = _robot_of(packet.body)
+    _require(robot == packet.robot, f"a packet of robot {packet.robot} speaks for robot {robot!r}")
+    _CHECKS[type(packet.body)](packet.body, packet)
+
+
+def check_name(name: str, what: str) -> None:
+    """Refuse a name that is no plain word of at most 64 letters, digits and ``. _ + -``.
+
+    Raises:
+        PacketError: naming ``what`` it was for.
+    """
+    _require(NAME.fullmatch(name) is not None, f"{what}: {name[:64]!r} is no name (1-64 of A-Z a-z 0-9 . _ + -)")
+
+
+def _robot_of(body: Body) -> str:
+    return body.id.robot if isinstance(body, Keyscan | Place) else body.robot
+
+
+def _check_hello(hello: Hello, packet: Packet) -> None:
+    _require(hello.epoch == packet.epoch, f"hello: epoch {hello.epoch} in a packet of epoch {packet.epoch}")
+    _check_laser(hello.laser)
+    for channel, version in hello.detector_versions.items():
+        check_name(version, f"hello: detector version of {channel}")
+
+
+def _check_laser(laser: LaserModel) -> None:
+    _require(0 < laser.beam_count <= MAXIMUM_BEAMS, f"laser: {laser.beam_count} beams, not in 1..{MAXIMUM_BEAMS}")
+    _require(abs(laser.angle_min_rad) <= FULL_TURN_RAD, "laser: first beam is not within a full turn")
+    _require(laser.angle_increment_rad != 0.0, "laser: beams do not turn")
+    span = abs(laser.angle_increment_rad) * laser.beam_count
+    # a full turn may be closed by one beam twice, and drivers round the increment
+    _require(span <= 1.01 * FULL_TURN_RAD + abs(laser.angle_increment_rad), "laser: beams cover over a full turn")
+    _require(0.0 < laser.max_range_m <= MAXIMUM_LASER_RANGE_M, "laser: maximum range is not in (0, 1000] m")
+    _check_pose(np.array(laser.T_base_laser), "laser: T_base_laser")
+
+
+def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
+    _check_count(keyscan.id.number, "keyscan: number", MAXIMUM_NUMBER)
+    _require(math.isfinite(keyscan.stamp), "keyscan: stamp is not finite")
+    _require(keyscan.stamp <= packet.time, "keyscan: stamp is later than the packet's time")
+    ranges = keyscan.ranges_m
+    _require(ranges.ndim == 1, f"keyscan: ranges have shape {ranges.shape}, not (N,)")
+    _require(0 < len(ranges) <= MAXIMUM_BEAMS, f"keyscan: {len(ranges)} ranges, not in 1..{MAXIMUM_BEAMS}")
+    if not np.array_equal(ranges, dequantise(quantise(ranges))):
+        raise PacketError("keyscan: ranges are not quantised; work with dequantise(quantise(ranges_m))")
+
+
+def _check_constraint(constraint: Constraint, _: Packet) -> None:
+    _check_count(constraint.i, "constraint: i", MAXIMUM_NUMBER)
+    _check_count(constraint.j, "constraint: j", MAXIMUM_NUMBER)
+    _require(constraint.i < constraint.j, f"constraint: i = {constraint.i} is not below j = {constraint.j}")
+    _check_pose(constraint.T_i_j, "constraint: T_i_j", math.pi)
+    _check_information(constraint.information)
+
+
+def _check_information(information: FloatArray) -> None:
+    """Symmetric and, in units of its own standard deviations and as rounded, clearly positive definite."""
+    _check_shape(information, (3, 3), "constraint: information")
+    sent = unpack_information(pack_information(information))
+    _require(bool(np.isfinite(sent).all()), "constraint: information is not finite")
+    diagonal = sent.diagonal()
+    bounded = bool(((diagonal >= MINIMUM_INFORMATION) & (diagonal <= MAXIMUM_INFORMATION)).all())
+    _require(bounded, "constraint: a diagonal element of information is not in [2^-20, 2^40]")
+    deviation = 1.0 / np.sqrt(diagonal)
+    scale = deviation * deviation[:, np.newaxis]
+    symmetric = bool((np.abs(information - sent) * scale <= 1e-6).all())
+    _require(symmetric, "constraint: information is not symmetric")
+    smallest = float(np.linalg.eigvalsh(sent * scale)[0])
+    _require(smallest >= MINIMUM_CORRELATION_EIGENVALUE, "constraint: information is not clearly positive definite")
+
+
+def _check_place(place: Place, _: Packet) -> None:
+    _check_count(place.id.number, "place: number", MAXIMUM_NUMBER)
+    _check_count(place.first, "place: first", MAXIMUM_NUMBER)
+    _check_count(place.last, "place: last", MAXIMUM_NUMBER)
+    _require(place.first <= place.last, f"place: first = {place.first} is after last = {place.last}")
+    check_name(place.detector_version, "place: detector version")
+    count = len(place.keypoints)
+    _require(count <= MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {MAXIMUM_KEYPOINTS}")
+    _check_shape(place.keypoints, (count, 2), "place: keypoints")
+    _check_shape(place.descriptors, (count, CODE_BYTES), "place: descriptors")
+    _require(place.descriptors.dtype == np.uint8, f"place: descriptors are {place.descriptors.dtype}, not bytes")
+    within = bool((np.abs(place.keypoints) <= MAXIMUM_KEYPOINT_M).all())
+    _require(within, f"place: a keypoint is not within {MAXIMUM_KEYPOINT_M:g} m")
+
+
+def _check_correction(correction: Correction, _: Packet) -> None:
+    _check_count(correction.version, "correction: version", MAXIMUM_NUMBER)
+    _check_count(correction.map_index, "correction: map index", MAXIMUM_NUMBER)
+    _check_pose(correction.T_map_odom, "correction: T_map_odom", math.pi)
+
+
+def _check_acknowledgement(acknowledgement: Acknowledgement, _: Packet) -> None:
+    _check_count(acknowledgement.epoch, "acknowledgement: epoch", MAXIMUM_SEQUENCE)
+    _check_count(acknowledgement.sequence, "acknowledgement: sequence", MAXIMUM_SEQUENCE)
+
+
+_CHECKS: dict[type, Callable[[Any, Packet], None]] = {
+    Hello: _check_hello,
+    Keyscan: _check_keyscan,
+    Constraint: _check_constraint,
+    Place: _check_place,
+    Correction: _check_correction,
+    Acknowledgement: _check_acknowledgement,
+}
+
+
+def _check_pose(pose: FloatArray, what: str, maximum_angle_rad: float = FULL_TURN_RAD) -> None:
+    _check_shape(pose, (3,), what)
+    x, y, theta = pose.tolist()
+    within = abs(x) <= MAXIMUM_COORDINATE_M and abs(y) <= MAXIMUM_COORDINATE_M
+    _require(within, f"{what}: not within {MAXIMUM_COORDINATE_M:g} m")
+    _require(abs(theta) <= maximum_angle_rad, f"{what}: the angle is beyond {maximum_angle_rad:.4f} rad")
+
+
+def _check_shape(array: NDArray[Any], shape: tuple[int, ...], what: str) -> None:
+    _require(array.shape == shape, f"{what} have shape {array.shape}, not {shape}")
+
+
+def _check_count(value: int, what: str, maximum: int) -> None:
+    _require(0 <= value <= maximum, f"{what} is {value}, not in 0..{maximum}")
+
+
+def _require(condition: bool, reason: str) -> None:
+    """False also for comparisons with NaN: every condition is written so that NaN fails it."""
+    if not condition:
+        raise PacketError(reason)

@@ -1,0 +1,146 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Channel(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CHANNEL_UNSPECIFIED: _ClassVar[Channel]
+    CHANNEL_LIDAR: _ClassVar[Channel]
+    CHANNEL_CAMERA: _ClassVar[Channel]
+
+class ConstraintKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CONSTRAINT_KIND_UNSPECIFIED: _ClassVar[ConstraintKind]
+    CONSTRAINT_KIND_ODOMETRY: _ClassVar[ConstraintKind]
+    CONSTRAINT_KIND_CLOSURE: _ClassVar[ConstraintKind]
+CHANNEL_UNSPECIFIED: Channel
+CHANNEL_LIDAR: Channel
+CHANNEL_CAMERA: Channel
+CONSTRAINT_KIND_UNSPECIFIED: ConstraintKind
+CONSTRAINT_KIND_ODOMETRY: ConstraintKind
+CONSTRAINT_KIND_CLOSURE: ConstraintKind
+
+class Packet(_message.Message):
+    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "correction", "acknowledgement")
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    ROBOT_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    HELLO_FIELD_NUMBER: _ClassVar[int]
+    KEYSCAN_FIELD_NUMBER: _ClassVar[int]
+    CONSTRAINT_FIELD_NUMBER: _ClassVar[int]
+    PLACE_FIELD_NUMBER: _ClassVar[int]
+    CORRECTION_FIELD_NUMBER: _ClassVar[int]
+    ACKNOWLEDGEMENT_FIELD_NUMBER: _ClassVar[int]
+    version: int
+    robot: str
+    epoch: int
+    sequence: int
+    time: float
+    hello: Hello
+    keyscan: Keyscan
+    constraint: Constraint
+    place: Place
+    correction: Correction
+    acknowledgement: Acknowledgement
+    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ...) -> None: ...
+
+class Pose(_message.Message):
+    __slots__ = ("x_m", "y_m", "theta_rad")
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    Y_M_FIELD_NUMBER: _ClassVar[int]
+    THETA_RAD_FIELD_NUMBER: _ClassVar[int]
+    x_m: float
+    y_m: float
+    theta_rad: float
+    def __init__(self, x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., theta_rad: _Optional[float] = ...) -> None: ...
+
+class Hello(_message.Message):
+    __slots__ = ("beam_count", "angle_min_rad", "angle_increment_rad", "max_range_m", "t_base_laser", "detectors")
+    BEAM_COUNT_FIELD_NUMBER: _ClassVar[int]
+    ANGLE_MIN_RAD_FIELD_NUMBER: _ClassVar[int]
+    ANGLE_INCREMENT_RAD_FIELD_NUMBER: _ClassVar[int]
+    MAX_RANGE_M_FIELD_NUMBER: _ClassVar[int]
+    T_BASE_LASER_FIELD_NUMBER: _ClassVar[int]
+    DETECTORS_FIELD_NUMBER: _ClassVar[int]
+    beam_count: int
+    angle_min_rad: float
+    angle_increment_rad: float
+    max_range_m: float
+    t_base_laser: Pose
+    detectors: _containers.RepeatedCompositeFieldContainer[Detector]
+    def __init__(self, beam_count: _Optional[int] = ..., angle_min_rad: _Optional[float] = ..., angle_increment_rad: _Optional[float] = ..., max_range_m: _Optional[float] = ..., t_base_laser: _Optional[_Union[Pose, _Mapping]] = ..., detectors: _Optional[_Iterable[_Union[Detector, _Mapping]]] = ...) -> None: ...
+
+class Detector(_message.Message):
+    __slots__ = ("channel", "version")
+    CHANNEL_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    channel: Channel
+    version: str
+    def __init__(self, channel: _Optional[_Union[Channel, str]] = ..., version: _Optional[str] = ...) -> None: ...
+
+class Keyscan(_message.Message):
+    __slots__ = ("number", "stamp", "ranges")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    STAMP_FIELD_NUMBER: _ClassVar[int]
+    RANGES_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    stamp: float
+    ranges: bytes
+    def __init__(self, number: _Optional[int] = ..., stamp: _Optional[float] = ..., ranges: _Optional[bytes] = ...) -> None: ...
+
+class Constraint(_message.Message):
+    __slots__ = ("i", "j", "kind", "t_i_j", "information")
+    I_FIELD_NUMBER: _ClassVar[int]
+    J_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    T_I_J_FIELD_NUMBER: _ClassVar[int]
+    INFORMATION_FIELD_NUMBER: _ClassVar[int]
+    i: int
+    j: int
+    kind: ConstraintKind
+    t_i_j: Pose
+    information: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, i: _Optional[int] = ..., j: _Optional[int] = ..., kind: _Optional[_Union[ConstraintKind, str]] = ..., t_i_j: _Optional[_Union[Pose, _Mapping]] = ..., information: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Place(_message.Message):
+    __slots__ = ("number", "channel", "detector_version", "first", "last", "keypoints", "descriptors")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    CHANNEL_FIELD_NUMBER: _ClassVar[int]
+    DETECTOR_VERSION_FIELD_NUMBER: _ClassVar[int]
+    FIRST_FIELD_NUMBER: _ClassVar[int]
+    LAST_FIELD_NUMBER: _ClassVar[int]
+    KEYPOINTS_FIELD_NUMBER: _ClassVar[int]
+    DESCRIPTORS_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    channel: Channel
+    detector_version: str
+    first: int
+    last: int
+    keypoints: bytes
+    descriptors: bytes
+    def __init__(self, number: _Optional[int] = ..., channel: _Optional[_Union[Channel, str]] = ..., detector_version: _Optional[str] = ..., first: _Optional[int] = ..., last: _Optional[int] = ..., keypoints: _Optional[bytes] = ..., descriptors: _Optional[bytes] = ...) -> None: ...
+
+class Correction(_message.Message):
+    __slots__ = ("version", "map_index", "t_map_odom")
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    MAP_INDEX_FIELD_NUMBER: _ClassVar[int]
+    T_MAP_ODOM_FIELD_NUMBER: _ClassVar[int]
+    version: int
+    map_index: int
+    t_map_odom: Pose
+    def __init__(self, version: _Optional[int] = ..., map_index: _Optional[int] = ..., t_map_odom: _Optional[_Union[Pose, _Mapping]] = ...) -> None: ...
+
+class Acknowledgement(_message.Message):
+    __slots__ = ("epoch", "sequence")
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    epoch: int
+    sequence: int
+    def __init__(self, epoch: _Optional[int] = ..., sequence: _Optional[int] = ...) -> None: ...

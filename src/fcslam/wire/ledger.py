@@ -1,0 +1,58 @@
+"""How many bytes of which kind each robot exchanged with the cloud."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from fcslam.wire.messages import Kind
+from fcslam.wire.packets import Label
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """Packets and their bytes, without what a network adds to them."""
+
+    count: int = 0
+    bytes: int = 0
+
+    def __add__(self, other: "Traffic") -> "Traffic":
+        return Traffic(self.count + other.count, self.bytes + other.bytes)
+
+
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """The traffic up to one moment."""
+
+    accepted: Mapping[Label, Traffic]
+    """By robot and kind; the kind also tells the direction."""
+    refused: Traffic
+    """Not by robot: whom refused bytes come from is not known."""
+
+    def total(self, robot: str | None = None, kind: Kind | None = None) -> Traffic:
+        """Accepted traffic of one robot or of all, of one kind or of all."""
+        chosen = (
+            traffic
+            for label, traffic in self.accepted.items()
+            if robot in (None, label.robot) and kind in (None, label.kind)
+        )
+        return sum(chosen, Traffic())
+
+
+class Counter:
+    """Counts traffic; ``ledger`` shows it."""
+
+    def __init__(self) -> None:
+        self._accepted: dict[Label, Traffic] = {}
+        self._refused = Traffic()
+
+    def accept(self, label: Label, size: int) -> None:
+        """Count a packet of ``size`` bytes that was accepted."""
+        self._accepted[label] = self._accepted.get(label, Traffic()) + Traffic(1, size)
+
+    def refuse(self, size: int) -> None:
+        """Count ``size`` bytes that were refused."""
+        self._refused += Traffic(1, size)
+
+    def ledger(self) -> Ledger:
+        """What was counted so far; later traffic does not change it."""
+        return Ledger(MappingProxyType(dict(self._accepted)), self._refused)

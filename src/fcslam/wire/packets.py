@@ -1,0 +1,82 @@
+"""Packets to bytes and back; docs/wire.md says what the bytes mean."""
+
+from typing import Any, NamedTuple
+
+from google.protobuf.message import DecodeError
+
+from fcslam.errors import PacketError
+from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS
+from fcslam.wire.checks import check, check_name
+from fcslam.wire.limits import MAXIMUM_PACKET_BYTES, PROTOCOL_VERSION
+from fcslam.wire.messages import Kind, Packet
+
+
+class Label(NamedTuple):
+    """What the outside of a packet says."""
+
+    robot: str
+    kind: Kind
+
+
+def encode(packet: Packet) -> bytes:
+    """The bytes of a packet; keypoints are rounded to 1 cm, information matrices to float32, nothing else changes.
+
+    Raises:
+        PacketError: the packet breaks a limit of the format, with the reason.
+    """
+    check(packet)
+    kind, codec = CODEC_OF_TYPE[type(packet.body)]
+    body: dict[str, Any] = {kind: codec.write(packet.body)}
+    message = pb.Packet(
+        version=PROTOCOL_VERSION,
+        robot=packet.robot,
+        epoch=packet.epoch,
+        sequence=packet.sequence,
+        time=packet.time,
+        **body,
+    )
+    return message.SerializeToString(deterministic=True)
+
+
+def decode(data: bytes) -> Packet:
+    """The packet that ``encode`` made ``data`` of, checked in everything that one packet alone can tell.
+
+    Raises:
+        PacketError: ``data`` is not a valid packet of a known version, with the reason.
+    """
+    message, kind = _parse(data)
+    body = CODECS[kind].read(getattr(message, kind), message)
+    packet = Packet(message.robot, message.epoch, message.sequence, message.time, body)
+    check(packet)
+    return packet
+
+
+def read_label(data: bytes) -> Label:
+    """Robot and kind of a packet without the cost, and without the checks, of reading its body.
+
+    Raises:
+        PacketError: ``data`` is not a packet of a known version, with the reason.
+    """
+    message, kind = _parse(data)
+    check_name(message.robot, "robot")
+    return Label(message.robot, kind)
+
+
+def _parse(data: bytes) -> tuple[pb.Packet, Kind]:
+    if len(data) > MAXIMUM_PACKET_BYTES:
+        raise PacketError(f"{len(data)} bytes, at most {MAXIMUM_PACKET_BYTES}")
+    message = pb.Packet()
+    try:
+        message.ParseFromString(data)
+    except DecodeError as error:
+        raise PacketError("not a protobuf message of a packet") from error
+    if message.version != PROTOCOL_VERSION:
+        raise PacketError(f"version {message.version} is unknown, this side speaks version {PROTOCOL_VERSION}")
+    message.DiscardUnknownFields()
+    if message.ByteSize() != len(data):
+        raise PacketError("unknown, repeated or overlong fields")
+    kind = message.WhichOneof("body")
+    if kind is None:
+        raise PacketError("the packet is empty")
+    return message, Kind(kind)

@@ -1,0 +1,98 @@
+"""One packet of every kind, written down; ``python -m wire.examples`` (from tests/) writes the golden files anew."""
+
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fcslam.records import (
+    Channel,
+    Constraint,
+    ConstraintKind,
+    Correction,
+    Keyscan,
+    KeyscanId,
+    LaserModel,
+    Place,
+    frozen,
+)
+from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet
+from fcslam.wire.packets import encode
+from fcslam.wire.quantisation import dequantise
+
+GOLDEN = Path(__file__).parent / "golden"
+
+HELLO = Hello(
+    "alice",
+    7,
+    LaserModel(181, -1.5, 0.0166015625, 81.25, (0.125, -0.25, 0.5)),
+    {Channel.LIDAR: "orb-1", Channel.CAMERA: "cnn-0.3+r12"},
+)
+KEYSCAN = Keyscan(
+    KeyscanId("alice", 12),
+    1042.25,
+    dequantise(np.array([0, 1, 500, 501, 501, 499, 65535, 0, 0, 1000, 999, 998, 997, 996], np.uint16)),
+)
+ODOMETRY = Constraint(
+    "alice",
+    11,
+    12,
+    ConstraintKind.ODOMETRY,
+    frozen([0.5, -0.03125, 0.25]),
+    frozen([[2500.0, 16.0, -8.0], [16.0, 1600.0, 4.0], [-8.0, 4.0, 10000.0]]),
+)
+CLOSURE = Constraint(
+    "alice", 3, 12, ConstraintKind.CLOSURE, frozen([-1.5, 2.0, -3.125]), frozen(np.diag([100.0, 1.0, 400.0]))
+)
+LIDAR_PLACE = Place(
+    KeyscanId("alice", 12),
+    Channel.LIDAR,
+    "orb-1",
+    2,
+    12,
+    frozen([[0.0, 0.0], [1.25, -3.5], [-327.67, 327.67]], np.float32),
+    frozen(np.arange(96).reshape(3, 32), np.uint8),
+)
+CAMERA_PLACE = Place(
+    KeyscanId("alice", 12),
+    Channel.CAMERA,
+    "cnn-0.3+r12",
+    12,
+    12,
+    frozen(np.zeros((0, 2)), np.float32),
+    frozen(np.zeros((0, 32)), np.uint8),
+)
+CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]))
+ACKNOWLEDGEMENT = Acknowledgement("alice", 7, 41)
+
+
+def packet(body: Body) -> Packet:
+    return Packet("alice", 7, 42, 1042.5, body)
+
+
+EXAMPLES = {
+    "hello": packet(HELLO),
+    "keyscan": packet(KEYSCAN),
+    "odometry": packet(ODOMETRY),
+    "closure": packet(CLOSURE),
+    "lidar_place": packet(LIDAR_PLACE),
+    "camera_place": packet(CAMERA_PLACE),
+    "correction": packet(CORRECTION),
+    "acknowledgement": packet(ACKNOWLEDGEMENT),
+}
+
+
+def same(a: Any, b: Any) -> bool:
+    """Equality of records, arrays included: shapes, types and every number."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b)
+    if is_dataclass(a):
+        return type(a) is type(b) and all(same(getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
+    return bool(a == b)
+
+
+if __name__ == "__main__":
+    GOLDEN.mkdir(exist_ok=True)
+    for name, example in EXAMPLES.items():
+        (GOLDEN / f"{name}.bin").write_bytes(encode(example))

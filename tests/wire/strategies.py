@@ -1,0 +1,93 @@
+"""Valid packets of every kind, for hypothesis."""
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from fcslam.records import Channel, Constraint, ConstraintKind, Correction, Keyscan, KeyscanId, LaserModel, Place
+from fcslam.wire.messages import Acknowledgement, Hello, Packet
+from fcslam.wire.quantisation import dequantise
+
+NAMES = st.text("AZaz09._+-", min_size=0, max_size=63).map(lambda rest: "a" + rest)
+SEQUENCES = st.integers(0, 2**63 - 1)
+NUMBERS = st.integers(0, 2**31 - 1)
+STAMPS = st.floats(allow_nan=False, allow_infinity=False)
+COORDINATES = st.floats(-1e6, 1e6)
+ANGLES = st.floats(-np.pi, np.pi)
+POSES = st.tuples(COORDINATES, COORDINATES, ANGLES)
+
+
+def poses():
+    return POSES.map(np.array)
+
+
+def lasers():
+    return st.builds(
+        LaserModel,
+        beam_count=st.integers(1, 4096),
+        angle_min_rad=ANGLES,
+        angle_increment_rad=st.floats(1e-6, 2 * np.pi / 4096) | st.floats(-2 * np.pi / 4096, -1e-6),
+        max_range_m=st.floats(0.1, 1000.0),
+        T_base_laser=POSES,
+    )
+
+
+@st.composite
+def informations(draw):
+    """Correlations bounded away from singular, standard deviations from 0.1 mm to 100 m."""
+    factor = draw(hnp.arrays(np.float64, (3, 3), elements=st.floats(-1.0, 1.0)))
+    deviation = 10.0 ** np.array(draw(st.tuples(*[st.floats(-4.0, 2.0)] * 3)))
+    matrix = (factor @ factor.T + 0.01 * np.eye(3)) / deviation / deviation[:, np.newaxis]
+    return (matrix + matrix.T) / 2.0
+
+
+def codes():
+    return hnp.arrays(np.uint16, st.integers(1, 200), elements=st.integers(0, 65535), fill=st.integers(0, 65535))
+
+
+def descriptors(count):
+    return st.binary(min_size=32 * count, max_size=32 * count).map(
+        lambda data: np.frombuffer(data, np.uint8).reshape(-1, 32)
+    )
+
+
+@st.composite
+def places(draw, robot):
+    count = draw(st.integers(0, 20))
+    first = draw(NUMBERS)
+    return Place(
+        KeyscanId(robot, draw(NUMBERS)),
+        draw(st.sampled_from(Channel)),
+        draw(NAMES),
+        first,
+        draw(st.integers(first, 2**31 - 1)),
+        draw(hnp.arrays(np.float32, (count, 2), elements=st.floats(-327.0, 327.0, width=32))),
+        draw(descriptors(count)),
+    )
+
+
+@st.composite
+def constraints(draw, robot):
+    j = draw(st.integers(1, 2**31 - 1))
+    i = draw(st.integers(0, j - 1))
+    return Constraint(robot, i, j, draw(st.sampled_from(ConstraintKind)), draw(poses()), draw(informations()))
+
+
+def bodies(robot, epoch, time):
+    versions = st.dictionaries(st.sampled_from(Channel), NAMES)
+    stamps = st.floats(max_value=time, allow_nan=False, allow_infinity=False)
+    identity = st.builds(KeyscanId, st.just(robot), NUMBERS)
+    return st.one_of(
+        st.builds(Hello, st.just(robot), st.just(epoch), lasers(), versions),
+        st.builds(Keyscan, identity, stamps, codes().map(dequantise)),
+        constraints(robot),
+        places(robot),
+        st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses()),
+        st.builds(Acknowledgement, st.just(robot), SEQUENCES, SEQUENCES),
+    )
+
+
+@st.composite
+def packets(draw):
+    robot, epoch, sequence, time = draw(NAMES), draw(SEQUENCES), draw(SEQUENCES), draw(STAMPS)
+    return Packet(robot, epoch, sequence, time, draw(bodies(robot, epoch, time)))

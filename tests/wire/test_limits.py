@@ -1,0 +1,253 @@
+"""Every limit, on the way in and on the way out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from wire.examples import ACKNOWLEDGEMENT, CLOSURE, CORRECTION, EXAMPLES, HELLO, KEYSCAN, LIDAR_PLACE, packet, same
+
+from fcslam.errors import PacketError
+from fcslam.records import Channel, KeyscanId
+from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.packets import decode, encode
+from fcslam.wire.quantisation import pack_ranges
+
+NAN, INF = float("nan"), float("inf")
+
+
+def information(*diagonal, xy=0.0, yx=None):
+    matrix = np.diag(diagonal)
+    matrix[0, 1], matrix[1, 0] = xy, xy if yx is None else yx
+    return matrix
+
+
+def place(count, positions=None, codes=None):
+    return replace(
+        LIDAR_PLACE,
+        keypoints=np.zeros((count, 2), np.float32) if positions is None else positions,
+        descriptors=np.zeros((count, 32), np.uint8) if codes is None else codes,
+    )
+
+
+def hello(**laser):
+    return replace(HELLO, laser=replace(HELLO.laser, **laser))
+
+
+REFUSED_BODIES = [
+    (replace(HELLO, robot="bob"), "speaks for robot"),
+    (replace(HELLO, epoch=8), "epoch 8 in a packet of epoch 7"),
+    (replace(HELLO, detector_versions={Channel.LIDAR: "two words"}), "detector version of lidar"),
+    (hello(beam_count=0), "0 beams"),
+    (hello(beam_count=4097), "4097 beams"),
+    (hello(angle_min_rad=NAN), "first beam"),
+    (hello(angle_min_rad=6.3), "first beam"),
+    (hello(angle_increment_rad=0.0), "do not turn"),
+    (hello(angle_increment_rad=NAN), "over a full turn"),
+    (hello(angle_increment_rad=-0.036), "over a full turn"),
+    (hello(max_range_m=0.0), "maximum range"),
+    (hello(max_range_m=1000.1), "maximum range"),
+    (hello(max_range_m=INF), "maximum range"),
+    (hello(T_base_laser=(0.0, NAN, 0.0)), "T_base_laser"),
+    (hello(T_base_laser=(0.0, 0.0, 6.3)), "angle"),
+    (replace(KEYSCAN, id=KeyscanId("bob", 0)), "speaks for robot"),
+    (replace(KEYSCAN, id=KeyscanId("alice", -1)), "number"),
+    (replace(KEYSCAN, id=KeyscanId("alice", 2**31)), "number"),
+    (replace(KEYSCAN, stamp=NAN), "stamp is not finite"),
+    (replace(KEYSCAN, stamp=1042.75), "later than"),
+    (replace(KEYSCAN, ranges_m=np.zeros(0, np.float32)), "0 ranges"),
+    (replace(KEYSCAN, ranges_m=np.zeros(4097, np.float32)), "4097 ranges"),
+    (replace(KEYSCAN, ranges_m=np.zeros((2, 2), np.float32)), "shape"),
+    (replace(KEYSCAN, ranges_m=np.array([1.001], np.float32)), "not quantised"),
+    (replace(KEYSCAN, ranges_m=np.array([NAN], np.float32)), "not quantised"),
+    (replace(KEYSCAN, ranges_m=np.array([131.1], np.float32)), "not quantised"),
+    (replace(KEYSCAN, ranges_m=np.array([-0.5], np.float32)), "not quantised"),
+    (replace(CLOSURE, i=12), "not below"),
+    (replace(CLOSURE, i=-1), "i is -1"),
+    (replace(CLOSURE, j=2**31), "j is"),
+    (replace(CLOSURE, T_i_j=np.array([0.0, 0.0, 3.2])), "angle"),
+    (replace(CLOSURE, T_i_j=np.array([0.0, 0.0, NAN])), "angle"),
+    (replace(CLOSURE, T_i_j=np.array([0.0, -INF, 0.0])), "not within"),
+    (replace(CLOSURE, T_i_j=np.array([1.1e6, 0.0, 0.0])), "not within"),
+    (replace(CLOSURE, T_i_j=np.zeros(4)), "shape"),
+    (replace(CLOSURE, information=np.eye(4)), "shape"),
+    (replace(CLOSURE, information=information(1.0, NAN, 1.0)), "not finite"),
+    (replace(CLOSURE, information=information(1.0, 1e300, 1.0)), "not finite"),
+    (replace(CLOSURE, information=information(1.0, 1.2e12, 1.0)), "diagonal"),
+    (replace(CLOSURE, information=information(1.0, 9e-7, 1.0)), "diagonal"),
+    (replace(CLOSURE, information=information(1.0, -1.0, 1.0)), "diagonal"),
+    (replace(CLOSURE, information=information(1.0, 1.0, 1.0, xy=0.5, yx=0.4)), "symmetric"),
+    (replace(CLOSURE, information=information(1.0, 1.0, 1.0, xy=0.5, yx=NAN)), "symmetric"),
+    (replace(CLOSURE, information=information(1.0, 1.0, 1.0, xy=1.5)), "positive definite"),
+    (replace(CLOSURE, information=information(1.0, 1.0, 1.0, xy=NAN)), "not finite"),
+    (replace(CLOSURE, information=information(1.0, 1.0, 1.0, xy=INF)), "not finite"),
+    (replace(CLOSURE, information=information(1e4, 1e4, 1.0, xy=1e4 * (1.0 - 5e-7))), "clearly positive definite"),
+    (replace(LIDAR_PLACE, id=KeyscanId("alice", -1)), "number"),
+    (replace(LIDAR_PLACE, first=13), "after last"),
+    (replace(LIDAR_PLACE, first=-1), "first is -1"),
+    (replace(LIDAR_PLACE, last=2**31), "last is"),
+    (replace(LIDAR_PLACE, detector_version=""), "detector version"),
+    (place(2049), "2049 keypoints"),
+    (place(2, codes=np.zeros((3, 32), np.uint8)), "descriptors have shape"),
+    (place(2, codes=np.zeros((2, 31), np.uint8)), "descriptors have shape"),
+    (place(2, codes=np.zeros((2, 32), np.float32)), "not bytes"),
+    (place(2, positions=np.zeros((2, 3), np.float32)), "keypoints have shape"),
+    (place(1, positions=np.array([[327.7, 0.0]], np.float32)), "not within"),
+    (place(1, positions=np.array([[0.0, NAN]], np.float32)), "not within"),
+    (replace(CORRECTION, version=-1), "version"),
+    (replace(CORRECTION, map_index=-1), "map index"),
+    (replace(CORRECTION, T_map_odom=np.array([NAN, 0.0, 0.0])), "not within"),
+    (replace(ACKNOWLEDGEMENT, epoch=-1), "epoch"),
+    (replace(ACKNOWLEDGEMENT, sequence=2**63), "sequence"),
+]
+
+
+@pytest.mark.parametrize(("body", "reason"), REFUSED_BODIES)
+def test_a_body_beyond_a_limit_is_not_written(body, reason):
+    with pytest.raises(PacketError, match=reason):
+        encode(packet(body))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"robot": ""}, "no name"),
+        ({"robot": "a" * 65}, "no name"),
+        ({"robot": "../alice"}, "no name"),
+        ({"robot": ".alice"}, "no name"),
+        ({"robot": "alicé"}, "no name"),
+        ({"robot": "alice\n"}, "no name"),
+        ({"epoch": -1}, "epoch"),
+        ({"epoch": 2**63}, "epoch"),
+        ({"sequence": -1}, "sequence"),
+        ({"time": NAN}, "time"),
+        ({"time": INF}, "time"),
+    ],
+)
+def test_an_envelope_beyond_a_limit_is_not_written(change, reason):
+    with pytest.raises(PacketError, match=reason):
+        encode(replace(EXAMPLES["correction"], **change))
+
+
+ALLOWED_BODIES = [
+    hello(beam_count=4096, angle_increment_rad=-0.0015),
+    hello(beam_count=361, angle_increment_rad=np.pi / 180.0),
+    replace(HELLO, detector_versions={}),
+    replace(KEYSCAN, stamp=1042.5),
+    replace(CLOSURE, T_i_j=np.array([1e6, -1e6, -np.pi])),
+    replace(CLOSURE, information=information(2.0**40, 2.0**-20, 1.0)),
+    place(0),
+    place(2048),
+    replace(ACKNOWLEDGEMENT, sequence=2**63 - 1),
+]
+
+
+@pytest.mark.parametrize("body", ALLOWED_BODIES)
+def test_a_body_at_a_limit_is_written_and_read(body):
+    assert same(decode(encode(packet(body))).body, body)
+
+
+def changed(name, **fields):
+    """A valid example whose message is changed behind the back of ``encode``."""
+    message = pb.Packet.FromString(encode(EXAMPLES[name]))
+    body = getattr(message, message.WhichOneof("body"))
+    for field, value in fields.items():
+        target = message if field in ("version", "robot", "epoch", "sequence", "time") else body
+        if value is None:
+            target.ClearField(field)
+        elif isinstance(value, list):
+            target.ClearField(field)
+            getattr(target, field).extend(value)
+        elif isinstance(value, pb.Pose):
+            getattr(target, field).CopyFrom(value)
+        else:
+            setattr(target, field, value)
+    return message.SerializeToString()
+
+
+LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, version="b")
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "reason"),
+    [
+        ("hello", {"version": 0}, "version 0 is unknown, this side speaks version 1"),
+        ("hello", {"version": 2}, "version 2 is unknown"),
+        ("hello", {"robot": "a/b"}, "no name"),
+        ("hello", {"epoch": 2**63}, "epoch"),
+        ("hello", {"sequence": 2**64 - 1}, "sequence"),
+        ("hello", {"time": NAN}, "time"),
+        ("hello", {"beam_count": 0}, "beams"),
+        ("hello", {"beam_count": 2**32 - 1}, "beams"),
+        ("hello", {"angle_increment_rad": 0.05}, "full turn"),
+        ("hello", {"t_base_laser": None}, "t_base_laser is missing"),
+        ("hello", {"t_base_laser": pb.Pose(theta_rad=INF)}, "angle"),
+        ("hello", {"detectors": [CAMERA, LIDAR]}, "ascending"),
+        ("hello", {"detectors": [LIDAR, LIDAR]}, "ascending"),
+        ("hello", {"detectors": [pb.Detector(version="a")]}, "channel 0 is unknown"),
+        ("hello", {"detectors": [LIDAR, pb.Detector(channel=7, version="a")]}, "channel 7 is unknown"),
+        ("hello", {"detectors": [pb.Detector(channel=1, version="x" * 65)]}, "detector version"),
+        ("keyscan", {"number": 2**31}, "number"),
+        ("keyscan", {"stamp": -INF}, "stamp"),
+        ("keyscan", {"stamp": 1e9}, "later"),
+        ("keyscan", {"ranges": b""}, "cut off"),
+        ("keyscan", {"ranges": bytes(12289)}, "12289 bytes of ranges"),
+        ("keyscan", {"ranges": pack_ranges(np.zeros(4097, np.uint16))}, "no differences"),
+        ("keyscan", {"ranges": pack_ranges(np.zeros(0, np.uint16))}, "0 ranges"),
+        ("closure", {"i": 12}, "not below"),
+        ("closure", {"kind": 0}, "kind 0 is unknown"),
+        ("closure", {"kind": 9}, "kind 9 is unknown"),
+        ("closure", {"t_i_j": None}, "t_i_j is missing"),
+        ("closure", {"t_i_j": pb.Pose(x_m=NAN)}, "not within"),
+        ("closure", {"t_i_j": pb.Pose(theta_rad=3.15)}, "angle"),
+        ("closure", {"information": [1.0, 0.0, 0.0, 1.0, 0.0]}, "5 numbers"),
+        ("closure", {"information": [1.0] * 7}, "7 numbers"),
+        ("closure", {"information": [1.0] * 6}, "positive definite"),
+        ("closure", {"information": [1.0, 0.0, 0.0, NAN, 0.0, 1.0]}, "not finite"),
+        ("closure", {"information": [1.0, INF, 0.0, 1.0, 0.0, 1.0]}, "not finite"),
+        ("closure", {"information": [0.0] * 6}, "diagonal"),
+        ("lidar_place", {"channel": 0}, "channel 0 is unknown"),
+        ("lidar_place", {"channel": 3}, "channel 3 is unknown"),
+        ("lidar_place", {"detector_version": "a b"}, "detector version"),
+        ("lidar_place", {"first": 13}, "after last"),
+        ("lidar_place", {"descriptors": bytes(97)}, "97 bytes of descriptors"),
+        ("lidar_place", {"descriptors": bytes(64)}, "12 bytes of keypoints for 2 descriptors"),
+        ("lidar_place", {"descriptors": bytes(32 * 2049), "keypoints": bytes(4 * 2049)}, "2049 descriptors"),
+        ("lidar_place", {"keypoints": b"\x00\x80" * 6}, "not within"),
+        ("correction", {"t_map_odom": pb.Pose(y_m=2e6)}, "not within"),
+        ("correction", {"t_map_odom": None}, "t_map_odom is missing"),
+        ("acknowledgement", {"robot": "a" * 65}, "no name"),
+    ],
+)
+def test_a_message_beyond_a_limit_is_not_read(name, fields, reason):
+    with pytest.raises(PacketError, match=reason):
+        decode(changed(name, **fields))
+
+
+def test_numbers_beyond_a_limit_are_not_read():
+    for body, reason in [(pb.Correction(version=2**31), "version"), (pb.Correction(map_index=2**31), "map index")]:
+        body.t_map_odom.x_m = 1.0
+        with pytest.raises(PacketError, match=reason):
+            decode(pb.Packet(version=1, robot="alice", correction=body).SerializeToString())
+
+
+def test_only_whole_known_messages_are_read():
+    data = encode(EXAMPLES["closure"])
+    unknown_field = b"\xfa\x07\x03abc"
+    for broken, reason in [
+        (b"", "version 0"),
+        (data[:-1], "not a protobuf"),
+        (data + unknown_field, "unknown, repeated"),
+        (data + data, "unknown, repeated"),
+        (data + b"\x18\x87\x00", "unknown, repeated"),  # epoch 7 again, in an overlong varint
+        (pb.Packet(version=1, robot="alice").SerializeToString(), "empty"),
+        (data + bytes(96 * 1024), "at most 98304"),
+    ]:
+        with pytest.raises(PacketError, match=reason):
+            decode(broken)
+
+
+def test_a_reason_quotes_little_of_a_hostile_name():
+    with pytest.raises(PacketError) as caught:
+        decode(changed("hello", robot="\n" * 50_000))
+    assert len(str(caught.value)) < 250
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,98 @@
+"""The in-memory transport: bytes both ways, refusals as values, a ledger that adds up."""
+
+import pytest
+from wire.examples import ACKNOWLEDGEMENT, CORRECTION, EXAMPLES, packet, same
+
+from fcslam.errors import PacketError
+from fcslam.wire.ledger import Counter, Ledger, Traffic
+from fcslam.wire.messages import Kind
+from fcslam.wire.packets import Label, decode, encode
+from fcslam.wire.transport import InMemoryTransport, Reply, Transport
+
+DOWNLINK = (encode(packet(ACKNOWLEDGEMENT)), encode(packet(CORRECTION)))
+
+
+class Cloud:
+    def __init__(self):
+        self.received = []
+
+    def receive(self, data):
+        self.received.append(decode(data))
+        return DOWNLINK
+
+
+def test_bytes_arrive_and_answers_come_back():
+    cloud = Cloud()
+    transport: Transport = InMemoryTransport(cloud.receive)
+    for example in EXAMPLES.values():
+        assert transport.send(encode(example)) == Reply(DOWNLINK)
+    assert all(same(received, sent) for received, sent in zip(cloud.received, EXAMPLES.values(), strict=True))
+
+
+def test_the_ledger_adds_up():
+    transport = InMemoryTransport(Cloud().receive)
+    keyscan, closure = encode(EXAMPLES["keyscan"]), encode(EXAMPLES["closure"])
+    for data in (keyscan, closure, keyscan):
+        transport.send(data)
+    ledger = transport.ledger()
+    assert dict(ledger.accepted) == {
+        Label("alice", Kind.KEYSCAN): Traffic(2, 2 * len(keyscan)),
+        Label("alice", Kind.CONSTRAINT): Traffic(1, len(closure)),
+        Label("alice", Kind.ACKNOWLEDGEMENT): Traffic(3, 3 * len(DOWNLINK[0])),
+        Label("alice", Kind.CORRECTION): Traffic(3, 3 * len(DOWNLINK[1])),
+    }
+    assert ledger.total() == Traffic(9, 2 * len(keyscan) + len(closure) + 3 * sum(map(len, DOWNLINK)))
+    assert ledger.total("alice", Kind.KEYSCAN) == ledger.total(kind=Kind.KEYSCAN) == Traffic(2, 2 * len(keyscan))
+    assert ledger.total("bob") == Traffic()
+    assert ledger.refused == Traffic()
+
+
+def test_a_ledger_shown_does_not_change():
+    transport = InMemoryTransport(lambda _: ())
+    before = transport.ledger()
+    transport.send(encode(EXAMPLES["hello"]))
+    assert before.total() == Traffic()
+    with pytest.raises(TypeError):
+        before.accepted[Label("eve", Kind.HELLO)] = Traffic()
+
+
+@pytest.mark.parametrize("data", [b"", b"noise", encode(EXAMPLES["keyscan"])[:-1], bytes(200_000)])
+def test_broken_bytes_are_refused_with_a_reason(data):
+    cloud = Cloud()
+    transport = InMemoryTransport(cloud.receive)
+    reply = transport.send(data)
+    assert reply.refusal
+    assert reply.packets == ()
+    assert cloud.received == []
+    assert transport.ledger() == Ledger({}, Traffic(1, len(data)))
+
+
+def test_what_the_handler_refuses_is_refused_and_not_counted_as_accepted():
+    def handler(data):
+        raise PacketError("robot alice is unknown")
+
+    transport = InMemoryTransport(handler)
+    data = encode(EXAMPLES["hello"])
+    assert transport.send(data) == Reply(refusal="robot alice is unknown")
+    assert transport.ledger() == Ledger({}, Traffic(1, len(data)))
+
+
+def test_a_fault_of_the_handler_is_no_refusal():
+    def handler(data):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        InMemoryTransport(handler).send(encode(EXAMPLES["hello"]))
+
+
+def test_a_broken_answer_is_a_fault_and_no_refusal():
+    transport = InMemoryTransport(lambda _: [b"noise"])
+    with pytest.raises(PacketError):
+        transport.send(encode(EXAMPLES["hello"]))
+
+
+def test_counting_is_addition():
+    counter = Counter()
+    for size in (3, 4, 5):
+        counter.accept(Label("bob", Kind.PLACE), size)
+    assert counter.ledger().total() == Traffic(3, 12)
