@@ -1,12 +1,12 @@
 """The exception tree.
 
-    FcslamError
-    ├── InputError            something the user gave is wrong: one line says what, where, what to do (exit code 2)
-    │   ├── SourceError       a recording cannot be read
-    │   ├── ConfigError       a configuration file or key is wrong
-    │   ├── OutputError       the output folder cannot be used
-    │   └── EvaluationError   a reference file or a run folder cannot be evaluated
-    └── PacketError           bytes received are not a packet that may be trusted
+FcslamError
+├── InputError            something the user gave is wrong: one line says what, where, what to do (exit code 2)
+│   ├── SourceError       a recording cannot be read
+│   ├── ConfigError       a configuration file or key is wrong
+│   ├── OutputError       the output folder cannot be used
+│   └── EvaluationError   a reference file or a run folder cannot be evaluated
+└── PacketError           bytes received are not a packet that may be trusted
 """
 
 
