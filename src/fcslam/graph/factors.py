@@ -10,9 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from fcslam.graph.pose_graph import PoseGraph, anchors
 from fcslam.records import FloatArray
 
-MAXIMUM_INFORMATION = 1e8
-"""No measurement counts as better than 0.1 mm or 0.1 mrad: a stiffer one makes the linear systems indeterminate."""
-
 HUBER_WIDTH = 1.345
 """95 % efficiency on normal residuals; in standard deviations."""
 
@@ -78,7 +75,7 @@ class FactorCache:
         """Build the factors of edges that are new."""
         edges = self.graph.arrays()
         new = slice(self._built, None)
-        roots = square_roots(edges.information[new])
+        roots = np.linalg.cholesky(edges.information[new]).transpose(0, 2, 1)
         columns = zip(edges.i[new].tolist(), edges.j[new].tolist(), edges.T_i_j[new].tolist(), roots, strict=True)
         for (i, j, T_i_j, root), robust in zip(columns, edges.robust[new].tolist(), strict=True):
             if robust:
@@ -86,15 +83,6 @@ class FactorCache:
             else:
                 self._trusted.push_back(_between(i, j, gtsam.Pose2(*T_i_j), _gaussian(root)))
         self._built = len(edges.i)
-
-
-def square_roots(information: FloatArray) -> FloatArray:
-    """Upper triangular R with ``R^T R = information`` (E, 3, 3), eigenvalues bounded by MAXIMUM_INFORMATION."""
-    bounded = information.copy()
-    stiff = np.flatnonzero(np.einsum("eaa->e", information) > MAXIMUM_INFORMATION)
-    values, vectors = np.linalg.eigh(information[stiff])
-    bounded[stiff] = np.einsum("eab,eb,ecb->eac", vectors, np.clip(values, 1.0, MAXIMUM_INFORMATION), vectors)
-    return np.linalg.cholesky(bounded).transpose(0, 2, 1)
 
 
 def to_values(poses: ArrayLike) -> Any:

@@ -13,27 +13,32 @@ from pydantic import Field
 from scipy.stats import chi2 as chi2_distribution
 
 from fcslam.config import Settings
+from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss, from_values, to_values
-from fcslam.graph.pose_graph import PoseGraph
+from fcslam.graph.pose_graph import PoseGraph, anchors
 from fcslam.records import FloatArray, frozen
 
 _TOLERANCE = 1e-6
 _UNTIL_CONVERGED = 100
 _BINARY = 1e-4
 """Distance from 0 or 1 at which a weight is decided."""
-_POLISH_ROUNDS = 10
+_POLISH_ROUNDS = 5
 
 
 class GncSettings(Settings):
     """Graduated non-convexity."""
 
     inlier_probability: float = Field(
-        0.99, gt=0.0, lt=1.0, description="A true closure passes the chi-square test with this probability"
+        default=0.99, gt=0.0, lt=1.0, description="A true closure passes the chi-square test with this probability"
     )
-    control_step: float = Field(1.4, gt=1.0, description="Factor by which the loss sharpens from step to step")
-    first_iterations: int = Field(5, ge=1, description="Solver iterations with every closure, before the first step")
-    step_iterations: int = Field(1, ge=1, description="Solver iterations in each step")
-    maximum_steps: int = Field(100, ge=1, description="Steps after which undecided closures are decided as they are")
+    control_step: float = Field(default=1.4, gt=1.0, description="Factor by which the loss sharpens from step to step")
+    first_iterations: int = Field(
+        default=5, ge=1, description="Solver iterations with every closure, before the first step"
+    )
+    step_iterations: int = Field(default=1, ge=1, description="Solver iterations in each step")
+    maximum_steps: int = Field(
+        default=100, ge=1, description="Steps after which undecided closures are decided as they are"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +75,13 @@ def optimize(
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
     if not graph.edges:
-        return _solution(graph, start, np.ones(0), SolveStats(0, 0.0, 0.0))
+        return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
     problem, values = cache.robust(loss, start), to_values(start)
     result, iterations = _levenberg_marquardt(problem, values, _UNTIL_CONVERGED)
     poses = from_values(result)
     robust = graph.arrays().robust
     weights = loss.weights(graph.chi2(poses)[robust])
-    return _solution(graph, poses, weights, SolveStats(iterations, problem.error(values), problem.error(result)))
+    return _solution(graph, start, poses, weights, SolveStats(iterations, problem.error(values), problem.error(result)))
 
 
 def optimize_gnc(
@@ -102,7 +107,7 @@ def optimize_gnc(
     start, cache = _start(graph, initial), _cache(graph, factors)
     robust = graph.arrays().robust
     if not graph.edges:
-        return _solution(graph, start, np.ones(0), SolveStats(0, 0.0, 0.0))
+        return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
     limit = float(chi2_distribution.ppf(chosen.inlier_probability, 3))
     steps = _Steps(cache, to_values(start))
     steps.solve(np.ones(int(robust.sum())), chosen.first_iterations)
@@ -112,7 +117,7 @@ def optimize_gnc(
     stats = SolveStats(
         steps.iterations, _truncated(graph.chi2(start), robust, limit), _truncated(graph.chi2(poses), robust, limit)
     )
-    return _solution(graph, poses, weights, stats)
+    return _solution(graph, start, poses, weights, stats)
 
 
 class _Steps:
@@ -196,7 +201,14 @@ def _cache(graph: PoseGraph, factors: FactorCache | None) -> FactorCache:
     return factors or FactorCache(graph)
 
 
-def _solution(graph: PoseGraph, poses: FloatArray, closure_weights: FloatArray, stats: SolveStats) -> Solution:
+def _solution(
+    graph: PoseGraph, start: FloatArray, poses: FloatArray, closure_weights: FloatArray, stats: SolveStats
+) -> Solution:
+    """The solution with each component (of edges that count) moved so that its first variable is where it started."""
     weights = np.ones(len(graph.edges))
     weights[graph.arrays().robust] = closure_weights
-    return Solution(frozen(poses), frozen(weights), stats)
+    components = graph.components(weights > 0.0)
+    first = anchors(components)
+    moved = se2.compose(se2.compose(start[first], se2.inverse(poses[first]))[components], poses)
+    moved[first] = start[first]
+    return Solution(frozen(moved), frozen(weights), stats)

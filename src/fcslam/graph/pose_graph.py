@@ -11,6 +11,12 @@ from scipy.sparse.csgraph import connected_components
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, frozen
 
+MAXIMUM_INFORMATION = 1e8
+"""No measurement counts as better than 0.1 mm or 0.1 mrad: a stiffer one makes the linear systems indeterminate."""
+
+_MINIMUM_INFORMATION = 1e-4
+"""Of a bounded matrix, where rounding may have eaten the small eigenvalues."""
+
 _ASYMMETRY = 1e-6
 """Relative asymmetry of an information matrix that rounding may explain."""
 
@@ -43,7 +49,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class EdgeArrays:
-    """All edges of a graph, one row each."""
+    """All edges of a graph, one row each; information is bounded by MAXIMUM_INFORMATION (eigenvalues)."""
 
     i: NDArray[np.int64]
     j: NDArray[np.int64]
@@ -115,7 +121,8 @@ class PoseGraph:
         x = self.poses() if poses is None else np.asarray(poses, dtype=np.float64)
         edges = self.arrays()
         residual = se2.between(edges.T_i_j, se2.between(x[edges.i], x[edges.j]))
-        return np.einsum("ea,eab,eb->e", residual, edges.information, residual)
+        chi2: FloatArray = np.einsum("ea,eab,eb->e", residual, edges.information, residual)
+        return chi2
 
     def components(self, kept: ArrayLike | None = None) -> NDArray[np.int64]:
         """Number of each variable's connected component, shape (N,), counted in the order of first variables.
@@ -142,9 +149,18 @@ def _stack(edges: Sequence[Edge]) -> EdgeArrays:
         i=np.array([edge.i for edge in edges], dtype=np.int64),
         j=np.array([edge.j for edge in edges], dtype=np.int64),
         T_i_j=np.array([edge.T_i_j for edge in edges], dtype=np.float64).reshape(-1, 3),
-        information=np.array([edge.information for edge in edges], dtype=np.float64).reshape(-1, 3, 3),
+        information=_bounded(np.array([edge.information for edge in edges], dtype=np.float64).reshape(-1, 3, 3)),
         robust=np.array([edge.robust for edge in edges], dtype=bool),
     )
+
+
+def _bounded(information: FloatArray) -> FloatArray:
+    """Information (E, 3, 3) with eigenvalues at most MAXIMUM_INFORMATION."""
+    stiff = np.flatnonzero(np.einsum("eaa->e", information) > MAXIMUM_INFORMATION)
+    values, vectors = np.linalg.eigh(information[stiff])
+    values = np.clip(values, _MINIMUM_INFORMATION, MAXIMUM_INFORMATION)
+    information[stiff] = np.einsum("eab,eb,ecb->eac", vectors, values, vectors)
+    return information
 
 
 def _checked(values: ArrayLike, shape: tuple[int, ...], what: str) -> FloatArray:
