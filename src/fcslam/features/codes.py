@@ -1,0 +1,120 @@
+"""Packed 256-bit codes: Hamming distances and mutual nearest neighbours.
+
+A set of codes has shape (N, 32), uint8. Kernels see it as (N, 4) uint64 and count bits with the processor's own
+instruction.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from fcslam.records import CODE_BYTES, Codes
+
+CODE_BITS = 8 * CODE_BYTES
+CODE_WORDS = CODE_BYTES // 8
+
+CodeWords = NDArray[np.uint64]
+
+_INDEX_BITS = 22
+_MOST_CODES = 1 << _INDEX_BITS
+_UNMATCHED = np.uint32(0xFFFFFFFF)
+
+
+class Matches(NamedTuple):
+    """Codes of two sets that belong together."""
+
+    pairs: NDArray[np.int64]
+    """Shape (M, 2): index into the first set, index into the second; ascending in the first."""
+    distances: NDArray[np.uint16]
+    """Shape (M,): Hamming distance in bits."""
+
+
+@intrinsic
+def popcount(_context: Any, word: Any) -> Any:
+    """Bits set in a uint64; for use in compiled code only."""
+
+    def generate(_target: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return (types.uint64(types.uint64), generate) if word == types.uint64 else None
+
+
+def code_words(codes: Codes) -> CodeWords:
+    """Codes (N, 32) as a read-only, aligned (N, 4) uint64 view, or a copy where a view is impossible.
+
+    Raises:
+        ValueError: ``codes`` is not (N, 32) uint8.
+    """
+    if codes.ndim != 2 or codes.shape[1] != CODE_BYTES or codes.dtype != np.uint8:
+        raise ValueError(f"expected codes of shape (N, {CODE_BYTES}) uint8, not {codes.shape} {codes.dtype}")
+    words: CodeWords = np.ascontiguousarray(codes).view(np.uint64)
+    if not words.flags.aligned:
+        words = words.copy()
+    words.setflags(write=False)
+    return words
+
+
+def hamming_matrix(a: Codes, b: Codes) -> NDArray[np.uint16]:
+    """Distances in bits between every code of ``a`` (N, 32) and every code of ``b`` (M, 32), shape (N, M)."""
+    distances: NDArray[np.uint16] = _hamming_matrix(code_words(a), code_words(b))
+    return distances
+
+
+def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches:
+    """Pairs that are each other's nearest neighbour, at most ``max_distance`` bits apart.
+
+    Of neighbours at the same distance the one with the lowest index counts as the nearest.
+
+    Raises:
+        ValueError: a set is not (N, 32) uint8, or has more codes than a key can number.
+    """
+    if max(len(a), len(b)) > _MOST_CODES:
+        raise ValueError(f"at most {_MOST_CODES} codes a set, not {max(len(a), len(b))}")
+    row_keys, column_keys = _nearest_keys(code_words(a), code_words(b))
+    column_of = (row_keys & np.uint32(_MOST_CODES - 1)).astype(np.int64)
+    distances = (row_keys >> np.uint32(_INDEX_BITS)).astype(np.uint16)
+    rows = np.flatnonzero((row_keys != _UNMATCHED) & (distances <= max_distance))
+    row_of = (column_keys & np.uint32(_MOST_CODES - 1)).astype(np.int64)
+    rows = rows[row_of[column_of[rows]] == rows]
+    return Matches(np.stack((rows, column_of[rows]), axis=1), distances[rows])
+
+
+@njit(cache=True)
+def hamming(a: CodeWords, b: CodeWords) -> Any:
+    """Distance in bits between two codes of 4 words; for use in compiled code."""
+    return popcount(a[0] ^ b[0]) + popcount(a[1] ^ b[1]) + popcount(a[2] ^ b[2]) + popcount(a[3] ^ b[3])
+
+
+@njit(cache=True)
+def _hamming_matrix(a: CodeWords, b: CodeWords) -> NDArray[np.uint16]:
+    distances = np.empty((a.shape[0], b.shape[0]), np.uint16)
+    for i in range(a.shape[0]):
+        for j in range(b.shape[0]):
+            distances[i, j] = hamming(a[i], b[j])
+    return distances
+
+
+@njit(cache=True)
+def _nearest_keys(a: CodeWords, b: CodeWords) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    """Nearest neighbours of rows and columns in one pass.
+
+    A key is distance << 22 | index, so that one minimum finds the nearest and breaks ties by the index. The columns
+    are transposed first: only then does the inner loop run in vector registers.
+    """
+    columns = b.T.copy()
+    row_keys = np.full(a.shape[0], _UNMATCHED, np.uint32)
+    column_keys = np.full(b.shape[0], _UNMATCHED, np.uint32)
+    for i in range(a.shape[0]):
+        a0, a1, a2, a3 = a[i, 0], a[i, 1], a[i, 2], a[i, 3]
+        best = _UNMATCHED
+        for j in range(b.shape[0]):
+            distance = popcount(a0 ^ columns[0, j]) + popcount(a1 ^ columns[1, j])
+            distance += popcount(a2 ^ columns[2, j]) + popcount(a3 ^ columns[3, j])
+            key = np.uint32(distance) << np.uint32(_INDEX_BITS)
+            best = min(best, key | np.uint32(j))
+            column_keys[j] = min(column_keys[j], key | np.uint32(i))
+        row_keys[i] = best
+    return row_keys, column_keys

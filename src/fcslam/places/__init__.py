@@ -1,0 +1,1 @@
+"""Places: vocabulary, index, similarity and how two places lie to each other."""

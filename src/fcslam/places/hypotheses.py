@@ -1,0 +1,207 @@
+"""How two places may lie to each other: rigid motions on which many of their matches agree.
+
+A hypothesis proposes; how many matches agree with it says little about whether it is true.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.features.codes import Matches
+from fcslam.records import FloatArray, frozen
+
+_REFINEMENTS = 5
+"""Least squares and inliers are taken in turn until the inliers stay; they nearly always do after two or three."""
+
+
+class HypothesisConfig(Settings):
+    """Search for rigid motions between the keypoints of two places."""
+
+    seeds: int = Field(default=50, ge=2, le=1000, description="closest matches of which every two propose a motion")
+    inlier_distance_m: float = Field(default=0.3, gt=0.0, le=5.0, description="distance up to which a match agrees [m]")
+    minimum_inliers: int = Field(default=4, ge=2, description="matches that must agree")
+    minimum_baseline_m: float = Field(
+        default=0.8, gt=0.0, le=50.0, description="distance of the two keypoints of a pair [m]"
+    )
+    most_hypotheses: int = Field(default=2, ge=1, le=20, description="hypotheses returned, the best first")
+    distinct_distance_m: float = Field(default=1.0, ge=0.0, description="shift that makes two hypotheses different [m]")
+    distinct_angle_rad: float = Field(default=0.26, ge=0.0, le=3.2, description="turn that makes them different [rad]")
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A rigid motion and the matches that agree with it."""
+
+    T_a_b: FloatArray
+    """Shape (3,): takes coordinates of place b to place a."""
+    inliers: NDArray[np.int64]
+    """Shape (K,): rows of ``matches.pairs``, ascending."""
+
+    @property
+    def inlier_count(self) -> int:
+        """How many matches agree."""
+        return len(self.inliers)
+
+
+class _Limits(NamedTuple):
+    """What compiled code needs of the configuration."""
+
+    inlier_distance_m: float
+    minimum_inliers: int
+    most: int
+    distinct_distance_m: float
+    distinct_angle_rad: float
+
+
+def propose(
+    keypoints_a: NDArray[np.float32], keypoints_b: NDArray[np.float32], matches: Matches, config: HypothesisConfig
+) -> list[Hypothesis]:
+    """The motions with most agreement, the best first; none if too few matches agree on any.
+
+    Every pair among the ``seeds`` closest matches proposes a motion (two-point alignment), all matches judge it, and
+    least squares over the inliers refines the best. No chance is involved. Mirror images are never proposed.
+
+    Args:
+        keypoints_a: shape (N, 2), metres in place a's coordinate frame.
+        keypoints_b: shape (M, 2), metres in place b's coordinate frame.
+        matches: pairs of their indices.
+        config: the search.
+    """
+    if len(matches.pairs) < config.minimum_inliers:
+        return []
+    a = keypoints_a[matches.pairs[:, 0]].astype(np.float64)
+    b = keypoints_b[matches.pairs[:, 1]].astype(np.float64)
+    seeds = np.argsort(matches.distances, kind="stable")[: config.seeds]
+    trials = _trials(a, b, seeds, config.minimum_baseline_m, config.inlier_distance_m)
+    limits = _Limits(
+        config.inlier_distance_m,
+        config.minimum_inliers,
+        config.most_hypotheses,
+        config.distinct_distance_m,
+        config.distinct_angle_rad,
+    )
+    poses, agreeing = _best(a, b, trials, limits)
+    return [
+        Hypothesis(frozen(pose), frozen(np.flatnonzero(agrees), np.int64))
+        for pose, agrees in zip(poses, agreeing, strict=True)
+    ]
+
+
+@njit(cache=True)
+def _trials(
+    a: FloatArray, b: FloatArray, seeds: NDArray[np.int64], baseline_m: float, tolerance_m: float
+) -> FloatArray:
+    """Motions from every two seeds whose keypoints lie equally far apart in both places: rows x, y, theta, score."""
+    trials = np.empty((seeds.shape[0] * (seeds.shape[0] - 1) // 2, 4))
+    count = 0
+    for p in range(1, seeds.shape[0]):
+        for q in range(p):
+            i, j = seeds[p], seeds[q]
+            ax, ay = a[j, 0] - a[i, 0], a[j, 1] - a[i, 1]
+            bx, by = b[j, 0] - b[i, 0], b[j, 1] - b[i, 1]
+            length_a, length_b = np.hypot(ax, ay), np.hypot(bx, by)
+            if min(length_a, length_b) < baseline_m or abs(length_a - length_b) > tolerance_m:
+                continue
+            cos = (bx * ax + by * ay) / (length_a * length_b)
+            sin = (bx * ay - by * ax) / (length_a * length_b)
+            middle_x, middle_y = 0.5 * (b[i, 0] + b[j, 0]), 0.5 * (b[i, 1] + b[j, 1])
+            x = 0.5 * (a[i, 0] + a[j, 0]) - (cos * middle_x - sin * middle_y)
+            y = 0.5 * (a[i, 1] + a[j, 1]) - (sin * middle_x + cos * middle_y)
+            trials[count, 0], trials[count, 1], trials[count, 2] = x, y, np.arctan2(sin, cos)
+            trials[count, 3] = _score(a, b, (x, y, cos, sin), tolerance_m)
+            count += 1
+    return trials[:count]
+
+
+@njit(cache=True)
+def _score(a: FloatArray, b: FloatArray, motion: tuple[float, float, float, float], tolerance_m: float) -> float:
+    """Sum over the inliers of 1 - (distance / tolerance)^2: closer agreement breaks ties of the count."""
+    x, y, cos, sin = motion
+    score = 0.0
+    scale = 1.0 / tolerance_m**2
+    for k in range(a.shape[0]):
+        dx = x + cos * b[k, 0] - sin * b[k, 1] - a[k, 0]
+        dy = y + sin * b[k, 0] + cos * b[k, 1] - a[k, 1]
+        score += max(0.0, 1.0 - scale * (dx * dx + dy * dy))
+    return score
+
+
+@njit(cache=True)
+def _best(a: FloatArray, b: FloatArray, trials: FloatArray, limits: _Limits) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Refine the best trials one after another, leaving out what lies near a hypothesis found before."""
+    scores = trials[:, 3].copy()
+    poses = np.empty((limits.most, 3))
+    agreeing = np.empty((limits.most, a.shape[0]), np.bool_)
+    found = 0
+    while found < limits.most and scores.shape[0]:
+        best = np.argmax(scores)
+        if scores[best] <= 0.0:
+            break
+        pose, agrees = _refine(a, b, trials[best, :3], limits.inlier_distance_m)
+        scores[best] = 0.0
+        if agrees.sum() < limits.minimum_inliers or _near(pose, poses[:found], limits):
+            continue
+        poses[found], agreeing[found] = pose, agrees
+        found += 1
+        for index in range(scores.shape[0]):
+            if _near(trials[index], pose.reshape(1, 3), limits):
+                scores[index] = 0.0
+    return poses[:found], agreeing[:found]
+
+
+@njit(cache=True)
+def _near(pose: FloatArray, others: FloatArray, limits: _Limits) -> bool:
+    for index in range(others.shape[0]):
+        turn = abs(pose[2] - others[index, 2])
+        turn = min(turn, 2.0 * np.pi - turn)
+        if (
+            np.hypot(pose[0] - others[index, 0], pose[1] - others[index, 1]) <= limits.distinct_distance_m
+            and turn <= limits.distinct_angle_rad
+        ):
+            return True
+    return False
+
+
+@njit(cache=True)
+def _refine(a: FloatArray, b: FloatArray, pose: FloatArray, tolerance_m: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+    agrees = _agreeing(a, b, pose, tolerance_m)
+    for _ in range(_REFINEMENTS):
+        refined = _least_squares(a, b, agrees)
+        now = _agreeing(a, b, refined, tolerance_m)
+        if now.sum() < agrees.sum():
+            break
+        unchanged = (now == agrees).all()
+        pose, agrees = refined, now
+        if unchanged:
+            break
+    return pose, agrees
+
+
+@njit(cache=True)
+def _agreeing(a: FloatArray, b: FloatArray, pose: FloatArray, tolerance_m: float) -> NDArray[np.bool_]:
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    dx = pose[0] + cos * b[:, 0] - sin * b[:, 1] - a[:, 0]
+    dy = pose[1] + sin * b[:, 0] + cos * b[:, 1] - a[:, 1]
+    agrees: NDArray[np.bool_] = dx * dx + dy * dy <= tolerance_m * tolerance_m
+    return agrees
+
+
+@njit(cache=True)
+def _least_squares(a: FloatArray, b: FloatArray, agrees: NDArray[np.bool_]) -> FloatArray:
+    """The rigid motion with the least squared distances, from the centred sums of products."""
+    n = agrees.sum()
+    ax, ay = (a[:, 0] * agrees).sum() / n, (a[:, 1] * agrees).sum() / n
+    bx, by = (b[:, 0] * agrees).sum() / n, (b[:, 1] * agrees).sum() / n
+    dot = cross = 0.0
+    for k in range(a.shape[0]):
+        if agrees[k]:
+            dot += (a[k, 0] - ax) * (b[k, 0] - bx) + (a[k, 1] - ay) * (b[k, 1] - by)
+            cross += (b[k, 0] - bx) * (a[k, 1] - ay) - (b[k, 1] - by) * (a[k, 0] - ax)
+    theta = np.arctan2(cross, dot)
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.array([ax - (cos * bx - sin * by), ay - (sin * bx + cos * by), theta])

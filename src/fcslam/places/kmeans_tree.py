@@ -1,0 +1,159 @@
+"""A k-means tree over binary codes: growing it and finding the leaf of a code, all compiled.
+
+The centres are binary too: each bit is the majority of its cluster.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fcslam.features.codes import CODE_BITS, CODE_WORDS, CodeWords, hamming
+
+
+class TreeShape(NamedTuple):
+    """Limits of a tree's growth."""
+
+    branching: int
+    depth: int
+    smallest_split: int
+    """A cluster of fewer codes is a leaf."""
+    iterations: int
+
+
+class Tree(NamedTuple):
+    """V vertices level by level: 0 is the root, the children of a vertex are consecutive."""
+
+    centres: CodeWords
+    """Shape (V, 4)."""
+    first_child: NDArray[np.int64]
+    """Shape (V,)."""
+    child_count: NDArray[np.int64]
+    """Shape (V,): 0 for a leaf."""
+    leaf_number: NDArray[np.int64]
+    """Shape (V,): counts the leaves; -1 elsewhere."""
+
+
+@njit(cache=True)
+def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int64]:
+    """Number of the leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
+    leaves = np.empty(codes.shape[0], np.int64)
+    for index in range(codes.shape[0]):
+        vertex = 0
+        while tree.child_count[vertex]:
+            first = tree.first_child[vertex]
+            vertex = first + _nearest(codes[index], tree.centres[first : first + tree.child_count[vertex]])
+        leaves[index] = tree.leaf_number[vertex]
+    return leaves
+
+
+@njit(cache=True)
+def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
+    """Split the codes (N, 4) level by level; the codes of one vertex stay together in ``members``."""
+    most = 1 + shape.branching * (1 + shape.depth * (codes.shape[0] // shape.smallest_split))
+    centres = np.zeros((most, CODE_WORDS), np.uint64)
+    first_child, child_count = np.zeros(most, np.int64), np.zeros(most, np.int64)
+    begin, end, level = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros(most, np.int64)
+    members = np.arange(codes.shape[0])
+    end[0], used, vertex = codes.shape[0], 1, 0
+    state = np.array([seed], np.uint64)
+    while vertex < used:
+        low, high = begin[vertex], end[vertex]
+        if level[vertex] < shape.depth and high - low >= shape.smallest_split:
+            found, labels = _k_means(codes[members[low:high]], shape, state)
+            if found.shape[0] > 1:
+                first_child[vertex], child_count[vertex] = used, found.shape[0]
+                members[low:high] = members[low:high][np.argsort(labels, kind="mergesort")]
+                bounds = low + np.cumsum(np.bincount(labels, minlength=found.shape[0]))
+                children = slice(used, used + found.shape[0])
+                centres[children], level[children], end[children] = found, level[vertex] + 1, bounds
+                begin[used], begin[used + 1 : used + found.shape[0]] = low, bounds[:-1]
+                used += found.shape[0]
+        vertex += 1
+    leaves = child_count[:used] == 0
+    numbers = np.where(leaves, np.cumsum(leaves) - 1, -1)
+    return Tree(centres[:used].copy(), first_child[:used].copy(), child_count[:used].copy(), numbers)
+
+
+@njit(cache=True)
+def _k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tuple[CodeWords, NDArray[np.int64]]:
+    """At most ``shape.branching`` centres, none without members, and the centre nearest to every code."""
+    centres = _seed_centres(codes, shape.branching, state)
+    labels = np.full(codes.shape[0], -1, np.int64)
+    for _ in range(shape.iterations):
+        changed = _assign(codes, centres, labels)
+        if not changed:
+            break
+        centres = _majorities(codes, labels, centres.shape[0])
+    _assign(codes, centres, labels)
+    sizes = np.bincount(labels, minlength=centres.shape[0])
+    return centres[sizes > 0], (np.cumsum(sizes > 0) - 1)[labels]
+
+
+@njit(cache=True)
+def _nearest(code: CodeWords, centres: CodeWords) -> int:
+    best, best_distance = 0, np.uint64(CODE_BITS + 1)
+    for index in range(centres.shape[0]):
+        distance = hamming(code, centres[index])
+        if distance < best_distance:
+            best, best_distance = index, distance
+    return best
+
+
+@njit(cache=True)
+def _assign(codes: CodeWords, centres: CodeWords, labels: NDArray[np.int64]) -> int:
+    changed = 0
+    for index in range(codes.shape[0]):
+        label = _nearest(codes[index], centres)
+        changed += label != labels[index]
+        labels[index] = label
+    return changed
+
+
+@njit(cache=True)
+def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -> CodeWords:
+    """k-means++: the next centre is a code drawn by its squared distance to the centres so far."""
+    centres = np.empty((branching, CODE_WORDS), np.uint64)
+    centres[0] = codes[int(_uniform(state) * codes.shape[0])]
+    nearest = np.full(codes.shape[0], CODE_BITS + 1, np.int64)
+    count = 1
+    while count < branching:
+        for index in range(codes.shape[0]):
+            nearest[index] = min(nearest[index], np.int64(hamming(codes[index], centres[count - 1])))
+        reach = np.cumsum(nearest * nearest)
+        if reach[-1] == 0:
+            break
+        centres[count] = codes[np.searchsorted(reach, int(_uniform(state) * reach[-1]), side="right")]
+        count += 1
+    return centres[:count]
+
+
+@njit(cache=True)
+def _majorities(codes: CodeWords, labels: NDArray[np.int64], count: int) -> CodeWords:
+    """The majority of every bit in every cluster; a tie, as in a cluster without members, is 0."""
+    ones = np.zeros((count, CODE_BITS), np.int32)
+    sizes = np.bincount(labels, minlength=count)
+    for index in range(codes.shape[0]):
+        target = ones[labels[index]]
+        for word in range(CODE_WORDS):
+            bits = codes[index, word]
+            for bit in range(64):
+                target[word * 64 + bit] += np.int32((bits >> np.uint64(bit)) & np.uint64(1))
+    centres = np.zeros((count, CODE_WORDS), np.uint64)
+    for label in range(count):
+        for bit in range(CODE_BITS):
+            if 2 * ones[label, bit] > sizes[label]:
+                centres[label, bit // 64] |= np.uint64(1) << np.uint64(bit % 64)
+    return centres
+
+
+@njit(cache=True)
+def _uniform(state: NDArray[np.uint64]) -> float:
+    """The next number in [0, 1) of splitmix64 (Steele, Lea, Flood 2014): the tree depends on the seed alone."""
+    state[0] += np.uint64(0x9E3779B97F4A7C15)
+    z = state[0]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z ^= z >> np.uint64(31)
+    return float(z >> np.uint64(11)) * 2.0**-53
