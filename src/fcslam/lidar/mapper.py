@@ -7,8 +7,8 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.graph.factors import FactorCache
-from fcslam.graph.optimizer import Loss, optimize, optimize_gnc
+from fcslam.graph.factors import FactorCache, Loss
+from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.closing import Anchored, Closure, ClosingConfig, LoopCloser
 from fcslam.lidar.correlative import SearchConfig
@@ -48,12 +48,17 @@ class ScanPose:
 
 
 @dataclass(frozen=True, slots=True)
-class PlaceWindow:
-    """A submap is complete: its anchor and the keyscans it is made of (last inclusive)."""
+class FinishedSubmap:
+    """The submap around a keyscan is complete: what it shows, and the closures that it brought."""
 
     anchor: int
     first: int
+    """First keyscan of the submap."""
     last: int
+    """Last one (inclusive)."""
+    surface: FloatArray
+    """Points of the surfaces in the anchor's base, shape (N, 2)."""
+    closures: tuple[Constraint, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +67,8 @@ class Step:
 
     pose: ScanPose
     keyscan: Keyscan | None = None
-    constraints: tuple[Constraint, ...] = ()
-    place: PlaceWindow | None = None
+    odometry: Constraint | None = None
+    submap: FinishedSubmap | None = None
 
 
 class Mapper:
@@ -88,16 +93,15 @@ class Mapper:
         tracked = self._tracker.track(scan)
         if not self._is_keyscan(tracked):
             return Step(self._scan_pose(scan.stamp, tracked))
-        keyscan, odometry = self._add_keyscan(scan, tracked)
-        window = self._complete_window()
-        closures = self._close_loops(window) if window else ()
-        return Step(self._scan_pose(scan.stamp, tracked), keyscan, (*odometry, *closures), window)
+        keyscan, odometry = self._add_keyscan(scan, tracked)  # pose graph grows
+        submap = self._finish_submap()  # loops are closed between submaps
+        return Step(self._scan_pose(scan.stamp, tracked), keyscan, odometry, submap)
 
-    def finish(self) -> list[tuple[PlaceWindow, tuple[Constraint, ...]]]:
-        """Submaps still open at the end of the recording, with the closures they bring."""
+    def finish(self) -> list[FinishedSubmap]:
+        """The submaps still open at the end of the recording."""
         rest = []
-        while window := self._complete_window(at_end=True):
-            rest.append((window, self._close_loops(window)))
+        while submap := self._finish_submap(at_end=True):
+            rest.append(submap)
         return rest
 
     def optimized(self) -> FloatArray:
@@ -127,7 +131,7 @@ class Mapper:
         number = len(self._local) - 1
         return ScanPose(stamp, number, se2.between(self._local[number], tracked.T_local_base))
 
-    def _add_keyscan(self, scan: LaserScan, tracked: Tracked) -> tuple[Keyscan, tuple[Constraint, ...]]:
+    def _add_keyscan(self, scan: LaserScan, tracked: Tracked) -> tuple[Keyscan, Constraint | None]:
         """New variable of the pose graph, tied to the keyscan before it."""
         assert tracked.scan is not None
         number = len(self._local)
@@ -140,7 +144,7 @@ class Mapper:
             self._poses.append(start)
             self._travel.append(0.0)
             self._graph.add_variable(start)
-            return keyscan, ()
+            return keyscan, None
         motion = se2.between(self._local[-1], tracked.T_local_base)
         constraint = Constraint(
             self.robot, number - 1, number, ConstraintKind.ODOMETRY, frozen(motion),
@@ -151,27 +155,26 @@ class Mapper:
         self._travel.append(self._travel[-1] + float(np.hypot(motion[0], motion[1])))
         self._graph.add_variable(self._poses[-1])
         self._graph.add_edge(Edge(number - 1, number, constraint.T_i_j, constraint.information, robust=False))
-        return keyscan, (constraint,)
+        return keyscan, constraint
 
-    def _complete_window(self, at_end: bool = False) -> PlaceWindow | None:
-        """The next submap, once the robot is far enough past its anchor."""
-        gate = self._config.keyscans
-        travel = np.array(self._travel)
+    def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
+        """The next submap, once the robot is far enough past its anchor; closes loops to earlier ones."""
+        gate, travel = self._config.keyscans, np.array(self._travel)
         anchor = int(np.searchsorted(travel, self._next_anchor_m))
         if anchor == len(travel) or (not at_end and travel[-1] < travel[anchor] + gate.submap_reach_m):
             return None
         self._next_anchor_m = travel[anchor] + gate.submap_every_m
         first = int(np.searchsorted(travel, travel[anchor] - gate.submap_reach_m))
         last = int(np.searchsorted(travel, travel[anchor] + gate.submap_reach_m, side="right")) - 1
-        return PlaceWindow(anchor, first, last)
-
-    def _close_loops(self, window: PlaceWindow) -> tuple[Constraint, ...]:
-        """Compare the new submap with earlier ones; what holds becomes constraints."""
-        anchor = self._local[window.anchor]
-        scans = [(self._points[k], se2.between(anchor, self._local[k])) for k in range(window.first, window.last + 1)]
-        for number in [k for k in self._points if k < window.first]:
+        T_anchor = [se2.between(self._local[anchor], self._local[k]) for k in range(first, last + 1)]
+        submap = build_submap([(self._points[first + k], pose) for k, pose in enumerate(T_anchor)])
+        for number in [k for k in self._points if k < first]:
             del self._points[number]
-        place = Anchored(window.anchor, self._travel[window.anchor], build_submap(scans))
+        closures = self._close_loops(Anchored(anchor, travel[anchor], submap))
+        return FinishedSubmap(anchor, first, last, submap.surface.points, closures)
+
+    def _close_loops(self, place: Anchored) -> tuple[Constraint, ...]:
+        """Compare the new submap with earlier ones; what holds becomes constraints."""
         closures = self._closer.add(place, np.array(self._poses))
         constraints = tuple(self._constraint(closure) for closure in closures)
         for c in constraints:

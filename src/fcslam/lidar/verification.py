@@ -11,6 +11,8 @@ from fcslam.lidar.matching import MatchingConfig, match_scan
 from fcslam.lidar.submap import Agreement, Submap, agreement
 from fcslam.records import FloatArray
 
+WEAKEST = 1e-2
+"""Information left in a direction that no point fixes: 10 m or 10 rad."""
 NO_PRIOR = np.zeros((3, 3))
 _ALIGNMENT = MatchingConfig(wide_scale_m=0.4)
 
@@ -104,7 +106,7 @@ def _information(points: FloatArray, T_a_b: FloatArray, config: VerificationConf
     turn = np.eye(3)
     cos, sin = np.cos(T_a_b[2]), np.sin(T_a_b[2])
     turn[:2, :2] = ((cos, -sin), (sin, cos))
-    covariance = np.linalg.inv(turn.T @ points @ turn + np.diag((1e-3, 1e-3, 1e-3)))
+    covariance = np.linalg.inv(turn.T @ points @ turn + np.diag((WEAKEST, WEAKEST, WEAKEST)))
     floor = np.diag((config.closure_sigma_m**2, config.closure_sigma_m**2, config.closure_sigma_rad**2))
     information = np.linalg.inv(covariance + floor)
     return np.asarray(0.5 * (information + information.T))

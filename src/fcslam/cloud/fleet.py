@@ -1,0 +1,292 @@
+"""The cloud: packets of N robots in, one robust pose graph and the robots' corrections out (the paper's figure 1).
+
+A plain object without a network. Robots stay in maps of their own until the evidence to join them is there; what
+arrives later may still revoke it. ``finalize`` depends on the set of packets only, not on their arrival.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.cloud.joining import first_estimate, judge
+from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.ledger import ClosureLedger, Entry
+from fcslam.cloud.robots import RobotStore
+from fcslam.config import Settings
+from fcslam.errors import PacketError
+from fcslam.geometry import se2
+from fcslam.graph.consistency import ConsistencySettings
+from fcslam.lidar.scan import point_scan
+from fcslam.lidar.submap import Submap, build_submap
+from fcslam.places.matcher import MatcherConfig, PlaceMatcher
+from fcslam.records import (
+    Channel,
+    ClosureStatus,
+    Constraint,
+    ConstraintKind,
+    Correction,
+    FloatArray,
+    Keyscan,
+    KeyscanId,
+    LaserModel,
+    LoopClosure,
+    Place,
+    frozen,
+)
+from fcslam.wire.messages import Acknowledgement, Hello, Packet
+from fcslam.wire.packets import decode, encode
+
+
+class FleetConfig(Settings):
+    """The cloud's part."""
+
+    join_maps: bool = Field(default=True, description="look for places that several robots saw")
+    sight_m: float = Field(default=6.0, gt=0, description="in a joint map, places this near are compared")
+    near_visits: int = Field(default=2, ge=0, description="so many of another robot's visits are compared with one place")
+    surprise_m: float = Field(default=0.5, gt=0, description="a closure this far off the joint map needs a cluster")
+    surprise_rad: float = Field(default=0.1, gt=0, description="or turned this much")
+    solve_every: int = Field(default=40, gt=0, description="closures between two quick solves")
+    submaps_kept: int = Field(default=300, gt=1, description="submaps held ready for comparison; others are rebuilt")
+    matcher: MatcherConfig = Field(default=MatcherConfig(), description="place matching")
+    consistency: ConsistencySettings = Field(default=ConsistencySettings(), description="pairwise consistency")
+
+
+@dataclass(frozen=True, slots=True)
+class MappedRobot:
+    """One robot in the result."""
+
+    robot: str
+    map_index: int
+    keyscans: tuple[Keyscan, ...]
+    T_map_base: FloatArray
+    """Of each keyscan, in the frame of its map, shape (N, 3)."""
+    laser: LaserModel
+
+
+@dataclass(frozen=True, slots=True)
+class FleetResult:
+    """What the packets say in the end."""
+
+    robots: tuple[MappedRobot, ...]
+    closures: tuple[LoopClosure, ...]
+    """Between robots and within them."""
+    corrections: tuple[Correction, ...]
+    graph: JointGraph
+
+
+class Fleet:
+    """Receives packets; matches, verifies, joins, optimises."""
+
+    def __init__(self, config: FleetConfig, seed: int) -> None:
+        self._config = config
+        self._seed = seed
+        self._store = RobotStore()
+        self._graph = JointGraph()
+        self._ledger = ClosureLedger()
+        self._local: list[tuple[Constraint, int]] = []
+        self._submaps: dict[KeyscanId, Submap] = {}
+        self._matcher = PlaceMatcher(config.matcher, self._submap, np.random.default_rng(seed))
+        self._places: dict[str, list[KeyscanId]] = {}
+        self._maps: list[list[str]] = []
+        self._version = 0
+
+    def receive(self, data: bytes) -> list[bytes]:
+        """Take in an encoded packet; returns encoded packets for its sender.
+
+        Raises:
+            PacketError: it is no valid packet, or does not fit what its robot sent before.
+        """
+        packet = decode(data)
+        for ready in self._store.admit(packet):
+            self._take(ready)
+        return self._replies(packet)
+
+    def finalize(self) -> FleetResult:
+        """The result of all packets so far, in their canonical order: replayed, unless they arrived in it."""
+        if self._store.in_canonical_order:
+            return self._conclude()
+        replay = Fleet(self._config, self._seed)
+        for packet in self._store.canonical():
+            for ready in replay._store.admit(packet):
+                replay._take(ready)
+        return replay._conclude()
+
+    def closure_counts(self) -> dict[str, int]:
+        """Closures so far by kind and status, for progress displays."""
+        counts = {"intra-robot": len(self._local)}
+        for entry in self._ledger:
+            status = entry.closure.status.value
+            counts[status] = counts.get(status, 0) + 1
+        return counts
+
+    def _take(self, packet: Packet) -> None:
+        """One packet's effect: figure 1 of the paper, cloud side."""
+        match packet.body:
+            case Hello() as hello:
+                self._store.greet(hello)
+            case Keyscan() as keyscan:
+                self._store.add_keyscan(keyscan)
+                if keyscan.id.number == 0:
+                    self._graph.start(keyscan.id.robot)
+                    self._maps.append([keyscan.id.robot])
+            case Constraint(kind=ConstraintKind.ODOMETRY) as motion:
+                self._store.require_next(motion)
+                self._graph.extend(motion)
+            case Constraint() as closure:
+                self._store.require(KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j))
+                self._add_local(closure)
+            case Place() as place:
+                self._store.require(place.id, KeyscanId(place.id.robot, place.last))
+                self._add_place(place)  # place recognition and map fusion
+            case Correction() | Acknowledgement():
+                raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
+
+    def _add_place(self, place: Place) -> None:
+        """Match a place (Algorithm 1), judge what it brings, join maps, optimise."""
+        if self._config.join_maps:
+            matches = self._matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
+            surprises = [entry for match in matches if (entry := self._accept_or_wait(self._ledger.add(match)))]
+            for other in dict.fromkeys(entry.closure.i.robot for entry in surprises):
+                self._judge_pair(other, place.id.robot)
+            self._places.setdefault(place.id.robot, []).append(place.id)
+        if self._graph.is_due(self._config.solve_every):
+            self._optimize()
+
+    def _predicted(self, place: Place) -> dict[KeyscanId, FloatArray]:
+        """T_i_j of the nearest place of each visit of the robots in the same map."""
+        pose = self._graph.pose(place.id)
+        near: dict[KeyscanId, FloatArray] = {}
+        for robot in self._map_of(place.id.robot):
+            ids = self._places.get(robot, []) if robot != place.id.robot else []
+            anchors = np.array([self._graph.pose(i) for i in ids]).reshape(-1, 3)
+            distance = np.hypot(anchors[:, 0] - pose[0], anchors[:, 1] - pose[1])
+            close = np.flatnonzero(distance < self._config.sight_m)
+            visits = np.split(close, np.flatnonzero(np.diff(close) > 1) + 1) if len(close) else []
+            best = sorted((int(v[np.argmin(distance[v])]) for v in visits), key=lambda k: float(distance[k]))
+            for k in best[: self._config.near_visits]:
+                near[ids[k]] = se2.between(anchors[k], pose)
+        return near
+
+    def _is_stranger(self, robot: str) -> Callable[[KeyscanId], bool]:
+        """Whether a place belongs to a robot in another map than ``robot``."""
+        known = frozenset(self._map_of(robot))
+        return lambda place: place.robot not in known
+
+    def _map_of(self, robot: str) -> list[str]:
+        """The robots that share a map with this one, itself included."""
+        return next(robots for robots in self._maps if robot in robots)
+
+    def _submap(self, place: Place) -> Submap:
+        """The submap around a place, rebuilt from its keyscans and the robot's own motions; kept while in use."""
+        if place.id not in self._submaps:
+            robot = place.id.robot
+            if len(self._submaps) >= self._config.submaps_kept:
+                del self._submaps[next(iter(self._submaps))]
+            laser, anchor = self._store.laser(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
+            poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))
+            keyscans = self._store.keyscans(robot, place.first, place.last)
+            self._submaps[place.id] = build_submap(
+                [(point_scan(keyscan.ranges_m, laser), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]
+            )
+        self._submaps[place.id] = submap = self._submaps.pop(place.id)  # newest last
+        return submap
+
+    def _accept_or_wait(self, entry: Entry) -> Entry | None:
+        """Accept what fits the joint map; returns the entry if only a cluster may accept it."""
+        closure = entry.closure
+        if closure.status is not ClosureStatus.VERIFIED:
+            return None
+        if entry.predicted:
+            off = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
+            if np.hypot(off[0], off[1]) < self._config.surprise_m and abs(off[2]) < self._config.surprise_rad:
+                self._accept(entry, "fits the joint map")
+                return None
+        return entry
+
+    def _judge_pair(self, a: str, b: str) -> None:
+        """Join two robots' maps, or add to their link, if one cluster of closures dominates."""
+        entries = self._ledger.between(a, b)
+        verdict = judge(entries, (a, b), self._graph, self._config.consistency)
+        if not verdict.dominant:
+            for entry in entries:
+                if entry.closure.status is ClosureStatus.VERIFIED:
+                    entry.set(ClosureStatus.VERIFIED, verdict.reason)
+            return
+        members = [entries[k] for k in verdict.members]
+        if b not in self._map_of(a):
+            self._join(members, a, b)
+        reason = f"in the dominant cluster of {len(members)} closures ({verdict.supporters} places apart)"
+        for entry in members:
+            if entry.edge is None:
+                self._accept(entry, reason)
+        self._optimize()
+
+    def _join(self, members: list[Entry], a: str, b: str) -> None:
+        """Move the younger map into the older one's frame."""
+        older, younger = self._map_of(a), self._map_of(b)
+        T_a_b = first_estimate(members, (a, b), self._graph)
+        if self._maps.index(older) > self._maps.index(younger):
+            older, younger, T_a_b = younger, older, se2.inverse(T_a_b)
+        self._graph.move(younger, T_a_b)
+        self._maps.remove(younger)
+        older.extend(younger)
+
+    def _accept(self, entry: Entry, reason: str) -> None:
+        closure = entry.closure
+        entry.edge = self._graph.close(closure.i, closure.j, closure.T_i_j, closure.information)
+        entry.set(ClosureStatus.ACCEPTED, reason)
+
+    def _add_local(self, closure: Constraint) -> None:
+        """A closure that a robot found within its own map."""
+        i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)
+        self._local.append((closure, self._graph.close(i, j, closure.T_i_j, closure.information)))
+
+    def _optimize(self) -> None:
+        self._graph.optimize()
+        self._version += 1
+
+    def _conclude(self) -> FleetResult:
+        """Decide on every closure, separate what only revoked closures held, and collect."""
+        if len(self._graph.graph):
+            self._graph.optimize_robustly()
+        for entry in self._ledger:
+            if entry.edge is not None and self._graph.weight(entry.edge) < 0.5:
+                entry.set(ClosureStatus.REVOKED, "contradicts the joint graph")
+            elif entry.edge is None and entry.closure.status is ClosureStatus.VERIFIED:
+                entry.set(ClosureStatus.REJECTED, entry.closure.reason or "outside the dominant cluster")
+        maps = self._graph.maps(self._ledger.accepted_edges())
+        index = {robot: k for k, robots in enumerate(maps) for robot in robots}
+        robots = tuple(
+            MappedRobot(
+                robot, index[robot], self._store.keyscans(robot), frozen(self._graph.trajectory(robot)),
+                self._store.laser(robot),
+            )  # fmt: skip
+            for robot in self._store.robots
+        )
+        corrections = tuple(
+            Correction(robot, self._version, index[robot], frozen(self._graph.T_map_odom(robot)))
+            for robot in self._store.robots
+        )
+        closures = (*self._local_closures(), *(entry.closure for entry in self._ledger))
+        return FleetResult(robots, closures, corrections, self._graph)
+
+    def _local_closures(self) -> Iterator[LoopClosure]:
+        for c, edge in self._local:
+            holds = self._graph.weight(edge) >= 0.5
+            yield LoopClosure(
+                KeyscanId(c.robot, c.i), KeyscanId(c.robot, c.j), Channel.LIDAR, 0.0, c.T_i_j, c.information,
+                ClosureStatus.ACCEPTED if holds else ClosureStatus.REVOKED,
+                "found by the robot" if holds else "contradicts the joint graph",
+            )  # fmt: skip
+
+    def _replies(self, packet: Packet) -> list[bytes]:
+        """Acknowledgement and, after a place, where the robot's odometry lies in the map."""
+        robot, epoch = packet.robot, packet.epoch
+        bodies: list[Acknowledgement | Correction] = [Acknowledgement(robot, epoch, packet.sequence)]
+        if isinstance(packet.body, Place) and self._graph.keyscan_count(robot):
+            index = next(k for k, robots in enumerate(self._maps) if robot in robots)
+            bodies.append(Correction(robot, self._version, index, frozen(self._graph.T_map_odom(robot))))
+        first = self._store.number_replies(robot, len(bodies))
+        return [encode(Packet(robot, epoch, first + k, packet.time, body)) for k, body in enumerate(bodies)]

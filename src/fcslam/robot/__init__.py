@@ -1,0 +1,1 @@
+"""What runs on a robot: sensor records in, numbered packets out."""
