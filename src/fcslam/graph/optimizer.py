@@ -3,6 +3,7 @@
 Gauge: each connected component keeps the initial pose of its first variable.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,6 +119,23 @@ def optimize_gnc(
         steps.iterations, _truncated(graph.chi2(start), robust, limit), _truncated(graph.chi2(poses), robust, limit)
     )
     return _solution(graph, start, poses, weights, stats)
+
+
+def optimize_gnc_best(
+    graph: PoseGraph,
+    starts: Sequence[ArrayLike],
+    *,
+    settings: GncSettings | None = None,
+    factors: FactorCache | None = None,
+) -> Solution:
+    """The cheapest of :func:`optimize_gnc` from several ``starts``: the loss has many minima, its value ranks them.
+
+    Raises:
+        ValueError: no start, or as :func:`optimize_gnc`.
+    """
+    cache = _cache(graph, factors)
+    solutions = [optimize_gnc(graph, start, settings=settings, factors=cache) for start in starts]
+    return min(solutions, key=lambda solution: solution.stats.final_cost)
 
 
 class _Steps:
