@@ -141,6 +141,16 @@ def test_covariance_is_in_the_frame_of_j() -> None:
         assert bool(pairwise_consistency(still, still, closures, SETTINGS)[0, 1]) is agrees
 
 
+def test_covariance_turns_with_the_path_between_the_closures() -> None:
+    """As above, with the second closure at a keyscan that is turned against the first one's: its x is wide."""
+    tight, wide = np.linalg.inv(np.diag([1e-4, 1e-4, 1e-6])), np.linalg.inv(np.diag([0.25, 1e-4, 1e-6]))
+    b = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2)])
+    for shift, agrees in (((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)):
+        T = np.stack((b[0], se2.compose(b[1], shift)))
+        closures = Closures(np.array([0, 0]), np.array([0, 1]), T, np.stack((tight, wide)))
+        assert bool(pairwise_consistency(np.zeros((1, 3)), b, closures, SETTINGS)[0, 1]) is agrees
+
+
 def test_as_many_closures_from_fewer_places_lead_nothing() -> None:
     agree = np.zeros((9, 9), dtype=bool)
     agree[:6, :6] = agree[6:, 6:] = True
