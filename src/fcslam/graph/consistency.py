@@ -33,7 +33,7 @@ class ConsistencySettings(Settings):
     )
     minimum_closures: int = Field(default=3, ge=1, description="Supporters needed, from places that lie apart")
     separation_m: float = Field(default=3.0, ge=0.0, description="Distance from which two places lie apart")
-    lead: float = Field(default=2.0, ge=1.0, description="Supporters needed for each of the second largest cluster")
+    lead: float = Field(default=2.0, ge=1.0, description="Size needed, as a multiple of the second largest cluster")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ def pairwise_chi2(
     over_b = se2.compose(closures.T_i_j[m], along_b)
     residual = se2.log(se2.compose(se2.between(closures.T_i_j[k], along_a), over_b))
     # First-order covariance in the tangent space at the loop's end, as if it closed.
-    covariance: FloatArray = np.linalg.inv(closures.information)
+    covariance = np.linalg.inv(closures.information).astype(np.float64)
     spread = covariance[k] + _carried(covariance[m], along_b)
     spread += _carried(_drift(a, closures.i[k], closures.i[m], settings), over_b)
     spread += _drift(b, closures.j[m], closures.j[k], settings)
@@ -114,7 +114,8 @@ def dominant_cluster(
 
     ``consistent`` (K, K) from :func:`pairwise_consistency`, ``places`` (K, 2) where each closure is (metres, in one
     frame), ``informative`` (K,) whether it fixes the pose in every direction. Aliases agree with one another, too:
-    so the cluster must have enough supporters from different places, an informative one, and a clear lead.
+    so the cluster must have enough supporters from different places, an informative one, and a clear lead over the
+    largest one that contradicts it: in closures, and no less in places.
     """
     xy, informs = np.asarray(places, dtype=np.float64).reshape(-1, 2), np.asarray(informative, dtype=bool)
     first = maximum_clique(consistent)
@@ -129,8 +130,8 @@ def dominant_cluster(
         reason = f"{supporters} supporters {settings.separation_m:g} m apart, {settings.minimum_closures} needed"
     elif not informs[members].any():
         reason = "no supporter with information in every direction"
-    elif supporters < settings.lead * rivals:
-        reason = f"{supporters} supporters, but {rivals} for another alignment"
+    elif len(members) < settings.lead * len(runner_up) or supporters < rivals:
+        reason = f"{len(members)} closures from {supporters} places, but {len(runner_up)} from {rivals} disagree"
     return ClusterVerdict(
         members=first.members,
         runner_up=tuple(runner_up.tolist()),

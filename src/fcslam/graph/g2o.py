@@ -136,11 +136,11 @@ def _assemble(content: _Content, path: Path) -> G2oGraph:
     number_of = {name: number for number, name in enumerate(ids)}
     graph = PoseGraph([poses[name] for name in ids])
     for line, edge in content.edges:
-        missing = {edge.i, edge.j} - number_of.keys()
+        missing = [name for name in (edge.i, edge.j) if name not in number_of]
         if missing:
-            raise InputError(f"{path}: line {line}: the edge names vertex {min(missing)}, which no line gives")
+            raise InputError(f"{path}: line {line}: the edge names vertex {missing[0]}, which no line gives")
         graph.add_edge(Edge(number_of[edge.i], number_of[edge.j], edge.T_i_j, edge.information, edge.robust))
-    unknown = set(content.fixed) - number_of.keys()
+    unknown = set(content.fixed) - set(ids)
     if unknown:
         raise InputError(f"{path}: FIX names vertex {min(unknown)}, which no line gives")
     return G2oGraph(graph, ids, tuple(content.fixed))

@@ -1,0 +1,228 @@
+"""True closures agree, false ones do not, aliases agree with one another; cliques against brute force."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from graph_worlds import INFORMATION, measured, walk
+
+from fcslam.geometry import se2
+from fcslam.graph.clique import maximum_clique
+from fcslam.graph.consistency import (
+    Closures,
+    ConsistencySettings,
+    dominant_cluster,
+    pairwise_chi2,
+    pairwise_consistency,
+)
+
+SETTINGS = ConsistencySettings(position_drift_m=0.03, heading_drift_rad=0.01)
+T_A_B = np.array([4.0, -7.0, 2.2])
+
+
+def drifted(generator: np.random.Generator, truth: np.ndarray) -> np.ndarray:
+    """The trajectory as a robot with SETTINGS' drift has it."""
+    poses = [np.zeros(3)]
+    for step in se2.relative(truth):
+        metres = np.hypot(*step[:2])
+        sigma = np.sqrt(metres) * np.array([SETTINGS.position_drift_m] * 2 + [SETTINGS.heading_drift_rad])
+        poses.append(se2.compose(poses[-1], se2.compose(step, sigma * generator.normal(size=3))))
+    return np.array(poses)
+
+
+def two_robots(seed: int, true: int = 20, false: int = 30, aliases: int = 0) -> tuple[np.ndarray, np.ndarray, Closures]:
+    """Trajectories of two robots in one town and closures between them: true, random, and a shifted alias group."""
+    generator = np.random.default_rng(seed)
+    truth_a, truth_b = walk(seed, 120), walk(seed + 100, 120)
+    shift = np.array([6.0, 3.0, 0.0])
+    rows = []
+    for _ in range(true):
+        i, j = generator.integers(0, 121, 2)
+        rows.append((i, j, measured(generator, se2.between(truth_a[i], truth_b[j]))))
+    for _ in range(false):
+        i, j = generator.integers(0, 121, 2)
+        rows.append((i, j, np.append(generator.normal(0.0, 1.0, 2), generator.uniform(-np.pi, np.pi))))
+    for _ in range(aliases):
+        i, j = generator.integers(0, 121, 2)
+        rows.append((i, j, measured(generator, se2.between(truth_a[i], se2.compose(shift, truth_b[j])))))
+    closures = Closures(
+        i=np.array([row[0] for row in rows], dtype=np.int64),
+        j=np.array([row[1] for row in rows], dtype=np.int64),
+        T_i_j=np.array([row[2] for row in rows]).reshape(-1, 3),
+        information=np.tile(INFORMATION, (len(rows), 1, 1)),
+    )
+    return drifted(generator, truth_a), drifted(generator, truth_b), closures
+
+
+def verdict_of(seed: int, **counts: int):
+    a, b, closures = two_robots(seed, **counts)
+    consistent = pairwise_consistency(a, b, closures, SETTINGS)
+    return dominant_cluster(consistent, a[closures.i, :2], np.ones(len(closures.i), dtype=bool), SETTINGS)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_cluster_is_the_true_closures(seed: int) -> None:
+    verdict = verdict_of(seed, true=20, false=40)
+    members = set(verdict.members)
+    assert len(members & set(range(20))) >= 16
+    assert len(members - set(range(20))) <= 1
+    assert verdict.dominant
+    assert verdict.exact
+    assert len(verdict.members) > 4 * len(verdict.runner_up)
+
+
+def test_an_alias_group_of_like_size_forbids_a_verdict() -> None:
+    verdict = verdict_of(0, true=12, false=10, aliases=12)
+    assert not verdict.dominant
+    assert "disagree" in verdict.reason
+    assert not set(verdict.members) & set(verdict.runner_up)
+    groups = {
+        tuple(sorted({0 if k < 12 else 2 if k >= 22 else 1 for k in g})) for g in (verdict.members, verdict.runner_up)
+    }
+    assert groups <= {(0,), (2,), (0, 1), (1, 2)}
+    assert len(groups) == 2
+
+
+def test_a_small_alias_group_is_outvoted() -> None:
+    verdict = verdict_of(1, true=20, false=10, aliases=4)
+    assert verdict.dominant
+    assert set(verdict.members) <= set(range(30))
+
+
+def test_noise_alone_gives_no_verdict() -> None:
+    for seed in range(3):
+        assert not verdict_of(seed, true=0, false=40).dominant
+    assert not verdict_of(0, true=0, false=0).dominant
+    assert verdict_of(0, true=1, false=0).members == (0,)
+
+
+def test_chi2_of_true_pairs_has_the_distribution_it_claims() -> None:
+    values = []
+    for seed in range(6):
+        a, b, closures = two_robots(seed, true=25, false=0)
+        values.append(pairwise_chi2(a, b, closures, SETTINGS)[np.triu_indices(25, 1)])
+    sample = np.concatenate(values)
+    assert 0.95 < np.mean(sample < 11.345) <= 1.0
+    assert 1.8 < np.mean(sample) < 4.2
+
+
+def test_drift_is_that_of_simulated_trajectories() -> None:
+    truth = walk(3, 60)
+    ends = np.array([5, 55])
+    exact = Closures(ends, np.zeros(2, dtype=np.int64), se2.inverse(truth[ends]), np.tile(np.eye(3) * 1e10, (2, 1, 1)))
+    generator = np.random.default_rng(0)
+    still = np.zeros((1, 3))
+    chi2 = [pairwise_chi2(drifted(generator, truth), still, exact, SETTINGS)[0, 1] for _ in range(300)]
+    assert np.mean(chi2) == pytest.approx(3.0, abs=0.5)
+
+
+def test_consistency_ignores_the_frames_and_the_order() -> None:
+    a, b, closures = two_robots(2)
+    here = pairwise_chi2(a, b, closures, SETTINGS)
+    there = pairwise_chi2(se2.compose(T_A_B, a), se2.compose((1.0, 90.0, -3.0), b), closures, SETTINGS)
+    assert there == pytest.approx(here, rel=1e-5, abs=1e-6)
+    assert np.array_equal(here, here.T)
+    assert (np.diag(here) == 0.0).all()
+    order = np.random.default_rng(0).permutation(len(closures.i))
+    shuffled = Closures(closures.i[order], closures.j[order], closures.T_i_j[order], closures.information[order])
+    limit = 11.345
+    forward, backward = here[np.ix_(order, order)] < limit, pairwise_chi2(a, b, shuffled, SETTINGS) < limit
+    assert np.mean(forward != backward) < 0.01
+
+
+def test_covariance_is_in_the_frame_of_j() -> None:
+    """Two closures that differ by 0.3 m along j's x, where the covariance is wide, agree; along y they do not."""
+    wide = np.linalg.inv(np.diag([0.25, 1e-4, 1e-6]))
+    turned = np.array([0.0, 0.0, np.pi / 2])
+    for shift, agrees in (((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)):
+        T = np.stack((turned, se2.compose(turned, shift)))
+        closures = Closures(np.array([0, 0]), np.array([0, 0]), T, np.stack((wide, wide)))
+        still = np.zeros((1, 3))
+        assert bool(pairwise_consistency(still, still, closures, SETTINGS)[0, 1]) is agrees
+
+
+def test_covariance_turns_with_the_path_between_the_closures() -> None:
+    """As above, with the second closure at a keyscan that is turned against the first one's: its x is wide."""
+    tight, wide = np.linalg.inv(np.diag([1e-4, 1e-4, 1e-6])), np.linalg.inv(np.diag([0.25, 1e-4, 1e-6]))
+    b = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2)])
+    for shift, agrees in (((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)):
+        T = np.stack((b[0], se2.compose(b[1], shift)))
+        closures = Closures(np.array([0, 0]), np.array([0, 1]), T, np.stack((tight, wide)))
+        assert bool(pairwise_consistency(np.zeros((1, 3)), b, closures, SETTINGS)[0, 1]) is agrees
+
+
+def test_as_many_closures_from_fewer_places_lead_nothing() -> None:
+    agree = np.zeros((9, 9), dtype=bool)
+    agree[:6, :6] = agree[6:, 6:] = True
+    ones = np.ones(9, dtype=bool)
+    many = np.array([(3.5 * k, 0.0) for k in range(9)])
+    few = many.copy()
+    few[3:6] = few[2]
+    assert dominant_cluster(agree, many, ones, SETTINGS).dominant
+    assert dominant_cluster(agree, few, ones, SETTINGS).dominant
+    few[2:6] = few[1]
+    assert not dominant_cluster(agree, few, ones, SETTINGS.model_copy(update={"minimum_closures": 2})).dominant
+
+
+def test_supporters_are_places_that_lie_apart_and_one_must_inform() -> None:
+    agree = np.ones((6, 6), dtype=bool)
+    near = np.array([(0.1 * k, 0.0) for k in range(6)])
+    far = np.array([(3.5 * k, 0.0) for k in range(6)])
+    informative = np.array([False, True, False, False, False, False])
+    assert dominant_cluster(agree, far, informative, SETTINGS).dominant
+    one_place = dominant_cluster(agree, near, informative, SETTINGS)
+    assert (one_place.supporters, one_place.dominant) == (1, False)
+    assert "1 supporters" in one_place.reason
+    corridor = dominant_cluster(agree, far, np.zeros(6, dtype=bool), SETTINGS)
+    assert "information in every direction" in corridor.reason
+
+
+def test_a_keyscan_out_of_range_is_refused() -> None:
+    a, b, closures = two_robots(0)
+    for cut_a, cut_b, name in ((a[:50], b, "a"), (a, b[:50], "b")):
+        with pytest.raises(ValueError, match=f"trajectory {name} has keyscans 0 to 49"):
+            pairwise_chi2(cut_a, cut_b, closures, SETTINGS)
+
+
+@pytest.mark.parametrize("density", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("seed", range(5))
+def test_clique_is_the_largest_of_brute_force(seed: int, density: float) -> None:
+    upper = np.triu(np.random.default_rng(seed).random((11, 11)) < density, 1)
+    adjacent = upper | upper.T
+    largest = max(
+        size
+        for size in range(1, 12)
+        for group in combinations(range(11), size)
+        if adjacent[np.ix_(group, group)].sum() == size * (size - 1)
+    )
+    clique = maximum_clique(adjacent)
+    assert clique.exact
+    assert len(clique.members) == largest
+    assert adjacent[np.ix_(clique.members, clique.members)].sum() == largest * (largest - 1)
+
+
+def test_a_planted_clique_among_hundreds() -> None:
+    generator = np.random.default_rng(0)
+    upper = np.triu(generator.random((400, 400)) < 0.1, 1)
+    adjacent = upper | upper.T
+    planted = np.sort(generator.choice(400, 60, replace=False))
+    adjacent[np.ix_(planted, planted)] = True
+    assert set(planted) <= set(maximum_clique(adjacent).members)
+    assert maximum_clique(np.ones((1500, 1500), dtype=bool)).members == tuple(range(1500))
+
+
+def test_the_node_budget_ends_a_hard_search_with_a_clique() -> None:
+    upper = np.triu(np.random.default_rng(0).random((200, 200)) < 0.9, 1)
+    adjacent = upper | upper.T
+    clique = maximum_clique(adjacent, node_budget=100)
+    members = list(clique.members)
+    assert not clique.exact
+    assert len(members) >= 20
+    assert adjacent[np.ix_(members, members)].sum() == len(members) * (len(members) - 1)
+
+
+def test_clique_of_nothing_and_of_no_edges() -> None:
+    assert maximum_clique(np.zeros((0, 0), dtype=bool)).members == ()
+    assert len(maximum_clique(np.zeros((3, 3), dtype=bool)).members) == 1
+    with pytest.raises(ValueError, match="symmetric"):
+        maximum_clique(np.triu(np.ones((3, 3), dtype=bool)))

@@ -1,0 +1,192 @@
+"""Laws of the optimum, an independent solver, and false closures."""
+
+import numpy as np
+import pytest
+from graph_worlds import INFORMATION, gauss_newton, manhattan
+
+from fcslam.geometry import se2
+from fcslam.graph.factors import FactorCache, Loss
+from fcslam.graph.initialization import initialize, initialize_robust
+from fcslam.graph.optimizer import GncSettings, Solution, optimize, optimize_gnc, optimize_gnc_best
+from fcslam.graph.pose_graph import Edge, PoseGraph
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> float:
+    """Largest coordinate of the motions between two sets of poses."""
+    return float(np.abs(se2.between(a, b)).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_optimum_is_that_of_an_independent_solver(seed: int) -> None:
+    graph, truth, _ = manhattan(seed, steps=60, closures=25)
+    solution = optimize(graph)
+    oracle = gauss_newton(graph, truth)
+    assert apart(solution.poses, oracle) < 2e-3
+    assert graph.chi2(solution.poses).sum() == pytest.approx(graph.chi2(oracle).sum(), rel=1e-3)
+    assert solution.stats.final_cost < solution.stats.initial_cost
+
+
+@pytest.mark.parametrize("mutate", ["transposed", "sign", "inverse"])
+def test_the_oracle_tells_mutations_of_the_information_apart(mutate: str) -> None:
+    graph, truth, _ = manhattan(0, steps=60, closures=25)
+    matrix = {
+        "transposed": INFORMATION[::-1, ::-1],
+        "sign": INFORMATION * np.array([[1, -1, -1], [-1, 1, 1], [-1, 1, 1]]),
+        "inverse": np.linalg.inv(INFORMATION),
+    }[mutate]
+    edges = [Edge(e.i, e.j, e.T_i_j, matrix if e.robust else e.information, e.robust) for e in graph.edges]
+    assert apart(optimize(PoseGraph(graph.poses(), edges)).poses, gauss_newton(graph, truth)) > 4e-3
+
+
+@pytest.mark.parametrize("solve", [optimize, optimize_gnc])
+def test_moving_the_start_moves_the_result(solve: type[Solution]) -> None:
+    graph, _, _ = manhattan(1, steps=80, closures=30)
+    T = np.array([30.0, -12.0, 2.0])
+    still, moved = solve(graph), solve(graph, se2.compose(T, graph.poses()))
+    assert apart(moved.poses, se2.compose(T, still.poses)) < 1e-3
+    assert still.poses[0] == pytest.approx(graph.poses()[0])
+
+
+@pytest.mark.parametrize("solve", [optimize, optimize_gnc])
+def test_order_of_edges_does_not_matter_and_repetition_gives_the_same_bytes(solve: type[Solution]) -> None:
+    graph, _, _ = manhattan(2, steps=80, closures=30, outlier_share=0.3)
+    graph = graph if solve is optimize_gnc else manhattan(2, steps=80, closures=30)[0]
+    order = np.random.default_rng(0).permutation(len(graph.edges))
+    shuffled = PoseGraph(graph.poses(), [graph.edges[k] for k in order])
+    first, second = solve(graph), solve(shuffled)
+    assert apart(first.poses, second.poses) < 1e-3
+    assert np.array_equal(first.weights[order], second.weights)
+    again = solve(graph)
+    assert first.poses.tobytes() == again.poses.tobytes()
+    assert first.weights.tobytes() == again.weights.tobytes()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize("seed", range(3))
+def test_gnc_rejects_false_closures(seed: int, share: float) -> None:
+    graph, truth, true = manhattan(seed, closures=60, outlier_share=share)
+    solution = optimize_gnc_best(graph, [graph.poses(), initialize_robust(graph)])
+    clean = optimize(PoseGraph(graph.poses(), [e for e, known in zip(graph.edges, true, strict=True) if known]))
+    assert (solution.weights[~true] == 0.0).all()
+    assert (solution.weights[true] == 0.0).sum() <= 4
+    assert np.abs(solution.poses[:, :2] - clean.poses[:, :2]).max() < 0.1
+    assert np.abs(optimize(graph).poses[:, :2] - truth[:, :2]).max() > 1.0
+
+
+def test_a_clean_graph_keeps_every_closure_and_its_optimum() -> None:
+    graph, _, _ = manhattan(5)
+    loose = GncSettings(inlier_probability=0.9999)
+    solution = optimize_gnc(graph, settings=loose)
+    assert (solution.weights == 1.0).all()
+    assert apart(solution.poses, optimize(graph).poses) < 1e-3
+
+
+def test_robust_losses_weigh_false_closures_down() -> None:
+    graph, truth, true = manhattan(3, outlier_share=0.2)
+    cauchy = optimize(graph, initialize_robust(graph), loss=Loss.CAUCHY)
+    huber = optimize(graph, initialize_robust(graph), loss=Loss.HUBER)
+    assert cauchy.weights[~true].max() < 0.05 < cauchy.weights[true].min()
+    assert np.abs(cauchy.poses[:, :2] - truth[:, :2]).max() < 0.5
+    assert huber.weights[~true].max() < huber.weights[true].min()
+    assert (cauchy.weights[~graph.arrays().robust] == 1.0).all()
+
+
+def test_components_are_solved_apart_each_in_its_own_gauge() -> None:
+    one, _, _ = manhattan(0, steps=40, closures=15)
+    two, _, _ = manhattan(1, steps=50, closures=15)
+    offset, T = len(one), np.array([100.0, 5.0, 1.0])
+    second = [Edge(e.i + offset, e.j + offset, e.T_i_j, e.information, e.robust) for e in two.edges]
+    both = PoseGraph(np.concatenate((one.poses(), se2.compose(T, two.poses()))), [*one.edges, *second])
+    for poses in (optimize(both).poses, optimize_gnc(both).poses):
+        assert apart(poses[:offset], optimize(one).poses) < 1e-3
+        assert apart(poses[offset:], se2.compose(T, optimize(two).poses)) < 1e-3
+
+
+def test_a_component_whose_only_link_is_rejected_stays_where_it_was() -> None:
+    one, _, _ = manhattan(0, steps=40, closures=0)
+    count = len(one)
+    copy = [Edge(e.i + count, e.j + count, e.T_i_j, e.information, False) for e in one.edges]
+    false = [
+        Edge(5, count + 30, np.array([0.0, 3.0, 1.0]), INFORMATION, True),
+        Edge(20, count + 2, np.array([9.0, 1.0, 2.0]), INFORMATION, True),
+        Edge(9, count + 12, np.array([-7.0, 1.0, -2.0]), INFORMATION, True),
+    ]
+    graph = PoseGraph(np.tile(one.poses(), (2, 1)), [*one.edges, *copy, *false])
+    solution = optimize_gnc(graph)
+    kept = graph.components(solution.weights > 0.0)
+    assert np.isfinite(solution.poses).all()
+    for component in np.unique(kept):
+        first = np.flatnonzero(kept == component)[0]
+        assert solution.poses[first] == pytest.approx(graph.poses()[first])
+
+
+@pytest.mark.parametrize("solve", [optimize, optimize_gnc])
+def test_small_graphs(solve: type[Solution]) -> None:
+    assert solve(PoseGraph()).poses.shape == (0, 3)
+    single = solve(PoseGraph([(1.0, 2.0, 3.0)]))
+    assert single.poses.tolist() == [[1.0, 2.0, 3.0]]
+    assert single.weights.shape == (0,)
+    T_0_1 = np.array([1.0, 0.5, 0.2])
+    pair = solve(PoseGraph([(1.0, 2.0, 3.0), (0, 0, 0)], [Edge(0, 1, T_0_1, INFORMATION, False)]))
+    assert pair.poses[1] == pytest.approx(se2.compose((1.0, 2.0, 3.0), T_0_1), abs=1e-4)
+
+
+def test_odometry_alone_reproduces_itself() -> None:
+    graph, _, _ = manhattan(4, steps=50, closures=0)
+    assert apart(optimize_gnc(graph).poses, graph.poses()) < 1e-6
+
+
+def test_a_kept_cache_gives_the_same_bytes() -> None:
+    graph, _, _ = manhattan(6)
+    grown = PoseGraph(graph.poses())
+    cache = FactorCache(grown)
+    for k, known in enumerate(graph.edges):
+        grown.add_edge(known)
+        if k in (150, 170):
+            optimize(grown, factors=cache)
+    for solve in (optimize, optimize_gnc):
+        assert solve(grown, factors=cache).poses.tobytes() == solve(graph).poses.tobytes()
+
+
+def test_misfits_are_refused() -> None:
+    graph, _, _ = manhattan(0, steps=5, closures=0)
+    with pytest.raises(ValueError, match=r"shape \(6, 3\)"):
+        optimize(graph, np.zeros((5, 3)))
+    with pytest.raises(ValueError, match="finite"):
+        optimize_gnc(graph, np.full((6, 3), np.nan))
+    with pytest.raises(ValueError, match="another pose graph"):
+        optimize(graph, factors=FactorCache(PoseGraph()))
+
+
+def test_initialisation_needs_no_estimate() -> None:
+    graph, _, _ = manhattan(7)
+    lost = PoseGraph(np.random.default_rng(0).uniform(-99.0, 99.0, (len(graph), 3)), graph.edges)
+    T = se2.compose(lost.poses()[0], se2.inverse(graph.poses()[0]))
+    start = initialize(lost)
+    optimum = optimize(graph).poses
+    assert start[0] == pytest.approx(lost.poses()[0])
+    assert apart(start, se2.compose(T, optimum)) < 0.5
+    assert apart(optimize(lost, start).poses, se2.compose(T, optimum)) < 1e-3
+
+
+def test_initialisation_by_odometry_alone_is_the_odometry() -> None:
+    graph, _, _ = manhattan(7, outlier_share=0.5)
+    lost = PoseGraph(np.zeros((len(graph), 3)), graph.edges)
+    assert apart(initialize(lost, ~graph.arrays().robust), graph.poses()) < 1e-6
+    assert np.array_equal(initialize(PoseGraph([(1.0, 2.0, 3.0)])), [[1.0, 2.0, 3.0]])
+
+
+def test_initialisation_treats_components_apart() -> None:
+    one, _, _ = manhattan(0, steps=30, closures=10)
+    second = [Edge(e.i + 31, e.j + 31, e.T_i_j, e.information, e.robust) for e in one.edges]
+    T = np.array([3.0, 4.0, 1.0])
+    both = PoseGraph(np.concatenate((one.poses(), se2.compose(T, one.poses()))), [*one.edges, *second])
+    poses = initialize(both)
+    assert apart(poses[31:], se2.compose(T, poses[:31])) < 1e-9
+
+
+def test_robust_initialisation_ignores_false_closures() -> None:
+    graph, _, true = manhattan(8, outlier_share=0.5)
+    chi2 = graph.chi2(initialize_robust(graph))
+    assert np.median(chi2[true & graph.arrays().robust]) < 10.0
+    assert chi2[~true].min() > 100.0

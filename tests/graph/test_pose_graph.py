@@ -1,0 +1,86 @@
+"""Edges check themselves; chi-square and components against plain loops."""
+
+import numpy as np
+import pytest
+from graph_worlds import INFORMATION, manhattan
+
+from fcslam.geometry import se2
+from fcslam.graph.pose_graph import MAXIMUM_INFORMATION, Edge, PoseGraph
+
+
+def edge(i: int, j: int, information: np.ndarray = INFORMATION) -> Edge:
+    return Edge(i, j, np.array([1.0, 0.0, 0.1]), information, robust=False)
+
+
+def test_chi2_is_the_residuals_squared_mahalanobis_length() -> None:
+    graph, truth, _ = manhattan(0, steps=20, closures=5)
+    for number, known in enumerate(graph.edges):
+        residual = se2.compose(se2.inverse(known.T_i_j), se2.between(truth[known.i], truth[known.j]))
+        assert graph.chi2(truth)[number] == pytest.approx(residual @ known.information @ residual)
+
+
+def test_chi2_of_true_motions_is_zero_and_in_the_frame_of_j() -> None:
+    information = np.diag([100.0, 1.0, 1.0])
+    graph = PoseGraph([(0, 0, 0), (0, 0, 0)], [Edge(0, 1, np.array([0.0, 0.0, np.pi / 2]), information, False)])
+    assert graph.chi2([(0, 0, 0), (0, 0, np.pi / 2)]) == pytest.approx([0.0], abs=1e-12)
+    assert graph.chi2([(0, 0, 0), (0.0, 0.5, np.pi / 2)]) == pytest.approx([25.0])
+    assert graph.chi2([(0, 0, 0), (0.5, 0.0, np.pi / 2)]) == pytest.approx([0.25])
+
+
+def test_rounding_is_symmetrised_and_more_is_refused() -> None:
+    rounded = INFORMATION.copy()
+    rounded[0, 1] *= 1.0 + 1e-9
+    assert np.array_equal(edge(0, 1, rounded).information, edge(0, 1, rounded).information.T)
+    rounded[0, 1] += 0.01 * rounded.max()
+    with pytest.raises(ValueError, match="not symmetric"):
+        edge(0, 1, rounded)
+
+
+@pytest.mark.parametrize("diagonal", [(1.0, 1.0, 0.0), (1.0, 1.0, -1.0), (0.0, 0.0, 0.0)])
+def test_information_must_be_positive_definite(diagonal: tuple[float, float, float]) -> None:
+    with pytest.raises(ValueError, match=r"edge 3 -> 4.*positive definite"):
+        edge(3, 4, np.diag(diagonal))
+
+
+@pytest.mark.parametrize("bad", [np.full((3, 3), np.nan), np.eye(2), np.full((3, 3), np.inf)])
+def test_information_must_be_finite_and_of_shape(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="information must be finite"):
+        edge(0, 1, bad)
+
+
+@pytest.mark.parametrize(("i", "j"), [(1, 1), (-1, 0)])
+def test_an_edge_joins_two_variables(i: int, j: int) -> None:
+    with pytest.raises(ValueError, match="two different variables"):
+        edge(i, j)
+
+
+def test_an_edge_names_variables_of_the_graph() -> None:
+    with pytest.raises(ValueError, match="variables 0 to 1"):
+        PoseGraph(np.zeros((2, 3)), [edge(1, 2)])
+    with pytest.raises(ValueError, match="finite"):
+        PoseGraph([(0.0, np.inf, 0.0)])
+
+
+def test_stiff_information_is_bounded_in_the_arrays_only() -> None:
+    stiff = np.diag([1e12, 10.0, 50.0])
+    graph = PoseGraph(np.zeros((2, 3)), [edge(0, 1, stiff)])
+    assert graph.edges[0].information[0, 0] == 1e12
+    assert graph.arrays().information[0] == pytest.approx(np.diag([MAXIMUM_INFORMATION, 10.0, 50.0]))
+
+
+def test_arrays_grow_with_the_graph() -> None:
+    whole, _, _ = manhattan(1, steps=12, closures=4)
+    grown = PoseGraph(whole.poses())
+    for known in whole.edges:
+        grown.add_edge(known)
+        assert len(grown.arrays().i) == len(grown.edges)
+    for name in ("i", "j", "T_i_j", "information", "robust"):
+        assert np.array_equal(getattr(grown.arrays(), name), getattr(whole.arrays(), name))
+
+
+def test_components_are_numbered_by_their_first_variable() -> None:
+    graph = PoseGraph(np.zeros((6, 3)), [edge(1, 4), edge(5, 2), edge(0, 3)])
+    assert graph.components().tolist() == [0, 1, 2, 0, 1, 2]
+    assert graph.components([True, False, True]).tolist() == [0, 1, 2, 0, 1, 3]
+    assert PoseGraph(np.zeros((2, 3))).components().tolist() == [0, 1]
+    assert PoseGraph().components().tolist() == []
