@@ -31,16 +31,17 @@ def judge(entries: list[Entry], robots: tuple[str, str], graph: JointGraph, sett
     """The dominant cluster among the verified closures of two robots."""
     a, b = robots
     sides = [oriented(entry, a) for entry in entries]
-    trajectory_a = graph.trajectory(a)
+    trajectory_a, trajectory_b = graph.trajectory(a), graph.trajectory(b)
     closures = Closures(
         i=np.array([i.number for i, _, _, _ in sides]),
         j=np.array([j.number for _, j, _, _ in sides]),
         T_i_j=np.array([T for _, _, T, _ in sides]),
         information=np.array([information for _, _, _, information in sides]),
     )
-    consistent = pairwise_consistency(trajectory_a, graph.trajectory(b), closures, settings)
+    consistent = pairwise_consistency(trajectory_a, trajectory_b, closures, settings)
     informative = [entry.closure.informative for entry in entries]
-    return dominant_cluster(consistent, trajectory_a[closures.i, :2], informative, settings)
+    places = np.stack((trajectory_a[closures.i, :2], trajectory_b[closures.j, :2]), axis=1)
+    return dominant_cluster(consistent, places, informative, settings)
 
 
 def first_estimate(members: list[Entry], robots: tuple[str, str], graph: JointGraph) -> FloatArray:

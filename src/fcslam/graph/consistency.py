@@ -112,12 +112,12 @@ def dominant_cluster(
 ) -> ClusterVerdict:
     """The largest consistent cluster, and whether it is enough to join two maps.
 
-    ``consistent`` (K, K) from :func:`pairwise_consistency`, ``places`` (K, 2) where each closure is (metres, in one
+    ``consistent`` (K, K) from :func:`pairwise_consistency`, ``places`` (K, 2), or (K, S, 2) as seen by S trajectories, where each closure is (metres, each in one
     frame), ``informative`` (K,) whether it fixes the pose in every direction. Aliases agree with one another, too:
     so the cluster must have enough supporters from different places, an informative one, and a clear lead over the
     largest one that contradicts it: in closures, and no less in places.
     """
-    xy, informs = np.asarray(places, dtype=np.float64).reshape(-1, 2), np.asarray(informative, dtype=bool)
+    xy, informs = np.asarray(places, dtype=np.float64).reshape(len(consistent), -1, 2), np.asarray(informative, dtype=bool)
     first = maximum_clique(consistent)
     members = list(first.members)
     others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))
@@ -192,10 +192,13 @@ def _between_sums(values: FloatArray, low: NDArray[np.int64], high: NDArray[np.i
 
 
 def _apart(xy: FloatArray, separation_m: float) -> int:
-    """How many of the points (K, 2), taken in order, lie ``separation_m`` or more from all taken before."""
+    """How many of the places (K, S, 2), taken in order, lie ``separation_m`` or more from all before, on every side.
+
+    One place of b that looks like three of a is one witness, not three.
+    """
     taken: list[FloatArray] = []
     for point in xy:
-        if all(np.hypot(*(point - other)) >= separation_m for other in taken):
+        if all(np.hypot(*(point - other).T).min() >= separation_m for other in taken):
             taken.append(point)
     return len(taken)
 
