@@ -25,9 +25,6 @@ class HypothesisConfig(Settings):
     seeds: int = Field(default=50, ge=2, le=1000, description="closest matches of which every two propose a motion")
     inlier_distance_m: float = Field(default=0.3, gt=0.0, le=5.0, description="distance up to which a match agrees [m]")
     minimum_inliers: int = Field(default=4, ge=2, description="matches that must agree")
-    minimum_baseline_m: float = Field(
-        default=0.8, gt=0.0, le=50.0, description="distance of the two keypoints of a pair [m]"
-    )
     most_hypotheses: int = Field(default=2, ge=1, le=20, description="hypotheses returned, the best first")
     distinct_distance_m: float = Field(default=1.0, ge=0.0, description="shift that makes two hypotheses different [m]")
     distinct_angle_rad: float = Field(default=0.26, ge=0.0, le=3.2, description="turn that makes them different [rad]")
@@ -77,7 +74,7 @@ def propose(
     a = keypoints_a[matches.pairs[:, 0]].astype(np.float64)
     b = keypoints_b[matches.pairs[:, 1]].astype(np.float64)
     seeds = np.argsort(matches.distances, kind="stable")[: config.seeds]
-    trials = _trials(a, b, seeds, config.minimum_baseline_m, config.inlier_distance_m)
+    trials = _trials(a, b, seeds, config.inlier_distance_m)
     limits = _Limits(
         config.inlier_distance_m,
         config.minimum_inliers,
@@ -93,10 +90,11 @@ def propose(
 
 
 @njit(cache=True)
-def _trials(
-    a: FloatArray, b: FloatArray, seeds: NDArray[np.int64], baseline_m: float, tolerance_m: float
-) -> FloatArray:
-    """Motions from every two seeds whose keypoints lie equally far apart in both places: rows x, y, theta, score."""
+def _trials(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64], tolerance_m: float) -> FloatArray:
+    """Motions from every two seeds whose keypoints lie equally far apart in both places: rows x, y, theta, score.
+
+    Two keypoints closer than twice the tolerance fix no angle.
+    """
     trials = np.empty((seeds.shape[0] * (seeds.shape[0] - 1) // 2, 4))
     count = 0
     for p in range(1, seeds.shape[0]):
@@ -105,7 +103,7 @@ def _trials(
             ax, ay = a[j, 0] - a[i, 0], a[j, 1] - a[i, 1]
             bx, by = b[j, 0] - b[i, 0], b[j, 1] - b[i, 1]
             length_a, length_b = np.hypot(ax, ay), np.hypot(bx, by)
-            if min(length_a, length_b) < baseline_m or abs(length_a - length_b) > tolerance_m:
+            if min(length_a, length_b) < 2.0 * tolerance_m or abs(length_a - length_b) > tolerance_m:
                 continue
             cos = (bx * ax + by * ay) / (length_a * length_b)
             sin = (bx * ay - by * ax) / (length_a * length_b)

@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from fcslam.places.similarity import BagOfWords
 from fcslam.places.vocabulary import Vocabulary
-from fcslam.records import Codes, FloatArray
+from fcslam.records import Codes, FloatArray, Scalar
 
 PlaceId = TypeVar("PlaceId")
+
+_BLOCK = 16
+_FIRST_BLOCKS = 256
 
 
 class Found(NamedTuple, Generic[PlaceId]):
@@ -22,27 +25,51 @@ class Found(NamedTuple, Generic[PlaceId]):
     """L1 score in [0, 1]."""
 
 
+class _Blocks(NamedTuple):
+    """Postings as compiled code sees them: every word has a chain of blocks of (place row, value)."""
+
+    newest: NDArray[np.int64]
+    """Shape (word_count,): the block of each word that is being filled, -1 for none."""
+    older: NDArray[np.int64]
+    """Shape (B,): the block before it of the same word, -1 for none."""
+    sizes: NDArray[np.int64]
+    """Shape (B,): entries in the block."""
+    rows: NDArray[np.int32]
+    """Shape (B, _BLOCK)."""
+    values: FloatArray
+    """Shape (B, _BLOCK)."""
+
+
 class _Postings:
-    """For every word a linked list of (place row, value), newest first, in arrays that double when full."""
+    """For every word the places that have it. Blocks, because a query is bound by memory: it reads them in a row."""
 
     def __init__(self, word_count: int) -> None:
-        self.newest = np.full(word_count, -1, np.int64)
-        self.older = np.empty(1024, np.int64)
-        self.rows = np.empty(1024, np.int64)
-        self.values = np.empty(1024)
-        self.size = 0
+        self.blocks = _Blocks(
+            np.full(word_count, -1, np.int64),
+            np.empty(_FIRST_BLOCKS, np.int64),
+            np.empty(_FIRST_BLOCKS, np.int64),
+            np.empty((_FIRST_BLOCKS, _BLOCK), np.int32),
+            np.empty((_FIRST_BLOCKS, _BLOCK)),
+        )
+        self._used = 0
 
     def append(self, row: int, bag: BagOfWords) -> None:
-        while self.size + len(bag.words) > len(self.rows):
-            self.older = np.concatenate((self.older, np.empty_like(self.older)))
-            self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
-            self.values = np.concatenate((self.values, np.empty_like(self.values)))
-        new = np.arange(self.size, self.size + len(bag.words))
-        self.older[new] = self.newest[bag.words]
-        self.newest[bag.words] = new
-        self.rows[new] = row
-        self.values[new] = bag.values
-        self.size += len(new)
+        """Add a place; its cost does not depend on how many there are."""
+        needed = self._used + len(bag.words)
+        if needed > len(self.blocks.older):
+            newest, older, sizes, rows, values = self.blocks
+            longer = 2 * needed
+            self.blocks = _Blocks(
+                newest, _longer(older, longer), _longer(sizes, longer), _longer(rows, longer), _longer(values, longer)
+            )
+        self._used = _append(self.blocks, self._used, row, bag.words, bag.values)
+
+
+def _longer(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
+    """``array`` with room for ``length`` rows."""
+    longer = np.empty((length, *array.shape[1:]), array.dtype)
+    longer[: len(array)] = array
+    return longer
 
 
 class InvertedIndex(Generic[PlaceId]):
@@ -90,9 +117,7 @@ class InvertedIndex(Generic[PlaceId]):
         Places without a common word are neither touched nor returned; of equals the one stored first comes first.
         """
         bag = self._vocabulary.bag(descriptors)
-        postings = self._postings
-        entries = (postings.newest, postings.older, postings.rows, postings.values)
-        rows, scores = _score(bag.words, bag.values, entries, len(self._ids))
+        rows, scores = _score(self._postings.blocks, bag.words, bag.values, len(self._ids))
         found: list[Found[PlaceId]] = []
         for position in np.lexsort((rows, -scores)):
             if len(found) >= top_k:
@@ -104,24 +129,36 @@ class InvertedIndex(Generic[PlaceId]):
 
 
 @njit(cache=True)
+def _append(blocks: _Blocks, used: int, row: int, words: NDArray[np.int64], values: FloatArray) -> int:
+    """Enter the words of one place and return how many blocks are used then; there must be room for them."""
+    for index in range(words.shape[0]):
+        block = blocks.newest[words[index]]
+        if block < 0 or blocks.sizes[block] == _BLOCK:
+            blocks.older[used], blocks.sizes[used] = block, 0
+            blocks.newest[words[index]] = block = used
+            used += 1
+        blocks.rows[block, blocks.sizes[block]] = row
+        blocks.values[block, blocks.sizes[block]] = values[index]
+        blocks.sizes[block] += 1
+    return used
+
+
+@njit(cache=True)
 def _score(
-    words: NDArray[np.int64],
-    weights: FloatArray,
-    entries: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], FloatArray],
-    place_count: int,
+    blocks: _Blocks, words: NDArray[np.int64], weights: FloatArray, place_count: int
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Sum of min(query, place) over the common words, for the places that have one."""
-    newest, older, rows, values = entries
     scores = np.zeros(place_count)
     touched = np.empty(place_count, np.int64)
     count = 0
     for index in range(words.shape[0]):
-        entry = newest[words[index]]
-        while entry >= 0:
-            row = rows[entry]
-            if scores[row] == 0.0:
-                touched[count] = row
-                count += 1
-            scores[row] += min(weights[index], values[entry])
-            entry = older[entry]
+        block = blocks.newest[words[index]]
+        while block >= 0:
+            for entry in range(blocks.sizes[block]):
+                row = blocks.rows[block, entry]
+                if scores[row] == 0.0:
+                    touched[count] = row
+                    count += 1
+                scores[row] += min(weights[index], blocks.values[block, entry])
+            block = blocks.older[block]
     return touched[:count], scores[touched[:count]]

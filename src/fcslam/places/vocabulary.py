@@ -22,7 +22,7 @@ from fcslam.records import CODE_BYTES, Codes, FloatArray, frozen
 class VocabularyConfig(Settings):
     """Shape of the k-means tree."""
 
-    branching: int = Field(default=10, ge=2, le=64, description="children of a tree vertex")
+    branching: int = Field(default=16, ge=2, le=64, description="children of a tree vertex")
     depth: int = Field(default=3, ge=1, le=8, description="levels below the root; at most branching ** depth words")
     smallest_split: int = Field(default=20, ge=2, description="a cluster of fewer descriptors stays one word")
     iterations: int = Field(default=8, ge=1, le=100, description="rounds of k-means per cluster, at most")
