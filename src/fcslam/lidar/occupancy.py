@@ -1,0 +1,210 @@
+"""Occupancy grid by ray casting: every beam passes the cells up to its end and hits the last one."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.geometry import se2
+from fcslam.records import FloatArray, LaserModel, Ranges
+
+Counts = NDArray[np.uint32]
+Cells = NDArray[np.uint8]
+
+FARTHEST_M = 1e7
+"""Poses beyond it are taken for a mistake: a float no longer resolves cells out there."""
+
+
+class OccupancyConfig(Settings):
+    """The occupancy grid."""
+
+    resolution_m: float = Field(default=0.05, ge=0.001, le=10.0, description="side of a cell")
+    usable_range_m: float = Field(default=30.0, gt=0, le=1000.0, description="longer beams clear so far, hit nothing")
+    minimum_passes: int = Field(default=2, ge=1, description="beams through a cell before it counts as known")
+    occupied_ratio: float = Field(default=0.15, gt=0, lt=1, description="hits per pass above which a cell is occupied")
+    maximum_cells: int = Field(default=64_000_000, ge=1024, description="a larger grid gets a coarser resolution")
+
+
+class Occupancy(IntEnum):
+    """What is known of a cell."""
+
+    UNKNOWN = 0
+    FREE = 1
+    OCCUPIED = 2
+
+
+@dataclass(frozen=True, slots=True)
+class OccupancyGrid:
+    """Beam counts per cell; row 0 is the lowest y, column 0 the lowest x.
+
+    Cell edges lie on multiples of the resolution. The resolution is that of the configuration, doubled as often as the limit on cells asked for.
+    """
+
+    hits: Counts
+    """Beams that end in the cell, shape (H, W)."""
+    passes: Counts
+    """Beams that cross the cell or end in it, shape (H, W)."""
+    resolution_m: float
+    origin_xy: tuple[float, float]
+    """Lower left corner of cell (0, 0) in ``map``."""
+
+
+Casting = tuple[Ranges, LaserModel, FloatArray]
+"""Ranges (beam_count,), their laser, ``T_map_base`` (3,)."""
+
+
+class _Beams(NamedTuple):
+    """Scans of one laser, stacked."""
+
+    ranges_m: Ranges  # (N, beam_count)
+    angles_rad: FloatArray  # (beam_count,)
+    T_map_laser: FloatArray  # (N, 3)
+    max_range_m: float
+
+
+class _Layout(NamedTuple):
+    """Where the grid lies and how fine it is."""
+
+    resolution_m: float
+    column: int  # of the lower left cell, counted from the origin of map
+    row: int
+    width: int
+    height: int
+
+
+def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
+    """Count hits and passes of all beams; a range that is no return (0, not finite, at the maximum) adds nothing.
+
+    The grid spans all hits and all lasers; beams that see nothing in usable range clear inside it only.
+
+    Raises:
+        ValueError: ranges do not fit their laser, or a pose is not finite or out of all bounds.
+    """
+    lasers = list(dict.fromkeys(laser for _, laser, _ in keyscans))
+    groups = [_stacked([scan for scan in keyscans if scan[1] == laser], laser) for laser in lasers]
+    layout = _layout(groups, config)
+    hits, passes = (np.zeros((layout.height, layout.width), np.uint32) for _ in range(2))
+    for beams in groups:
+        _cast(beams, layout, config.usable_range_m, hits, passes)
+    for counts in (hits, passes):
+        counts.setflags(write=False)
+    side = layout.resolution_m
+    return OccupancyGrid(hits, passes, side, (layout.column * side, layout.row * side))
+
+
+def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
+    """``Occupancy`` of every cell by Karto's rule: known after enough passes, occupied by the share of hits."""
+    cells: Cells = _classify(grid.hits, grid.passes, config.minimum_passes, config.occupied_ratio)
+    cells.setflags(write=False)
+    return cells
+
+
+def _stacked(keyscans: list[Casting], laser: LaserModel) -> _Beams:
+    for ranges_m, _, T_map_base in keyscans:
+        if np.shape(ranges_m) != (laser.beam_count,):
+            raise ValueError(f"ranges of shape {np.shape(ranges_m)} from a laser of {laser.beam_count} beams")
+        if np.shape(T_map_base) != (3,):
+            raise ValueError(f"a pose of shape {np.shape(T_map_base)}, expected (3,)")
+    ranges_m = np.array([ranges_m for ranges_m, _, _ in keyscans], np.float32)
+    poses = np.array([T_map_base for _, _, T_map_base in keyscans])
+    if not (np.abs(poses) < FARTHEST_M).all():  # false for NaN
+        raise ValueError(f"poses must be finite and within {FARTHEST_M:g} m of the origin")
+    return _Beams(ranges_m, laser.angles_rad(), se2.compose(poses, laser.T_base_laser), laser.max_range_m)
+
+
+def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:
+    if not groups:
+        return _Layout(config.resolution_m, 0, 0, 1, 1)
+    boxes = [_bounds(beams, config.usable_range_m) for beams in groups]
+    low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+    resolution_m = config.resolution_m
+    while True:
+        # One cell to spare on each side: rounding may differ between the bounds and the casting.
+        column, row = (math.floor(value / resolution_m) - 1 for value in low)
+        width = math.floor(high[0] / resolution_m) + 2 - column
+        height = math.floor(high[1] / resolution_m) + 2 - row
+        if width * height <= config.maximum_cells:
+            return _Layout(resolution_m, column, row, width, height)
+        resolution_m *= 2.0
+
+
+@njit(cache=True)
+def _bounds(beams, usable):  # type: ignore[no-untyped-def]
+    """Lowest and highest (x, y) of the lasers and of all returns in usable range."""
+    reach = min(usable, beams.max_range_m)
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for k in range(len(beams.ranges_m)):
+        pose = beams.T_map_laser[k]
+        for i in range(len(beams.angles_rad)):
+            r = beams.ranges_m[k, i]
+            if not (r > 0.0 and r < reach):  # true for NaN
+                r = 0.0  # the laser itself
+            heading = pose[2] + beams.angles_rad[i]
+            for axis, way in ((0, np.cos(heading)), (1, np.sin(heading))):
+                value = pose[axis] + r * way
+                low[axis] = min(low[axis], value)
+                high[axis] = max(high[axis], value)
+    return low, high
+
+
+@njit(cache=True)
+def _cast(beams, layout, usable, hits, passes):  # type: ignore[no-untyped-def]
+    for k in range(len(beams.ranges_m)):
+        pose = beams.T_map_laser[k]
+        x0 = pose[0] / layout.resolution_m - layout.column
+        y0 = pose[1] / layout.resolution_m - layout.row
+        for i in range(len(beams.angles_rad)):
+            r = beams.ranges_m[k, i]
+            if not (r > 0.0 and r < beams.max_range_m):  # true for NaN
+                continue
+            length = min(r, usable) / layout.resolution_m
+            heading = pose[2] + beams.angles_rad[i]
+            x1, y1 = x0 + length * np.cos(heading), y0 + length * np.sin(heading)
+            if _traverse(x0, y0, x1, y1, passes) and r < usable:
+                hits[int(np.floor(y1)), int(np.floor(x1))] += np.uint32(1)
+
+
+@njit(cache=True)
+def _traverse(x0, y0, x1, y1, passes):  # type: ignore[no-untyped-def]
+    """A pass for each cell on the way, the first and the last included; whether the last lies in the grid.
+
+    Coordinates are in cells. Amanatides and Woo, "A fast voxel traversal algorithm for ray tracing", 1987.
+    """
+    height, width = passes.shape
+    column, row = int(np.floor(x0)), int(np.floor(y0))
+    last_column, last_row = int(np.floor(x1)), int(np.floor(y1))
+    right, up = x1 > x0, y1 > y0
+    step_x, step_y = 1 if right else -1, 1 if up else -1
+    per_x = 1.0 / (x1 - x0) if x1 != x0 else 0.0
+    per_y = 1.0 / (y1 - y0) if y1 != y0 else 0.0
+    edge_x, edge_y = column + int(right) - x0, row + int(up) - y0
+    while 0 <= column < width and 0 <= row < height:
+        passes[row, column] += np.uint32(1)
+        if column == last_column and row == last_row:
+            return True
+        if row == last_row or (column != last_column and edge_x * per_x < edge_y * per_y):
+            column += step_x
+            edge_x += step_x
+        else:
+            row += step_y
+            edge_y += step_y
+    return False
+
+
+@njit(cache=True)
+def _classify(hits, passes, minimum_passes, occupied_ratio):  # type: ignore[no-untyped-def]
+    cells = np.zeros(hits.shape, np.uint8)
+    for row in range(hits.shape[0]):
+        for column in range(hits.shape[1]):
+            n = passes[row, column]
+            if n >= minimum_passes:
+                occupied = hits[row, column] > occupied_ratio * n
+                cells[row, column] = 2 if occupied else 1
+    return cells
