@@ -27,7 +27,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(INSTALLED)
-	@$(BIN)/fcslam demo --output $(DEMO) --force
+	@$(BIN)/fcslam demo --output $(DEMO)
 
 test: $(INSTALLED)
 	@$(BIN)/python -m pytest -m "not system"

@@ -8,7 +8,8 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import config, evaluate
+from fcslam.cli import config, demo, evaluate
+from fcslam.cli import map as mapping
 from fcslam.errors import FcslamError
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -21,6 +22,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+app.command("map", epilog="Example: fcslam map robot1.clf.gz robot2.clf.gz --output runs/building")(
+    mapping.map_recordings
+)
+app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo.demo)
 app.add_typer(config.app, name="config")
 app.add_typer(evaluate.app, name="evaluate")
 

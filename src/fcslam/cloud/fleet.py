@@ -18,6 +18,7 @@ from fcslam.config import Settings
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.pose_graph import PoseGraph
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
@@ -44,7 +45,9 @@ class FleetConfig(Settings):
 
     join_maps: bool = Field(default=True, description="look for places that several robots saw")
     sight_m: float = Field(default=6.0, gt=0, description="in a joint map, places this near are compared")
-    near_visits: int = Field(default=2, ge=0, description="so many of another robot's visits are compared with one place")
+    near_visits: int = Field(
+        default=2, ge=0, description="so many of another robot's visits are compared with one place"
+    )
     surprise_m: float = Field(default=0.5, gt=0, description="a closure this far off the joint map needs a cluster")
     surprise_rad: float = Field(default=0.1, gt=0, description="or turned this much")
     solve_every: int = Field(default=40, gt=0, description="closures between two quick solves")
@@ -73,7 +76,8 @@ class FleetResult:
     closures: tuple[LoopClosure, ...]
     """Between robots and within them."""
     corrections: tuple[Correction, ...]
-    graph: JointGraph
+    graph: PoseGraph
+    """All keyscans at their optimised poses, with the constraints that hold."""
 
 
 class Fleet:
@@ -260,7 +264,10 @@ class Fleet:
         index = {robot: k for k, robots in enumerate(maps) for robot in robots}
         robots = tuple(
             MappedRobot(
-                robot, index[robot], self._store.keyscans(robot), frozen(self._graph.trajectory(robot)),
+                robot,
+                index[robot],
+                self._store.keyscans(robot),
+                frozen(self._graph.trajectory(robot)),
                 self._store.laser(robot),
             )  # fmt: skip
             for robot in self._store.robots
@@ -270,7 +277,12 @@ class Fleet:
             for robot in self._store.robots
         )
         closures = (*self._local_closures(), *(entry.closure for entry in self._ledger))
-        return FleetResult(robots, closures, corrections, self._graph)
+        dropped = {edge for edge in self._closure_edges() if self._graph.weight(edge) < 0.5}
+        return FleetResult(robots, closures, corrections, self._graph.optimized(dropped))
+
+    def _closure_edges(self) -> Iterator[int]:
+        yield from (edge for _, edge in self._local)
+        yield from (entry.edge for entry in self._ledger if entry.edge is not None)
 
     def _local_closures(self) -> Iterator[LoopClosure]:
         for c, edge in self._local:

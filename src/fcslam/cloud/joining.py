@@ -27,7 +27,9 @@ def oriented(entry: Entry, robot_a: str) -> tuple[KeyscanId, KeyscanId, FloatArr
     return closure.j, closure.i, se2.inverse(closure.T_i_j), back.T @ closure.information @ back
 
 
-def judge(entries: list[Entry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings) -> ClusterVerdict:
+def judge(
+    entries: list[Entry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
+) -> ClusterVerdict:
     """The dominant cluster among the verified closures of two robots."""
     a, b = robots
     sides = [oriented(entry, a) for entry in entries]

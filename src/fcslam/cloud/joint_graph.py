@@ -1,6 +1,6 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -104,6 +104,11 @@ class JointGraph:
     def weight(self, edge: int) -> float:
         """What the closure counted for in the last solve, in [0, 1]; 1 before its first."""
         return float(self._weights[edge]) if edge < len(self._weights) else 1.0
+
+    def optimized(self, dropped: Collection[int] = ()) -> PoseGraph:
+        """The graph with its present poses, without the edges in ``dropped``: what a run leaves behind."""
+        edges = [edge for number, edge in enumerate(self.graph.edges) if number not in dropped]
+        return PoseGraph(self._poses[: len(self.graph)], edges)
 
     def maps(self, accepted: Sequence[int]) -> list[list[str]]:
         """Robots by map, connected by the given closure edges; the largest map first, then by the robots' order."""

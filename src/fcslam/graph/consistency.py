@@ -117,7 +117,10 @@ def dominant_cluster(
     so the cluster must have enough supporters from different places, an informative one, and a clear lead over the
     largest one that contradicts it: in closures, and no less in places.
     """
-    xy, informs = np.asarray(places, dtype=np.float64).reshape(len(consistent), -1, 2), np.asarray(informative, dtype=bool)
+    xy, informs = (
+        np.asarray(places, dtype=np.float64).reshape(len(consistent), -1, 2),
+        np.asarray(informative, dtype=bool),
+    )
     first = maximum_clique(consistent)
     members = list(first.members)
     others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))

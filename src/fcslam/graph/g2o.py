@@ -69,8 +69,8 @@ def read_g2o(path: Path) -> G2oGraph:
     return _assemble(content, path)
 
 
-def write_g2o(path: Path, graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence[int] = ()) -> None:
-    """Write a graph as g2o; reading it again gives the same numbers, bit by bit.
+def g2o_text(graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence[int] = ()) -> str:
+    """A graph as g2o; reading it again gives the same numbers, bit by bit.
 
     ``ids``: of variable k, by default k; ``fixed``: ids to name in FIX lines.
 
@@ -86,7 +86,12 @@ def write_g2o(path: Path, graph: PoseGraph, ids: Sequence[int] | None = None, fi
     for edge in graph.edges:
         numbers = [*edge.T_i_j.tolist(), *edge.information[upper].tolist()]
         lines.append(f"EDGE_SE2 {names[edge.i]} {names[edge.j]} {_text(numbers)}")
-    data = ("\n".join(lines) + "\n").encode("ascii")
+    return "\n".join(lines) + "\n"
+
+
+def write_g2o(path: Path, graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence[int] = ()) -> None:
+    """Write ``g2o_text`` to a file, compressed if its name ends in .gz."""
+    data = g2o_text(graph, ids, fixed).encode("ascii")
     path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
 
 

@@ -23,7 +23,9 @@ from fcslam.records import FloatArray, KeyscanId, Place
 class MatcherConfig(Settings):
     """Place matching."""
 
-    small_fleet: int = Field(default=150, ge=0, description="up to this many places are all compared; then words choose")
+    small_fleet: int = Field(
+        default=150, ge=0, description="up to this many places are all compared; then words choose"
+    )
     candidates: int = Field(default=20, gt=0, description="places that words propose for one place")
     hamming_limit: int = Field(default=60, gt=0, le=256, description="most different bits of matching descriptors")
     inliers: int = Field(default=8, ge=4, description="keypoints that must agree before geometry is asked")
@@ -53,9 +55,7 @@ class PlaceMatch:
 class PlaceMatcher:
     """All places of one channel and detector version, and the vocabulary that follows them."""
 
-    def __init__(
-        self, config: MatcherConfig, submap_of: Callable[[Place], Submap], rng: np.random.Generator
-    ) -> None:
+    def __init__(self, config: MatcherConfig, submap_of: Callable[[Place], Submap], rng: np.random.Generator) -> None:
         self._config = config
         self._submap_of = submap_of
         self._places: dict[KeyscanId, Place] = {}
@@ -100,14 +100,10 @@ class PlaceMatcher:
     def _near_match(
         self, i: KeyscanId, place: Place, T_i_j: FloatArray, similarity: Mapping[KeyscanId, float]
     ) -> PlaceMatch:
-        check = verify(
-            self._submap_of(self._places[i]), self._submap_of(place), T_i_j, self._config.verification
-        )
+        check = verify(self._submap_of(self._places[i]), self._submap_of(place), T_i_j, self._config.verification)
         return PlaceMatch(i, place.id, similarity.get(i, 0.0), check, predicted=True)
 
-    def _far_match(
-        self, i: KeyscanId, place: Place, similarity: Mapping[KeyscanId, float]
-    ) -> PlaceMatch | None:
+    def _far_match(self, i: KeyscanId, place: Place, similarity: Mapping[KeyscanId, float]) -> PlaceMatch | None:
         """Verify the motions that the keypoints propose; the most convincing one, None if there is none."""
         stored = self._places[i]
         matches = mutual_matches(stored.descriptors, place.descriptors, self._config.hamming_limit)

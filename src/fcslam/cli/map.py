@@ -1,0 +1,130 @@
+"""`fcslam map`: recordings of several robots in, one map out."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.mission import MissionConfig, Progress, Watch
+    from fcslam.runs import Run
+    from fcslam.sources import Source
+
+
+def map_recordings(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="One recording a robot.")],
+    *,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The run folder to write.")],
+    split: Annotated[int, typer.Option(min=1, help="Cut one LOG into this many robots of equal scan count.")] = 1,
+    no_fuse: Annotated[bool, typer.Option("--no-fuse", help="Map each robot alone.")] = False,
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="Configuration file; see `fcslam config dump`.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the run; the configuration's if not given.")] = None,
+    force: Annotated[bool, typer.Option("--force", "-f", help="Replace a run that is there already.")] = False,
+) -> None:
+    """Map recordings together: one map, every robot's trajectory in it, and the closures that hold it together."""
+    from fcslam.runs import prepare_output
+    from fcslam.sources import open_source
+
+    prepare_output(output, force)
+    settings = _settings(config, seed, no_fuse)
+    sources = _sources([open_source(log) for log in logs], split)
+    map_sources(sources, settings, output)
+
+
+def map_sources(sources: "Sequence[Source]", settings: "MissionConfig", output: Path) -> "Run":
+    """Run the mission with a progress display, write the run folder, say what came out."""
+    from rich.console import Console
+
+    from fcslam.mission import run_mission
+    from fcslam.runs import write_run
+
+    console = Console(stderr=True)
+    total = sum(source.survey().scan_count for source in sources)  # refuses bad recordings before the work
+    began = time.perf_counter()
+    with _progress(console, total) as watch:
+        run = run_mission(sources, settings, watch)
+    write_run(run, output, force=True)
+    for source in sources:
+        if source.faults:
+            console.print(f"{source.name}: {source.faults}", highlight=False)
+    _report(Console(), run, time.perf_counter() - began, output)
+    return run
+
+
+def _settings(config: Path | None, seed: int | None, no_fuse: bool) -> "MissionConfig":
+    from fcslam.config import load
+    from fcslam.mission import MissionConfig
+
+    settings = MissionConfig() if config is None else load(MissionConfig, config)
+    if seed is not None:
+        settings = settings.model_copy(update={"seed": seed})
+    if no_fuse:
+        settings = settings.model_copy(update={"fleet": settings.fleet.model_copy(update={"join_maps": False})})
+    return settings
+
+
+def _sources(sources: "list[Source]", parts: int) -> "list[Source]":
+    from fcslam.errors import SourceError
+    from fcslam.sources import split
+
+    if parts == 1:
+        return sources
+    if len(sources) != 1:
+        raise SourceError(f"--split cuts one recording, {len(sources)} are given; map them one by one")
+    return split(sources[0], parts)
+
+
+@contextmanager
+def _progress(console: "Console", total: int) -> "Iterator[Watch]":
+    """A live line: scans, speed against real time, keyscans, closures per kind."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = [
+        TextColumn("mapping"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("scans"),
+        TextColumn("{task.fields[what]}"), TimeRemainingColumn(),
+    ]  # fmt: skip
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("", total=total, what="")
+        began = time.perf_counter()
+
+        def watch(progress: "Progress") -> None:  # type: ignore[valid-type]
+            bar.update(task, completed=progress.scans, what=_what(progress, time.perf_counter() - began))
+
+        yield watch
+
+
+def _what(progress: "Progress", elapsed_s: float) -> str:
+    closures = ", ".join(f"{count} {kind}" for kind, count in progress.closures.items() if count)
+    speed = progress.recorded_s / max(elapsed_s, 1e-9)
+    return f"{speed:.0f} x real time, {progress.keyscans} keyscans, closures: {closures or 'none'}"
+
+
+def _report(console: "Console", run: "Run", elapsed_s: float, output: Path) -> None:
+    from rich.table import Table
+
+    values = {metric.name: metric.value for metric in run.metrics}
+    table = Table("robot", "map", "path, m", "scans")
+    for trajectory in run.trajectories:
+        table.add_row(
+            trajectory.robot, str(trajectory.map_index), f"{trajectory.path_length_m:.1f}", str(len(trajectory.stamps))
+        )
+    console.print(table)
+    console.print(
+        f"{values['scans']:.0f} scans in {elapsed_s:.1f} s ({values['recorded_time'] / elapsed_s:.0f} x real time), "
+        f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
+        f"{values['inter_robot_closures_accepted']:.0f} between them",
+        highlight=False,
+    )
+    maps = int(values["maps"])
+    if maps > 1:
+        console.print(
+            f"{maps} maps: some robots share no place that geometry confirms (see closures.csv)", highlight=False
+        )
+    console.print(f"map: {output / 'map.png'}", highlight=False, soft_wrap=True)

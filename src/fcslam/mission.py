@@ -1,0 +1,204 @@
+"""A mission: recordings in, robots, cloud, one map out. The paper's figure 1 on one screen.
+
+sources -> robot (LiDAR SLAM, features) -> packets -> cloud (places -> graph -> fusion) -> run folder
+"""
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.cloud.fleet import Fleet, FleetConfig, FleetResult, MappedRobot
+from fcslam.cloud.fusion import FusedMap, fuse, map_yaml, pgm_bytes
+from fcslam.cloud.picture import Meeting, map_png
+from fcslam.config import Settings, dump
+from fcslam.errors import FcslamError, SourceError
+from fcslam.geometry import se2
+from fcslam.graph.g2o import g2o_text
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.records import ClosureStatus, FloatArray, LaserScan, LoopClosure
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, check_names
+from fcslam.sources import Source
+from fcslam.wire.ledger import Ledger
+from fcslam.wire.messages import Kind, Packet
+from fcslam.wire.packets import encode
+from fcslam.wire.transport import InMemoryTransport
+
+
+class MissionConfig(Settings):
+    """Everything that can be set; one default for all recordings."""
+
+    seed: int = Field(default=0, ge=0, description="of the one random generator; the same seed gives the same run")
+    robot: RobotConfig = Field(default=RobotConfig(), description="what runs on a robot")
+    fleet: FleetConfig = Field(default=FleetConfig(), description="what runs in the cloud")
+    map: OccupancyConfig = Field(default=OccupancyConfig(), description="the occupancy grid")
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a mission is."""
+
+    scans: int
+    keyscans: int
+    recorded_s: float
+    """Time that the recordings have played, of all robots together."""
+    closures: dict[str, int]
+
+
+Watch = Callable[[Progress], None]
+
+
+def run_mission(sources: Sequence[Source], config: MissionConfig, watch: Watch = lambda _: None) -> Run:
+    """Map recordings together, one robot each.
+
+    Raises:
+        SourceError: two recordings have one name, or one cannot be read.
+        OutputError: a robot's name cannot be a file name.
+    """
+    _check_robots(sources)
+    robots = [RobotFrontend(source.name, config.robot) for source in sources]
+    cloud = Fleet(config.fleet, config.seed)
+    transport = InMemoryTransport(cloud.receive)
+    meter = _Meter(watch, cloud)
+    streams = [_packets(source, robot, meter) for source, robot in zip(sources, robots, strict=True)]
+    for packet in heapq.merge(*streams, key=lambda packet: packet.order):
+        reply = transport.send(encode(packet))
+        if reply.refusal:
+            raise FcslamError(f"{packet.robot}: the cloud refused a packet: {reply.refusal}")
+    return _run_of(robots, cloud.finalize(), transport.ledger(), config, meter)
+
+
+def _packets(source: Source, robot: RobotFrontend, meter: "_Meter") -> Iterator[Packet]:
+    """What one robot sends over its whole recording."""
+    for record in source.records():
+        packets = robot.process(record)
+        if isinstance(record, LaserScan):
+            meter.count(robot.robot, record.stamp, packets)
+        yield from packets
+    yield from robot.finish()
+
+
+class _Meter:
+    """Counts scans, keyscans and recorded time, and tells the watcher now and then."""
+
+    EVERY = 50
+
+    def __init__(self, watch: Watch, cloud: Fleet) -> None:
+        self._watch = watch
+        self._cloud = cloud
+        self._span: dict[str, tuple[float, float]] = {}
+        self.scans = self.keyscans = 0
+
+    @property
+    def recorded_s(self) -> float:
+        """Time between the first and the last scan, of all robots together."""
+        return sum(last - first for first, last in self._span.values())
+
+    def count(self, robot: str, stamp: float, packets: Sequence[Packet]) -> None:
+        """One more scan."""
+        first, last = self._span.get(robot, (stamp, stamp))
+        self._span[robot] = min(first, stamp), max(last, stamp)
+        self.scans += 1
+        self.keyscans += any(packet.body.__class__.__name__ == "Keyscan" for packet in packets)
+        if self.scans % self.EVERY == 0:
+            self._watch(Progress(self.scans, self.keyscans, self.recorded_s, self._cloud.closure_counts()))
+
+
+def _check_robots(sources: Sequence[Source]) -> None:
+    names = [source.name for source in sources]
+    for name in names:
+        if names.count(name) > 1:
+            raise SourceError(f"two recordings are called '{name}'; a robot is named by its file, so rename one")
+    check_names(names)
+
+
+def _run_of(
+    robots: Sequence[RobotFrontend], result: FleetResult, ledger: Ledger, config: MissionConfig, meter: _Meter
+) -> Run:
+    """Collect what the run folder holds."""
+    mapped = {robot.robot: robot for robot in result.robots}
+    trajectories = tuple(_trajectory(robot, mapped[robot.robot]) for robot in robots)
+    return Run(
+        trajectories=trajectories,
+        closures=tuple(_closure_row(closure, mapped) for closure in result.closures),
+        metrics=(*_metrics(result, meter), *_traffic(ledger)),
+        config_yaml=dump(config),
+        pose_graph_g2o=g2o_text(result.graph),
+        map_files=_map_files(result, trajectories, config.map),
+    )
+
+
+def _trajectory(robot: RobotFrontend, mapped: MappedRobot) -> RobotTrajectory:
+    """Every raw scan hangs on its keyscan."""
+    keyscans = mapped.T_map_base[[pose.keyscan for pose in robot.scan_poses]]
+    offsets = np.array([pose.T_keyscan_base for pose in robot.scan_poses])
+    stamps = np.array([pose.stamp for pose in robot.scan_poses])
+    return RobotTrajectory(robot.robot, mapped.map_index, stamps, se2.compose(keyscans, offsets))
+
+
+def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> ClosureRow:
+    i, j = closure.i, closure.j
+    return ClosureRow(
+        i.robot, mapped[i.robot].keyscans[i.number].stamp, j.robot, mapped[j.robot].keyscans[j.number].stamp,
+        closure.channel, closure.similarity, closure.T_i_j, closure.status, closure.reason,
+    )  # fmt: skip
+
+
+def _map_files(
+    result: FleetResult, trajectories: Sequence[RobotTrajectory], config: OccupancyConfig
+) -> dict[str, bytes]:
+    """map.* of the largest map, map_<k>.* of robots that are not connected to it."""
+    files: dict[str, bytes] = {}
+    for k in sorted({robot.map_index for robot in result.robots}):
+        members = [robot for robot in result.robots if robot.map_index == k]
+        stem = "map" if k == 0 else f"map_{k}"
+        fused = _fuse(members, config)
+        drawn = {t.robot: t.T_map_base for t in trajectories if t.map_index == k}
+        files[f"{stem}.pgm"] = pgm_bytes(fused)
+        files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
+        files[f"{stem}.png"] = map_png(fused, drawn, _meetings(result.closures, members))
+    return files
+
+
+def _fuse(members: Sequence[MappedRobot], config: OccupancyConfig) -> FusedMap:
+    keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
+    poses: FloatArray = np.concatenate([robot.T_map_base for robot in members])
+    return fuse(keyscans, poses, {robot.robot: robot.laser for robot in members}, config)
+
+
+def _meetings(closures: Sequence[LoopClosure], members: Sequence[MappedRobot]) -> list[Meeting]:
+    """Accepted closures between robots, as lines of the picture."""
+    poses = {robot.robot: robot.T_map_base for robot in members}
+    return [
+        Meeting(poses[c.i.robot][c.i.number][:2], poses[c.j.robot][c.j.number][:2], c.i.robot, c.j.robot)
+        for c in closures
+        if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot and c.i.robot in poses
+    ]
+
+
+def _metrics(result: FleetResult, meter: _Meter) -> list[Metric]:
+    between = [c.status for c in result.closures if c.i.robot != c.j.robot]
+    within = [c.status for c in result.closures if c.i.robot == c.j.robot]
+    return [
+        Metric("robots", len(result.robots), "1"),
+        Metric("maps", len({robot.map_index for robot in result.robots}), "1"),
+        Metric("scans", meter.scans, "1"),
+        Metric("recorded_time", meter.recorded_s, "s"),
+        Metric("keyscans", sum(len(robot.keyscans) for robot in result.robots), "1"),
+        Metric("intra_robot_closures_accepted", within.count(ClosureStatus.ACCEPTED), "1"),
+        Metric("intra_robot_closures_revoked", within.count(ClosureStatus.REVOKED), "1"),
+        *(Metric(f"inter_robot_closures_{status}", between.count(status), "1") for status in ClosureStatus),
+    ]
+
+
+def _traffic(ledger: Ledger) -> list[Metric]:
+    """Bytes and packets per kind of message, of the whole fleet."""
+    kinds = sorted({label.kind for label in ledger.accepted})
+    traffic = [(Kind(kind), ledger.total(kind=Kind(kind))) for kind in kinds]
+    return [
+        *(Metric(f"{kind}_packets", total.count, "1") for kind, total in traffic),
+        *(Metric(f"{kind}_bytes", total.bytes, "B") for kind, total in traffic),
+    ]
