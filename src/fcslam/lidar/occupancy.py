@@ -44,7 +44,8 @@ class Occupancy(IntEnum):
 class OccupancyGrid:
     """Beam counts per cell; row 0 is the lowest y, column 0 the lowest x.
 
-    Cell edges lie on multiples of the resolution. The resolution is that of the configuration, doubled as often as the limit on cells asked for.
+    Cell edges lie on multiples of the resolution, which is that of the configuration, doubled as often as the limit
+    on cells asked for.
     """
 
     hits: Counts
@@ -142,10 +143,11 @@ def _bounds(beams, usable):  # type: ignore[no-untyped-def]
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for k in range(len(beams.ranges_m)):
         pose = beams.T_map_laser[k]
+        low, high = np.minimum(low, pose[:2]), np.maximum(high, pose[:2])
         for i in range(len(beams.angles_rad)):
             r = beams.ranges_m[k, i]
             if not (r > 0.0 and r < reach):  # true for NaN
-                r = 0.0  # the laser itself
+                continue
             heading = pose[2] + beams.angles_rad[i]
             for axis, way in ((0, np.cos(heading)), (1, np.sin(heading))):
                 value = pose[axis] + r * way

@@ -1,0 +1,221 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from fcslam.geometry import se2
+from fcslam.lidar.occupancy import Occupancy, OccupancyConfig, cast, classify
+from fcslam.records import LaserModel
+
+CELL_M = 0.0625  # a power of two: moving by whole cells is exact
+CONFIG = OccupancyConfig(resolution_m=CELL_M)
+ONE_BEAM = LaserModel(1, 0.0, 0.01, 1000.0)
+ALL_ROUND = LaserModel(720, -np.pi, np.pi / 360, 50.0, (0.1, -0.05, 0.3))
+FRONT = LaserModel(91, -np.pi / 2, np.pi / 90, 20.0)
+HALF_ROOM_M = 2.03
+
+coordinate = st.floats(-20.0, 20.0)
+beam = st.tuples(coordinate, coordinate, st.floats(-np.pi, np.pi), st.floats(0.01, 6.0))
+
+
+def room_ranges(T_map_base, laser=ALL_ROUND, half=HALF_ROOM_M):
+    """Ranges in a square room around the origin of map."""
+    x, y, heading = se2.compose(T_map_base, laser.T_base_laser)
+    way = np.stack((np.cos(heading + laser.angles_rad()), np.sin(heading + laser.angles_rad())))
+    with np.errstate(divide="ignore"):
+        return ((half - np.sign(way) * np.array([[x], [y]])) / np.abs(way)).min(axis=0).astype(np.float32)
+
+
+def room_scans(laser=ALL_ROUND, count=12, seed=3):
+    poses = np.random.default_rng(seed).uniform((-1.5, -1.5, -3.0), (1.5, 1.5, 3.0), (count, 3))
+    return [(room_ranges(pose, laser), laser, pose) for pose in poses]
+
+
+def one_beam(x, y, heading, length):
+    return cast([(np.array([length], np.float32), ONE_BEAM, np.array((x, y, heading)))], CONFIG)
+
+
+def chords(grid, start, end, grow_m):
+    """Share of the segment in each cell, grown by ``grow_m`` on every side: by clipping it at the four sides."""
+    lower, upper = np.zeros(grid.passes.shape), np.ones(grid.passes.shape)
+    for axis, way in ((1, 0), (0, 1)):
+        edges = grid.origin_xy[way] + grid.resolution_m * np.arange(grid.passes.shape[axis] + 1) - start[way]
+        delta = np.copysign(max(abs(end[way] - start[way]), 1e-12), end[way] - start[way])
+        t = np.sort(((edges[:-1] - grow_m) / delta, (edges[1:] + grow_m) / delta), axis=0)
+        shape = (1, -1) if axis == 1 else (-1, 1)
+        lower, upper = np.maximum(lower, t[0].reshape(shape)), np.minimum(upper, t[1].reshape(shape))
+    return upper - lower
+
+
+@settings(max_examples=200, deadline=None)
+@given(beam)
+def test_a_beam_passes_exactly_the_cells_it_crosses(given_beam):
+    x, y, heading, length = given_beam
+    grid = one_beam(*given_beam)
+    length = float(np.float32(length))
+    start, end = np.array((x, y)), np.array((x + length * np.cos(heading), y + length * np.sin(heading)))
+    # On an edge, rounding decides: so what lies deep in a cell must be passed, what stays off it must not.
+    assert grid.passes.max() == 1
+    assert (grid.passes[chords(grid, start, end, -1e-9) > 0.0] == 1).all()
+    assert (chords(grid, start, end, 1e-9)[grid.passes == 1] > 0.0).all()
+    # The same by dense samples.
+    samples = (start + np.linspace(0.0, 1.0, 5000)[:, None] * (end - start) - grid.origin_xy) / grid.resolution_m
+    off_edge = (np.abs(samples - np.rint(samples)) > 1e-6).all(axis=1)
+    columns, rows = np.floor(samples[off_edge]).astype(int).T
+    assert (grid.passes[rows, columns] == 1).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(beam)
+def test_a_beam_hits_the_cell_of_its_end(given_beam):
+    x, y, heading, length = given_beam
+    grid = one_beam(*given_beam)
+    end = np.array((x, y)) + np.float64(np.float32(length)) * np.array((np.cos(heading), np.sin(heading)))
+    rows, columns = np.nonzero(grid.hits)
+    assert grid.hits.sum() == 1
+    low = np.array(grid.origin_xy) + grid.resolution_m * np.array((columns[0], rows[0]))
+    assert (low - 1e-6 <= end).all()
+    assert (end <= low + grid.resolution_m + 1e-6).all()
+    assert (grid.hits <= grid.passes).all()
+
+
+@pytest.mark.parametrize("heading", [0.0, np.pi / 2, np.pi, -np.pi / 2, np.pi / 4, -3 * np.pi / 4])
+@pytest.mark.parametrize("start", [(0.0, 0.0), (0.03125, 0.03125), (-0.0625, 0.125)])
+def test_beams_along_edges_and_through_corners_end(heading, start):
+    grid = one_beam(*start, heading, 1.0)
+    assert grid.hits.sum() == 1
+    rows, columns = np.nonzero(grid.passes)
+    path_cells = len(rows)
+    assert path_cells >= 12
+    assert path_cells <= 1 + np.ptp(rows) + np.ptp(columns)
+    assert ndimage.label(grid.passes)[1] == 1
+
+
+def test_the_origin_is_the_lower_left_corner():
+    grid = one_beam(1.0, 2.0, np.pi / 2, 3.01)  # straight up
+    (row,), (column,) = np.nonzero(grid.hits)
+    assert grid.origin_xy[0] + column * CELL_M == 1.0
+    assert grid.origin_xy[1] + row * CELL_M <= 5.01 < grid.origin_xy[1] + (row + 1) * CELL_M
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(-4000, 4000), st.integers(-4000, 4000))
+def test_moving_every_pose_by_whole_cells_moves_the_grid(columns, rows):
+    scans = room_scans(count=3)
+    shift = np.array((columns, rows, 0.0)) * CELL_M
+    grid, moved = cast(scans, CONFIG), cast([(ranges, laser, pose + shift) for ranges, laser, pose in scans], CONFIG)
+    np.testing.assert_allclose(np.subtract(moved.origin_xy, grid.origin_xy), shift[:2], atol=1e-12)
+    assert moved.hits.shape == grid.hits.shape
+    # The sums round differently once in a blue moon: a beam end on an edge may change its cell.
+    assert (moved.hits != grid.hits).sum() <= 4
+    assert (moved.passes != grid.passes).sum() <= 8
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.permutations(range(10)))
+def test_the_order_of_keyscans_does_not_matter(order):
+    scans = room_scans(count=5) + room_scans(FRONT, count=5, seed=4)
+    grid, permuted = cast(scans, CONFIG), cast([scans[k] for k in order], CONFIG)
+    np.testing.assert_array_equal(permuted.hits, grid.hits)
+    np.testing.assert_array_equal(permuted.passes, grid.passes)
+    assert permuted.origin_xy == grid.origin_xy
+
+
+def test_counts_of_all_keyscans_are_the_sum_of_each():
+    scans = room_scans(count=3) + room_scans(FRONT, count=2)
+    whole = cast(scans, CONFIG)
+    total = np.zeros(whole.passes.shape, np.int64)
+    for part in (cast([scan], CONFIG) for scan in scans):
+        offset = np.rint(np.subtract(part.origin_xy, whole.origin_xy) / CELL_M).astype(int)
+        height, width = part.passes.shape
+        total[offset[1] : offset[1] + height, offset[0] : offset[0] + width] += part.passes
+    np.testing.assert_array_equal(whole.passes, total)
+
+
+def test_a_square_room_is_closed_and_free_inside():
+    grid = cast(room_scans(), CONFIG)
+    cells = classify(grid, CONFIG)
+    rooms, _ = ndimage.label(cells != Occupancy.OCCUPIED)
+    y, x = (grid.origin_xy[k] + (np.arange(cells.shape[1 - k]) + 0.5) * CELL_M for k in (1, 0))
+    inside = (np.abs(x)[None, :] < HALF_ROOM_M - 0.1) & (np.abs(y)[:, None] < HALF_ROOM_M - 0.1)
+    assert (cells[inside] == Occupancy.FREE).all()
+    label = rooms[inside][0]
+    border = np.concatenate((rooms[0], rooms[-1], rooms[:, 0], rooms[:, -1]))
+    assert label not in border
+    outside = (np.abs(x)[None, :] > HALF_ROOM_M + 0.1) | (np.abs(y)[:, None] > HALF_ROOM_M + 0.1)
+    assert (cells[outside] == Occupancy.UNKNOWN).all()
+
+
+def test_a_beam_beyond_the_usable_range_clears_inside_the_grid_and_hits_nothing():
+    near = CONFIG.model_copy(update={"usable_range_m": 3.0})
+    pose = np.array((0.03, 0.03, 0.0))
+    long_beam = (np.array([100.0], np.float32), ONE_BEAM, pose)
+    alone = cast([long_beam], near)
+    assert alone.hits.sum() == 0
+    assert alone.passes.shape[1] <= 4
+    frame = [(np.array([2.5], np.float32), ONE_BEAM, np.array((x, 1.0, 0.0))) for x in (0.03, 3.0)]
+    grid = cast([long_beam, *frame], near)
+    row = round((0.0 - grid.origin_xy[1]) / CELL_M)
+    cleared = np.flatnonzero(grid.passes[row]) * CELL_M + grid.origin_xy[0]
+    assert grid.hits.sum() == 2
+    assert cleared[0] == 0.0
+    assert cleared[-1] == 3.0
+
+
+@pytest.mark.parametrize("nothing", [0.0, -1.0, np.nan, np.inf, -np.inf, 50.0, 81.83])
+def test_what_is_no_return_adds_nothing(nothing):
+    scans = room_scans(count=2)
+    silent = np.full(ALL_ROUND.beam_count, nothing, np.float32)
+    grid = cast(scans, CONFIG)
+    more = cast([*scans, (silent, ALL_ROUND, np.zeros(3))], CONFIG)
+    np.testing.assert_array_equal(more.hits, grid.hits)
+    np.testing.assert_array_equal(more.passes, grid.passes)
+
+
+def test_a_grid_too_large_gets_coarser_instead():
+    small = CONFIG.model_copy(update={"maximum_cells": 10_000})
+    scans = room_scans(count=2)
+    far = [(ranges, laser, pose + np.array((9000.0, 5000.0, 0.0))) for ranges, laser, pose in scans]
+    grid = cast(scans + far, small)
+    assert grid.hits.size <= 10_000
+    assert np.log2(grid.resolution_m / CELL_M) % 1 == 0
+    assert grid.resolution_m > CELL_M
+    assert grid.hits.sum() == 4 * ALL_ROUND.beam_count
+    assert cast(scans, small).resolution_m == CELL_M
+
+
+def test_no_keyscans_make_one_unknown_cell():
+    grid = cast([], CONFIG)
+    assert grid.passes.tolist() == [[0]]
+    assert classify(grid, CONFIG).tolist() == [[Occupancy.UNKNOWN]]
+
+
+@pytest.mark.parametrize("pose", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0, np.nan), (0, 0, np.inf), (1e12, 0, 0)])
+def test_a_pose_out_of_all_bounds_is_refused(pose):
+    with pytest.raises(ValueError, match="poses must be finite"):
+        cast([(np.ones(1, np.float32), ONE_BEAM, np.array(pose, np.float64))], CONFIG)
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match="ranges of shape"):
+        cast([(np.ones(2, np.float32), ONE_BEAM, np.zeros(3))], CONFIG)
+    with pytest.raises(ValueError, match="a pose of shape"):
+        cast([(np.ones(1, np.float32), ONE_BEAM, np.zeros(2))], CONFIG)
+
+
+def test_a_cell_is_known_after_two_passes_and_occupied_by_the_share_of_hits():
+    lengths = [0.5] * 8 + [0.3]  # the last ends in a cell that the others pass
+    scans = [(np.array([r], np.float32), ONE_BEAM, np.array((0.01, 0.01, 0.0))) for r in lengths]
+    grid = cast(scans, CONFIG)
+    row, first = (round(-grid.origin_xy[k] / CELL_M) for k in (1, 0))
+    near, far = first + int(0.31 / CELL_M), first + int(0.51 / CELL_M)
+    assert (grid.hits[row, near], grid.passes[row, near]) == (1, 9)
+    assert (grid.hits[row, far], grid.passes[row, far]) == (8, 8)
+    for ratio, expected in ((0.11, Occupancy.OCCUPIED), (0.12, Occupancy.FREE)):
+        cells = classify(grid, CONFIG.model_copy(update={"occupied_ratio": ratio}))
+        assert cells[row, near] == expected
+        assert cells[row, far] == Occupancy.OCCUPIED
+        assert cells[row, near + 1] == Occupancy.FREE
+    assert (classify(cast(scans[:1], CONFIG), CONFIG) == Occupancy.UNKNOWN).all()
+    assert (classify(cast(scans[:2], CONFIG), CONFIG) != Occupancy.UNKNOWN).sum() == far - first + 1
