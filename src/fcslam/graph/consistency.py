@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import gammaincinv
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
@@ -102,7 +102,7 @@ def pairwise_consistency(
     trajectory_a: ArrayLike, trajectory_b: ArrayLike, closures: Closures, settings: ConsistencySettings
 ) -> NDArray[np.bool_]:
     """Which closures agree, (K, K), symmetric, true on the diagonal; arguments as in :func:`pairwise_chi2`."""
-    limit = chi2_distribution.ppf(settings.probability, 3)
+    limit = 2.0 * gammaincinv(1.5, settings.probability)  # chi-square quantile, 3 degrees of freedom
     agree: NDArray[np.bool_] = pairwise_chi2(trajectory_a, trajectory_b, closures, settings) <= limit
     return agree
 

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import gammaincinv
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
@@ -109,7 +109,7 @@ def optimize_gnc(
     robust = graph.arrays().robust
     if not graph.edges:
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
-    limit = float(chi2_distribution.ppf(chosen.inlier_probability, 3))
+    limit = 2.0 * float(gammaincinv(1.5, chosen.inlier_probability))  # chi-square quantile, 3 degrees of freedom
     steps = _Steps(cache, to_values(start))
     steps.solve(np.ones(int(robust.sum())), chosen.first_iterations)
     _graduate(steps, limit, chosen)

@@ -133,14 +133,14 @@ class LoopCloser:
         check = verify(a, b, guess, self._verification)
         innovation = se2.between(predicted, check.T_a_b)
         off = np.hypot(innovation[0], innovation[1])
-        if not check.loose or off > radius + 0.3 or abs(innovation[2]) > angle + 0.1:
+        if not (check.loose or check.testimony) or off > radius + 0.3 or abs(innovation[2]) > angle + 0.1:
             return None
         return Closure(earlier, later, check, innovation, radius)
 
     def _judge(self, found: list[Closure], anchors: FloatArray) -> list[Closure]:
         """Closures near their prediction hold at once; others wait until enough of them agree."""
-        sure = [c for c in found if c.slack_m < 0.8 or (c.check.strict and self._is_plain(c))]
-        self._pending += [c for c in found if c not in sure and c.check.strict]
+        sure = [c for c in found if self._is_expected(c) or self._is_plain(c)]
+        self._pending += [c for c in found if c not in sure and c.check.testimony]
         self._pending = [c for c in self._pending if self.places[-1].travel_m - self.places[c.later].travel_m < 60.0]
         cluster = self._cluster(anchors)
         sure += cluster
@@ -148,11 +148,17 @@ class LoopCloser:
         self._accepted += sure
         return sure
 
-    def _is_plain(self, closure: Closure) -> bool:
+    @staticmethod
+    def _is_expected(closure: Closure) -> bool:
+        """Near the prediction while little drift is to be allowed for."""
+        return closure.check.loose and closure.slack_m < 0.8
+
+    @staticmethod
+    def _is_plain(closure: Closure) -> bool:
         """A wide closure that stands alone: informative, rich, and close to where it was expected."""
         off = float(np.hypot(closure.innovation[0], closure.innovation[1]))
         worse = closure.check.worse
-        return closure.check.informative and off < 0.3 * closure.slack_m + 0.2 and worse.overlap > 0.4
+        return closure.check.strict and closure.check.informative and off < 0.3 * closure.slack_m + 0.2 and worse.overlap > 0.4
 
     def _cluster(self, anchors: FloatArray) -> list[Closure]:
         """The largest set of pending closures that agree with the newest one, if there are enough."""
@@ -161,7 +167,8 @@ class LoopCloser:
         newest = self._pending[-1]
         agreeing = [c for c in self._pending if self._agree(c, newest, anchors)]
         spread = np.ptp([self.places[c.later].travel_m for c in agreeing])
-        if len(agreeing) >= 3 and spread >= 3.0 and any(c.check.informative for c in agreeing):
+        testimony = sum(c.check.testimony for c in agreeing)
+        if testimony >= 3.0 and spread >= 3.0 and any(c.check.informative for c in agreeing):
             return agreeing
         return []
 

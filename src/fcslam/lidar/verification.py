@@ -31,6 +31,10 @@ class VerificationConfig(Settings):
 
     strict: Gate = Field(default=Gate(explained=0.80, violation=0.05), description="gate without a prediction")
     loose: Gate = Field(default=Gate(explained=0.70, violation=0.10), description="gate where a closure is predicted")
+    rich: Gate = Field(
+        default=Gate(explained=0.65, violation=0.22, count=500, overlap=0.5),
+        description="gate for half a witness: much is seen, but the submaps are bent (outdoors, on a slope)",
+    )
     informative: float = Field(
         default=30.0, ge=0, description="least small eigenvalue of the normal tensor: below, it may be a corridor"
     )
@@ -51,9 +55,15 @@ class Verification:
     """The less convincing of the two directions."""
     strict: bool
     loose: bool
+    rich: bool
     informative: bool
     reason: str
     """Why it is not more, in words; empty if strict and informative."""
+
+    @property
+    def testimony(self) -> float:
+        """What it counts for in a cluster of closures that agree: 1 if strict, a half if only rich, else nothing."""
+        return 1.0 if self.strict else 0.5 * self.rich
 
 
 def verify(a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig) -> Verification:
@@ -75,14 +85,14 @@ def verify(a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationCo
     symmetric = np.hypot(gap[0], gap[1]) < config.symmetry_m and abs(gap[2]) < config.symmetry_rad
     informative = worse.weakest >= config.informative
     strict_reason = _shortfall(worse, config.strict)
-    loose_reason = _shortfall(worse, config.loose)
     reason = strict_reason or ("" if informative else "fixed in one direction only, as in a corridor")
     return Verification(
         T_a_b=T_a_b,
         information=_information(forward.information, T_a_b, config),
         worse=worse,
         strict=symmetric and not strict_reason,
-        loose=symmetric and not loose_reason,
+        loose=symmetric and not _shortfall(worse, config.loose),
+        rich=symmetric and informative and not _shortfall(worse, config.rich),
         informative=informative,
         reason=reason if symmetric else "the two directions of the alignment disagree",
     )
