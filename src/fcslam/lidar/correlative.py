@@ -1,4 +1,4 @@
-"""Correlative scan matching (Karto) as branch and bound (Hess et al., ICRA 2016): the global search behind Gauss-Newton.
+"""Correlative scan matching (Karto) by branch and bound (Hess et al., ICRA 2016): the global search.
 
 The field is drawn as a likelihood grid; each level of a pyramid holds the maximum over windows of 2^h cells, so one
 look-up bounds a whole square of shifts from above, and only squares that can still win are opened.
@@ -70,7 +70,10 @@ def likelihood_pyramid(
 def search(
     scan: PointScan, field: SurfelField, T_field_guess: FloatArray, window: SearchWindow, config: SearchConfig
 ) -> SearchResult:
-    """Best pose of the scan in the window around the guess, to half a cell and half an angle step."""
+    """Best pose of the scan in the window around the guess, to half a cell and half an angle step.
+
+    The guess itself, with score 0, where no pose of the window lays a point on a surface.
+    """
     thinned = scan.thinned(config.cell_m, config.points)
     reach = float(np.max(np.hypot(*thinned.points.T), initial=1.0))
     half_side = min(reach, 25.0) + window.radius_m + config.cell_m
@@ -107,8 +110,7 @@ def _draw(points, normals, viewpoint, corner, size, cell, smear):  # type: ignor
             for gx in range(max(0, cx - half), min(size, cx + half + 1)):
                 dx = corner[0] + (gx + 0.5) * cell - x
                 value = np.uint8(255.0 * np.exp(-0.5 * (dx * dx + dy * dy) / (smear * smear)))
-                if value > grid[gy, gx]:
-                    grid[gy, gx] = value
+                grid[gy, gx] = max(grid[gy, gx], value)
     return grid
 
 
@@ -125,19 +127,20 @@ def _pyramid(base, count):  # type: ignore[no-untyped-def]
             y2 = min(y + half, rows - 1)
             for x in range(columns):
                 x2 = min(x + half, columns - 1)
-                upper[y, x] = max(max(lower[y, x], lower[y, x2]), max(lower[y2, x], lower[y2, x2]))
+                upper[y, x] = max(lower[y, x], lower[y, x2], lower[y2, x], lower[y2, x2])
     return levels
 
 
 @njit(cache=True)
-def _bound(cells, level, sx, sy):  # type: ignore[no-untyped-def]
-    """Sum of likelihoods of the points shifted by (sx, sy) cells; cells off the grid count nothing."""
+def _bound(cells, level, width, sx, sy):  # type: ignore[no-untyped-def]
+    """Sum of the points' largest likelihoods over shifts from (sx, sy) on, ``width`` cells; off the grid they are 0."""
     total = 0
     rows, columns = level.shape
     for i in range(len(cells)):
         x, y = cells[i, 0] + sx, cells[i, 1] + sy
-        if x >= 0 and y >= 0 and x < columns and y < rows:
-            total += level[y, x]
+        # A square that begins before the grid may reach into it.
+        if x > -width and y > -width and x < columns and y < rows:
+            total += level[max(y, 0), max(x, 0)]
     return total
 
 
@@ -176,7 +179,7 @@ def _branch_and_bound(  # type: ignore[no-untyped-def]
     while top > 0 and (1 << top) > shifts + 1:
         top -= 1
     width = 1 << top
-    best, best_raw = -1.0, 0.0
+    best = best_raw = 0.0
     best_pose = guess.copy()
     stack = np.empty((4 * (top + 2), 3), np.int64)
     # Small turns first: a good early score closes most of the rest.
@@ -190,8 +193,10 @@ def _branch_and_bound(  # type: ignore[no-untyped-def]
                 while size > 0:
                     size -= 1
                     sx, sy, h = stack[size, 0], stack[size, 1], stack[size, 2]
+                    if sx > shifts or sy > shifts:  # the last squares overhang the window
+                        continue
                     nx, ny = _nearest(sx, sx + (1 << h) - 1), _nearest(sy, sy + (1 << h) - 1)
-                    raw = _bound(cells, levels[h], sx, sy) / (255.0 * n)
+                    raw = _bound(cells, levels[h], 1 << h, sx, sy) / (255.0 * n)
                     near = nx * nx + ny * ny
                     score = raw * _penalty(near, shifts, turn, turns, distance_penalty, angle_penalty)
                     if score <= best:

@@ -28,7 +28,7 @@ TABLE: Final = 256
 """Tiles along one side of the field: 409.6 m, more than any submap with any laser."""
 EMPTY: Final = -1
 
-_REACH_CELLS = int(round(REACH_M / CELL_M))
+_REACH_CELLS = round(REACH_M / CELL_M)
 
 
 class SurfelField:
@@ -42,7 +42,7 @@ class SurfelField:
         self.used = np.zeros(2, np.int64)  # tiles, surfels
 
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
-        """Add a scan seen from ``T_field_base``."""
+        """Add a scan seen from ``T_field_base``; returns outside the table are left out."""
         done = 0
         while True:
             done = _insert(
@@ -120,7 +120,12 @@ def _insert(points, normals, T, start, corner, table, labels, surfels, used):  #
         y = T[1] + sin * points[i, 0] + cos * points[i, 1]
         nx = cos * normals[i, 0] - sin * normals[i, 1]
         ny = sin * normals[i, 0] + cos * normals[i, 1]
-        if _merge(x, y, nx, ny, label_at(x, y, corner, table, labels), surfels):
+        if not _within(x, y, corner, table):
+            continue
+        # A thin wall's other side may hold the cell: one step towards the robot this side does.
+        label = label_at(x, y, corner, table, labels)
+        ahead = label_at(x + CELL_M * nx, y + CELL_M * ny, corner, table, labels)
+        if _merge(x, y, nx, ny, label, corner, surfels) or _merge(x, y, nx, ny, ahead, corner, surfels):
             continue
         if used[1] == len(surfels) or len(labels) - used[0] < 9:
             return i
@@ -131,15 +136,32 @@ def _insert(points, normals, T, start, corner, table, labels, surfels, used):  #
 
 
 @njit(cache=True)
-def _merge(x, y, nx, ny, label, surfels):  # type: ignore[no-untyped-def]
-    """Join a return to its surfel if it is near and does not face away; whether it did."""
+def _within(x, y, corner, table):  # type: ignore[no-untyped-def]
+    """Whether the table holds every cell within reach of (x, y)."""
+    side = table.shape[0] * TILE * CELL_M
+    margin = REACH_M + CELL_M
+    cx, cy = x - corner[0], y - corner[1]
+    return cx > margin and cy > margin and cx < side - margin and cy < side - margin
+
+
+@njit(cache=True)
+def _merge(x, y, nx, ny, label, corner, surfels):  # type: ignore[no-untyped-def]
+    """Join a return to its surfel if it is near and does not face away; whether it did.
+
+    Near is also where the return's own cell would stay with that surfel: one added there could not be found again.
+    """
     if label == EMPTY:
         return False
     s = surfels[label]
     dx, dy = x - s[0], y - s[1]
     facing = nx * s[2] + ny * s[3]
-    if dx * dx + dy * dy > MERGE_M * MERGE_M or facing < 0.0:
+    if facing < 0.0:
         return False
+    if dx * dx + dy * dy > MERGE_M * MERGE_M:
+        px = corner[0] + (np.floor((x - corner[0]) / CELL_M) + 0.5) * CELL_M
+        py = corner[1] + (np.floor((y - corner[1]) / CELL_M) + 0.5) * CELL_M
+        if (px - s[0]) ** 2 + (py - s[1]) ** 2 > (px - x) ** 2 + (py - y) ** 2:
+            return False
     s[4] = min(s[4] + 1.0, MEAN_OVER)
     gain = 1.0 / s[4]
     s[0] += gain * dx
@@ -161,9 +183,6 @@ def _spread(x, y, label, corner, table, labels, surfels, used):  # type: ignore[
     """Give the surfel every cell within reach that has no nearer one."""
     cx = int(np.floor((x - corner[0]) / CELL_M))
     cy = int(np.floor((y - corner[1]) / CELL_M))
-    side = table.shape[0] * TILE
-    if cx < _REACH_CELLS or cy < _REACH_CELLS or cx >= side - _REACH_CELLS or cy >= side - _REACH_CELLS:
-        return
     for gy in range(cy - _REACH_CELLS, cy + _REACH_CELLS + 1):
         py = corner[1] + (gy + 0.5) * CELL_M
         for gx in range(cx - _REACH_CELLS, cx + _REACH_CELLS + 1):

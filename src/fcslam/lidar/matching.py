@@ -89,7 +89,7 @@ def _match(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _normal_equations(points, normals, pose, corner, table, labels, surfels, scale):  # type: ignore[no-untyped-def]
-    """Point-to-line where the surface has a normal, point-to-point elsewhere; Geman-McClure weights."""
+    """Distance across the surface where its normal is known, across the beam elsewhere; Geman-McClure weights."""
     H = np.zeros((3, 3))
     g = np.zeros(3)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -112,9 +112,12 @@ def _normal_equations(points, normals, pose, corner, table, labels, surfels, sca
         if nx == 0.0 and ny == 0.0:
             nx, ny = mx, my
         if nx == 0.0 and ny == 0.0:
+            # Far along a wall, lone returns repeat the pattern of the beams: how far they are would tie the robot to
+            # where it stood before, with great certainty. Only their bearing counts.
             w = 0.5 * (c2 / (c2 + d2)) ** 2
-            _add(H, g, w, 1.0, 0.0, -ry, dx)
-            _add(H, g, w, 0.0, 1.0, rx, dy)
+            length = max(np.hypot(rx, ry), 1e-9)
+            nx, ny = -ry / length, rx / length
+            _add(H, g, w, nx, ny, ny * rx - nx * ry, nx * dx + ny * dy)
         else:
             e = nx * dx + ny * dy
             along2 = max(0.0, d2 - e * e)

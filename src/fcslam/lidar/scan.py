@@ -38,7 +38,13 @@ class PointScan:
 
 
 def point_scan(ranges_m: Ranges, laser: LaserModel) -> PointScan:
-    """Points and normals of the valid returns (0 < range < maximum, finite)."""
+    """Points and normals of the valid returns (0 < range < maximum, finite).
+
+    Raises:
+        ValueError: there is not one range for each beam.
+    """
+    if np.shape(ranges_m) != (laser.beam_count,):
+        raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {np.shape(ranges_m)}")
     return PointScan(*_project(ranges_m, laser.angles_rad(), laser.max_range_m, np.array(laser.T_base_laser)))
 
 

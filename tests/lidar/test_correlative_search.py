@@ -1,0 +1,161 @@
+"""Branch and bound against exhaustive search over the same window."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import box, path, ring, ring_drive, room, scan_at
+
+from fcslam.geometry import se2
+from fcslam.lidar.correlative import SearchConfig, SearchWindow, likelihood_pyramid, search, search_pyramid
+from fcslam.lidar.field import field_of
+from fcslam.lidar.scan import PointScan
+
+CONFIG = SearchConfig()
+
+
+def random_scan(rng, count, reach):
+    points = rng.uniform(-reach, reach, (count, 2))
+    return PointScan(points, np.zeros((count, 2)))
+
+
+def steps(scan, window, cell_m):
+    """Angle of one turn that moves far points by a cell, and the numbers of turns and shifts to either side."""
+    reach = max(1.0, np.quantile(np.hypot(*scan.points.T), 0.9))
+    step_rad = 2 * np.arcsin(min(0.5, 0.5 * cell_m / reach))
+    return step_rad, int(np.ceil(window.angle_rad / step_rad)), int(np.ceil(window.radius_m / cell_m))
+
+
+def exhaustive(scan, pyramid, guess, window, config):
+    """Best penalised score over every shift and turn of the window."""
+    grid, cell = pyramid.levels[0].astype(float), pyramid.cell_m
+    step, turns, shifts = steps(scan, window, cell)
+    moves = np.arange(-shifts, shifts + 1)
+    best = -1.0
+    for turn in range(-turns, turns + 1):
+        points = se2.transform(guess + np.array([0, 0, turn * step]), scan.points)
+        cells = np.floor((points - pyramid.corner) / cell).astype(int)
+        raw = np.zeros((len(moves), len(moves)))
+        for x, y in cells:
+            rows, columns = y + moves, x + moves
+            inside = ((rows >= 0) & (rows < len(grid)))[:, None] & ((columns >= 0) & (columns < len(grid)))[None]
+            raw += np.where(inside, grid[np.ix_(rows.clip(0, len(grid) - 1), columns.clip(0, len(grid) - 1))], 0.0)
+        away = config.distance_penalty * np.minimum(1, (moves[:, None] ** 2 + moves**2) / max(1, shifts**2))
+        penalty = (1 - away) * (1 - config.angle_penalty * (turn / max(1, turns)) ** 2)
+        best = max(best, float((raw / (255 * len(points)) * penalty).max()))
+    return best
+
+
+def penalised(result, guess, window, scan, config):
+    """The score of a result with the penalty of where it lies."""
+    step, turns, shifts = steps(scan, window, config.cell_m)
+    move = np.round((result.T_field_base[:2] - guess[:2]) / config.cell_m)
+    turn = np.round(se2.wrap_angle(result.T_field_base[2] - guess[2]) / step)
+    away = config.distance_penalty * min(1, float(move @ move) / max(1, shifts**2))
+    return result.score * (1 - away) * (1 - config.angle_penalty * (turn / max(1, turns)) ** 2)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    radius=st.sampled_from([0.0, 0.3, 0.75, 1.2]),
+    angle=st.sampled_from([0.0, 0.2]),
+    levels=st.integers(1, 6),
+    half_side=st.sampled_from([2.0, 6.0]),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_best_score_is_that_of_exhaustive_search(seed, radius, angle, levels, half_side):
+    """On random worlds; with the small grid, points leave it on every side."""
+    rng = np.random.default_rng(seed)
+    config = SearchConfig(levels=levels)
+    field = field_of([(random_scan(rng, 40, 3.0), np.zeros(3))])
+    scan, guess = random_scan(rng, 25, 3.0), rng.uniform(-1, 1, 3)
+    window = SearchWindow(radius, angle)
+    pyramid = likelihood_pyramid(field, guess, half_side, config)
+    found = search_pyramid(scan, pyramid, guess, window, config)
+    best = exhaustive(scan, pyramid, guess, window, config)
+    assert penalised(found, guess, window, scan, config) == pytest.approx(best, abs=1e-9)
+
+
+def test_the_result_lies_in_the_window():
+    """The world matches 0.3 m outside the window, on either side of it."""
+    scan = scan_at((0, 0, 0), room())
+    field = field_of([(scan, np.zeros(3))])
+    window = SearchWindow(1.0, 0.1)
+    for away in ((1.3, 0.0), (-1.3, 0.0), (0.0, 1.3), (0.0, -1.3)):
+        guess = np.array([*away, 0.0])
+        found = search(scan, field, guess, window, CONFIG)
+        assert np.abs(found.T_field_base[:2] - guess[:2]).max() <= window.radius_m + 1e-9
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_every_level_bounds_the_cells_it_covers(seed):
+    rng = np.random.default_rng(seed)
+    field = field_of([(random_scan(rng, 60, 2.5), np.zeros(3))])
+    levels = likelihood_pyramid(field, np.zeros(3), 3.0, CONFIG).levels
+    size = levels.shape[1]
+    for h, level in enumerate(levels):
+        for y, x in rng.integers(0, size, (40, 2)):
+            assert level[y, x] == levels[0][y : y + 2**h, x : x + 2**h].max()
+
+
+@pytest.mark.parametrize(
+    "offset", [(1.0, 0.0, 0.0), (0.6, -0.7, np.deg2rad(25)), (-0.9, 0.4, np.deg2rad(-20)), (0, 0, 0.4)]
+)
+def test_a_near_offset_is_recovered(offset):
+    truth = ring_drive()[60]
+    rng = np.random.default_rng(0)
+    field = field_of([(scan_at(pose, ring(), noise_m=0.015, rng=rng), pose) for pose in ring_drive()[30:90:6]])
+    found = search(
+        scan_at(truth, ring(), noise_m=0.015, rng=rng), field, truth + np.array(offset), SearchWindow(1.1, 0.5), CONFIG
+    )
+    rest = se2.between(truth, found.T_field_base)
+    assert np.hypot(rest[0], rest[1]) < 0.15
+    assert abs(rest[2]) < np.deg2rad(2)
+    assert found.score > 0.6
+
+
+@pytest.mark.parametrize("offset", [(8.0, 0.0, np.deg2rad(40)), (-5.0, 6.0, np.deg2rad(-35)), (1.0, -8.0, 0.0)])
+def test_a_far_offset_is_recovered_in_a_wide_window(offset):
+    walls = room()
+    rng = np.random.default_rng(1)
+    poses = [np.array([x, y, 0.3]) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 1.0)]
+    field = field_of([(scan_at(pose, walls, noise_m=0.015, rng=rng), pose) for pose in poses])
+    truth = np.array([0.4, 0.2, 0.1])
+    scan = scan_at(truth, walls, noise_m=0.015, rng=rng)
+    found = search(scan, field, truth + np.array(offset), SearchWindow(8.5, 0.75), CONFIG)
+    rest = se2.between(truth, found.T_field_base)
+    assert np.hypot(rest[0], rest[1]) < 0.15
+    assert abs(rest[2]) < np.deg2rad(2)
+
+
+def test_nothing_to_see_answers_with_the_guess():
+    guess = np.array([1.0, -2.0, 0.5])
+    nothing = PointScan(np.empty((0, 2)), np.empty((0, 2)))
+    field = field_of([(scan_at((0, 0, 0), room()), np.zeros(3))])
+    far = np.array([150.0, 0.0, 0.5])
+    for scan, where, there in (
+        (nothing, field, guess),
+        (scan_at((0, 0, 0), room()), field_of([]), guess),
+        (nothing, field, far),
+    ):
+        found = search(scan, where, there, SearchWindow(1.0, 0.3), CONFIG)
+        np.testing.assert_array_equal(found.T_field_base, there)
+        assert found.score == 0.0
+
+
+def test_returns_beyond_the_grid_do_not_break_the_bound():
+    """A laser that reaches 60 m: the grid ends at 25 m, and points just off it come in when shifted."""
+    rng = np.random.default_rng(2)
+    walls = np.vstack((path((-25.3, -30), (-25.3, 30)), path((-30, -25.2), (30, -25.2)), box(-2, 1, 4, 3)))
+    points = np.vstack(
+        (rng.uniform((-26.5, -26), (-25.4, 26), (60, 2)), rng.uniform((-26, -26.5), (26, -25.4), (60, 2)))
+    )
+    scan = PointScan(points, np.zeros_like(points))
+    drawn = np.vstack([np.linspace(s[:2], s[2:], 300) for s in walls])
+    field = field_of([(PointScan(drawn, np.zeros_like(drawn)), np.zeros(3))])
+    window = SearchWindow(1.5, 0.0)
+    pyramid = likelihood_pyramid(field, np.zeros(3), 25.0 + 0.6, CONFIG)
+    found = search_pyramid(scan, pyramid, np.zeros(3), window, CONFIG)
+    best = exhaustive(scan, pyramid, np.zeros(3), window, CONFIG)
+    assert penalised(found, np.zeros(3), window, scan, CONFIG) == pytest.approx(best, abs=1e-9)

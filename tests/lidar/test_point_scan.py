@@ -1,0 +1,102 @@
+"""Points and normals of one scan, against the walls that were drawn."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import LASER, MAX_RANGE_M, box, path, ranges, room, scan_at
+
+from fcslam.geometry import se2
+from fcslam.lidar.scan import PointScan, point_scan
+from fcslam.records import LaserModel, frozen
+
+
+def clear_of_ends(points, segments, margin_m):
+    """Wall of each point (index, distance), and whether the point is farther than the margin from its ends."""
+    start, side = segments[:, :2], segments[:, 2:] - segments[:, :2]
+    length = np.hypot(*side.T)
+    along = np.einsum("nsk,sk->ns", points[:, None] - start, side / length[:, None])
+    inside = np.clip(along, 0, length)
+    foot = start + inside[..., None] * (side / length[:, None])
+    distance = np.linalg.norm(points[:, None] - foot, axis=2)
+    wall = distance.argmin(axis=1)
+    rows = np.arange(len(points))
+    clear = (along[rows, wall] > margin_m) & (along[rows, wall] < length[wall] - margin_m)
+    return wall, distance[rows, wall], clear
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (-2.0, 1.0, 2.5), (1.2, -1.9, -0.7)])
+def test_points_lie_on_the_walls_and_normals_stand_on_them_facing_the_laser(pose):
+    walls = room()
+    scan = scan_at(pose, walls)
+    points = se2.transform(pose, scan.points)
+    wall, distance, clear = clear_of_ends(points, walls, 0.5)
+    assert distance.max() < 1e-5
+    normals = se2.transform((0, 0, pose[2]), scan.normals)
+    known = clear & (np.hypot(*normals.T) > 0)
+    assert known[clear].mean() > 0.95
+    np.testing.assert_allclose(np.hypot(*normals[known].T), 1.0, atol=1e-9)
+    along = walls[wall, 2:] - walls[wall, :2]
+    along /= np.hypot(*along.T)[:, None]
+    tilt = np.rad2deg(np.arcsin(np.abs(np.einsum("nk,nk->n", normals, along)[known])))
+    assert tilt.max() < 2.0
+    assert np.all(np.einsum("nk,nk->n", normals, np.array(pose[:2]) - points)[known] > 0)
+
+
+def test_normals_are_right_on_average_under_noise():
+    rng = np.random.default_rng(0)
+    walls = box(-3, -2, 3, 2)
+    scan = scan_at((0, 0, 0.3), walls, noise_m=0.01, rng=rng)
+    points, normals = se2.transform((0, 0, 0.3), scan.points), se2.transform((0, 0, 0.3), scan.normals)
+    _, _, clear = clear_of_ends(points, walls, 0.5)
+    known = clear & (np.hypot(*normals.T) > 0)
+    tilt = np.arcsin(np.clip(np.abs(normals).min(axis=1)[known], 0, 1))
+    assert np.rad2deg(np.median(tilt)) < 6.0
+
+
+INVALID = [np.nan, np.inf, -np.inf, 0.0, -1.0, MAX_RANGE_M, MAX_RANGE_M + 5.0]
+
+
+@given(st.lists(st.sampled_from([*INVALID, 0.5, 3.0, 19.9]), min_size=1, max_size=40))
+@settings(max_examples=100, deadline=None)
+def test_only_returns_become_points(found):
+    laser = LaserModel(len(found), -1.0, 0.05, MAX_RANGE_M)
+    scan = point_scan(frozen(found, np.float32), laser)
+    valid = np.array([k for k, r in enumerate(found) if r in (0.5, 3.0, 19.9)], dtype=int)
+    r, angle = np.array(found, np.float32)[valid].astype(float), laser.angles_rad()[valid]
+    np.testing.assert_allclose(scan.points, np.column_stack((r * np.cos(angle), r * np.sin(angle))), atol=1e-9)
+    assert len(scan) == len(valid) == len(scan.normals)
+    assert np.isfinite(scan.normals).all()
+
+
+@pytest.mark.parametrize("mount", [(0.3, 0.0, 0.0), (0.1, -0.2, 1.1), (-0.25, 0.05, np.pi)])
+def test_moving_the_mount_moves_the_points(mount):
+    found = ranges((0.5, 0.4, 0.2), room())[0]
+    plain = point_scan(found, LASER)
+    mounted = point_scan(
+        found, LaserModel(LASER.beam_count, LASER.angle_min_rad, LASER.angle_increment_rad, MAX_RANGE_M, mount)
+    )
+    np.testing.assert_allclose(mounted.points, se2.transform(mount, plain.points), atol=1e-9)
+    np.testing.assert_allclose(mounted.normals, se2.transform((0, 0, mount[2]), plain.normals), atol=1e-6)
+
+
+def test_a_normal_does_not_bridge_a_gap():
+    """A post in front of a wall: the wall behind it keeps its own normals."""
+    walls = np.vstack((path((4, -5), (4, 5)), path((2, -0.2), (2, 0.2))))
+    scan = scan_at((0, 0, 0), walls)
+    known = np.hypot(*scan.normals.T) > 0
+    np.testing.assert_allclose(scan.normals[known], np.tile((-1.0, 0.0), (known.sum(), 1)), atol=1e-3)
+    assert known.sum() > 0.9 * len(scan)
+
+
+def test_thinned_keeps_distance_and_limit():
+    scan = scan_at((0, 0, 0), room())
+    thinned = scan.thinned(0.2, 1000)
+    assert np.all(np.hypot(*np.diff(thinned.points, axis=0).T) >= 0.2)
+    assert len(scan.thinned(0.0, 50)) == 50
+    assert len(PointScan(np.empty((0, 2)), np.empty((0, 2))).thinned(0.1, 5)) == 0
+
+
+def test_ranges_of_another_laser_are_refused():
+    with pytest.raises(ValueError, match="360"):
+        point_scan(np.full(400, 3.0, np.float32), LASER)

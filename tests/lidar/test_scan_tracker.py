@@ -1,0 +1,133 @@
+"""A robot with drifting odometry stays where it is in the buffer of what it saw."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import LASER, box, corridor, drifting, drive, pose_errors, recording, ring, ring_drive
+
+from fcslam.geometry import se2
+from fcslam.lidar.field import TABLE
+from fcslam.lidar.tracker import ScanTracker, TrackerConfig
+from fcslam.records import LaserModel, frozen
+
+KEYSCAN_M, KEYSCAN_RAD = 0.25, 0.25
+
+
+def track(scans, config=None):
+    """Poses of every scan; what moved on enough goes into the buffer, as the mapper does it."""
+    tracker = ScanTracker(config or TrackerConfig())
+    poses, last = [], None
+    for scan in scans:
+        tracked = tracker.track(scan)
+        poses.append(tracked.T_local_base)
+        motion = np.full(3, np.inf) if last is None else se2.between(last, tracked.T_local_base)
+        if tracked.scan is not None and (np.hypot(motion[0], motion[1]) > KEYSCAN_M or abs(motion[2]) > KEYSCAN_RAD):
+            tracker.insert(tracked.scan, tracked.T_local_base)
+            last = tracked.T_local_base
+    return np.array(poses), tracker
+
+
+def slipped(odometry, at, motion):
+    """The odometry with one step that did not happen."""
+    motions = se2.relative(odometry)
+    motions[at] = se2.compose(motions[at], motion)
+    poses = [odometry[0]]
+    for step in motions:
+        poses.append(se2.compose(poses[-1], step))
+    return np.array(poses)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return ring_drive()
+
+
+@pytest.fixture(scope="module")
+def odometry(truth):
+    return drifting(truth, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.3, 0.1, 0.4)])
+def test_a_drive_of_fifty_metres_is_tracked(truth, odometry, mount):
+    laser = replace(LASER, T_base_laser=mount)
+    poses, _ = track(recording(truth, odometry, ring(), laser))
+    assert pose_errors(odometry, truth)[0].max() > 2.0
+    shift, turn = pose_errors(poses, truth)
+    assert shift.max() < 0.10
+    assert np.rad2deg(turn.max()) < 1.0
+
+
+@pytest.mark.parametrize("slip", [(0.5, 0.0, np.deg2rad(15)), (-0.35, 0.35, np.deg2rad(-15)), (0.0, -0.5, 0.0)])
+def test_a_slip_is_recovered(truth, odometry, slip):
+    scans = recording(truth, slipped(odometry, 200, slip), ring())[:260]
+    shift, turn = pose_errors(track(scans)[0], truth[:260])
+    assert shift[201:].max() < 0.05
+    assert np.rad2deg(turn[201:].max()) < 0.5
+
+
+def test_without_returns_poses_follow_odometry(truth, odometry):
+    scans = [replace(s, ranges_m=frozen(np.full(360, np.nan), np.float32)) for s in recording(truth, odometry, ring())]
+    poses, _ = track(scans)
+    np.testing.assert_allclose(poses, odometry, atol=1e-9)
+
+
+def test_a_blind_stretch_is_bridged_by_odometry(truth):
+    odometry = drifting(truth, np.random.default_rng(2), scale=1.05, veer_rad_m=0.03)
+    blind = range(150, 190)
+    scans = [
+        replace(scan, ranges_m=frozen(np.full(360, LASER.max_range_m), np.float32)) if k in blind else scan
+        for k, scan in enumerate(recording(truth, odometry, ring())[:250])
+    ]
+    poses, _ = track(scans)
+    np.testing.assert_allclose(se2.relative(poses[150:190]), se2.relative(odometry[150:190]), atol=1e-9)
+    shift, _ = pose_errors(poses, truth[:250])
+    assert shift[189] > 0.2
+    assert shift[195:].max() < 0.10
+
+
+@pytest.mark.parametrize("beams", [180, 360])
+@pytest.mark.parametrize("step_m", [0.1, 0.25])
+def test_a_bare_corridor_leaves_the_way_along_it_to_odometry(beams, step_m):
+    """Nothing tells how far the robot went but its wheels: the pattern of the beams on the walls must not."""
+    laser = LaserModel(beams, -0.5 * np.deg2rad(beams), np.deg2rad(1.0), 20.0)
+    truth = drive([(-10, 0), (5, 0)], step_m=step_m)
+    poses, _ = track(recording(truth, se2.between(truth[0], truth), corridor(), laser, noise_m=0.01))
+    shift, turn = pose_errors(poses, truth)
+    assert shift.max() < 0.6
+    assert np.rad2deg(turn.max()) < 0.5
+
+
+def test_a_standing_robot_stands(truth):
+    poses = np.repeat(truth[50:51], 20, axis=0)
+    found, _ = track(recording(poses, np.zeros((20, 3)), ring(), noise_m=0.02))
+    np.testing.assert_array_equal(found, np.zeros((20, 3)))
+
+
+def test_somebody_who_walks_by_does_not_take_the_robot_along(truth, odometry):
+    """A legs-sized box keeps pace with the robot for 10 m."""
+    scans = []
+    for k, scan in enumerate(recording(truth, odometry, ring())[:200]):
+        x, y = se2.transform(truth[k], np.array([[0.8, 0.5]]))[0]
+        walls = np.vstack((ring(), box(x - 0.15, y - 0.15, x + 0.15, y + 0.15)))
+        scans.append(recording(truth[k : k + 1], odometry[k : k + 1], walls, seed=k)[0])
+        scans[-1] = replace(scans[-1], stamp=scan.stamp)
+    shift, _ = pose_errors(track(scans)[0], truth[:200])
+    assert shift.max() < 0.10
+
+
+def test_the_buffer_does_not_grow_with_the_drive(truth):
+    """Twice round the ring needs no more than once: at most two fields, each as large as the stretch it holds."""
+
+    def memory(rounds):
+        poses = ring_drive(rounds)
+        _, tracker = track(recording(poses, se2.between(poses[0], poses), ring(), noise_m=0.005))
+        fields = [field for field, _ in tracker._fields]
+        assert len(fields) <= 2
+        assert all(count <= TrackerConfig().buffer_keyscans for _, count in tracker._fields)
+        assert all(field.table.shape == (TABLE, TABLE) for field in fields)
+        return max(len(field.points) for field in fields), max(field.labels.nbytes for field in fields)
+
+    once, twice = memory(1.0), memory(2.0)
+    assert twice[0] < 1.3 * once[0]
+    assert twice[1] <= 2 * once[1]

@@ -1,0 +1,142 @@
+"""Two submaps of one room are the same place, two rooms are not; what cannot be told is not told."""
+
+import numpy as np
+import pytest
+from worlds import box, corridor, other_room, path, ring, room, scan_at
+
+from fcslam.geometry import se2
+from fcslam.lidar.scan import PointScan
+from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, agreement, build_submap
+from fcslam.lidar.verification import VerificationConfig, verify
+
+CONFIG = VerificationConfig()
+
+
+def submap_along(waypoints, walls, seed):
+    """Submap of a drive, in the base of its middle pose, and that pose."""
+    rng = np.random.default_rng(seed)
+    poses = [np.array(pose) for pose in waypoints]
+    anchor = poses[len(poses) // 2]
+    scans = [(scan_at(pose, walls, noise_m=0.01, rng=rng), se2.between(anchor, pose)) for pose in poses]
+    return build_submap(scans), anchor
+
+
+WEST = [(-2.0 + 0.3 * k, -1.0 + 0.1 * k, 0.2 * k) for k in range(9)]
+EAST = [(1.5 - 0.3 * k, 1.2 - 0.2 * k, 2.5 - 0.1 * k) for k in range(9)]
+
+
+@pytest.fixture(scope="module")
+def same_room():
+    return submap_along(WEST, room(), 0), submap_along(EAST, room(), 1)
+
+
+def test_the_same_room_from_two_drives_is_verified(same_room):
+    (a, anchor_a), (b, anchor_b) = same_room
+    truth = se2.between(anchor_a, anchor_b)
+    for offset in ((0.0, 0.0, 0.0), (0.25, -0.2, 0.08), (-0.2, 0.2, -0.08)):
+        found = verify(a, b, se2.compose(truth, offset), CONFIG)
+        assert found.strict
+        assert found.loose
+        assert found.informative
+        assert found.reason == ""
+        rest = se2.between(truth, found.T_a_b)
+        assert np.hypot(rest[0], rest[1]) < 0.03
+        assert abs(rest[2]) < np.deg2rad(0.3)
+
+
+def test_both_orders_give_inverse_poses(same_room):
+    (a, anchor_a), (b, anchor_b) = same_room
+    guess = se2.compose(se2.between(anchor_a, anchor_b), (0.15, -0.1, 0.05))
+    there, back = verify(a, b, guess, CONFIG), verify(b, a, se2.inverse(guess), CONFIG)
+    rest = se2.compose(there.T_a_b, back.T_a_b)
+    assert np.hypot(rest[0], rest[1]) < 0.01
+    assert abs(rest[2]) < np.deg2rad(0.1)
+    assert (there.strict, there.loose, there.informative) == (back.strict, back.loose, back.informative)
+
+
+def test_the_information_is_symmetric_positive_and_no_better_than_the_floor(same_room):
+    (a, anchor_a), (b, anchor_b) = same_room
+    information = verify(a, b, se2.between(anchor_a, anchor_b), CONFIG).information
+    np.testing.assert_array_equal(information, information.T)
+    sigma = np.sqrt(np.diag(np.linalg.inv(information)))
+    assert np.all(sigma >= np.array([CONFIG.closure_sigma_m, CONFIG.closure_sigma_m, CONFIG.closure_sigma_rad]) - 1e-12)
+    assert sigma[0] < 0.1
+
+
+@pytest.mark.parametrize("guess", [(0.0, 0.0, 0.0), (0.5, 0.3, 0.4), (-1.0, 0.2, -1.2), (0.2, 0.8, 3.0)])
+def test_two_different_rooms_are_not_the_same_place(guess):
+    a, _ = submap_along(WEST, room(), 0)
+    b, _ = submap_along(EAST, other_room(), 1)
+    found = verify(a, b, np.array(guess), CONFIG)
+    assert not found.loose
+    assert not found.strict
+    assert found.reason != ""
+
+
+def test_a_room_against_itself_turned_around_is_not_the_same_place(same_room):
+    (a, anchor_a), (b, anchor_b) = same_room
+    turned = se2.compose(se2.compose(se2.inverse(anchor_a), (0, 0, np.pi)), anchor_b)
+    assert not verify(a, b, turned, CONFIG).loose
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0])
+def test_a_bare_corridor_is_not_informative(heading):
+    """Wherever along it one lays the other, it fits: that must be said, and its information must say it too."""
+    turned = np.array([0.0, 0.0, heading])
+    walls = np.hstack((se2.transform(turned, corridor()[:, :2]), se2.transform(turned, corridor()[:, 2:])))
+
+    def along(offset_m, seed):
+        line = [np.array([x, 0.1 * np.sin(x), 0.1 * np.cos(x)]) for x in np.arange(-3, 3.1, 0.3) + offset_m]
+        return submap_along([se2.compose(turned, pose) for pose in line], walls, seed)
+
+    (a, anchor_a), (b, anchor_b) = along(0.0, 0), along(2.0, 1)
+    found = verify(a, b, se2.between(anchor_a, anchor_b), CONFIG)
+    assert not found.informative
+    assert found.reason != ""
+    values, vectors = np.linalg.eigh(found.information[:2, :2])
+    axis = se2.transform((0, 0, heading - anchor_b[2]), np.array([[1.0, 0.0]]))[0]
+    assert abs(vectors[:, 0] @ axis) > 0.98
+    assert values[0] < 0.5 * values[1]
+
+
+def test_too_little_in_common_is_refused():
+    a, anchor_a = submap_along([(1.5 + 0.2 * k, 1.5, 0.0) for k in range(5)], ring(), 0)
+    b, anchor_b = submap_along([(14.5, 10.5 - 0.2 * k, 3.0) for k in range(5)], ring(), 1)
+    assert not verify(a, b, se2.between(anchor_a, anchor_b), CONFIG).loose
+
+
+def test_nothing_seen_is_no_place(same_room):
+    empty = build_submap([(PointScan(np.empty((0, 2)), np.empty((0, 2))), np.zeros(3))])
+    found = verify(same_room[0][0], empty, np.zeros(3), CONFIG)
+    assert not found.loose
+    assert np.isfinite(found.information).all()
+
+
+def test_free_space_is_what_beams_crossed():
+    """Every cell said to be free lies inside the room, off its walls; most of the room is."""
+    walls = box(-4, -3, 4, 3)
+    submap, anchor = submap_along([(-1.0, 0.0, 0.0), (0.0, 0.0, 0.5), (1.0, 0.5, 1.0)], walls, 0)
+    rows, columns = np.nonzero(submap.free.cells)
+    centres = submap.free.corner + (np.column_stack((columns, rows)) + 0.5) * FREE_CELL_M
+    inside = np.abs(se2.transform(anchor, centres))
+    assert inside[:, 0].max() < 4 - 0.05
+    assert inside[:, 1].max() < 3 - 0.05
+    assert len(rows) * FREE_CELL_M**2 > 0.8 * 7.6 * 5.6
+
+
+def test_a_box_moved_into_free_space_violates():
+    walls = box(-4, -3, 4, 3)
+    a, _ = submap_along([(0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0)], walls, 0)
+    b, _ = submap_along([(0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0)], np.vstack((walls, box(1.5, 1, 2.5, 2))), 1)
+    found = agreement(b, a, np.zeros(3))
+    share = 1.4 / SPACING_M / len(b.surface)  # the faces seen, about
+    assert found.violation > 0.5 * share
+    assert agreement(a, a, np.zeros(3)).violation == 0.0
+    assert agreement(a, a, np.zeros(3)).explained == 1.0
+
+
+def test_one_wall_is_fixed_in_one_direction_only():
+    a, _ = submap_along([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)], path((-5, 2), (5, 2)), 0)
+    found = agreement(a, a, np.zeros(3))
+    assert found.count > 50
+    assert found.weakest < 0.05 * np.trace(found.normal_tensor)
