@@ -61,6 +61,8 @@ class PlaceMatcher:
         self._places: dict[KeyscanId, Place] = {}
         self._dynamic = DynamicVocabulary(config.vocabulary, rng)
         self._index: InvertedIndex[KeyscanId] | None = None
+        self._backlog: list[Place] = []
+        self._undescribed: list[Place] = []
 
     def __len__(self) -> int:
         return len(self._places)
@@ -73,17 +75,22 @@ class PlaceMatcher:
         ``predicted``: T_i_j of stored places i that the joint map says are near; ``strangers``: whether a stored
         place belongs to a robot whose relative pose is not known yet.
         """
-        similarity = self._similarities(place)  # Algorithm 1, lines 11-13
+        comparable = bool(predicted) or any(strangers(i) for i in self._places)
+        similarity = self._similarities(place) if comparable else {}  # Algorithm 1, lines 11-13
         matches = [self._near_match(i, place, T_i_j, similarity) for i, T_i_j in predicted.items()]
         matches += [
             match
             for i in self._candidates(similarity, strangers)
             if (match := self._far_match(i, place, similarity)) is not None
         ]
-        self._store(place)
+        self._places[place.id] = place
+        self._backlog.append(place)
         return matches
 
     def _similarities(self, place: Place) -> dict[KeyscanId, float]:
+        for stored in self._backlog:  # a robot alone never needs its words
+            self._describe(stored)
+        self._backlog.clear()
         if self._index is None:
             return {}
         return dict(self._index.query(place.descriptors, top_k=len(self._index)))
@@ -117,17 +124,18 @@ class PlaceMatcher:
         share = len(matches.pairs) / max(1, min(len(stored.descriptors), len(place.descriptors)))
         return PlaceMatch(i, place.id, similarity.get(i, share), best, predicted=False)
 
-    def _store(self, place: Place) -> None:
-        self._places[place.id] = place
+    def _describe(self, place: Place) -> None:
+        """Algorithm 1, lines 3-11: the place joins the vocabulary's window, and the index in its words."""
         retrained = self._dynamic.add(place.descriptors)
         vocabulary = self._dynamic.vocabulary
         if vocabulary is None:
+            self._undescribed.append(place)
             return
         if self._index is None:
             self._index = InvertedIndex(vocabulary)
-            for stored in self._places.values():
-                self._index.add(stored.id, stored.descriptors)
-            return
-        if retrained:
+            for earlier in self._undescribed:
+                self._index.add(earlier.id, earlier.descriptors)
+            self._undescribed.clear()
+        elif retrained:
             self._index.describe_again(vocabulary)
         self._index.add(place.id, place.descriptors)
