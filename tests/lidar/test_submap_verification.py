@@ -85,11 +85,11 @@ def test_a_bare_corridor_is_not_informative(heading):
     turned = np.array([0.0, 0.0, heading])
     walls = np.hstack((se2.transform(turned, corridor()[:, :2]), se2.transform(turned, corridor()[:, 2:])))
 
-    def along(offset_m, seed):
-        line = [np.array([x, 0.1 * np.sin(x), 0.1 * np.cos(x)]) for x in np.arange(-3, 3.1, 0.3) + offset_m]
+    def along(offset_m, facing, seed):
+        line = [np.array([x, 0.1 * np.sin(x), facing + 0.1 * np.cos(x)]) for x in np.arange(-3, 3.1, 0.3) + offset_m]
         return submap_along([se2.compose(turned, pose) for pose in line], walls, seed)
 
-    (a, anchor_a), (b, anchor_b) = along(0.0, 0), along(2.0, 1)
+    (a, anchor_a), (b, anchor_b) = along(0.0, 0.0, 0), along(2.0, 1.9, 1)
     found = verify(a, b, se2.between(anchor_a, anchor_b), CONFIG)
     assert not found.informative
     assert found.reason != ""
@@ -135,8 +135,12 @@ def test_a_box_moved_into_free_space_violates():
     assert agreement(a, a, np.zeros(3)).explained == 1.0
 
 
-def test_one_wall_is_fixed_in_one_direction_only():
-    a, _ = submap_along([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)], path((-5, 2), (5, 2)), 0)
+@pytest.mark.parametrize("slope", [0.0, 0.3])
+def test_one_wall_is_fixed_in_one_direction_only(slope):
+    walls = path((-5, 2 - 5 * slope), (5, 2 + 5 * slope))
+    a, _ = submap_along([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)], walls, 0)
     found = agreement(a, a, np.zeros(3))
     assert found.count > 50
+    flat = np.hypot(*a.surface.normals.T) > 0
+    assert np.trace(found.normal_tensor) == pytest.approx(flat.sum())
     assert found.weakest < 0.05 * np.trace(found.normal_tensor)

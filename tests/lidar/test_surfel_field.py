@@ -81,7 +81,7 @@ def test_noise_averages_out():
     assert np.sqrt(np.mean((settled[:, 0] - 3) ** 2)) < 0.01
 
 
-@pytest.mark.parametrize("thickness_m", [0.10, 0.20])
+@pytest.mark.parametrize("thickness_m", [0.04, 0.10, 0.20])
 def test_both_sides_of_a_wall_stay_apart(thickness_m):
     rng = np.random.default_rng(2)
     wall = np.vstack((path((0, -3), (0, 3)), path((thickness_m, -3), (thickness_m, 3))))
