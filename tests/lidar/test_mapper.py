@@ -31,12 +31,16 @@ class Mapped:
         return se2.compose(self.keyscans[[p.keyscan for p in poses]], np.array([p.T_keyscan_base for p in poses]))
 
     @property
-    def constraints(self):
-        return [c for s in self.steps for c in s.constraints] + [c for _, found in self.rest for c in found]
+    def submaps(self):
+        return [step.submap for step in self.steps if step.submap is not None] + self.rest
+
+    @property
+    def odometry(self):
+        return [step.odometry for step in self.steps if step.odometry is not None]
 
     @property
     def closures(self):
-        return [c for c in self.constraints if c.kind is ConstraintKind.CLOSURE]
+        return [closure for submap in self.submaps for closure in submap.closures]
 
     def false_closures(self, truth, limit_m=0.5):
         """Closures whose measured motion is off the true one, by how much."""
@@ -75,8 +79,9 @@ def test_every_scan_has_a_pose_and_every_keyscan_a_place_in_the_chain(scans, map
     assert [step.pose.stamp for step in mapped.steps] == [scan.stamp for scan in scans]
     numbers = [step.keyscan.id.number for step in mapped.steps if step.keyscan is not None]
     assert numbers == list(range(len(mapped.keyscans)))
-    chain = [(c.i, c.j) for c in mapped.constraints if c.kind is ConstraintKind.ODOMETRY]
-    assert chain == [(k, k + 1) for k in range(len(numbers) - 1)]
+    assert {c.kind for c in mapped.odometry} == {ConstraintKind.ODOMETRY}
+    assert {c.kind for c in mapped.closures} == {ConstraintKind.CLOSURE}
+    assert [(c.i, c.j) for c in mapped.odometry] == [(k, k + 1) for k in range(len(numbers) - 1)]
     assert np.isfinite(mapped.poses).all()
     near = np.array([step.pose.T_keyscan_base for step in mapped.steps])
     assert np.hypot(*near[:, :2].T).max() < 0.4
@@ -92,23 +97,22 @@ def test_the_map_starts_at_the_first_odometry_pose(truth):
     assert np.abs(rest).max() < 0.05
 
 
-def test_windows_cover_the_drive(mapped):
-    windows = [s.place for s in mapped.steps if s.place] + [window for window, _ in mapped.rest]
-    anchors = [window.anchor for window in windows]
+def test_submaps_cover_the_drive(mapped):
+    anchors = [submap.anchor for submap in mapped.submaps]
     assert anchors == sorted(set(anchors))
     travel = np.array(mapped.mapper._travel)
     assert np.diff(travel[anchors]).max() < 2.0 + 0.5
-    for window in windows:
-        assert window.first <= window.anchor <= window.last
-        assert travel[window.last] - travel[window.first] <= 10.0 + 1e-9
-    assert windows[-1].last == len(travel) - 1
+    for submap in mapped.submaps:
+        assert submap.first <= submap.anchor <= submap.last
+        assert travel[submap.last] - travel[submap.first] <= 10.0 + 1e-9
+        assert len(submap.surface) > 100
+    assert mapped.submaps[-1].last == len(travel) - 1
 
 
 def test_the_same_recording_gives_the_same_bytes(scans, mapped):
     again = Mapped(scans)
     assert again.poses.tobytes() == mapped.poses.tobytes()
-    assert len(again.constraints) == len(mapped.constraints)
-    for one, other in zip(again.constraints, mapped.constraints, strict=True):
+    for one, other in zip(again.odometry + again.closures, mapped.odometry + mapped.closures, strict=True):
         assert (one.i, one.j, one.kind) == (other.i, other.j, other.kind)
         assert one.T_i_j.tobytes() == other.T_i_j.tobytes()
         assert one.information.tobytes() == other.information.tobytes()
