@@ -10,15 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from fcslam.cloud.fleet import Fleet, FleetConfig, FleetResult, MappedRobot
+from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.cloud.fusion import FusedMap, fuse, map_yaml, pgm_bytes
 from fcslam.cloud.picture import Meeting, map_png
+from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.config import Settings, dump
 from fcslam.errors import FcslamError, SourceError
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.records import ClosureStatus, FloatArray, LaserScan, LoopClosure
+from fcslam.records import ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, check_names
 from fcslam.sources import Source
@@ -102,7 +103,7 @@ class _Meter:
         first, last = self._span.get(robot, (stamp, stamp))
         self._span[robot] = min(first, stamp), max(last, stamp)
         self.scans += 1
-        self.keyscans += any(packet.body.__class__.__name__ == "Keyscan" for packet in packets)
+        self.keyscans += any(isinstance(packet.body, Keyscan) for packet in packets)
         if self.scans % self.EVERY == 0:
             self._watch(Progress(self.scans, self.keyscans, self.recorded_s, self._cloud.closure_counts()))
 

@@ -84,18 +84,18 @@ def _sources(sources: "list[Source]", parts: int) -> "list[Source]":
 @contextmanager
 def _progress(console: "Console", total: int) -> "Iterator[Watch]":
     """A live line: scans, speed against real time, keyscans, closures per kind."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich import progress
 
     columns = [
-        TextColumn("mapping"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("scans"),
-        TextColumn("{task.fields[what]}"), TimeRemainingColumn(),
+        progress.TextColumn("mapping"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
+        progress.TextColumn("scans, {task.fields[what]}"), progress.TimeRemainingColumn(),
     ]  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as bar:
+    with progress.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=total, what="")
         began = time.perf_counter()
 
-        def watch(progress: "Progress") -> None:  # type: ignore[valid-type]
-            bar.update(task, completed=progress.scans, what=_what(progress, time.perf_counter() - began))
+        def watch(now: "Progress") -> None:
+            bar.update(task, completed=now.scans, what=_what(now, time.perf_counter() - began))
 
         yield watch
 

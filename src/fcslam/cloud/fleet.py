@@ -4,8 +4,7 @@ A plain object without a network. Robots stay in maps of their own until the evi
 arrives later may still revoke it. ``finalize`` depends on the set of packets only, not on their arrival.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 from pydantic import Field
@@ -13,17 +12,16 @@ from pydantic import Field
 from fcslam.cloud.joining import first_estimate, judge
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger, Entry
+from fcslam.cloud.result import FleetResult, conclude
 from fcslam.cloud.robots import RobotStore
 from fcslam.config import Settings
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
-from fcslam.graph.pose_graph import PoseGraph
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
 from fcslam.records import (
-    Channel,
     ClosureStatus,
     Constraint,
     ConstraintKind,
@@ -31,8 +29,6 @@ from fcslam.records import (
     FloatArray,
     Keyscan,
     KeyscanId,
-    LaserModel,
-    LoopClosure,
     Place,
     frozen,
 )
@@ -56,30 +52,6 @@ class FleetConfig(Settings):
     consistency: ConsistencySettings = Field(default=ConsistencySettings(), description="pairwise consistency")
 
 
-@dataclass(frozen=True, slots=True)
-class MappedRobot:
-    """One robot in the result."""
-
-    robot: str
-    map_index: int
-    keyscans: tuple[Keyscan, ...]
-    T_map_base: FloatArray
-    """Of each keyscan, in the frame of its map, shape (N, 3)."""
-    laser: LaserModel
-
-
-@dataclass(frozen=True, slots=True)
-class FleetResult:
-    """What the packets say in the end."""
-
-    robots: tuple[MappedRobot, ...]
-    closures: tuple[LoopClosure, ...]
-    """Between robots and within them."""
-    corrections: tuple[Correction, ...]
-    graph: PoseGraph
-    """All keyscans at their optimised poses, with the constraints that hold."""
-
-
 class Fleet:
     """Receives packets; matches, verifies, joins, optimises."""
 
@@ -89,7 +61,6 @@ class Fleet:
         self._store = RobotStore()
         self._graph = JointGraph()
         self._ledger = ClosureLedger()
-        self._local: list[tuple[Constraint, int]] = []
         self._submaps: dict[KeyscanId, Submap] = {}
         self._matcher = PlaceMatcher(config.matcher, self._submap, np.random.default_rng(seed))
         self._places: dict[str, list[KeyscanId]] = {}
@@ -117,12 +88,15 @@ class Fleet:
                 replay._take(ready)
         return replay._conclude()
 
+    def _conclude(self) -> FleetResult:
+        return conclude(self._store, self._graph, self._ledger, self._version)
+
     def closure_counts(self) -> dict[str, int]:
-        """Closures so far by kind and status, for progress displays."""
-        counts = {"intra-robot": len(self._local)}
+        """Closures so far by kind, for progress displays."""
+        counts = {"within robots": 0, "between robots": 0}
         for entry in self._ledger:
-            status = entry.closure.status.value
-            counts[status] = counts.get(status, 0) + 1
+            if entry.closure.status is ClosureStatus.ACCEPTED:
+                counts["between robots" if entry.is_between else "within robots"] += 1
         return counts
 
     def _take(self, packet: Packet) -> None:
@@ -245,53 +219,11 @@ class Fleet:
     def _add_local(self, closure: Constraint) -> None:
         """A closure that a robot found within its own map."""
         i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)
-        self._local.append((closure, self._graph.close(i, j, closure.T_i_j, closure.information)))
+        self._ledger.add_local(closure, self._graph.close(i, j, closure.T_i_j, closure.information))
 
     def _optimize(self) -> None:
         self._graph.optimize()
         self._version += 1
-
-    def _conclude(self) -> FleetResult:
-        """Decide on every closure, separate what only revoked closures held, and collect."""
-        if len(self._graph.graph):
-            self._graph.optimize_robustly()
-        for entry in self._ledger:
-            if entry.edge is not None and self._graph.weight(entry.edge) < 0.5:
-                entry.set(ClosureStatus.REVOKED, "contradicts the joint graph")
-            elif entry.edge is None and entry.closure.status is ClosureStatus.VERIFIED:
-                entry.set(ClosureStatus.REJECTED, entry.closure.reason or "outside the dominant cluster")
-        maps = self._graph.maps(self._ledger.accepted_edges())
-        index = {robot: k for k, robots in enumerate(maps) for robot in robots}
-        robots = tuple(
-            MappedRobot(
-                robot,
-                index[robot],
-                self._store.keyscans(robot),
-                frozen(self._graph.trajectory(robot)),
-                self._store.laser(robot),
-            )  # fmt: skip
-            for robot in self._store.robots
-        )
-        corrections = tuple(
-            Correction(robot, self._version, index[robot], frozen(self._graph.T_map_odom(robot)))
-            for robot in self._store.robots
-        )
-        closures = (*self._local_closures(), *(entry.closure for entry in self._ledger))
-        dropped = {edge for edge in self._closure_edges() if self._graph.weight(edge) < 0.5}
-        return FleetResult(robots, closures, corrections, self._graph.optimized(dropped))
-
-    def _closure_edges(self) -> Iterator[int]:
-        yield from (edge for _, edge in self._local)
-        yield from (entry.edge for entry in self._ledger if entry.edge is not None)
-
-    def _local_closures(self) -> Iterator[LoopClosure]:
-        for c, edge in self._local:
-            holds = self._graph.weight(edge) >= 0.5
-            yield LoopClosure(
-                KeyscanId(c.robot, c.i), KeyscanId(c.robot, c.j), Channel.LIDAR, 0.0, c.T_i_j, c.information,
-                ClosureStatus.ACCEPTED if holds else ClosureStatus.REVOKED,
-                "found by the robot" if holds else "contradicts the joint graph",
-            )  # fmt: skip
 
     def _replies(self, packet: Packet) -> list[bytes]:
         """Acknowledgement and, after a place, where the robot's odometry lies in the map."""

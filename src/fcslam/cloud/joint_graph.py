@@ -8,7 +8,7 @@ from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.records import Constraint, ConstraintKind, FloatArray, KeyscanId
+from fcslam.records import Constraint, FloatArray, KeyscanId
 
 
 class JointGraph:
@@ -69,13 +69,12 @@ class JointGraph:
         self._chains[robot].append(se2.compose(self._chains[robot][-1], constraint.T_i_j))
         step = float(np.hypot(constraint.T_i_j[0], constraint.T_i_j[1]))
         self._travel[robot].append(self._travel[robot][-1] + step)
-        robust = constraint.kind is not ConstraintKind.ODOMETRY
-        self._add_edge(Edge(previous, variable, constraint.T_i_j, constraint.information, robust))
+        self.graph.add_edge(Edge(previous, variable, constraint.T_i_j, constraint.information, robust=False))
 
     def close(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray, information: FloatArray) -> int:
         """A closure; returns the number of its edge."""
         self._unsolved += 1
-        return self._add_edge(Edge(self.variable(i), self.variable(j), T_i_j, information, robust=True))
+        return self.graph.add_edge(Edge(self.variable(i), self.variable(j), T_i_j, information, robust=True))
 
     def innovation(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray) -> FloatArray:
         """How far a measurement lies from the estimate, (x, y, theta)."""
@@ -131,6 +130,3 @@ class JointGraph:
             self._poses = np.concatenate([self._poses, np.zeros_like(self._poses)])
         self._poses[variable] = pose
         return variable
-
-    def _add_edge(self, edge: Edge) -> int:
-        return self.graph.add_edge(edge)

@@ -1,10 +1,10 @@
-"""Every closure between robots that was ever considered, how far it came and why."""
+"""Every closure that was ever considered, how far it came and why."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from fcslam.records import Channel, ClosureStatus, LoopClosure, frozen
 from fcslam.places.matcher import PlaceMatch
+from fcslam.records import Channel, ClosureStatus, Constraint, KeyscanId, LoopClosure, frozen
 
 
 @dataclass(slots=True)
@@ -15,13 +15,18 @@ class Entry:
     predicted: bool
     edge: int | None = None
 
+    @property
+    def is_between(self) -> bool:
+        """Whether it ties two robots, not two moments of one."""
+        return self.closure.i.robot != self.closure.j.robot
+
     def set(self, status: ClosureStatus, reason: str) -> None:
         """Move on to another status."""
         self.closure = replace(self.closure, status=status, reason=reason)
 
 
 class ClosureLedger:
-    """Closures between robots in the order in which they were found."""
+    """Closures in the order in which they were found."""
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
@@ -40,6 +45,15 @@ class ClosureLedger:
         self._entries.append(entry)
         return entry
 
+    def add_local(self, constraint: Constraint, edge: int) -> None:
+        """Book a closure that a robot found within its own map; it holds until the joint graph contradicts it."""
+        i, j = KeyscanId(constraint.robot, constraint.i), KeyscanId(constraint.robot, constraint.j)
+        closure = LoopClosure(
+            i, j, Channel.LIDAR, 0.0, constraint.T_i_j, constraint.information, ClosureStatus.ACCEPTED,
+            "found by the robot",
+        )  # fmt: skip
+        self._entries.append(Entry(closure, predicted=True, edge=edge))
+
     def between(self, a: str, b: str) -> list[Entry]:
         """Entries confirmed by geometry between two robots."""
         pair = {a, b}
@@ -52,8 +66,11 @@ class ClosureLedger:
 
     def accepted_edges(self) -> list[int]:
         """Edges of the closures that hold at present."""
-        return [
-            entry.edge
-            for entry in self._entries
-            if entry.edge is not None and entry.closure.status is ClosureStatus.ACCEPTED
-        ]
+        return self._edges(ClosureStatus.ACCEPTED)
+
+    def revoked_edges(self) -> list[int]:
+        """Edges of the closures that did once."""
+        return self._edges(ClosureStatus.REVOKED)
+
+    def _edges(self, status: ClosureStatus) -> list[int]:
+        return [e.edge for e in self._entries if e.edge is not None and e.closure.status is status]

@@ -112,9 +112,9 @@ def dominant_cluster(
 ) -> ClusterVerdict:
     """The largest consistent cluster, and whether it is enough to join two maps.
 
-    ``consistent`` (K, K) from :func:`pairwise_consistency`, ``places`` (K, 2), or (K, S, 2) as seen by S trajectories, where each closure is (metres, each in one
-    frame), ``informative`` (K,) whether it fixes the pose in every direction. Aliases agree with one another, too:
-    so the cluster must have enough supporters from different places, an informative one, and a clear lead over the
+    ``consistent`` (K, K) from :func:`pairwise_consistency`; ``places`` (K, 2), or (K, S, 2) as seen by S
+    trajectories, where each closure is (metres, each side in one frame); ``informative`` (K,) whether it fixes the
+    pose in every direction. Aliases agree with one another, too: so the cluster must have enough supporters from different places, an informative one, and a clear lead over the
     largest one that contradicts it: in closures, and no less in places.
     """
     xy, informs = (

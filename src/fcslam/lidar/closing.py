@@ -1,4 +1,4 @@
-"""Loop closing inside one robot: the submap around a keyscan is compared with earlier ones that may show the same place.
+"""Loop closing inside one robot: a submap is compared with earlier ones that may show the same place.
 
 How far the estimate may be off grows with the shortest path through the pose graph (odometry and accepted closures),
 not with time: after a closure the search is narrow again. A wide search is branch and bound over the whole window.
@@ -94,8 +94,8 @@ class LoopCloser:
         rows = [*range(n - 1), *(c.earlier for c in self._accepted)]
         columns = [*range(1, n), *(c.later for c in self._accepted)]
         lengths = [*(np.diff(travel) + 1e-3), *(1.0 for _ in self._accepted)]
-        links = coo_array((lengths, (rows, columns)), shape=(n, n)).tocsr()
-        paths: FloatArray = dijkstra(links, directed=False, indices=later)
+        links = coo_array((np.array(lengths), (np.array(rows), np.array(columns))), shape=(n, n))
+        paths: FloatArray = dijkstra(links, False, later)  # undirected, from the newest
         return paths
 
     def _slack(self, path_m: float) -> tuple[float, float]:
@@ -158,7 +158,8 @@ class LoopCloser:
         """A wide closure that stands alone: informative, rich, and close to where it was expected."""
         off = float(np.hypot(closure.innovation[0], closure.innovation[1]))
         worse = closure.check.worse
-        return closure.check.strict and closure.check.informative and off < 0.3 * closure.slack_m + 0.2 and worse.overlap > 0.4
+        near = off < 0.3 * closure.slack_m + 0.2
+        return closure.check.strict and closure.check.informative and worse.overlap > 0.4 and near
 
     def _cluster(self, anchors: FloatArray) -> list[Closure]:
         """The largest set of pending closures that agree with the newest one, if there are enough."""

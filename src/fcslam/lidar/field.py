@@ -185,22 +185,34 @@ def _spread(x, y, label, corner, table, labels, surfels, used):  # type: ignore[
     cy = int(np.floor((y - corner[1]) / CELL_M))
     for gy in range(cy - _REACH_CELLS, cy + _REACH_CELLS + 1):
         py = corner[1] + (gy + 0.5) * CELL_M
-        for gx in range(cx - _REACH_CELLS, cx + _REACH_CELLS + 1):
-            px = corner[0] + (gx + 0.5) * CELL_M
-            d2 = (px - x) ** 2 + (py - y) ** 2
-            if d2 > REACH_M * REACH_M:
-                continue
-            tx, ty = gx // TILE, gy // TILE
-            tile = table[ty, tx]
-            if tile == EMPTY:
-                tile = used[0]
-                table[ty, tx] = tile
-                labels[tile] = EMPTY
-                used[0] += 1
-            row, column = gy - ty * TILE, gx - tx * TILE
-            old = labels[tile, row, column]
-            if old == EMPTY or (px - surfels[old, 0]) ** 2 + (py - surfels[old, 1]) ** 2 > d2:
-                labels[tile, row, column] = label
+        across = REACH_M * REACH_M - (py - y) ** 2
+        if across < 0.0:
+            continue
+        ty = gy // TILE
+        row = gy - ty * TILE
+        half = np.sqrt(across)
+        low = max(cx - _REACH_CELLS, int(np.ceil((x - half - corner[0]) / CELL_M - 0.5)))
+        high = min(cx + _REACH_CELLS, int(np.floor((x + half - corner[0]) / CELL_M - 0.5)))
+        for tx in range(low // TILE, high // TILE + 1):
+            tile = _tile_at(tx, ty, table, labels, used)
+            for gx in range(max(low, tx * TILE), min(high, tx * TILE + TILE - 1) + 1):
+                px = corner[0] + (gx + 0.5) * CELL_M
+                old = labels[tile, row, gx - tx * TILE]
+                d2 = (px - x) ** 2 + (py - y) ** 2
+                if old == EMPTY or (px - surfels[old, 0]) ** 2 + (py - surfels[old, 1]) ** 2 > d2:
+                    labels[tile, row, gx - tx * TILE] = label
+
+
+@njit(cache=True)
+def _tile_at(tx, ty, table, labels, used):  # type: ignore[no-untyped-def]
+    """Storage of a tile of the table, made if it has none."""
+    tile = table[ty, tx]
+    if tile == EMPTY:
+        tile = used[0]
+        table[ty, tx] = tile
+        labels[tile] = EMPTY
+        used[0] += 1
+    return tile
 
 
 def field_of(scans: list[tuple[PointScan, FloatArray]]) -> SurfelField:

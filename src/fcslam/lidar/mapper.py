@@ -10,7 +10,7 @@ from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.lidar.closing import Anchored, Closure, ClosingConfig, LoopCloser
+from fcslam.lidar.closing import Anchored, ClosingConfig, Closure, LoopCloser
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import build_submap

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fcslam.lidar.field import EMPTY, SurfelField, field_of, label_at
+from fcslam.lidar.field import CELL_M, EMPTY, SurfelField, field_of, label_at
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
@@ -49,7 +49,8 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
 
 
 def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
-    """The returns within the radius of the anchor (measured from the robot: the window is short)."""
+    """Returns a field cell apart, within the radius of the anchor (measured from the robot: the window is short)."""
+    scan = scan.thinned(CELL_M)
     limit = max(1.0, RADIUS_M - float(np.hypot(T_anchor_base[0], T_anchor_base[1])))
     inside = scan.points[:, 0] ** 2 + scan.points[:, 1] ** 2 < limit * limit
     return PointScan(scan.points[inside], scan.normals[inside])
