@@ -3,7 +3,7 @@
     FCSLAM_DATA=/path/to/data python benchmarks/bytes.py
 
 Counted by the transport's ledger on the split logs: encoded packets, without what a network adds to them. Keyscans,
-constraints and places go up; corrections and acknowledgements come down.
+constraints and places go up; corrections and acknowledgements come down. Paths are the odometry's.
 """
 
 import heapq
@@ -34,24 +34,26 @@ def main() -> None:
     kinds, robots = [], []
     for name, parts in common.SPLITS.items():
         sources = split(open_source(common.log_path(folder, name)), parts)
-        ledger, paths_m = fly(sources)
-        seconds = {source.name: source.survey().duration_s for source in sources}
-        kinds += kind_rows(name, ledger, sum(seconds.values()), sum(paths_m.values()))
-        robots += [robot_row(robot, ledger, seconds[robot], paths_m[robot]) for robot in seconds]
+        surveys = {source.name: source.survey() for source in sources}
+        seconds = {robot: survey.duration_s for robot, survey in surveys.items()}
+        metres = {robot: survey.path_length_m for robot, survey in surveys.items()}
+        ledger = fly(sources)
+        kinds += kind_rows(name, ledger, sum(seconds.values()), sum(metres.values()))
+        robots += [robot_row(robot, ledger, seconds[robot], metres[robot]) for robot in surveys]
     report.table("By kind, all robots of a log", KINDS, kinds)
     report.table("By robot", ROBOTS, robots)
     report.write()
 
 
-def fly(sources: list[Source]) -> tuple[Ledger, dict[str, float]]:
-    """The whole traffic of a mission, and each robot's path length in metres."""
+def fly(sources: list[Source]) -> Ledger:
+    """The whole traffic of a mission."""
     config = MissionConfig()
     robots = [RobotFrontend(source.name, config.robot) for source in sources]
     transport = InMemoryTransport(Fleet(config.fleet, config.seed).receive)
     streams = [packets(source, robot) for source, robot in zip(sources, robots, strict=True)]
     for packet in heapq.merge(*streams, key=lambda packet: packet.order):
         transport.send(encode(packet))
-    return transport.ledger(), {robot.robot: robot.travel_m for robot in robots}
+    return transport.ledger()
 
 
 def packets(source: Source, robot: RobotFrontend) -> Iterator[Packet]:

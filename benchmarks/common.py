@@ -88,7 +88,7 @@ def run_fcslam(*arguments: object, environment: Mapping[str, str] | None = None)
         if process.returncode:
             output.seek(0)
             sys.exit(f"fcslam {' '.join(command[3:])} failed:\n{output.read().decode(errors='replace')}")
-    return Cost(usage.ru_utime + usage.ru_stime, wall_s, usage.ru_maxrss / 1024.0)
+    return Cost(usage.ru_utime + usage.ru_stime, wall_s, usage.ru_maxrss * 1024 / 1e6)
 
 
 def run_fcslam_cold(*arguments: object) -> Cost:

@@ -20,7 +20,7 @@ from fcslam.sources import open_source
 from fcslam.wire.messages import Kind
 from fcslam.wire.packets import encode, read_label
 
-TENTHS = {"tenth": "", "scans": "", "path so far, m": ".0f", "keyscans so far": "", "mean CPU, ms": ".3f",
+TENTHS = {"tenth": "", "scans": "", "odometry so far, m": ".0f", "keyscans so far": "", "mean CPU, ms": ".3f",
           "median CPU, ms": ".3f", "99 %, ms": ".2f", "max, ms": ".1f", "memory at its end, MB": ".1f"}  # fmt: skip
 
 
@@ -30,7 +30,6 @@ def main() -> None:
     report = common.Report(__file__, __doc__, chosen)
     drive(common.log_path(folder, "mit-csail"))
     gc.collect()
-    before_mb = resident_mb()
     cpu_ms, wall_ms, state = drive(common.log_path(folder, "intel"))
     fifth = len(cpu_ms) // 5
     first, last = cpu_ms[:fifth], cpu_ms[-fifth:]
@@ -47,7 +46,8 @@ def main() -> None:
         [(what, ms.mean(), *np.percentile(ms, quantiles)) for what, ms in (("CPU", cpu_ms), ("wall", wall_ms))],
     )
     report.table("Along the log", TENTHS, tenths(cpu_ms, state))
-    report.say(f"Memory grew by {state[-1, 2] - before_mb:.1f} MB over the log, from {before_mb:.1f} MB.")
+    grown_mb, path_m = state[-1, [2, 0]] - state[len(state) // 10, [2, 0]]
+    report.say(f"Memory grew by {grown_mb:.1f} MB over the last nine tenths, {1e3 * grown_mb / path_m:.0f} kB a metre.")
     report.write()
 
 
@@ -55,16 +55,18 @@ def drive(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """CPU and wall milliseconds of each scan, shape (N,); path m, keyscans and memory MB after it, shape (N, 3)."""
     robot = RobotFrontend("robot", RobotConfig())
     cpu_ms, wall_ms, state = [], [], []
-    keyscans = 0
+    keyscans, path_m, last = 0, 0.0, None
     for record in open_source(path).records():
         wall, cpu = time.perf_counter(), time.process_time()
         packets = [encode(packet) for packet in robot.process(record)]
         spent = (time.process_time() - cpu, time.perf_counter() - wall)
         if isinstance(record, LaserScan):
+            last, before = record.T_odom_base, record.T_odom_base if last is None else last
+            path_m += float(np.hypot(*(last - before)[:2]))
             keyscans += sum(read_label(packet).kind == Kind.KEYSCAN for packet in packets)
             cpu_ms.append(1e3 * spent[0])
             wall_ms.append(1e3 * spent[1])
-            state.append((robot.travel_m, keyscans, resident_mb()))
+            state.append((path_m, keyscans, resident_mb()))
     return np.array(cpu_ms), np.array(wall_ms), np.array(state)
 
 
@@ -79,7 +81,7 @@ def tenths(cpu_ms: np.ndarray, state: np.ndarray) -> list[tuple]:
 
 def resident_mb() -> float:
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 if __name__ == "__main__":
