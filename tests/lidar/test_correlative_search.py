@@ -4,19 +4,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import ring, ring_drive, room, scan_at
+from worlds import bare_scan, ring, ring_drive, room, scan_at
 
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchConfig, SearchWindow, likelihood_pyramid, search, search_pyramid
 from fcslam.lidar.field import field_of
-from fcslam.lidar.scan import PointScan
 
 CONFIG = SearchConfig()
 
 
 def random_scan(rng, count, reach):
     points = rng.uniform(-reach, reach, (count, 2))
-    return PointScan(points, np.zeros((count, 2)))
+    return bare_scan(points)
 
 
 def steps(scan, window, cell_m):
@@ -131,7 +130,7 @@ def test_a_far_offset_is_recovered_in_a_wide_window(offset):
 
 def test_nothing_to_see_answers_with_the_guess():
     guess = np.array([1.0, -2.0, 0.5])
-    nothing = PointScan(np.empty((0, 2)), np.empty((0, 2)))
+    nothing = bare_scan([])
     field = field_of([(scan_at((0, 0, 0), room()), np.zeros(3))])
     far = np.array([150.0, 0.0, 0.5])
     for scan, where, there in (
@@ -148,8 +147,8 @@ def test_returns_beyond_the_grid_do_not_break_the_bound():
     """A wall in the grid's first column, seen where every point lies off the grid until it is shifted by 0.8 m."""
     y = np.arange(-2.0, 2.0, 0.13)
     wall, seen = np.column_stack((np.full_like(y, -2.95), y)), np.column_stack((np.full_like(y, -3.75), y))
-    field = field_of([(PointScan(wall, np.zeros_like(wall)), np.zeros(3))])
-    scan = PointScan(seen, np.zeros_like(seen))
+    field = field_of([(bare_scan(wall), np.zeros(3))])
+    scan = bare_scan(seen)
     window = SearchWindow(1.5, 0.0)
     pyramid = likelihood_pyramid(field, np.zeros(3), 3.0, CONFIG)
     found = search_pyramid(scan, pyramid, np.zeros(3), window, CONFIG)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import LASER, MAX_RANGE_M, box, path, ranges, room, scan_at
+from worlds import LASER, MAX_RANGE_M, bare_scan, box, path, ranges, room, scan_at
 
 from fcslam.geometry import se2
-from fcslam.lidar.scan import PointScan, point_scan
+from fcslam.lidar.scan import point_scan
 from fcslam.records import LaserModel, frozen
 
 
@@ -94,7 +94,7 @@ def test_thinned_keeps_distance_and_limit():
     thinned = scan.thinned(0.2, 1000)
     assert np.all(np.hypot(*np.diff(thinned.points, axis=0).T) >= 0.2)
     assert len(scan.thinned(0.0, 50)) == 50
-    assert len(PointScan(np.empty((0, 2)), np.empty((0, 2))).thinned(0.1, 5)) == 0
+    assert len(bare_scan([]).thinned(0.1, 5)) == 0
 
 
 def test_ranges_of_another_laser_are_refused():

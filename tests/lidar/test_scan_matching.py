@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from worlds import box, corridor, path, ring, ring_drive, room, scan_at
+from worlds import bare_scan, box, corridor, path, ring, ring_drive, room, scan_at
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import field_of
 from fcslam.lidar.matching import MatchingConfig, match_scan
-from fcslam.lidar.scan import PointScan
 
 NO_PRIOR = np.zeros((3, 3))
 CONFIG = MatchingConfig()
@@ -144,7 +143,7 @@ def test_moving_field_and_guess_moves_the_result():
 
 
 def test_nothing_known_leaves_the_guess(field):
-    nothing = PointScan(np.empty((0, 2)), np.empty((0, 2)))
+    nothing = bare_scan([])
     guess = np.array([1.0, 2.0, 0.5])
     for scan, other in ((nothing, field), (scan_at((0, 0, 0), room()), field_of([]))):
         found = match_scan(scan, other, guess, NO_PRIOR, CONFIG)

@@ -125,8 +125,8 @@ def test_the_buffer_does_not_grow_with_the_drive(truth):
         fields = [field for field, _ in tracker._fields]
         assert len(fields) <= 2
         assert all(count <= TrackerConfig().buffer_keyscans for _, count in tracker._fields)
-        assert all(field.table.shape == (TABLE, TABLE) for field in fields)
-        return max(len(field.points) for field in fields), max(field.labels.nbytes for field in fields)
+        assert all(field.arrays.table.shape == (TABLE, TABLE) for field in fields)
+        return max(len(field.points) for field in fields), max(field.arrays.labels.nbytes for field in fields)
 
     once, twice = memory(1.0), memory(2.0)
     assert twice[0] < 1.3 * once[0]

@@ -5,18 +5,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
-from worlds import path, ring, ring_drive, room, scan_at
+from worlds import bare_scan, path, ring, ring_drive, room, scan_at
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import CELL_M, EMPTY, MERGE_M, REACH_M, TABLE, TILE, SurfelField, field_of
-from fcslam.lidar.scan import PointScan
 
 HALF_DIAGONAL_M = CELL_M * np.sqrt(0.5)
 SIDE_M = TABLE * TILE * CELL_M
 
 
 def points_scan(points):
-    return PointScan(np.asarray(points, dtype=float), np.zeros((len(points), 2)))
+    return bare_scan(points)
 
 
 def excess(field, queries):
@@ -75,7 +74,7 @@ def test_noise_averages_out():
     rng = np.random.default_rng(1)
     wall = path((3, -2), (3, 2))
     field = field_of([(scan_at(np.zeros(3), wall, noise_m=0.02, rng=rng), np.zeros(3)) for _ in range(30)])
-    counts = field.surfels[: len(field.points), 4]
+    counts = field.arrays.surfels[: len(field.points), 4]
     settled = field.points[counts >= 20]
     assert len(settled) > 20
     assert np.sqrt(np.mean((settled[:, 0] - 3) ** 2)) < 0.01
@@ -111,29 +110,30 @@ def test_growth_of_storage_changes_nothing():
     poses = ring_drive()[::25]
     scans = [(scan_at(pose, ring(), noise_m=0.01, rng=np.random.default_rng(k)), pose) for k, pose in enumerate(poses)]
     grown, large = SurfelField(poses[0]), SurfelField(poses[0])
-    large.labels = np.full((1000, TILE, TILE), EMPTY, np.int32)
-    large.surfels = np.zeros((50_000, 5))
+    roomy = {"labels": np.full((1000, TILE, TILE), EMPTY, np.int32), "surfels": np.zeros((50_000, 6))}
+    large.arrays = large.arrays._replace(**roomy)
     for scan, pose in scans:
         grown.insert(scan, pose)
         large.insert(scan, pose)
-    tiles, surfels = grown.used
+    tiles, surfels = grown.arrays.used
     assert surfels > 1024
     assert tiles > 64
-    np.testing.assert_array_equal(grown.used, large.used)
-    np.testing.assert_array_equal(grown.surfels[:surfels], large.surfels[:surfels])
-    np.testing.assert_array_equal(grown.labels[:tiles], large.labels[:tiles])
-    np.testing.assert_array_equal(grown.table, large.table)
+    np.testing.assert_array_equal(grown.arrays.used, large.arrays.used)
+    np.testing.assert_array_equal(grown.arrays.surfels[:surfels], large.arrays.surfels[:surfels])
+    np.testing.assert_array_equal(grown.arrays.labels[:tiles], large.arrays.labels[:tiles])
+    np.testing.assert_array_equal(grown.arrays.table, large.arrays.table)
 
 
-def test_a_kept_copy_is_the_same_field():
-    field = field_of([(scan_at(np.zeros(3), room()), np.zeros(3))])
-    kept = field.transformed_copy()
-    queries = np.random.default_rng(0).uniform(-5, 5, (500, 2))
+def test_a_compact_field_is_the_same_field():
+    field, kept = (field_of([(scan_at(np.zeros(3), room()), np.zeros(3))]) for _ in range(2))
+    kept.compact()
+    queries = np.random.default_rng(0).uniform(-30, 30, (2000, 2))
     np.testing.assert_array_equal(kept.nearest(queries), field.nearest(queries))
-    field.insert(scan_at((0, 0, 0), room() + 0.3), np.zeros(3))
-    assert len(kept.points) < len(field.points)
-    far = field_of([]).transformed_copy()
-    assert len(far.points) == 0
+    np.testing.assert_array_equal(kept.points, field.points)
+    assert sum(array.nbytes for array in kept.arrays) < 0.5 * sum(array.nbytes for array in field.arrays)
+    empty = field_of([])
+    empty.compact()
+    assert (empty.nearest(queries) == EMPTY).all()
 
 
 def test_insertion_is_equivariant_in_whole_cells():

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.scan import point_scan
+from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import LaserModel, LaserScan, frozen
 
 MAX_RANGE_M = 20.0
@@ -137,3 +137,9 @@ def pose_errors(estimate, truth):
     """Distance (N,) and turn (N,) of poses from the truth, both given relative to their first."""
     rest = se2.between(se2.between(truth[0], truth), se2.between(estimate[0], estimate))
     return np.hypot(rest[:, 0], rest[:, 1]), np.abs(rest[:, 2])
+
+
+def bare_scan(points: np.ndarray) -> PointScan:
+    """Returns seen from the origin of which nothing but the place is known."""
+    xy = np.asarray(points, dtype=float).reshape(-1, 2)
+    return PointScan(xy, np.zeros_like(xy), np.ones(len(xy), bool), np.zeros(2))

@@ -114,13 +114,12 @@ def dominant_cluster(
 
     ``consistent`` (K, K) from :func:`pairwise_consistency`; ``places`` (K, 2), or (K, S, 2) as seen by S
     trajectories, where each closure is (metres, each side in one frame); ``informative`` (K,) whether it fixes the
-    pose in every direction. Aliases agree with one another, too: so the cluster must have enough supporters from different places, an informative one, and a clear lead over the
-    largest one that contradicts it: in closures, and no less in places.
+    pose in every direction. Aliases agree with one another, too: so the cluster must have enough supporters from
+    different places, an informative one, and a clear lead over the largest one that contradicts it: in closures, and
+    no less in places.
     """
-    xy, informs = (
-        np.asarray(places, dtype=np.float64).reshape(len(consistent), -1, 2),
-        np.asarray(informative, dtype=bool),
-    )
+    xy, informs = np.asarray(places, dtype=np.float64), np.asarray(informative, dtype=bool)
+    xy = xy.reshape(len(xy), xy.size // (2 * max(1, len(xy))), 2)
     first = maximum_clique(consistent)
     members = list(first.members)
     others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))

@@ -4,6 +4,7 @@ How far the estimate may be off grows with the shortest path through the pose gr
 not with time: after a closure the search is narrow again. A wide search is branch and bound over the whole window.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,11 @@ from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import Verification, VerificationConfig, verify
 from fcslam.records import FloatArray
+
+SURPRISE_M, SURPRISE_RAD = 0.15, 0.03
+"""A closure this far off its prediction asks for a solve at once."""
+PENDING_M = 60.0
+"""Travel after which a closure that found no support is given up."""
 
 
 class ClosingConfig(Settings):
@@ -38,11 +44,11 @@ class Anchored:
 
     keyscan: int
     travel_m: float
-    """Path length up to the anchor."""
+    """Path length up to the anchor (turning counts a little)."""
     submap: Submap
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Closure:
     """A verified closure between the anchors of two submaps (indices into the closer's list)."""
 
@@ -53,6 +59,16 @@ class Closure:
     """How far the measurement lies from the prediction (x, y, theta)."""
     slack_m: float
     """Drift allowed for when it was found."""
+
+    @property
+    def off_m(self) -> float:
+        """Length of the innovation."""
+        return float(np.hypot(self.innovation[0], self.innovation[1]))
+
+    @property
+    def is_surprising(self) -> bool:
+        """Whether it says that the estimate is off."""
+        return self.off_m > SURPRISE_M or abs(self.innovation[2]) > SURPRISE_RAD
 
 
 class LoopCloser:
@@ -71,15 +87,15 @@ class LoopCloser:
         """Whether any closure was accepted."""
         return bool(self._accepted)
 
-    def add(self, place: Anchored, poses: FloatArray) -> list[Closure]:
+    def add(self, place: Anchored, poses: Sequence[FloatArray]) -> list[Closure]:
         """Take in the next submap; closures that hold now (of it, and of earlier ones it supports).
 
-        ``poses``: T_map_base of every keyscan so far, shape (N, 3).
+        ``poses``: T_map_base of every keyscan so far.
         """
         self.places.append(place)
         later = len(self.places) - 1
         paths = self._paths_from(later)
-        anchors = poses[[p.keyscan for p in self.places]]
+        anchors = np.array([poses[p.keyscan] for p in self.places])
         found = [
             closure
             for earlier in self._candidates(later, anchors, paths)
@@ -95,7 +111,7 @@ class LoopCloser:
         columns = [*range(1, n), *(c.later for c in self._accepted)]
         lengths = [*(np.diff(travel) + 1e-3), *(1.0 for _ in self._accepted)]
         links = coo_array((np.array(lengths), (np.array(rows), np.array(columns))), shape=(n, n))
-        paths: FloatArray = dijkstra(links, False, later)  # undirected, from the newest
+        paths: FloatArray = dijkstra(links.tocsr(), directed=False, indices=[later])[0]
         return paths
 
     def _slack(self, path_m: float) -> tuple[float, float]:
@@ -141,7 +157,9 @@ class LoopCloser:
         """Closures near their prediction hold at once; others wait until enough of them agree."""
         sure = [c for c in found if self._is_expected(c) or self._is_plain(c)]
         self._pending += [c for c in found if c not in sure and c.check.testimony]
-        self._pending = [c for c in self._pending if self.places[-1].travel_m - self.places[c.later].travel_m < 60.0]
+        self._pending = [
+            c for c in self._pending if self.places[-1].travel_m - self.places[c.later].travel_m < PENDING_M
+        ]
         cluster = self._cluster(anchors)
         sure += cluster
         self._pending = [c for c in self._pending if c not in cluster]
@@ -156,13 +174,12 @@ class LoopCloser:
     @staticmethod
     def _is_plain(closure: Closure) -> bool:
         """A wide closure that stands alone: informative, rich, and close to where it was expected."""
-        off = float(np.hypot(closure.innovation[0], closure.innovation[1]))
         worse = closure.check.worse
-        near = off < 0.3 * closure.slack_m + 0.2
+        near = closure.off_m < 0.3 * closure.slack_m + 0.2
         return closure.check.strict and closure.check.informative and worse.overlap > 0.4 and near
 
     def _cluster(self, anchors: FloatArray) -> list[Closure]:
-        """The largest set of pending closures that agree with the newest one, if there are enough."""
+        """The pending closures that agree with the newest one, if they are enough."""
         if not self._pending:
             return []
         newest = self._pending[-1]

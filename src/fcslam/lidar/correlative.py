@@ -58,17 +58,28 @@ class LikelihoodPyramid:
 
 
 def likelihood_pyramid(
-    field: SurfelField, T_field_guess: FloatArray, half_side_m: float, config: SearchConfig
+    field: SurfelField, T_field_guess: FloatArray, half_side_m: float, config: SearchConfig, visible_only: bool = False
 ) -> LikelihoodPyramid:
-    """Draw the surfaces around the guess that face it (Karto's visibility filter) and build the pyramid."""
+    """Draw the surfaces around the guess and build the pyramid.
+
+    ``visible_only`` draws those alone that face the guess (Karto's visibility filter): right for one scan near it.
+    """
     size = int(np.ceil(2.0 * half_side_m / config.cell_m)) + 1
     corner = np.asarray(T_field_guess[:2]) - half_side_m
-    base = _draw(field.points, field.normals, T_field_guess, corner, size, config.cell_m, config.smear_m)
+    points = field.points
+    if visible_only:
+        points = points[np.einsum("ij,ij->i", field.normals, T_field_guess[:2] - points) >= 0.0]
+    base = _draw(points, corner, size, config.cell_m, config.smear_m)
     return LikelihoodPyramid(_pyramid(base, config.levels), corner, config.cell_m)
 
 
 def search(
-    scan: PointScan, field: SurfelField, T_field_guess: FloatArray, window: SearchWindow, config: SearchConfig
+    scan: PointScan,
+    field: SurfelField,
+    T_field_guess: FloatArray,
+    window: SearchWindow,
+    config: SearchConfig,
+    visible_only: bool = False,
 ) -> SearchResult:
     """Best pose of the scan in the window around the guess, to half a cell and half an angle step.
 
@@ -77,8 +88,14 @@ def search(
     thinned = scan.thinned(config.cell_m, config.points)
     reach = float(np.max(np.hypot(*thinned.points.T), initial=1.0))
     half_side = min(reach, 25.0) + window.radius_m + config.cell_m
-    pyramid = likelihood_pyramid(field, T_field_guess, half_side, config)
+    pyramid = likelihood_pyramid(field, T_field_guess, half_side, _shallow(config, window), visible_only)
     return search_pyramid(thinned, pyramid, T_field_guess, window, config)
+
+
+def _shallow(config: SearchConfig, window: SearchWindow) -> SearchConfig:
+    """No more levels than the window can use."""
+    usable = int(np.log2(window.radius_m / config.cell_m + 1.0)) + 1
+    return config.model_copy(update={"levels": min(config.levels, max(1, usable))})
 
 
 def search_pyramid(
@@ -97,13 +114,11 @@ def search_pyramid(
 
 
 @njit(cache=True)
-def _draw(points, normals, viewpoint, corner, size, cell, smear):  # type: ignore[no-untyped-def]
+def _draw(points, corner, size, cell, smear):  # type: ignore[no-untyped-def]
     grid = np.zeros((size, size), np.uint8)
     half = int(np.ceil(2.5 * smear / cell))
     for i in range(len(points)):
         x, y = points[i, 0], points[i, 1]
-        if normals[i, 0] * (viewpoint[0] - x) + normals[i, 1] * (viewpoint[1] - y) < 0.0:
-            continue
         cx, cy = int(np.floor((x - corner[0]) / cell)), int(np.floor((y - corner[1]) / cell))
         for gy in range(max(0, cy - half), min(size, cy + half + 1)):
             dy = corner[1] + (gy + 0.5) * cell - y

@@ -5,7 +5,7 @@ tiles stores in each cell the nearest surfel, so the distance to the map is exac
 look-up. Tiles exist only near surfaces: memory follows what was seen, not the range squared.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -28,91 +28,114 @@ TABLE: Final = 256
 """Tiles along one side of the field: 409.6 m, more than any submap with any laser."""
 EMPTY: Final = -1
 
+MOST_NEW_TILES: Final = 9
+"""One surfel reaches into no more tiles."""
+
 _REACH_CELLS = round(REACH_M / CELL_M)
+
+
+class FieldArrays(NamedTuple):
+    """A field as compiled code sees it."""
+
+    corner: FloatArray
+    """Lower left corner of the table, shape (2,)."""
+    table: NDArray[np.int32]
+    """Storage number of each tile, or EMPTY; shape (rows, columns)."""
+    labels: NDArray[np.int32]
+    """Nearest surfel of each cell of each stored tile, or EMPTY; shape (tiles, TILE, TILE)."""
+    surfels: FloatArray
+    """x, y, normal x, normal y, returns, whether all of them stood alone; shape (capacity, 6)."""
+    used: NDArray[np.int64]
+    """Tiles and surfels in use, shape (2,)."""
 
 
 class SurfelField:
     """Nearest-surfel field around an origin, in the coordinates of its submap."""
 
     def __init__(self, origin_xy: FloatArray) -> None:
-        self.corner = np.asarray(origin_xy[:2], dtype=np.float64) - 0.5 * TABLE * TILE * CELL_M
-        self.table = np.full((TABLE, TABLE), EMPTY, np.int32)
-        self.labels = np.full((64, TILE, TILE), EMPTY, np.int32)
-        self.surfels = np.zeros((1024, 5))
-        self.used = np.zeros(2, np.int64)  # tiles, surfels
+        self.arrays = FieldArrays(
+            corner=np.asarray(origin_xy[:2], dtype=np.float64) - 0.5 * TABLE * TILE * CELL_M,
+            table=np.full((TABLE, TABLE), EMPTY, np.int32),
+            labels=np.full((64, TILE, TILE), EMPTY, np.int32),
+            surfels=np.zeros((1024, 6)),
+            used=np.zeros(2, np.int64),
+        )
 
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
         """Add a scan seen from ``T_field_base``; returns outside the table are left out."""
         done = 0
-        while True:
-            done = _insert(
-                scan.points, scan.normals, T_field_base, done,
-                self.corner, self.table, self.labels, self.surfels, self.used,
-            )  # fmt: skip
-            if done == len(scan):
-                return
+        while (done := _insert(scan.points, scan.normals, scan.solitary, T_field_base, done, self.arrays)) < len(scan):
             self._grow()
 
     @property
     def points(self) -> FloatArray:
         """Positions of the surfels, shape (N, 2)."""
-        return self.surfels[: self.used[1], :2]
+        return self.arrays.surfels[: self.arrays.used[1], :2]
 
     @property
     def normals(self) -> FloatArray:
         """Unit normals of the surfels, (0, 0) where unknown, shape (N, 2)."""
-        normals: FloatArray = self.surfels[: self.used[1], 2:4]
+        normals: FloatArray = self.arrays.surfels[: self.arrays.used[1], 2:4]
         return normals
 
-    def as_scan(self) -> PointScan:
-        """All surfels as one scan in the field's coordinates."""
-        return PointScan(self.points.copy(), self.normals.copy())
+    @property
+    def solitary(self) -> NDArray[np.bool_]:
+        """Surfels all of whose returns stood alone, shape (N,)."""
+        alone: NDArray[np.bool_] = self.arrays.surfels[: self.arrays.used[1], 5] > 0.0
+        return alone
 
     def nearest(self, points: FloatArray) -> NDArray[np.int32]:
         """Label of the surfel nearest to the cell of each point, or ``EMPTY``; shape (N,)."""
-        labels: NDArray[np.int32] = _labels_at(points, self.corner, self.table, self.labels)
+        labels: NDArray[np.int32] = _labels_at(points, self.arrays)
         return labels
 
-    def transformed_copy(self) -> "SurfelField":
-        """A field of the same surfels with storage cut to what is used (for keeping)."""
-        copy = SurfelField.__new__(SurfelField)
-        copy.corner, copy.table = self.corner, self.table
-        copy.labels = self.labels[: self.used[0]].copy()
-        copy.surfels = self.surfels[: self.used[1]].copy()
-        copy.used = self.used.copy()
-        return copy
+    def compact(self) -> None:
+        """Give back the storage that is not used; for a field that is complete."""
+        corner, table, labels, surfels, used = self.arrays
+        rows, columns = np.nonzero(table != EMPTY)
+        if not len(rows):
+            rows = columns = np.zeros(1, np.int64)
+        first, last = (rows.min(), columns.min()), (rows.max() + 1, columns.max() + 1)
+        self.arrays = FieldArrays(
+            corner=corner + TILE * CELL_M * np.array((first[1], first[0]), dtype=np.float64),
+            table=table[first[0] : last[0], first[1] : last[1]].copy(),
+            labels=labels[: max(1, used[0])].copy(),
+            surfels=surfels[: max(1, used[1])].copy(),
+            used=used,
+        )
 
     def _grow(self) -> None:
-        if len(self.labels) - self.used[0] < 9:
-            self.labels = np.concatenate([self.labels, np.full_like(self.labels, EMPTY)])
-        if self.used[1] == len(self.surfels):
-            self.surfels = np.concatenate([self.surfels, np.zeros_like(self.surfels)])
+        _, _, labels, surfels, used = self.arrays
+        if len(labels) - used[0] < MOST_NEW_TILES:
+            self.arrays = self.arrays._replace(labels=np.concatenate([labels, np.full_like(labels, EMPTY)]))
+        if used[1] == len(surfels):
+            self.arrays = self.arrays._replace(surfels=np.concatenate([surfels, np.zeros_like(surfels)]))
 
 
 @njit(cache=True)
-def label_at(x, y, corner, table, labels):  # type: ignore[no-untyped-def]
+def label_at(x, y, field):  # type: ignore[no-untyped-def]
     """Surfel nearest to the cell of (x, y), or EMPTY."""
-    cx = int(np.floor((x - corner[0]) / CELL_M))
-    cy = int(np.floor((y - corner[1]) / CELL_M))
+    cx = int(np.floor((x - field.corner[0]) / CELL_M))
+    cy = int(np.floor((y - field.corner[1]) / CELL_M))
     tx, ty = cx // TILE, cy // TILE
-    if tx < 0 or ty < 0 or tx >= table.shape[1] or ty >= table.shape[0]:
+    if tx < 0 or ty < 0 or tx >= field.table.shape[1] or ty >= field.table.shape[0]:
         return EMPTY
-    tile = table[ty, tx]
+    tile = field.table[ty, tx]
     if tile == EMPTY:
         return EMPTY
-    return labels[tile, cy - ty * TILE, cx - tx * TILE]
+    return field.labels[tile, cy - ty * TILE, cx - tx * TILE]
 
 
 @njit(cache=True)
-def _labels_at(points, corner, table, labels):  # type: ignore[no-untyped-def]
+def _labels_at(points, field):  # type: ignore[no-untyped-def]
     result = np.empty(len(points), np.int32)
     for i in range(len(points)):
-        result[i] = label_at(points[i, 0], points[i, 1], corner, table, labels)
+        result[i] = label_at(points[i, 0], points[i, 1], field)
     return result
 
 
 @njit(cache=True)
-def _insert(points, normals, T, start, corner, table, labels, surfels, used):  # type: ignore[no-untyped-def]
+def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-untyped-def]
     """Insert returns from ``start`` on; returns how many are done when all are, or when storage must grow."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
     for i in range(start, len(points)):
@@ -120,49 +143,51 @@ def _insert(points, normals, T, start, corner, table, labels, surfels, used):  #
         y = T[1] + sin * points[i, 0] + cos * points[i, 1]
         nx = cos * normals[i, 0] - sin * normals[i, 1]
         ny = sin * normals[i, 0] + cos * normals[i, 1]
-        if not _within(x, y, corner, table):
+        if not _within(x, y, field):
             continue
         # A thin wall's other side may hold the cell: one step towards the robot this side does.
-        label = label_at(x, y, corner, table, labels)
-        ahead = label_at(x + CELL_M * nx, y + CELL_M * ny, corner, table, labels)
-        if _merge(x, y, nx, ny, label, corner, surfels) or _merge(x, y, nx, ny, ahead, corner, surfels):
+        label = label_at(x, y, field)
+        ahead = label_at(x + CELL_M * nx, y + CELL_M * ny, field)
+        if _merge(x, y, nx, ny, solitary[i], label, field) or _merge(x, y, nx, ny, solitary[i], ahead, field):
             continue
-        if used[1] == len(surfels) or len(labels) - used[0] < 9:
+        if field.used[1] == len(field.surfels) or len(field.labels) - field.used[0] < MOST_NEW_TILES:
             return i
-        surfels[used[1]] = (x, y, nx, ny, 1.0)
-        _spread(x, y, used[1], corner, table, labels, surfels, used)
-        used[1] += 1
+        field.surfels[field.used[1]] = (x, y, nx, ny, 1.0, 1.0 if solitary[i] else 0.0)
+        _spread(x, y, field.used[1], field)
+        field.used[1] += 1
     return len(points)
 
 
 @njit(cache=True)
-def _within(x, y, corner, table):  # type: ignore[no-untyped-def]
+def _within(x, y, field):  # type: ignore[no-untyped-def]
     """Whether the table holds every cell within reach of (x, y)."""
-    side = table.shape[0] * TILE * CELL_M
+    side = field.table.shape[0] * TILE * CELL_M
     margin = REACH_M + CELL_M
-    cx, cy = x - corner[0], y - corner[1]
+    cx, cy = x - field.corner[0], y - field.corner[1]
     return cx > margin and cy > margin and cx < side - margin and cy < side - margin
 
 
 @njit(cache=True)
-def _merge(x, y, nx, ny, label, corner, surfels):  # type: ignore[no-untyped-def]
+def _merge(x, y, nx, ny, alone, label, field):  # type: ignore[no-untyped-def]
     """Join a return to its surfel if it is near and does not face away; whether it did.
 
     Near is also where the return's own cell would stay with that surfel: one added there could not be found again.
     """
     if label == EMPTY:
         return False
-    s = surfels[label]
+    s = field.surfels[label]
     dx, dy = x - s[0], y - s[1]
     facing = nx * s[2] + ny * s[3]
     if facing < 0.0:
         return False
     if dx * dx + dy * dy > MERGE_M * MERGE_M:
-        px = corner[0] + (np.floor((x - corner[0]) / CELL_M) + 0.5) * CELL_M
-        py = corner[1] + (np.floor((y - corner[1]) / CELL_M) + 0.5) * CELL_M
+        px = field.corner[0] + (np.floor((x - field.corner[0]) / CELL_M) + 0.5) * CELL_M
+        py = field.corner[1] + (np.floor((y - field.corner[1]) / CELL_M) + 0.5) * CELL_M
         if (px - s[0]) ** 2 + (py - s[1]) ** 2 > (px - x) ** 2 + (py - y) ** 2:
             return False
     s[4] = min(s[4] + 1.0, MEAN_OVER)
+    if not alone:
+        s[5] = 0.0
     gain = 1.0 / s[4]
     s[0] += gain * dx
     s[1] += gain * dy
@@ -179,8 +204,9 @@ def _merge(x, y, nx, ny, label, corner, surfels):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def _spread(x, y, label, corner, table, labels, surfels, used):  # type: ignore[no-untyped-def]
-    """Give the surfel every cell within reach that has no nearer one."""
+def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
+    """Give the surfel every cell within reach that has no nearer one, row by row of the disc, tile by tile."""
+    corner, labels, surfels = field.corner, field.labels, field.surfels
     cx = int(np.floor((x - corner[0]) / CELL_M))
     cy = int(np.floor((y - corner[1]) / CELL_M))
     for gy in range(cy - _REACH_CELLS, cy + _REACH_CELLS + 1):
@@ -194,7 +220,7 @@ def _spread(x, y, label, corner, table, labels, surfels, used):  # type: ignore[
         low = max(cx - _REACH_CELLS, int(np.ceil((x - half - corner[0]) / CELL_M - 0.5)))
         high = min(cx + _REACH_CELLS, int(np.floor((x + half - corner[0]) / CELL_M - 0.5)))
         for tx in range(low // TILE, high // TILE + 1):
-            tile = _tile_at(tx, ty, table, labels, used)
+            tile = _tile_at(tx, ty, field)
             for gx in range(max(low, tx * TILE), min(high, tx * TILE + TILE - 1) + 1):
                 px = corner[0] + (gx + 0.5) * CELL_M
                 old = labels[tile, row, gx - tx * TILE]
@@ -204,14 +230,13 @@ def _spread(x, y, label, corner, table, labels, surfels, used):  # type: ignore[
 
 
 @njit(cache=True)
-def _tile_at(tx, ty, table, labels, used):  # type: ignore[no-untyped-def]
-    """Storage of a tile of the table, made if it has none."""
-    tile = table[ty, tx]
+def _tile_at(tx, ty, field):  # type: ignore[no-untyped-def]
+    """Storage number of a tile, which is taken now if it had none."""
+    tile = field.table[ty, tx]
     if tile == EMPTY:
-        tile = used[0]
-        table[ty, tx] = tile
-        labels[tile] = EMPTY
-        used[0] += 1
+        tile = field.used[0]
+        field.table[ty, tx] = tile
+        field.used[0] += 1
     return tile
 
 

@@ -1,5 +1,6 @@
 """The robot's LiDAR SLAM (Karto class): every scan tracked, keyscans in a pose graph, loops closed between submaps."""
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +13,16 @@ from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.closing import Anchored, ClosingConfig, Closure, LoopCloser
 from fcslam.lidar.correlative import SearchConfig
-from fcslam.lidar.scan import PointScan
+from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.tracker import ScanTracker, Tracked, TrackerConfig
+from fcslam.lidar.tracker import ScanTracker, Tracked, TrackerConfig, odometry_information
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, KeyscanId, LaserScan, Ranges, frozen
+
+SOLVE_EVERY = 20
+"""Closures that may wait for a solve when none of them says that the estimate is off."""
+TURN_AS_TRAVEL_M = 0.1
+"""Progress that one radian of turning counts for: a robot that only turns finishes submaps, too."""
 
 
 class KeyscanConfig(Settings):
@@ -110,11 +116,6 @@ class Mapper:
             self._poses = list(optimize_gnc(self._graph, self._poses, factors=self._factors).poses)
         return np.array(self._poses).reshape(-1, 3)
 
-    @property
-    def travel_m(self) -> float:
-        """Path length so far."""
-        return self._travel[-1] if self._travel else 0.0
-
     def _is_keyscan(self, tracked: Tracked) -> bool:
         if tracked.scan is None:
             return False
@@ -133,10 +134,10 @@ class Mapper:
 
     def _add_keyscan(self, scan: LaserScan, tracked: Tracked) -> tuple[Keyscan, Constraint | None]:
         """New variable of the pose graph, tied to the keyscan before it."""
-        assert tracked.scan is not None
+        points = tracked.scan or point_scan(scan.ranges_m, scan.laser)
         number = len(self._local)
-        self._tracker.insert(tracked.scan, tracked.T_local_base)
-        self._points[number] = tracked.scan
+        self._tracker.insert(points, tracked.T_local_base)
+        self._points[number] = points
         keyscan = Keyscan(KeyscanId(self.robot, number), scan.stamp, _clean(scan.ranges_m, scan.laser.max_range_m))
         if number == 0:
             start = np.array(scan.T_odom_base)
@@ -152,20 +153,21 @@ class Mapper:
         )  # fmt: skip
         self._local.append(tracked.T_local_base)
         self._poses.append(se2.compose(self._poses[-1], motion))
-        self._travel.append(self._travel[-1] + float(np.hypot(motion[0], motion[1])))
+        progress = float(np.hypot(motion[0], motion[1])) + TURN_AS_TRAVEL_M * abs(float(motion[2]))
+        self._travel.append(self._travel[-1] + progress)
         self._graph.add_variable(self._poses[-1])
         self._graph.add_edge(Edge(number - 1, number, constraint.T_i_j, constraint.information, robust=False))
         return keyscan, constraint
 
     def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
         """The next submap, once the robot is far enough past its anchor; closes loops to earlier ones."""
-        gate, travel = self._config.keyscans, np.array(self._travel)
-        anchor = int(np.searchsorted(travel, self._next_anchor_m))
+        gate, travel = self._config.keyscans, self._travel
+        anchor = bisect_left(travel, self._next_anchor_m)
         if anchor == len(travel) or (not at_end and travel[-1] < travel[anchor] + gate.submap_reach_m):
             return None
         self._next_anchor_m = travel[anchor] + gate.submap_every_m
-        first = int(np.searchsorted(travel, travel[anchor] - gate.submap_reach_m))
-        last = int(np.searchsorted(travel, travel[anchor] + gate.submap_reach_m, side="right")) - 1
+        first = bisect_left(travel, travel[anchor] - gate.submap_reach_m)
+        last = bisect_right(travel, travel[anchor] + gate.submap_reach_m) - 1
         T_anchor = [se2.between(self._local[anchor], self._local[k]) for k in range(first, last + 1)]
         submap = build_submap([(self._points[first + k], pose) for k, pose in enumerate(T_anchor)])
         for number in [k for k in self._points if k < first]:
@@ -175,7 +177,7 @@ class Mapper:
 
     def _close_loops(self, place: Anchored) -> tuple[Constraint, ...]:
         """Compare the new submap with earlier ones; what holds becomes constraints."""
-        closures = self._closer.add(place, np.array(self._poses))
+        closures = self._closer.add(place, self._poses)
         constraints = tuple(self._constraint(closure) for closure in closures)
         for c in constraints:
             self._graph.add_edge(Edge(c.i, c.j, c.T_i_j, c.information, robust=True))
@@ -192,8 +194,7 @@ class Mapper:
     def _optimize_if_needed(self, closures: list[Closure]) -> None:
         """Solve at once when a closure says that the estimate is off, else only now and then."""
         self._unsolved += len(closures)
-        off = max((float(np.hypot(c.innovation[0], c.innovation[1])) for c in closures), default=0.0)
-        if self._unsolved >= 20 or off > 0.15:
+        if self._unsolved >= SOLVE_EVERY or any(c.is_surprising for c in closures):
             self._poses = list(optimize(self._graph, self._poses, loss=Loss.CAUCHY, factors=self._factors).poses)
             self._unsolved = 0
 
@@ -207,6 +208,8 @@ def motion_information(motion: FloatArray, tracked: Tracked) -> FloatArray:
     cos, sin = np.cos(tracked.T_local_base[2]), np.sin(tracked.T_local_base[2])
     turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
     odometry = np.diag(((0.01 + 0.1 * moved) ** -2, (0.01 + 0.1 * moved) ** -2, (0.005 + 0.1 * turned) ** -2))
+    if not tracked.information.any():  # nothing but odometry, which may have slipped
+        odometry = odometry_information(moved, turned)
     covariance = np.linalg.inv(0.1 * turn.T @ tracked.information @ turn + odometry)
     floor = np.diag(((0.003 + 0.01 * moved) ** 2, (0.003 + 0.01 * moved) ** 2, (0.001 + 0.01 * turned) ** 2))
     information = np.linalg.inv(covariance + floor)

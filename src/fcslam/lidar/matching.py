@@ -1,15 +1,22 @@
 """Scan matching: Gauss-Newton on the distances of a scan's points to the nearest surfels."""
 
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.lidar.field import EMPTY, SurfelField, label_at
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
+
+OPPOSED: Final = -0.1
+"""Normals with a smaller product face away from each other; a right angle, as at a corner, may still meet."""
+ALONG: Final = 0.25
+"""How much a squared distance along the surface counts against one across it in a point's weight."""
 
 
 class MatchingConfig(Settings):
@@ -49,22 +56,28 @@ def match_scan(
     ``prior_information``: (3, 3), of (x, y, theta) in the field's coordinates; zeros for none.
     """
     pose, information, explained, known = _match(
-        scan.points, scan.normals, T_field_guess, prior_information,
-        field.corner, field.table, field.labels, field.surfels,
+        _Points(scan.points, scan.normals, scan.solitary, scan.origin), T_field_guess, prior_information, field.arrays,
         config.iterations, config.wide_scale_m, config.narrow_scale_m, config.point_sigma_m, config.explained_m,
     )  # fmt: skip
     return ScanMatch(pose, information, explained, known)
 
 
+class _Points(NamedTuple):
+    """A scan as compiled code sees it."""
+
+    points: FloatArray
+    normals: FloatArray
+    solitary: NDArray[np.bool_]
+    origin: FloatArray
+
+
 @njit(cache=True)
-def _match(  # type: ignore[no-untyped-def]
-    points, normals, guess, prior, corner, table, labels, surfels, iterations, wide, narrow, sigma, explained_m
-):
+def _match(scan, guess, prior, field, iterations, wide, narrow, sigma, explained_m):  # type: ignore[no-untyped-def]
+    """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``narrow``."""
     pose = guess.copy()
     scale = wide
-    converged = False
     for _ in range(iterations):
-        H, g = _normal_equations(points, normals, pose, corner, table, labels, surfels, scale)
+        H, g = _normal_equations(scan, pose, field, scale)
         A = H / (sigma * sigma) + prior
         b = g / (sigma * sigma)
         offset = pose - guess
@@ -76,29 +89,27 @@ def _match(  # type: ignore[no-untyped-def]
         pose += step
         small = abs(step[0]) + abs(step[1]) < 2e-4 and abs(step[2]) < 1e-4
         if small and scale <= narrow:
-            converged = True
             break
         scale = max(narrow, scale * (0.35 if small else 0.6))
-    if not converged:
-        scale = narrow
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
-    H, g = _normal_equations(points, normals, pose, corner, table, labels, surfels, narrow)
-    explained, known = _explained(points, normals, pose, corner, table, labels, surfels, explained_m)
+    H, g = _normal_equations(scan, pose, field, narrow)
+    explained, known = _explained(scan, pose, field, explained_m)
     return pose, H / (sigma * sigma), explained, known
 
 
 @njit(cache=True)
-def _normal_equations(points, normals, pose, corner, table, labels, surfels, scale):  # type: ignore[no-untyped-def]
-    """Distance across the surface where its normal is known, across the beam elsewhere; Geman-McClure weights."""
+def _normal_equations(scan, pose, field, scale):  # type: ignore[no-untyped-def]
+    """Point-to-line where a normal is known, point-to-point for solitary returns; Geman-McClure weights."""
     H = np.zeros((3, 3))
     g = np.zeros(3)
+    points, normals, surfels = scan.points, scan.normals, field.surfels
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     c2 = scale * scale
     for i in range(len(points)):
         rx = cos * points[i, 0] - sin * points[i, 1]
         ry = sin * points[i, 0] + cos * points[i, 1]
         x, y = pose[0] + rx, pose[1] + ry
-        label = label_at(x, y, corner, table, labels)
+        label = label_at(x, y, field)
         if label == EMPTY:
             continue
         s = surfels[label]
@@ -106,22 +117,27 @@ def _normal_equations(points, normals, pose, corner, table, labels, surfels, sca
         nx, ny = s[2], s[3]
         mx = cos * normals[i, 0] - sin * normals[i, 1]
         my = sin * normals[i, 0] + cos * normals[i, 1]
-        if nx * mx + ny * my < -0.1:  # the two sides of a thin wall do not attract each other
+        if nx * mx + ny * my < OPPOSED:  # the two sides of a thin wall do not attract each other
             continue
         d2 = dx * dx + dy * dy
         if nx == 0.0 and ny == 0.0:
             nx, ny = mx, my
-        if nx == 0.0 and ny == 0.0:
-            # Far along a wall, lone returns repeat the pattern of the beams: how far they are would tie the robot to
-            # where it stood before, with great certainty. Only their bearing counts.
+        if nx == 0.0 and ny == 0.0 and scan.solitary[i]:
             w = 0.5 * (c2 / (c2 + d2)) ** 2
-            length = max(np.hypot(rx, ry), 1e-9)
-            nx, ny = -ry / length, rx / length
+            _add(H, g, w, 1.0, 0.0, -ry, dx)
+            _add(H, g, w, 0.0, 1.0, rx, dy)
+        elif nx == 0.0 and ny == 0.0:
+            # Far along a wall, returns in a row repeat the pattern of the beams: how far they are would tie the robot
+            # to where it stood before, with great certainty. Only their bearing counts.
+            w = 0.5 * (c2 / (c2 + d2)) ** 2
+            bx, by = points[i, 0] - scan.origin[0], points[i, 1] - scan.origin[1]
+            length = max(np.hypot(bx, by), 1e-9)
+            nx, ny = -(sin * bx + cos * by) / length, (cos * bx - sin * by) / length
             _add(H, g, w, nx, ny, ny * rx - nx * ry, nx * dx + ny * dy)
         else:
             e = nx * dx + ny * dy
             along2 = max(0.0, d2 - e * e)
-            w = (c2 / (c2 + e * e + 0.25 * along2)) ** 2
+            w = (c2 / (c2 + e * e + ALONG * along2)) ** 2
             _add(H, g, w, nx, ny, ny * rx - nx * ry, e)
     return H, g
 
@@ -143,20 +159,21 @@ def _add(H, g, w, jx, jy, jt, e):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _explained(points, normals, pose, corner, table, labels, surfels, limit):  # type: ignore[no-untyped-def]
+def _explained(scan, pose, field, limit):  # type: ignore[no-untyped-def]
+    points, normals, surfels = scan.points, scan.normals, field.surfels
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     explained = known = 0
     for i in range(len(points)):
         x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
         y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
-        label = label_at(x, y, corner, table, labels)
+        label = label_at(x, y, field)
         if label == EMPTY:
             continue
         known += 1
         s = surfels[label]
         mx = cos * normals[i, 0] - sin * normals[i, 1]
         my = sin * normals[i, 0] + cos * normals[i, 1]
-        if s[2] * mx + s[3] * my < -0.1:
+        if s[2] * mx + s[3] * my < OPPOSED:
             continue
         dx, dy = x - s[0], y - s[1]
         d = abs(s[2] * dx + s[3] * dy)

@@ -1,9 +1,11 @@
 """One scan as points with normals in the robot's base."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from fcslam.records import FloatArray, LaserModel, Ranges
 
@@ -15,6 +17,8 @@ GAP_PER_SPACING = 3.0
 """Neighbouring returns closer than this many beam spacings lie on one surface."""
 LINE_TOLERANCE_M = 0.05
 """A normal is kept only if its neighbours lie this close to the fitted line (standard deviation)."""
+ROUNDEST = 0.1
+"""And only if they spread this much less across the line than along it (variances)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,16 +29,24 @@ class PointScan:
     """Shape (N, 2), metres."""
     normals: FloatArray
     """Shape (N, 2): unit vectors towards the laser; (0, 0) where the surface is not a line."""
+    solitary: NDArray[np.bool_]
+    """Shape (N,): returns that stand alone, on no line and in no row: a post, a trunk."""
+    origin: FloatArray
+    """Where the laser is, shape (2,)."""
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def thinned(self, spacing_m: float, limit: int) -> "PointScan":
+    def thinned(self, spacing_m: float, limit: int | None = None) -> "PointScan":
         """Every return at least ``spacing_m`` from the one kept before, at most ``limit`` of them."""
         keep = _thin(self.points, spacing_m)
-        if len(keep) > limit:
+        if limit is not None and len(keep) > limit:
             keep = keep[np.linspace(0, len(keep) - 1, limit).astype(np.int64)]
-        return PointScan(self.points[keep], self.normals[keep])
+        return self.only(keep)
+
+    def only(self, kept: NDArray[Any]) -> "PointScan":
+        """The returns with these indices, or where this mask is true."""
+        return PointScan(self.points[kept], self.normals[kept], self.solitary[kept], self.origin)
 
 
 def point_scan(ranges_m: Ranges, laser: LaserModel) -> PointScan:
@@ -45,7 +57,9 @@ def point_scan(ranges_m: Ranges, laser: LaserModel) -> PointScan:
     """
     if np.shape(ranges_m) != (laser.beam_count,):
         raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {np.shape(ranges_m)}")
-    return PointScan(*_project(ranges_m, laser.angles_rad(), laser.max_range_m, np.array(laser.T_base_laser)))
+    T_base_laser = np.array(laser.T_base_laser)
+    points, normals, solitary = _project(ranges_m, laser.angles_rad(), laser.max_range_m, T_base_laser)
+    return PointScan(points, normals, solitary, T_base_laser[:2])
 
 
 @njit(cache=True)
@@ -66,9 +80,25 @@ def _project(ranges, angles, max_range, T_base_laser):  # type: ignore[no-untype
     points = xy[:n].copy()
     normals = np.zeros((n, 2))
     spacing = abs(angles[1] - angles[0]) if count > 1 else 0.0
+    solitary = np.zeros(n, np.bool_)
     for k in range(n):
         _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals)
-    return points, normals
+        if normals[k, 0] == 0.0 and normals[k, 1] == 0.0:
+            solitary[k] = not _in_row(points, k)
+    return points, normals, solitary
+
+
+@njit(cache=True)
+def _in_row(points, k):  # type: ignore[no-untyped-def]
+    """Whether return k and two neighbours lie in a row, as the far returns from a wall seen at a grazing angle do."""
+    for first in range(max(0, k - 2), min(k, len(points) - 3) + 1):
+        ax, ay = points[first + 1, 0] - points[first, 0], points[first + 1, 1] - points[first, 1]
+        bx, by = points[first + 2, 0] - points[first, 0], points[first + 2, 1] - points[first, 1]
+        chord2 = bx * bx + by * by
+        forward = 0.0 < ax * bx + ay * by < chord2
+        if forward and (ax * by - ay * bx) ** 2 < LINE_TOLERANCE_M**2 * chord2:
+            return True
+    return False
 
 
 @njit(cache=True)
@@ -98,7 +128,7 @@ def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # typ
     nx, ny = -np.sin(half), np.cos(half)
     across = (nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy) / m
     along = (sxx + syy) / m - across
-    if across > LINE_TOLERANCE_M**2 or across > 0.1 * along:
+    if across > LINE_TOLERANCE_M**2 or across > ROUNDEST * along:
         return
     if nx * (T_base_laser[0] - points[k, 0]) + ny * (T_base_laser[1] - points[k, 1]) < 0.0:
         nx, ny = -nx, -ny

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fcslam.lidar.field import CELL_M, EMPTY, SurfelField, field_of, label_at
+from fcslam.lidar.matching import OPPOSED
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
@@ -19,6 +20,10 @@ RADIUS_M: Final = 30.0
 """Surfaces and free space farther than this from the anchor are left out: distant ones are seen too sparsely."""
 SPACING_M: Final = 0.1
 """Surfaces are compared at points this far apart."""
+EXPLAINED_M: Final = 0.15
+VIOLATION_M: Final = 0.30
+LEVER_M: Final = 3.0
+"""Lever at which a turn moves a point as far as a shift does: about what a submap of a room has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +49,10 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
     """Submap of scans given with their poses in the anchor's base (T_anchor_base)."""
     near = [(_near(scan, pose), pose) for scan, pose in scans]
     field = field_of(near)
-    points, normals = _spaced(field.points, field.normals)
-    return Submap(field.transformed_copy(), PointScan(points, normals), _free_space(near, points))
+    surface = _spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
+    free = _free_space(near, surface.points)
+    field.compact()
+    return Submap(field, surface, free)
 
 
 def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
@@ -53,7 +60,7 @@ def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
     scan = scan.thinned(CELL_M)
     limit = max(1.0, RADIUS_M - float(np.hypot(T_anchor_base[0], T_anchor_base[1])))
     inside = scan.points[:, 0] ** 2 + scan.points[:, 1] ** 2 < limit * limit
-    return PointScan(scan.points[inside], scan.normals[inside])
+    return scan.only(inside)
 
 
 def _free_space(scans: Sequence[tuple[PointScan, FloatArray]], surface: FloatArray) -> FreeSpace:
@@ -63,36 +70,38 @@ def _free_space(scans: Sequence[tuple[PointScan, FloatArray]], surface: FloatArr
     columns, rows = np.ceil((around.max(axis=0) - corner) / FREE_CELL_M).astype(np.int64) + 1
     cells = np.zeros((rows, columns), np.bool_)
     for scan, pose in scans:
-        _clear(scan.points, pose, corner, cells)
+        _clear(scan.points, scan.origin, pose, corner, cells)
     return FreeSpace(cells, corner)
 
 
 @njit(cache=True)
-def _clear(points, T, corner, cells):  # type: ignore[no-untyped-def]
-    """Mark the cells between the robot and each return, short of the return itself."""
+def _clear(points, origin, T, corner, cells):  # type: ignore[no-untyped-def]
+    """Mark the cells between the laser and each return, short of the return itself."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
+    x0 = T[0] + cos * origin[0] - sin * origin[1] - corner[0]
+    y0 = T[1] + sin * origin[0] + cos * origin[1] - corner[1]
     rows, columns = cells.shape
     for i in range(len(points)):
-        dx = cos * points[i, 0] - sin * points[i, 1]
-        dy = sin * points[i, 0] + cos * points[i, 1]
+        px, py = points[i, 0] - origin[0], points[i, 1] - origin[1]
+        dx = cos * px - sin * py
+        dy = sin * px + cos * py
         length = np.hypot(dx, dy)
         steps = int((length - FREE_MARGIN_M) / FREE_CELL_M)
         if steps <= 0:
             continue
         ux, uy = dx / length, dy / length
         for k in range(steps + 1):
-            x = int((T[0] + k * FREE_CELL_M * ux - corner[0]) / FREE_CELL_M)
-            y = int((T[1] + k * FREE_CELL_M * uy - corner[1]) / FREE_CELL_M)
+            x = int(np.floor(x0 / FREE_CELL_M + k * ux))
+            y = int(np.floor(y0 / FREE_CELL_M + k * uy))
             if x >= 0 and y >= 0 and x < columns and y < rows:
                 cells[y, x] = True
 
 
-def _spaced(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _spaced(surfels: PointScan) -> PointScan:
     """First surfel of each cell of ``SPACING_M``."""
-    cells = np.floor(points / SPACING_M).astype(np.int64)
+    cells = np.floor(surfels.points / SPACING_M).astype(np.int64)
     _, first = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)
-    first.sort()
-    return points[first], normals[first]
+    return surfels.only(np.sort(first))
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +117,14 @@ class Agreement:
     overlap: float
     """Share of all points that fall into known area."""
     normal_tensor: FloatArray
-    """Sum of n n^T over the explained points, shape (2, 2): its small eigenvalue says how well the match is fixed."""
+    """Sum of J J^T over the explained points, J = (n_x, n_y, lever / LEVER_M), shape (3, 3).
+
+    Its smallest eigenvalue says how well the match is fixed: along a corridor, or turning in a round room, it is not.
+    """
 
     @property
     def weakest(self) -> float:
-        """Smaller eigenvalue of the normal tensor."""
+        """Smallest eigenvalue of the normal tensor."""
         return float(np.linalg.eigvalsh(self.normal_tensor)[0])
 
 
@@ -120,44 +132,42 @@ def agreement(query: Submap, target: Submap, T_target_query: FloatArray) -> Agre
     """Agreement of ``query`` with ``target`` when its anchor lies at ``T_target_query``."""
     known, explained, violating, tensor = _agreement(
         query.surface.points, query.surface.normals, T_target_query,
-        target.field.corner, target.field.table, target.field.labels, target.field.surfels,
-        target.free.cells, target.free.corner,
+        target.field.arrays, target.free.cells, target.free.corner,
     )  # fmt: skip
     total = max(1, len(query.surface))
     return Agreement(explained / max(1, known), violating / max(1, known), explained, known / total, tensor)
 
 
-EXPLAINED_M: Final = 0.15
-VIOLATION_M: Final = 0.30
-
-
 @njit(cache=True)
-def _agreement(points, normals, T, corner, table, labels, surfels, free, free_corner):  # type: ignore[no-untyped-def]
+def _agreement(points, normals, T, field, free, free_corner):  # type: ignore[no-untyped-def]
     cos, sin = np.cos(T[2]), np.sin(T[2])
     known = explained = violating = 0
-    tensor = np.zeros((2, 2))
+    tensor = np.zeros((3, 3))
+    jacobian = np.empty(3)
     for i in range(len(points)):
         x = T[0] + cos * points[i, 0] - sin * points[i, 1]
         y = T[1] + sin * points[i, 0] + cos * points[i, 1]
         mx = cos * normals[i, 0] - sin * normals[i, 1]
         my = sin * normals[i, 0] + cos * normals[i, 1]
-        label = label_at(x, y, corner, table, labels)
+        label = label_at(x, y, field)
         distance = 10.0
         if label != EMPTY:
-            s = surfels[label]
-            if s[2] * mx + s[3] * my > -0.1:
+            s = field.surfels[label]
+            if s[2] * mx + s[3] * my > OPPOSED:
                 distance = np.hypot(x - s[0], y - s[1])
         if distance < EXPLAINED_M:
             known += 1
             explained += 1
-            tensor[0, 0] += mx * mx
-            tensor[0, 1] += mx * my
-            tensor[1, 1] += my * my
+            jacobian[0] = mx
+            jacobian[1] = my
+            jacobian[2] = ((x - T[0]) * my - (y - T[1]) * mx) / LEVER_M
+            for r in range(3):
+                for c in range(3):
+                    tensor[r, c] += jacobian[r] * jacobian[c]
             continue
         cx, cy = int(np.floor((x - free_corner[0]) / FREE_CELL_M)), int(np.floor((y - free_corner[1]) / FREE_CELL_M))
         if cx >= 0 and cy >= 0 and cx < free.shape[1] and cy < free.shape[0] and free[cy, cx]:
             known += 1
             if distance > VIOLATION_M:
                 violating += 1
-    tensor[1, 0] = tensor[0, 1]
     return known, explained, violating, tensor

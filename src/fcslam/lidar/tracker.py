@@ -66,10 +66,10 @@ class ScanTracker:
             return Tracked(T_local_guess, np.zeros((3, 3)), None)
         points = point_scan(scan.ranges_m, scan.laser)
         match = self._match(points, T_local_guess) if self._fields else None
-        self._moved_m = self._turned_rad = 0.0
         if match is None:
             self._T_local_base = T_local_guess
             return Tracked(T_local_guess, np.zeros((3, 3)), points)
+        self._moved_m = self._turned_rad = 0.0
         self._T_local_base = match.T_field_base
         return Tracked(match.T_field_base, match.information, points)
 
@@ -100,7 +100,7 @@ class ScanTracker:
         match = match_scan(thinned, field, T_local_guess, prior, config.matching)
         if self._is_doubtful(match, T_local_guess):
             window = SearchWindow(config.search_radius_m, config.search_angle_rad)
-            found = search(points, field, T_local_guess, window, config.search)
+            found = search(points, field, T_local_guess, window, config.search, visible_only=True)
             other = match_scan(thinned, field, found.T_field_base, np.zeros((3, 3)), config.matching)
             if other.explained > match.explained + 0.05:
                 match = other

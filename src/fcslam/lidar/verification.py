@@ -52,7 +52,8 @@ class Verification:
     information: FloatArray
     """Of T_a_b, in the coordinates of b, shape (3, 3)."""
     worse: Agreement
-    """The less convincing of the two directions."""
+    """What the two directions have in common: of each measure the worse, but of the overlap the better one, since a
+    small submap may lie within a large one."""
     strict: bool
     loose: bool
     rich: bool

@@ -31,11 +31,6 @@ class RobotFrontend:
         self._sequence = 0
         self._time = float("-inf")
 
-    @property
-    def travel_m(self) -> float:
-        """Path length so far."""
-        return self._mapper.travel_m
-
     def process(self, record: SensorRecord) -> list[Packet]:
         """The packets that the next record of the recording causes."""
         if not isinstance(record, LaserScan):
