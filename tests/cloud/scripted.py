@@ -1,6 +1,6 @@
 """Robots whose packets and place matches are written by hand: what the cloud makes of evidence, without any LiDAR."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -46,10 +46,10 @@ class ScriptedMatcher:
 
     script: ClassVar[list[Script]] = []
 
-    def __init__(self, config, submap_of, rng):
+    def __init__(self, *_):
         self.stored = []
 
-    def match(self, place, predicted: Mapping, strangers) -> list[PlaceMatch]:
+    def match(self, place, _, strangers) -> list[PlaceMatch]:
         self.stored.append(place.id)
         found = [line for line in self.script if line.j == place.id]
         return [PlaceMatch(s.i, s.j, 0.5, verified(s), predicted=not strangers(s.i)) for s in found]
@@ -66,7 +66,9 @@ def rectangle(count: int = 61, step_m: float = 1.0) -> np.ndarray:
     corners = np.array([(0.0, 0.0), (20.0, 0.0), (20.0, 10.0), (0.0, 10.0), (0.0, 0.0)])
     lengths = np.array([0.0, 20.0, 30.0, 50.0, 60.0])
     heading = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2])[np.searchsorted(lengths, along, side="right") - 1]
-    return np.column_stack((np.interp(along, lengths, corners[:, 0]), np.interp(along, lengths, corners[:, 1]), heading))
+    return np.column_stack(
+        (np.interp(along, lengths, corners[:, 0]), np.interp(along, lengths, corners[:, 1]), heading)
+    )
 
 
 def stream(robot: str, truth: np.ndarray, start_s: float, local: Iterable[Body] = ()) -> list[Packet]:

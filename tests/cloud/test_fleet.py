@@ -130,9 +130,11 @@ def test_a_closure_that_contradicts_the_joint_graph_ends_revoked(scripted):
 
 
 def test_a_robots_own_closure_may_be_revoked_too(scripted):
-    loop = motion("a", 2, 58, se2.between(POSES[2], POSES[58]) + [2.0, 0.0, 0.0], ConstraintKind.CLOSURE)
+    wrong = se2.between(POSES[2], POSES[58]) + np.array([2.0, 0.0, 0.0])
+    loop = motion("a", 2, 58, wrong, ConstraintKind.CLOSURE)
     true = [
-        motion("a", i, j, se2.between(POSES[i], POSES[j]), ConstraintKind.CLOSURE) for i, j in ((0, 60), (1, 59), (3, 57))
+        motion("a", i, j, se2.between(POSES[i], POSES[j]), ConstraintKind.CLOSURE)
+        for i, j in ((0, 60), (1, 59), (3, 57))
     ]
     result = feed(scripted(), stream(*A, start_s=0.0, local=[*true, loop])).finalize()
     assert [c.status for c in result.closures] == [*[ClosureStatus.ACCEPTED] * 3, ClosureStatus.REVOKED]
