@@ -56,7 +56,7 @@ def map_sources(sources: "Sequence[Source]", settings: "MissionConfig", output: 
     write_run(run, output, force=True)
     for source in sources:
         if source.faults:
-            console.print(f"{source.name}: {source.faults}", highlight=False)
+            console.print(f"{source.name}: {source.faults}", highlight=False, soft_wrap=True)
     _report(Console(), run, time.perf_counter() - began, output)
     return run
 
@@ -93,7 +93,8 @@ def _progress(console: "Console", total: int) -> "Iterator[Watch]":
         progress.TextColumn("mapping"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
         progress.TextColumn("scans, {task.fields[what]}"), progress.TimeRemainingColumn(),
     ]  # fmt: skip
-    with progress.Progress(*columns, console=console, transient=True) as bar:
+    # where nobody watches, even an erased display leaves an empty line
+    with progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=total, what="")
         began = time.perf_counter()
 
@@ -124,10 +125,11 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path) -> N
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
         f"{values['inter_robot_closures_accepted']:.0f} between them",
         highlight=False,
+        soft_wrap=True,
     )
     maps = int(values["maps"])
     if maps > 1:
         console.print(
             f"{maps} maps: some robots share no place that geometry confirms (see closures.csv)", highlight=False
         )
-    console.print(f"map: {output / 'map.png'}", highlight=False, soft_wrap=True)
+    console.print(f"map: {output / 'map.png'}", highlight=False, markup=False, soft_wrap=True)
