@@ -129,7 +129,8 @@ class Fleet:
             for other in dict.fromkeys(entry.closure.i.robot for entry in surprises):
                 self._judge_pair(other, place.id.robot)
             self._places.setdefault(place.id.robot, []).append(place.id)
-        if self._graph.is_due(self._config.solve_every):
+        # A robot alone needs no estimate before the end.
+        if len(self._store.robots) > 1 and self._graph.is_due(self._config.solve_every):
             self._optimize()
 
     def _predicted(self, place: Place) -> dict[KeyscanId, FloatArray]:
