@@ -15,7 +15,7 @@ from fcslam.cloud.fusion import FusedMap, fuse, map_yaml, pgm_bytes
 from fcslam.cloud.picture import Meeting, map_png
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.config import Settings, dump
-from fcslam.errors import FcslamError, SourceError
+from fcslam.errors import FcslamError, PacketError, SourceError
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
@@ -23,6 +23,7 @@ from fcslam.records import ClosureStatus, FloatArray, Keyscan, LaserScan, LoopCl
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, check_names
 from fcslam.sources import Source
+from fcslam.wire.checks import check_name
 from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Kind, Packet
 from fcslam.wire.packets import encode
@@ -113,6 +114,10 @@ def _check_robots(sources: Sequence[Source]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise SourceError(f"two recordings are called '{name}'; a robot is named by its file, so rename one")
+        try:
+            check_name(name, "robot")
+        except PacketError as error:
+            raise SourceError(f"{error}; a robot is named by its file, so rename it") from error
     check_names(names)
 
 

@@ -62,10 +62,13 @@ class Fleet:
         self._graph = JointGraph()
         self._ledger = ClosureLedger()
         self._submaps: dict[KeyscanId, Submap] = {}
-        self._matcher = PlaceMatcher(config.matcher, self._submap, np.random.default_rng(seed))
-        self._places: dict[str, list[KeyscanId]] = {}
+        self._matchers: dict[str, PlaceMatcher] = {}
+        """By detector version: words of different ones are never compared."""
+        self._places: dict[tuple[str, str], list[KeyscanId]] = {}
+        """By detector version and robot."""
         self._maps: list[list[str]] = []
         self._version = 0
+        self._concluded = False
 
     def receive(self, data: bytes) -> list[bytes]:
         """Take in an encoded packet; returns encoded packets for its sender.
@@ -74,22 +77,24 @@ class Fleet:
             PacketError: it is no valid packet, or does not fit what its robot sent before.
         """
         packet = decode(data)
-        for ready in self._store.admit(packet):
-            self._take(ready)
+        self._admit(packet)
         return self._replies(packet)
 
     def finalize(self) -> FleetResult:
-        """The result of all packets so far, in their canonical order: replayed, unless they arrived in it."""
-        if self._store.in_canonical_order:
+        """The result of all packets so far, in their canonical order.
+
+        Replayed, unless they arrived in it and no earlier result left its mark on the graph.
+        """
+        if self._store.arrived_in_canonical_order and not self._concluded:
             return self._conclude()
         replay = Fleet(self._config, self._seed)
         for packet in self._store.canonical():
-            for ready in replay._store.admit(packet):
-                replay._take(ready)
+            replay._admit(packet)
         return replay._conclude()
 
     def _conclude(self) -> FleetResult:
-        return conclude(self._store, self._graph, self._ledger, self._version)
+        self._concluded = True
+        return conclude(self._store, self._graph, self._ledger, self._config.consistency, self._version)
 
     def closure_counts(self) -> dict[str, int]:
         """Closures so far by kind, for progress displays."""
@@ -99,8 +104,28 @@ class Fleet:
                 counts["between robots" if entry.is_between else "within robots"] += 1
         return counts
 
+    def _admit(self, packet: Packet) -> None:
+        """Take a packet and those that waited for it.
+
+        Raises:
+            PacketError: ``packet`` is refused. One that came early and proves wrong only now is forgotten: it is not
+                its sender's fault that shows in this call, and sent again it is refused for itself.
+        """
+        for ready in self._store.admit(packet):
+            try:
+                self._take(ready)
+            except PacketError:
+                self._store.withdraw(ready)
+                if ready is packet:
+                    raise
+                return
+
     def _take(self, packet: Packet) -> None:
-        """One packet's effect: figure 1 of the paper, cloud side."""
+        """One packet's effect: figure 1 of the paper, cloud side.
+
+        Raises:
+            PacketError: it does not fit what its robot sent before; nothing has changed.
+        """
         match packet.body:
             case Hello() as hello:
                 self._store.greet(hello)
@@ -110,13 +135,13 @@ class Fleet:
                     self._graph.start(keyscan.id.robot)
                     self._maps.append([keyscan.id.robot])
             case Constraint(kind=ConstraintKind.ODOMETRY) as motion:
-                self._store.require_next(motion)
+                self._store.connect(motion)
                 self._graph.extend(motion)
             case Constraint() as closure:
                 self._store.require(KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j))
                 self._add_local(closure)
             case Place() as place:
-                self._store.require(place.id, KeyscanId(place.id.robot, place.last))
+                self._store.add_place(place)
                 self._add_place(place)  # place recognition and map fusion
             case Correction() | Acknowledgement():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
@@ -124,20 +149,28 @@ class Fleet:
     def _add_place(self, place: Place) -> None:
         """Match a place (Algorithm 1), judge what it brings, join maps, optimise."""
         if self._config.join_maps:
-            matches = self._matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
+            matcher = self._matcher(place.detector_version)
+            matches = matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
             surprises = [entry for match in matches if (entry := self._accept_or_wait(self._ledger.add(match)))]
             for other in dict.fromkeys(entry.closure.i.robot for entry in surprises):
                 self._judge_pair(other, place.id.robot)
-            self._places.setdefault(place.id.robot, []).append(place.id)
-        if self._graph.is_due(self._config.solve_every):
+            self._places.setdefault((place.detector_version, place.id.robot), []).append(place.id)
+        # A robot alone needs no estimate before the end.
+        if len(self._store.robots) > 1 and self._graph.is_due(self._config.solve_every):
             self._optimize()
+
+    def _matcher(self, version: str) -> PlaceMatcher:
+        if version not in self._matchers:
+            rng = np.random.default_rng(self._seed)
+            self._matchers[version] = PlaceMatcher(self._config.matcher, self._submap, rng)
+        return self._matchers[version]
 
     def _predicted(self, place: Place) -> dict[KeyscanId, FloatArray]:
         """T_i_j of the nearest place of each visit of the robots in the same map."""
         pose = self._graph.pose(place.id)
         near: dict[KeyscanId, FloatArray] = {}
         for robot in self._map_of(place.id.robot):
-            ids = self._places.get(robot, []) if robot != place.id.robot else []
+            ids = self._places.get((place.detector_version, robot), []) if robot != place.id.robot else []
             anchors = np.array([self._graph.pose(i) for i in ids]).reshape(-1, 3)
             distance = np.hypot(anchors[:, 0] - pose[0], anchors[:, 1] - pose[1])
             close = np.flatnonzero(distance < self._config.sight_m)

@@ -15,6 +15,9 @@ from fcslam.graph.consistency import (
 )
 from fcslam.records import FloatArray, KeyscanId
 
+DIRECTION_M = 1.0
+"""Two points as far apart as this, each known to a few centimetres, give a direction."""
+
 
 def oriented(entry: Entry, robot_a: str) -> tuple[KeyscanId, KeyscanId, FloatArray, FloatArray]:
     """Keyscan of ``robot_a``, keyscan of the other robot, T_a_b, information: the closure seen from one side."""
@@ -47,11 +50,17 @@ def judge(
 
 
 def first_estimate(members: list[Entry], robots: tuple[str, str], graph: JointGraph) -> FloatArray:
-    """T_a_b of the two robots' maps from the two matched places that lie farthest apart, eqs. (5)-(6)."""
+    """T_a_b of the two robots' maps from the two matched places that lie farthest apart, eqs. (5)-(6).
+
+    Places too near to each other to tell a direction leave it to the first closure alone.
+    """
     a, _ = robots
     sides = [oriented(entry, a) for entry in members]
     in_a = np.array([se2.compose(graph.pose(i), T)[:2] for i, _, T, _ in sides])
     in_b = np.array([graph.pose(j)[:2] for _, j, _, _ in sides])
     distance = np.hypot(*np.moveaxis(in_b[:, None] - in_b[None], -1, 0))
     k, m = np.unravel_index(int(np.argmax(distance)), distance.shape)
+    if distance[k, m] < DIRECTION_M:
+        i, j, T_i_j, _ = sides[0]
+        return se2.compose(se2.compose(graph.pose(i), T_i_j), se2.inverse(graph.pose(j)))
     return two_point_alignment(in_a[[k, m]], in_b[[k, m]])

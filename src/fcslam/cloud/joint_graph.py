@@ -95,10 +95,16 @@ class JointGraph:
         solution = optimize(self.graph, self._poses[: len(self.graph)], loss=Loss.CAUCHY, factors=self._factors)
         self._take(solution.poses, solution.weights)
 
-    def optimize_robustly(self) -> None:
-        """Solve that decides for every closure whether it holds (graduated non-convexity)."""
-        solution = optimize_gnc(self.graph, self._poses[: len(self.graph)], factors=self._factors)
-        self._take(solution.poses, solution.weights)
+    def optimize_robustly(self, dropped: Collection[int] = ()) -> None:
+        """Solve that decides for every closure whether it holds (graduated non-convexity); ``dropped`` ones do not."""
+        if not dropped:
+            solution = optimize_gnc(self.graph, self._poses[: len(self.graph)], factors=self._factors)
+            self._take(solution.poses, solution.weights)
+            return
+        solution = optimize_gnc(self.optimized(dropped))
+        weights = np.zeros(len(self.graph.edges))
+        weights[[number for number in range(len(weights)) if number not in dropped]] = solution.weights
+        self._take(solution.poses, weights)
 
     def weight(self, edge: int) -> float:
         """What the closure counted for in the last solve, in [0, 1]; 1 before its first."""

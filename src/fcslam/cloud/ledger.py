@@ -64,6 +64,15 @@ class ClosureLedger:
             and {entry.closure.i.robot, entry.closure.j.robot} == pair
         ]
 
+    def joined(self) -> list[tuple[str, str]]:
+        """Pairs of robots between whom closures hold at present."""
+        pairs = [
+            (min(c.i.robot, c.j.robot), max(c.i.robot, c.j.robot))
+            for c in (entry.closure for entry in self._entries if entry.is_between)
+            if c.status is ClosureStatus.ACCEPTED
+        ]
+        return list(dict.fromkeys(pairs))
+
     def accepted_edges(self) -> list[int]:
         """Edges of the closures that hold at present."""
         return self._edges(ClosureStatus.ACCEPTED)

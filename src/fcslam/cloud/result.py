@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+from fcslam.cloud.joining import judge
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger
 from fcslam.cloud.robots import RobotStore
+from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import ClosureStatus, Correction, FloatArray, Keyscan, LaserModel, LoopClosure, frozen
 
@@ -37,11 +39,16 @@ class FleetResult:
     """All keyscans at their optimised poses, with the constraints that hold."""
 
 
-def conclude(store: RobotStore, graph: JointGraph, ledger: ClosureLedger, version: int) -> FleetResult:
+def conclude(
+    store: RobotStore, graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings, version: int
+) -> FleetResult:
     """Solve robustly, revoke what contradicts the rest, separate maps that only revoked closures held together."""
     if store.robots:
         graph.optimize_robustly()
     _decide(graph, ledger)
+    if _revoke_contested(graph, ledger, settings):
+        graph.optimize_robustly(ledger.revoked_edges())
+        _decide(graph, ledger)
     maps = graph.maps(ledger.accepted_edges())
     index = {robot: k for k, robots in enumerate(maps) for robot in robots}
     robots = tuple(
@@ -58,7 +65,26 @@ def conclude(store: RobotStore, graph: JointGraph, ledger: ClosureLedger, versio
 def _decide(graph: JointGraph, ledger: ClosureLedger) -> None:
     """Give every closure its last status and the reason for it."""
     for entry in ledger:
-        if entry.edge is not None and graph.weight(entry.edge) < HOLDS:
+        status = entry.closure.status
+        if status is ClosureStatus.ACCEPTED and entry.edge is not None and graph.weight(entry.edge) < HOLDS:
             entry.set(ClosureStatus.REVOKED, "contradicts the joint graph")
-        elif entry.edge is None and entry.closure.status is ClosureStatus.VERIFIED:
+        elif status is ClosureStatus.VERIFIED:
             entry.set(ClosureStatus.REJECTED, entry.closure.reason or "outside the dominant cluster")
+
+
+def _revoke_contested(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> bool:
+    """Revoke what joined two robots early if all evidence together would not; tells whether anything was revoked.
+
+    The cluster that joins is dominant when it does. Closures that contradict it and come later are never accepted,
+    so the robust solve does not see them.
+    """
+    contested = False
+    for pair in ledger.joined():
+        entries = ledger.between(*pair)
+        verdict = judge(entries, pair, graph, settings)
+        if verdict.contested:
+            contested = True
+            for entry in entries:
+                if entry.closure.status is ClosureStatus.ACCEPTED:
+                    entry.set(ClosureStatus.REVOKED, verdict.reason)
+    return contested

@@ -3,69 +3,125 @@
 from collections.abc import Iterator
 
 from fcslam.errors import PacketError
-from fcslam.records import Constraint, Keyscan, KeyscanId, LaserModel
+from fcslam.records import Channel, Constraint, Keyscan, KeyscanId, LaserModel, Place
 from fcslam.wire.messages import Hello, Packet
 
 
 class RobotStore:
-    """Packets as received are the truth: each is taken once, a robot's in the order of their numbers."""
+    """Packets as received are the truth: each is taken once, a robot's in the order of their numbers.
+
+    A packet that is refused leaves nothing behind, not even its number.
+    """
 
     def __init__(self) -> None:
-        self._journal: list[Packet] = []
-        self._waiting: dict[str, dict[int, Packet]] = {}
+        self._journal: dict[tuple[str, int], Packet] = {}
         self._expected: dict[str, int] = {}
-        self._lasers: dict[str, LaserModel] = {}
+        self._hellos: dict[str, Hello] = {}
         self._keyscans: dict[str, list[Keyscan]] = {}
+        self._connected: dict[str, int] = {}
+        """Keyscans that motions tie to the first; only they are known to others."""
+        self._places: set[KeyscanId] = set()
         self._replies: dict[str, int] = {}
-        self.in_canonical_order = True
 
     @property
     def robots(self) -> tuple[str, ...]:
         """Robots with at least one keyscan, in the order of their first."""
-        return tuple(self._keyscans)
+        return tuple(self._connected)
+
+    @property
+    def arrived_in_canonical_order(self) -> bool:
+        """Whether all packets were taken in canonical order, without one that waits for an earlier one."""
+        canonical = self.canonical()
+        expected: dict[str, int] = {}
+        for packet, arrived in zip(canonical, self._journal.values(), strict=True):
+            if packet is not arrived or packet.sequence != expected.get(packet.robot, 0):
+                return False
+            expected[packet.robot] = packet.sequence + 1
+        return True
 
     def admit(self, packet: Packet) -> Iterator[Packet]:
         """The packets that may take effect now that this one is here; none if it was here before or comes early.
 
+        A packet counts as taken when the next one is asked for.
+
         Raises:
             PacketError: the robot speaks in another epoch than it began.
         """
-        robot, expected = packet.robot, self._expected.setdefault(packet.robot, 0)
-        waiting = self._waiting.setdefault(robot, {})
+        robot = packet.robot
         if packet.epoch != 0:
             raise PacketError(f"{robot}: epoch {packet.epoch}; a robot that starts again needs a name of its own")
-        if packet.sequence < expected or packet.sequence in waiting:
+        if (robot, packet.sequence) in self._journal:
             return
-        self.in_canonical_order &= not waiting and packet.sequence == expected
-        if self._journal and packet.order < self._journal[-1].order:
-            self.in_canonical_order = False
-        self._journal.append(packet)
-        waiting[packet.sequence] = packet
-        while (ready := waiting.pop(self._expected[robot], None)) is not None:
-            self._expected[robot] += 1
+        self._journal[robot, packet.sequence] = packet
+        while (ready := self._journal.get((robot, self._expected.get(robot, 0)))) is not None:
             yield ready
+            self._expected[robot] = ready.sequence + 1
+
+    def withdraw(self, packet: Packet) -> None:
+        """Forget a packet that turned out to be refused: the next one with its number takes its place."""
+        del self._journal[packet.robot, packet.sequence]
 
     def canonical(self) -> list[Packet]:
         """All packets in canonical order."""
-        return sorted(self._journal, key=lambda packet: packet.order)
+        return sorted(self._journal.values(), key=lambda packet: packet.order)
 
     def greet(self, hello: Hello) -> None:
-        """A robot introduces its laser."""
-        if hello.robot in self._lasers:
+        """A robot introduces its laser.
+
+        Raises:
+            PacketError: it did before.
+        """
+        if hello.robot in self._hellos:
             raise PacketError(f"{hello.robot}: said hello before")
-        self._lasers[hello.robot] = hello.laser
+        self._hellos[hello.robot] = hello
 
     def add_keyscan(self, keyscan: Keyscan) -> None:
-        """The robot's next keyscan."""
-        robot = keyscan.id.robot
-        known = self._keyscans.setdefault(robot, []) if robot in self._lasers else None
-        if known is None:
+        """The robot's next keyscan.
+
+        Raises:
+            PacketError: it is not the next, does not fit the laser, or the motion to the one before is missing.
+        """
+        robot, number = keyscan.id
+        if robot not in self._hellos:
             raise PacketError(f"{robot}: sends a keyscan before its hello")
-        if keyscan.id.number != len(known):
-            raise PacketError(f"{robot}: keyscan {keyscan.id.number} where {len(known)} is next")
-        if len(keyscan.ranges_m) != self._lasers[robot].beam_count:
-            raise PacketError(f"{robot}: {len(keyscan.ranges_m)} beams, {self._lasers[robot].beam_count} announced")
-        known.append(keyscan)
+        known, beam_count = self._keyscans.get(robot, []), self.laser(robot).beam_count
+        if number != len(known):
+            raise PacketError(f"{robot}: keyscan {number} where {len(known)} is next")
+        if number > self._connected.get(robot, 0):
+            raise PacketError(f"{robot}: keyscan {number} before the motion to keyscan {number - 1}")
+        if len(keyscan.ranges_m) != beam_count:
+            raise PacketError(f"{robot}: {len(keyscan.ranges_m)} beams, {beam_count} announced")
+        self._keyscans.setdefault(robot, []).append(keyscan)
+        if number == 0:
+            self._connected[robot] = 1
+
+    def connect(self, motion: Constraint) -> None:
+        """The motion that leads to the newest keyscan.
+
+        Raises:
+            PacketError: it does not, or the keyscan has one already.
+        """
+        robot, connected = motion.robot, self._connected.get(motion.robot, 0)
+        if connected == len(self._keyscans.get(robot, ())) or (motion.i, motion.j) != (connected - 1, connected):
+            raise PacketError(f"{robot}: motion {motion.i} to {motion.j} does not lead to a new keyscan")
+        self._connected[robot] = connected + 1
+
+    def add_place(self, place: Place) -> None:
+        """A place of the robot.
+
+        Raises:
+            PacketError: its keyscans are not there, it was described before, or by a detector not announced.
+        """
+        self.require(place.id, KeyscanId(place.id.robot, place.last))
+        announced = self._hellos[place.id.robot].detector_versions.get(place.channel)
+        if place.channel is not Channel.LIDAR or place.detector_version != announced:
+            raise PacketError(
+                f"{place.id.robot}: a {place.channel} place of detector {place.detector_version}; "
+                f"LiDAR places are compared, of the detector announced ({announced})"
+            )
+        if place.id in self._places:
+            raise PacketError(f"{place.id.robot}: place {place.id.number} was described before")
+        self._places.add(place.id)
 
     def require(self, *ids: KeyscanId) -> None:
         """Check that the keyscans are there.
@@ -74,26 +130,17 @@ class RobotStore:
             PacketError: one is not.
         """
         for robot, number in ids:
-            if not 0 <= number < len(self._keyscans.get(robot, ())):
+            if not 0 <= number < self._connected.get(robot, 0):
                 raise PacketError(f"{robot}: names keyscan {number}, which it never sent")
 
-    def require_next(self, motion: Constraint) -> None:
-        """Check that the motion leads from the last but one keyscan to the last.
-
-        Raises:
-            PacketError: it does not.
-        """
-        last = len(self._keyscans.get(motion.robot, ())) - 1
-        if (motion.i, motion.j) != (last - 1, last) or last < 1:
-            raise PacketError(f"{motion.robot}: motion {motion.i} to {motion.j}, but keyscan {last} is the newest")
-
     def keyscans(self, robot: str, first: int = 0, last: int | None = None) -> tuple[Keyscan, ...]:
-        """Keyscans first to last (inclusive) of a robot."""
-        return tuple(self._keyscans[robot][first : None if last is None else last + 1])
+        """Connected keyscans first to last (inclusive) of a robot."""
+        end = self._connected[robot] if last is None else last + 1
+        return tuple(self._keyscans[robot][first:end])
 
     def laser(self, robot: str) -> LaserModel:
         """The robot's laser."""
-        return self._lasers[robot]
+        return self._hellos[robot].laser
 
     def number_replies(self, robot: str, count: int) -> int:
         """Number of the first of ``count`` packets that go to the robot now."""

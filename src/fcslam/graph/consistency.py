@@ -64,6 +64,8 @@ class ClusterVerdict:
     exact: bool
     """Whether both clusters are proven to be the largest."""
     dominant: bool
+    contested: bool
+    """Whether a cluster that would be enough to join two maps, too, contradicts it and is not clearly smaller."""
     reason: str
     """One clause; empty if dominant."""
 
@@ -127,12 +129,13 @@ def dominant_cluster(
     second = maximum_clique(consistent[np.ix_(others, others)])
     runner_up = others[list(second.members)]
     supporters, rivals = _apart(xy[members], settings.separation_m), _apart(xy[runner_up], settings.separation_m)
+    behind = len(members) < settings.lead * len(runner_up) or supporters < rivals
     reason = ""
     if supporters < settings.minimum_closures:
         reason = f"{supporters} supporters {settings.separation_m:g} m apart, {settings.minimum_closures} needed"
     elif not informs[members].any():
         reason = "no supporter with information in every direction"
-    elif len(members) < settings.lead * len(runner_up) or supporters < rivals:
+    elif behind:
         reason = f"{len(members)} closures from {supporters} places, but {len(runner_up)} from {rivals} disagree"
     return ClusterVerdict(
         members=first.members,
@@ -141,6 +144,7 @@ def dominant_cluster(
         runner_up_supporters=rivals,
         exact=first.exact and second.exact,
         dominant=not reason,
+        contested=behind and rivals >= settings.minimum_closures,
         reason=reason,
     )
 

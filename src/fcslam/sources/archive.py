@@ -28,7 +28,7 @@ def robot_name(path: Path) -> str:
     stem = path.name
     while match := _LOG_SUFFIX.search(stem):
         stem = stem[: match.start()]
-    return _UNSAFE.sub("_", stem).strip(".") or "robot"
+    return _UNSAFE.sub("_", stem).strip("._-") or "robot"
 
 
 def head(path: Path) -> bytes:

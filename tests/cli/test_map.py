@@ -1,0 +1,384 @@
+"""The real command: whole runs, and every bad input in one line with nothing left behind."""
+
+import csv
+import gzip
+import json
+import lzma
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from small_fleet import truth_at
+from sources.carmen_text import drive, flaser, odom, pose_at, save
+
+from fcslam import mission
+from fcslam.cli import main
+from fcslam.cli import map as mapping
+from fcslam.config import dump
+from fcslam.geometry import se2
+from fcslam.mission import MissionConfig
+from fcslam.runs import read_tum
+
+RUN_FILES = {
+    "closures.csv", "config.yaml", "map.pgm", "map.png", "map.yaml", "metrics.json", "pose_graph.g2o", "robots.csv",
+    "trajectories",
+}  # fmt: skip
+
+
+def run_map(*arguments):
+    return main(["map", *map(str, arguments)])
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def maps_of(run):
+    return {row["robot"]: int(row["map"]) for row in rows_of(run / "robots.csv")}
+
+
+def names_in(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def run(logs, tmp_path_factory):
+    """The three robots' run folder."""
+    folder = tmp_path_factory.mktemp("runs") / "deep" / "run"
+    assert run_map(*logs, "--output", folder, "--seed", 5) == 0
+    return folder
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A short healthy recording."""
+    return save(tmp_path / "healthy.log", drive(40))
+
+
+# Whole runs
+
+
+def test_the_run_folder_is_complete(run, drawn):
+    assert names_in(run) == RUN_FILES
+    assert names_in(run.parent) == {run.name}
+    assert names_in(run / "trajectories") == {f"{robot.name}.tum" for robot in drawn.robots}
+    for robot in rows_of(run / "robots.csv"):
+        truth = next(r for r in drawn.robots if r.name == robot["robot"])
+        assert int(robot["scans"]) == len(truth.stamps)
+        assert float(robot["path_length_m"]) == pytest.approx(30.0, rel=0.1)
+    assert {row["status"] for row in rows_of(run / "closures.csv")} >= {"accepted", "candidate"}
+    assert all(metric.keys() == {"name", "value", "unit"} for metric in json.loads((run / "metrics.json").read_text()))
+    assert (run / "pose_graph.g2o").read_text().startswith("VERTEX_SE2 0 ")
+
+
+def test_the_map_can_be_looked_at_and_served(run):
+    meta = yaml.safe_load((run / "map.yaml").read_text())
+    grid = cv2.imread(str(run / meta["image"]), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(grid)) == {0, 205, 254}
+    assert (grid == 254).sum() * meta["resolution"] ** 2 > 50.0, "square metres of free floor"
+    assert cv2.imread(str(run / "map.png")).shape[2] == 3
+
+
+def test_all_robots_lie_in_one_map_to_five_centimetres(run, drawn):
+    assert set(maps_of(run).values()) == {0}
+    first, *others = drawn.robots
+    stamps, poses = read_tum(run / "trajectories" / f"{first.name}.tum")
+    true = truth_at(first, stamps)
+    for robot in others:
+        other_stamps, other_poses = read_tum(run / "trajectories" / f"{robot.name}.tum")
+        other_true = truth_at(robot, other_stamps)
+        for k in range(0, len(stamps), 10):
+            seen, expected = se2.between(poses[k], other_poses), se2.between(true[k], other_true)
+            near = np.hypot(*expected[:, :2].T) < 5.0
+            assert np.all(np.hypot(*(seen - expected)[near, :2].T) < 0.05)
+
+
+def test_the_truths_relations_agree(run, logs, capsys):
+    relations = logs[0].parent / "ground_truth" / "relations"
+    assert main(["evaluate", "relations", str(run), str(relations), "--across-robots"]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if "translation" in line)
+    mean, *_ = (float(word) for word in line.replace("│", " ").split() if word[0].isdigit())
+    assert mean < 0.05
+
+
+def test_what_came_out_is_said(logs, tmp_path, capsys):
+    assert run_map(logs[0], "--output", tmp_path / "a[bold]" / "run") == 0
+    out, err = capsys.readouterr()
+    assert f"map: {tmp_path / 'a[bold]' / 'run' / 'map.png'}\n" in out
+    assert "robot_1" in out
+    assert any("closures within robots" in line and line.endswith("between them") for line in out.splitlines())
+    assert "Traceback" not in err
+
+
+def test_one_recording_split_into_robots(logs, tmp_path, drawn):
+    assert run_map(logs[0], "--split", 2, "--output", tmp_path / "run") == 0
+    rows = rows_of(tmp_path / "run" / "robots.csv")
+    assert [row["robot"] for row in rows] == ["robot_1_1", "robot_1_2"]
+    counts = [int(row["scans"]) for row in rows]
+    assert sum(counts) == len(drawn.robots[0].stamps)
+    assert max(counts) - min(counts) <= 1
+
+
+def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsys):
+    run = tmp_path / "run"
+    assert run_map(*logs, "--no-fuse", "--output", run) == 0
+    assert maps_of(run) == {robot.name: k for k, robot in enumerate(drawn.robots)}
+    assert {f"map{tail}.{kind}" for tail in ("", "_1", "_2") for kind in ("pgm", "png", "yaml")} <= names_in(run)
+    assert yaml.safe_load((run / "map_2.yaml").read_text())["image"] == "map_2.pgm"
+    assert all(row["robot_i"] == row["robot_j"] for row in rows_of(run / "closures.csv"))
+    assert "3 maps" in capsys.readouterr().out
+    assert yaml.safe_load((run / "config.yaml").read_text())["fleet"]["join_maps"] is False
+
+
+def test_the_configuration_goes_round(logs, run, tmp_path, capsys):
+    """A dumped configuration is a valid one, and the run's own gives the run again, byte for byte."""
+    assert main(["config", "dump"]) == 0
+    (tmp_path / "dumped.yaml").write_text(capsys.readouterr().out)
+    assert run_map(logs[0], "--config", tmp_path / "dumped.yaml", "--output", tmp_path / "one") == 0
+    assert (tmp_path / "one" / "config.yaml").read_text() == dump(MissionConfig())
+    assert run_map(*logs, "--config", run / "config.yaml", "--output", tmp_path / "again") == 0
+    for path in run.rglob("*"):
+        if path.is_file():
+            assert (tmp_path / "again" / path.relative_to(run)).read_bytes() == path.read_bytes(), path.name
+
+
+def test_the_seed_of_the_command_line_wins(run):
+    assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == 5
+
+
+def test_an_empty_folder_takes_a_run_and_force_replaces_one(log, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    assert run_map(log, "--output", run) == 0
+    assert run_map(log, "--output", run, "--force", "--seed", 9) == 0
+    assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == 9
+    assert names_in(tmp_path) == {"healthy.log", "run"}
+
+
+# Recordings that are damaged, but not much
+
+
+def damaged(lines, **changes):
+    return [changes.get(f"line_{number}", line) for number, line in enumerate(lines)]
+
+
+TOLERATED = {
+    "a broken line": (damaged(drive(40), line_21="FLASER 8 1.0 rubbish"), ["broken lines skipped: 1 (first: line 22)"]),
+    "a cut last line": ([*drive(40), flaser(108.2, pose_at(41))[:30]], ["broken lines skipped: 1 (first: line 81)"]),
+    "ranges that are no number": (
+        damaged(drive(40), line_21=flaser(102.0, pose_at(10), ranges=(1.0,) * 5 + (float("nan"),) * 3)),
+        ["no finite number made invalid: 3 (first: line 22"],
+    ),
+    "negative ranges": (
+        damaged(drive(40), line_21=flaser(102.0, pose_at(10), ranges=(-1.0,) * 8)),
+        ["negative ranges made invalid: 8 (first: line 22)"],
+    ),
+    "a clock that stumbles": (
+        damaged(drive(40), line_21=flaser(101.3, pose_at(10))),
+        ["steps back in time kept: 1 (first: line 22, largest 0.5 s)"],
+    ),
+    "several at once, on one line of their own": (
+        [*damaged(drive(40), line_21="FLASER x", line_31=flaser(103.0, pose_at(15), ranges=(-1.0,) * 8)), "ODOM x"],
+        ["healthy: broken lines skipped: 2 (first: line 22), negative ranges made invalid: 8 (first: line 32)"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("lines", "reports"), TOLERATED.values(), ids=TOLERATED)
+def test_little_damage_is_tolerated_and_reported(tmp_path, capsys, lines, reports):
+    log = save(tmp_path / "healthy.log", lines)
+    assert run_map(log, "--output", tmp_path / "run") == 0
+    error = capsys.readouterr().err
+    assert all(report in error for report in reports)
+    assert names_in(tmp_path / "run") == RUN_FILES
+
+
+@pytest.mark.parametrize("ranges", [(float("nan"),) * 8, (-1.0,) * 8, (81.91,) * 8, (0.0,) * 8])
+def test_a_laser_that_never_sees_anything_is_no_traceback(tmp_path, capsys, ranges):
+    log = save(tmp_path / "blind.log", [flaser(100 + 0.2 * k, pose_at(k), ranges=ranges) for k in range(40)])
+    code = run_map(log, "--output", tmp_path / "run")
+    assert code in (0, 2)
+    assert (tmp_path / "run").exists() is (code == 0)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_recording_of_one_scan_is_a_run(tmp_path):
+    assert run_map(save(tmp_path / "one.log", drive(1)), "--output", tmp_path / "run") == 0
+    assert maps_of(tmp_path / "run") == {"one": 0}
+
+
+# What the user has to mend: exit code 2, one line, nothing at the output path
+
+
+def written(path, content):
+    path.write_bytes(content)
+    return path
+
+
+BAD_LOGS = {
+    "missing": (lambda at: at / "missing.clf", "no such file"),
+    "empty": (lambda at: written(at / "e.clf", b""), "is empty"),
+    "a folder": (lambda at: at, "is a folder"),
+    "a truncated archive": (
+        lambda at: written(at / "t.clf.gz", gzip.compress("\n".join(drive(500)).encode())[:-200]), "truncated"
+    ),
+    "a truncated xz": (
+        lambda at: written(at / "t.clf.xz", lzma.compress("\n".join(drive(500)).encode())[:-200]), "truncated"
+    ),
+    "binary": (lambda at: written(at / "b.clf", np.random.default_rng(0).bytes(5000)), "of a known format"),
+    "no laser": (lambda at: save(at / "o.log", [odom(k, pose_at(k)) for k in range(30)]), "no laser scan"),
+    "no odometry": (lambda at: save(at / "s.log", [flaser(k, (0, 0, 0)) for k in range(30)]), "no odometry"),
+    "time backwards": (lambda at: save(at / "r.log", drive(50)[::-1]), "time runs backwards"),
+    "two in one": (lambda at: save(at / "w.log", drive(300) + drive(300)), "time jumps back"),
+    "a change of beams": (
+        lambda at: save(at / "c.log", drive(30) + drive(30, start_stamp=200, beams=9)), "beam count changes"
+    ),
+    "a name too long": (lambda at: save(at / f"{'x' * 80}.log", drive(40)), "rename"),
+}  # fmt: skip
+
+
+def refused(capsys, tmp_path, *arguments):
+    """The one line on stderr of a run that is refused and leaves nothing at ``tmp_path / 'run'``."""
+    capsys.readouterr()
+    assert run_map(*arguments) == 2
+    out, error = capsys.readouterr()
+    assert out == ""
+    assert error.startswith("fcslam: ")
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert not [path for path in tmp_path.rglob("*") if "partial" in path.name or "retired" in path.name]
+    return error
+
+
+@pytest.mark.parametrize(("make", "reason"), BAD_LOGS.values(), ids=BAD_LOGS)
+@pytest.mark.parametrize("first", [True, False])
+def test_a_bad_recording_is_refused(tmp_path, log, capsys, make, reason, first):
+    bad = make(tmp_path)
+    both = (bad, log) if first else (log, bad)
+    assert reason in refused(capsys, tmp_path, *both, "--output", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_two_recordings_of_one_name_are_refused(tmp_path, log, capsys):
+    (tmp_path / "other").mkdir()
+    twin = save(tmp_path / "other" / "healthy.clf", drive(40))
+    assert "'healthy'" in refused(capsys, tmp_path, log, twin, "--output", tmp_path / "run")
+    assert "'healthy'" in refused(capsys, tmp_path, log, log, "--output", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("fleet: {join_map: false}", "did you mean 'join_maps'?"),
+        ("sed: 3", "did you mean 'seed'?"),
+        ("seed: -1", "seed"),
+        ("seed: one", "seed"),
+        ("fleet: 3", "fleet"),
+        ("- 1\n- 2", "expected a mapping"),
+        ("{", "not valid YAML"),
+        ("fleet: {sight_m: .nan}", "sight_m"),
+        ("\x00", "YAML"),
+    ],
+)
+def test_a_bad_configuration_is_refused(tmp_path, log, capsys, content, reason):
+    config = tmp_path / "config.yaml"
+    config.write_text(content)
+    assert reason in refused(capsys, tmp_path, log, "--config", config, "--output", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_configuration_is_refused(tmp_path, log, capsys):
+    arguments = (log, "--config", tmp_path / "none.yaml", "--output", tmp_path / "run")
+    assert "cannot read the configuration" in refused(capsys, tmp_path, *arguments)
+
+
+@pytest.mark.parametrize(("force", "reason"), [((), "no run folder"), (("--force",), "no run folder")])
+def test_a_folder_that_is_not_a_run_is_never_touched(tmp_path, log, capsys, force, reason):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "thesis.tex").write_text("years of work")
+    assert reason in refused(capsys, tmp_path, log, "--output", run, *force)
+    assert names_in(run) == {"thesis.tex"}
+
+
+def test_a_run_is_only_replaced_with_force(tmp_path, log, capsys):
+    run = tmp_path / "run"
+    assert run_map(log, "--output", run) == 0
+    before = (run / "metrics.json").stat().st_mtime_ns
+    assert "--force" in refused(capsys, tmp_path, log, "--output", run)
+    assert "no such file" in refused(capsys, tmp_path, tmp_path / "none.log", "--output", run, "--force")
+    assert (run / "metrics.json").stat().st_mtime_ns == before
+
+
+def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
+    assert "output folder" in refused(capsys, tmp_path, log, "--output", log / "run")
+    assert "no run folder" in refused(capsys, tmp_path, log, "--output", log, "--force")
+    assert log.read_text().startswith("ODOM")
+
+
+def test_splits_that_cannot_be_are_refused(tmp_path, log, capsys):
+    other = save(tmp_path / "other.log", drive(40))
+    run = tmp_path / "run"
+    assert "--split cuts one recording" in refused(capsys, tmp_path, log, other, "--split", 2, "--output", run)
+    assert "cannot be cut into 41 parts" in refused(capsys, tmp_path, log, "--split", 41, "--output", run)
+    assert not run.exists()
+
+
+def test_relations_that_match_nothing_are_refused(run, tmp_path, capsys):
+    (tmp_path / "relations").write_text("1 2 0.5 0 0 0 0 0\n")
+    assert main(["evaluate", "relations", str(run), str(tmp_path / "relations")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("fcslam: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("usage", [("--split", "0"), ("--split", "x"), ("--seed", "-1"), ("--nonsense",)])
+def test_wrong_usage_is_exit_code_2(tmp_path, log, capsys, usage):
+    assert run_map(log, "--output", tmp_path / "run", *usage) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)])
+def test_ctrl_c_leaves_no_folder_and_the_old_run_alone(tmp_path, capsys, monkeypatch, force):
+    log = save(tmp_path / "long.log", drive(120))
+    run = tmp_path / "run"
+    if force:
+        assert run_map(log, "--output", run) == 0
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mapping, "_what", interrupt)  # what the progress display asks for after some scans
+    capsys.readouterr()
+    assert run_map(log, "--output", run, *force) == 130
+    assert capsys.readouterr().err.strip().splitlines()[-1] == "fcslam: interrupted"
+    assert names_in(tmp_path) == ({"long.log", "run"} if force else {"long.log"})
+    assert not force or names_in(run) == RUN_FILES
+
+
+def test_ctrl_c_while_writing_leaves_no_folder(tmp_path, log, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fcslam.runs.metrics_json", interrupt)
+    assert run_map(log, "--output", tmp_path / "run") == 130
+    assert names_in(tmp_path) == {"healthy.log"}
+
+
+def test_a_disk_that_is_full_is_one_line(tmp_path, log, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fcslam.runs.metrics_json", full)
+    assert "No space left" in refused(capsys, tmp_path, log, "--output", tmp_path / "run")
+    assert names_in(tmp_path) == {"healthy.log"}
+
+
+def test_the_command_refuses_before_the_long_work(tmp_path, log, monkeypatch, capsys):
+    monkeypatch.setattr(mission, "run_mission", lambda *_: pytest.fail("worked"))
+    refused(capsys, tmp_path, log, tmp_path / "none.log", "--output", tmp_path / "run")
+    refused(capsys, tmp_path, log, "--output", log / "run")

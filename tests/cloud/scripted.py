@@ -1,0 +1,116 @@
+"""Robots whose packets and place matches are written by hand: what the cloud makes of evidence, without any LiDAR."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fcslam.geometry import se2
+from fcslam.lidar.submap import Agreement
+from fcslam.lidar.verification import Verification
+from fcslam.places.matcher import PlaceMatch
+from fcslam.records import (
+    Channel,
+    Constraint,
+    ConstraintKind,
+    Keyscan,
+    KeyscanId,
+    LaserModel,
+    Place,
+    frozen,
+)
+from fcslam.wire.messages import Body, Hello, Packet
+from fcslam.wire.quantisation import dequantise
+
+LASER = LaserModel(8, -np.pi, np.pi / 4, 10.0)
+CLOSURE_INFORMATION = np.diag((1000.0, 1000.0, 10000.0))
+MOTION_INFORMATION = np.diag((1e4, 1e4, 1e5))
+PLACE_EVERY = 4
+ALIAS = np.array([7.0, -3.0, 0.4])
+"""Where a building that repeats itself would show robot b: all aliases made with it agree with one another."""
+
+
+@dataclass(frozen=True)
+class Script:
+    """What the place matcher finds when place j comes in: i, T_i_j, and whether it is fixed in every direction."""
+
+    i: KeyscanId
+    j: KeyscanId
+    T_i_j: np.ndarray
+    informative: bool = True
+
+
+class ScriptedMatcher:
+    """Stands in for PlaceMatcher: finds what the script says."""
+
+    script: ClassVar[list[Script]] = []
+
+    def __init__(self, *_):
+        self.stored = []
+
+    def match(self, place, _, strangers) -> list[PlaceMatch]:
+        self.stored.append(place.id)
+        found = [line for line in self.script if line.j == place.id]
+        return [PlaceMatch(s.i, s.j, 0.5, verified(s), predicted=not strangers(s.i)) for s in found]
+
+
+def verified(line: Script) -> Verification:
+    worse = Agreement(0.9, 0.0, 600, 0.9, np.eye(2) * 100.0)
+    return Verification(frozen(line.T_i_j), CLOSURE_INFORMATION, worse, True, True, True, line.informative, "")
+
+
+def rectangle(count: int = 61, step_m: float = 1.0) -> np.ndarray:
+    """True poses (N, 3) on a way round a block of 20 m by 10 m, metre by metre."""
+    along = np.arange(count) * step_m % 60.0
+    corners = np.array([(0.0, 0.0), (20.0, 0.0), (20.0, 10.0), (0.0, 10.0), (0.0, 0.0)])
+    lengths = np.array([0.0, 20.0, 30.0, 50.0, 60.0])
+    heading = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2])[np.searchsorted(lengths, along, side="right") - 1]
+    return np.column_stack(
+        (np.interp(along, lengths, corners[:, 0]), np.interp(along, lengths, corners[:, 1]), heading)
+    )
+
+
+def stream(robot: str, truth: np.ndarray, start_s: float, local: Iterable[Body] = ()) -> list[Packet]:
+    """All packets of a robot that drives the true poses without drift: a place each ``PLACE_EVERY`` keyscans."""
+    bodies: list[tuple[float, Body]] = [(start_s, Hello(robot, 0, LASER, {Channel.LIDAR: "test-1"}))]
+    for k in range(len(truth)):
+        bodies.append((start_s + k, keyscan(robot, k, start_s + k)))
+        if k:
+            bodies.append((start_s + k, motion(robot, k - 1, k, se2.between(truth[k - 1], truth[k]))))
+        if k % PLACE_EVERY == 0:
+            bodies.append((start_s + k, place(robot, k)))
+    bodies += [(start_s + len(truth), body) for body in local]
+    return [Packet(robot, 0, number, time, body) for number, (time, body) in enumerate(bodies)]
+
+
+def keyscan(robot: str, number: int, stamp: float, beams: int = LASER.beam_count) -> Keyscan:
+    return Keyscan(KeyscanId(robot, number), stamp, dequantise(np.full(beams, 1000 + number, np.uint16)))
+
+
+def motion(robot: str, i: int, j: int, T_i_j: np.ndarray, kind=ConstraintKind.ODOMETRY) -> Constraint:
+    return Constraint(robot, i, j, kind, frozen(T_i_j), frozen(MOTION_INFORMATION))
+
+
+def place(robot: str, number: int, **changed) -> Place:
+    fields = {
+        "channel": Channel.LIDAR,
+        "detector_version": "test-1",
+        "first": number,
+        "last": number,
+        "keypoints": frozen(np.zeros((0, 2)), np.float32),
+        "descriptors": frozen(np.zeros((0, 32)), np.uint8),
+    }
+    return Place(KeyscanId(robot, number), **{**fields, **changed})
+
+
+def closures(
+    a: tuple[str, np.ndarray], b: tuple[str, np.ndarray], pairs: Sequence[tuple[int, int]], shift=None, informative=True
+) -> list[Script]:
+    """What is measured between keyscans i of a and j of b; ``shift`` moves b as a whole, as an alias does."""
+    (name_a, poses_a), (name_b, poses_b) = a, b
+    moved = poses_b if shift is None else se2.compose(shift, poses_b)
+    return [
+        Script(KeyscanId(name_a, i), KeyscanId(name_b, j), se2.between(poses_a[i], moved[j]), informative)
+        for i, j in pairs
+    ]

@@ -1,0 +1,250 @@
+"""What the fleet makes of evidence: joins on true clusters, refuses aliases, revokes what the rest contradicts."""
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+import small_fleet
+from cloud.scripted import ALIAS, closures, motion, rectangle, stream
+from small_fleet import feed, fingerprint, in_order, map_of
+
+from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.geometry import se2
+from fcslam.records import ClosureStatus, ConstraintKind, KeyscanId
+from fcslam.wire.packets import encode
+
+POSES = rectangle()
+A, B, C = ("a", POSES), ("b", POSES), ("c", POSES)
+LATER = 1000.0
+"""Robot b drives when a has long been home, so b's places bring the closures."""
+TRUE = [(0, 0), (8, 8), (16, 16), (24, 24), (32, 32), (40, 40)]
+OTHERS = [(4, 4), (12, 12), (20, 20), (28, 28), (36, 36), (44, 44)]
+
+
+def two_robots():
+    return [*stream(*A, start_s=0.0), *stream(*B, start_s=LATER)]
+
+
+def between(result, status=None):
+    found = [c for c in result.closures if c.i.robot != c.j.robot]
+    return found if status is None else [c for c in found if c.status is status]
+
+
+def joint_error(result, robot_a="a", robot_b="b", truth=POSES):
+    """How far robot b's keyscans lie from the truth, seen from a's first, in metres; a and b drove the same poses."""
+    poses = {robot.robot: robot.T_map_base for robot in result.robots}
+    seen = se2.between(poses[robot_a][0], poses[robot_b])
+    return np.hypot(*(seen - se2.between(truth[0], truth))[:, :2].T).max()
+
+
+def test_a_true_cluster_joins_two_robots_and_leaves_aliases_out(scripted):
+    fleet = scripted(closures(A, B, TRUE), closures(A, B, OTHERS[:3], shift=ALIAS))
+    result = feed(fleet, two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert joint_error(result) < 1e-3
+    assert len(between(result, ClosureStatus.ACCEPTED)) == len(TRUE)
+    rejected = between(result, ClosureStatus.REJECTED)
+    assert len(rejected) == 3
+    assert all(closure.reason for closure in rejected)
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_robots_stay_apart_while_two_clusters_are_alike(scripted, count):
+    """True and alias closures take turns, so neither ever has twice as many as the other."""
+    alias = closures(A, B, OTHERS[:count], shift=ALIAS)
+    result = feed(scripted(closures(A, B, TRUE[:count]), alias), two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    assert not between(result, ClosureStatus.ACCEPTED)
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [(0, 0), (1, 4), (2, 8), (0, 12)],  # four places of b, one of a
+        [(0, 8), (20, 8), (40, 8)],  # one place of b that looks like three of a
+    ],
+    ids=["one place of a", "one place of b"],
+)
+def test_closures_from_one_place_are_one_witness(scripted, pairs):
+    stands = POSES.copy()
+    stands[:3] = stands[0]
+    a = ("a", stands)
+    lines = [line for pair in pairs for line in closures(a, B, [pair])]
+    base = lines[0]
+    # whatever they measure, they say the same about how the robots lie to each other
+    T_a_b = se2.compose(stands[base.i.number], se2.compose(base.T_i_j, se2.inverse(POSES[base.j.number])))
+    agreeing = [
+        replace(line, T_i_j=se2.between(stands[line.i.number], se2.compose(T_a_b, POSES[line.j.number])))
+        for line in lines
+    ]
+    result = feed(scripted(agreeing), [*stream(*a, start_s=0.0), *stream(*B, start_s=LATER)]).finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    assert {c.status for c in between(result)} == {ClosureStatus.REJECTED}
+    assert "supporters" in between(result)[0].reason
+
+
+def test_corridors_alone_join_nothing_but_one_informative_place_among_them_does(scripted):
+    corridor = closures(A, B, TRUE, informative=False)
+    apart = feed(scripted(corridor), two_robots()).finalize()
+    assert map_of(apart) == {"a": 0, "b": 1}
+    assert "every direction" in between(apart)[0].reason
+    joined = feed(scripted(corridor, closures(A, B, OTHERS[-1:])), two_robots()).finalize()
+    assert map_of(joined) == {"a": 0, "b": 0}
+
+
+def test_two_supporters_are_not_enough(scripted):
+    result = feed(scripted(closures(A, B, TRUE[:2])), two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+
+
+def test_a_join_on_aliases_is_revoked_when_the_truth_is_twice_as_strong(scripted):
+    """The aliases come first and join the maps; the true closures then are surprises that outnumber them."""
+    pairs = [(k, k) for k in range(12, 61, 4)]
+    fleet = scripted(closures(A, B, [(0, 0), (4, 4), (8, 8)], shift=ALIAS), closures(A, B, pairs))
+    result = feed(fleet, two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert joint_error(result) < 1e-3
+    assert sum(c.status is ClosureStatus.REVOKED for c in between(result)) == 3
+    assert len(between(result, ClosureStatus.ACCEPTED)) == len(pairs)
+
+
+def test_a_join_on_aliases_does_not_outlive_evidence_that_contradicts_it(scripted):
+    """Three aliases came first, five true closures later: neither cluster is twice the other, so nobody knows."""
+    alias = closures(A, B, [(0, 0), (4, 4), (8, 8)], shift=ALIAS)
+    result = feed(scripted(alias, closures(A, B, [(k, k) for k in range(12, 32, 4)])), two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    assert not between(result, ClosureStatus.ACCEPTED)
+
+
+def test_a_closure_that_contradicts_the_joint_graph_ends_revoked(scripted):
+    """0.4 m off is no surprise and goes in at once, but twelve standard deviations are too many for the end."""
+    wrong = closures(A, B, [(20, 20)], shift=np.array([0.4, 0.0, 0.0]))
+    fleet = feed(scripted(closures(A, B, TRUE), wrong), two_robots())
+    assert fleet.closure_counts()["between robots"] == len(TRUE) + 1
+    result = fleet.finalize()
+    (revoked,) = between(result, ClosureStatus.REVOKED)
+    assert (revoked.i.number, revoked.reason) == (20, "contradicts the joint graph")
+    assert joint_error(result) < 1e-3
+    assert len(result.graph.edges) == 2 * (len(POSES) - 1) + len(TRUE), "the revoked edge is left out"
+
+
+def test_a_robots_own_closure_may_be_revoked_too(scripted):
+    wrong = se2.between(POSES[2], POSES[58]) + np.array([2.0, 0.0, 0.0])
+    loop = motion("a", 2, 58, wrong, ConstraintKind.CLOSURE)
+    true = [
+        motion("a", i, j, se2.between(POSES[i], POSES[j]), ConstraintKind.CLOSURE)
+        for i, j in ((0, 60), (1, 59), (3, 57))
+    ]
+    result = feed(scripted(), stream(*A, start_s=0.0, local=[*true, loop])).finalize()
+    assert [c.status for c in result.closures] == [*[ClosureStatus.ACCEPTED] * 3, ClosureStatus.REVOKED]
+    assert np.allclose(se2.between(result.robots[0].T_map_base, POSES), 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("names", list(permutations("abcd")), ids="".join)
+def test_maps_of_several_robots_join_whoever_came_first(scripted, names):
+    """Two pairs of robots join first, then the pairs: each map moves as a whole, into the older one's frame."""
+    w, x, y, z = names
+    early, late = [(k, k) for k in range(0, 24, 4)], [(k, k) for k in range(28, 61, 4)]
+
+    def pair(robots, pairs):
+        one, other = sorted(robots)  # the later robot brings the closures
+        return closures((one, POSES), (other, POSES), pairs)
+
+    meetings = pair((w, x), early), pair((y, z), early), pair((x, y), late)
+    packets = [p for k, name in enumerate("abcd") for p in stream(name, POSES, start_s=0.1 * k)]
+    result = feed(scripted(*meetings), in_order(packets)).finalize()
+    assert map_of(result) == dict.fromkeys("abcd", 0)
+    assert all(joint_error(result, "a", robot) < 1e-3 for robot in "bcd")
+
+
+def test_no_fusing_means_no_comparing(scripted):
+    fleet = scripted(closures(A, B, TRUE), join_maps=False)
+    result = feed(fleet, two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    assert not result.closures
+
+
+def test_a_single_closure_joins_where_the_configuration_asks_for_no_more(scripted):
+    fleet = scripted(closures(A, B, TRUE[2:3]), consistency={"minimum_closures": 1})
+    result = feed(fleet, two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert joint_error(result) < 1e-3
+
+
+def test_the_largest_map_is_the_first(scripted):
+    fleet = scripted(closures(B, C, TRUE))
+    packets = [*two_robots(), *stream(*C, start_s=2 * LATER)]
+    assert map_of(feed(fleet, packets).finalize()) == {"b": 0, "c": 0, "a": 1}
+
+
+def test_nothing_received_is_nothing_mapped():
+    result = Fleet(FleetConfig(), seed=0).finalize()
+    assert result.robots == ()
+    assert result.closures == ()
+
+
+@pytest.mark.parametrize("seeds", [(1, 2), (3, 4)])
+def test_robots_in_two_buildings_stay_in_two_maps(seeds):
+    """Real scans, real matching: two offices with corridors of one width are full of places that look alike."""
+    packets = [
+        packet
+        for number, seed in enumerate(seeds)
+        for packet in small_fleet.sent_by(small_fleet.draw(1, seed=seed).robots[0], f"robot_{number}")
+    ]
+    result = feed(Fleet(FleetConfig(), seed=0), in_order(packets)).finalize()
+    assert sorted(map_of(result).values()) == [0, 1]
+    assert not between(result, ClosureStatus.ACCEPTED)
+
+
+def test_robots_that_met_lie_as_they_drove(drawn, packets):
+    """Across robots, every pair of keyscans within sight is measured to the centimetre."""
+    result = feed(Fleet(FleetConfig(), seed=0), packets).finalize()
+    assert set(map_of(result).values()) == {0}
+    truth = {robot.name: robot for robot in drawn.robots}
+    first, *others = result.robots
+    T_first = small_fleet.truth_at(truth[first.robot], [k.stamp for k in first.keyscans])
+    for other in others:
+        T_other = small_fleet.truth_at(truth[other.robot], [k.stamp for k in other.keyscans])
+        for i in range(0, len(T_first), 5):
+            true, seen = se2.between(T_first[i], T_other), se2.between(first.T_map_base[i], other.T_map_base)
+            near = np.hypot(true[:, 0], true[:, 1]) < 5.0
+            assert np.all(np.hypot(*(seen - true)[near, :2].T) < 0.05)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_result_is_a_function_of_the_set_of_packets(packets, seed):
+    reference = fingerprint(feed(Fleet(FleetConfig(), seed=0), packets).finalize())
+    rng = np.random.default_rng(seed)
+    twice = [*packets, *(packets[k] for k in rng.integers(0, len(packets), 200))]
+    shuffled = [twice[k] for k in rng.permutation(len(twice))]
+    assert fingerprint(feed(Fleet(FleetConfig(), seed=0), shuffled).finalize()) == reference
+
+
+def test_looking_at_the_result_does_not_change_it(scripted):
+    script = [*closures(A, B, TRUE), *closures(A, B, OTHERS[:3], shift=ALIAS)]
+    packets = in_order([*stream(*A, start_s=0.0), *stream(*B, start_s=5.5)])
+    reference = fingerprint(feed(scripted(script), packets).finalize())
+    looked = scripted(script)
+    for k, packet in enumerate(packets):
+        looked.receive(encode(packet))
+        if k % 40 == 0:
+            assert fingerprint(looked.finalize()) == fingerprint(looked.finalize())
+    assert fingerprint(looked.finalize()) == reference
+
+
+def test_duplicates_change_nothing(scripted):
+    once = feed(scripted(closures(A, B, TRUE)), two_robots())
+    doubled = feed(scripted(closures(A, B, TRUE)), [packet for packet in two_robots() for _ in range(2)])
+    assert doubled.closure_counts() == once.closure_counts()
+    assert fingerprint(doubled.finalize()) == fingerprint(once.finalize())
+
+
+def test_every_beginning_of_a_recording_has_a_result(scripted):
+    """A connection may break after any packet."""
+    packets = in_order([*stream("a", POSES[:12], start_s=0.0), *stream("b", POSES[:12], start_s=0.5)])
+    for length in range(len(packets) + 1):
+        result = feed(scripted(closures(A, B, [(0, 0), (4, 4), (8, 8)])), packets[:length]).finalize()
+        for robot in result.robots:
+            assert len(robot.keyscans) == len(robot.T_map_base) > 0
+            assert robot.keyscans[-1].id == KeyscanId(robot.robot, len(robot.keyscans) - 1)

@@ -1,0 +1,163 @@
+"""Packets through the in-memory transport: what is refused, why, and that the fleet is none the worse for it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cloud.scripted import LASER, closures, keyscan, motion, place, rectangle, stream
+from small_fleet import feed, fingerprint, in_order
+
+from fcslam.records import Channel, ConstraintKind, Correction, KeyscanId, frozen
+from fcslam.wire.messages import Acknowledgement, Hello, Packet
+from fcslam.wire.packets import decode, encode
+from fcslam.wire.transport import InMemoryTransport
+
+POSES = rectangle(17)
+STEP = np.array([1.0, 0.0, 0.0])
+PACKETS = in_order([*stream("a", POSES, start_s=0.0), *stream("b", POSES, start_s=0.5)])
+SCRIPT = closures(("a", POSES), ("b", POSES), [(0, 0), (4, 4), (8, 8), (12, 12)])
+HALF = len(PACKETS) // 2
+KNOWN = sum(packet.robot == "a" for packet in PACKETS[:HALF])
+"""Packets that robot a has sent by then."""
+NUMBER = sum(packet.robot == "a" and hasattr(packet.body, "ranges_m") for packet in PACKETS[:HALF])
+"""Keyscans among them."""
+NOW = PACKETS[HALF].time
+
+HOSTILE = {
+    "keyscan of an unknown robot": (keyscan("x", 0, NOW), "before its hello"),
+    "motion of an unknown robot": (motion("x", 0, 1, STEP), "does not lead to a new keyscan"),
+    "closure of an unknown robot": (motion("x", 0, 1, STEP, ConstraintKind.CLOSURE), "names keyscan 0"),
+    "place of an unknown robot": (place("x", 0), "names keyscan 0"),
+    "second hello": (Hello("a", 0, LASER, {}), "said hello before"),
+    "too many beams": (keyscan("a", NUMBER, NOW, beams=9), "9 beams, 8 announced"),
+    "too few beams": (keyscan("a", NUMBER, NOW, beams=1), "1 beams, 8 announced"),
+    "a keyscan left out": (keyscan("a", NUMBER + 1, NOW), f"keyscan {NUMBER + 1} where {NUMBER} is next"),
+    "a keyscan again": (keyscan("a", NUMBER - 1, NOW), f"keyscan {NUMBER - 1} where {NUMBER} is next"),
+    "motion again": (motion("a", NUMBER - 2, NUMBER - 1, STEP), "does not lead to a new keyscan"),
+    "motion ahead": (motion("a", NUMBER - 1, NUMBER, STEP), "does not lead to a new keyscan"),
+    "closure ahead": (motion("a", 0, NUMBER, STEP, ConstraintKind.CLOSURE), f"names keyscan {NUMBER}"),
+    "place ahead": (place("a", NUMBER), f"names keyscan {NUMBER}"),
+    "place that reaches ahead": (place("a", 1, last=NUMBER + 5), f"names keyscan {NUMBER + 5}"),
+    "place again": (place("a", 4), "described before"),
+    "place of another detector": (place("a", 1, detector_version="test-2"), "detector test-2"),
+    "camera place": (place("a", 1, channel=Channel.CAMERA), "camera place"),
+    "correction": (Correction("a", 0, 0, frozen(np.zeros(3))), "goes to a robot"),
+    "acknowledgement": (Acknowledgement("a", 0, 3), "goes to a robot"),
+}
+
+
+@pytest.fixture
+def reference(scripted):
+    return fingerprint(feed(scripted(SCRIPT), PACKETS).finalize())
+
+
+def next_packet(body):
+    """The next that the body's robot would send."""
+    robot = body.id.robot if hasattr(body, "id") else body.robot
+    return Packet(robot, 0, KNOWN if robot == "a" else 0, NOW, body)
+
+
+@pytest.mark.parametrize(("body", "reason"), HOSTILE.values(), ids=HOSTILE)
+def test_what_does_not_fit_is_refused_and_leaves_no_trace(scripted, reference, body, reason):
+    fleet = scripted(SCRIPT)
+    transport = InMemoryTransport(fleet.receive)
+    feed(fleet, PACKETS[:HALF])
+    before = fingerprint(feed(scripted(SCRIPT), PACKETS[:HALF]).finalize())
+    for _ in range(2):  # a second attempt fares no better
+        reply = transport.send(encode(next_packet(body)))
+        assert reason in (reply.refusal or "")
+        assert not reply.packets
+    assert transport.ledger().refused.count == 2
+    assert fingerprint(fleet.finalize()) == before
+    assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
+
+
+@pytest.mark.parametrize(("body", "reason"), HOSTILE.values(), ids=HOSTILE)
+def test_what_comes_early_and_does_not_fit_does_no_harm_either(scripted, reference, body, reason):
+    """It waits for the packets before it; the packet that lets it speak is not blamed."""
+    fleet = scripted(SCRIPT)
+    transport = InMemoryTransport(fleet.receive)
+    transport.send(encode(next_packet(body)))
+    for packet in PACKETS[:HALF]:
+        assert transport.send(encode(packet)).refusal is None
+    assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
+
+
+def test_a_robot_that_starts_again_under_its_old_name_is_refused(scripted, reference):
+    fleet = feed(scripted(SCRIPT), PACKETS[:HALF])
+    again = Packet("a", 1, 0, NOW, Hello("a", 1, LASER, {}))
+    assert "epoch 1" in (InMemoryTransport(fleet.receive).send(encode(again)).refusal or "")
+    assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
+
+
+def test_bytes_that_are_no_packet_are_refused(scripted, reference):
+    fleet = feed(scripted(SCRIPT), PACKETS[:HALF])
+    transport = InMemoryTransport(fleet.receive)
+    good = encode(PACKETS[HALF])
+    for data in (b"", b"\x00" * 50, good[:-3], good + b"\x00", b"GET / HTTP/1.1\r\n"):
+        assert transport.send(data).refusal
+    assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
+
+
+def test_a_keyscan_waits_for_the_motion_to_the_one_before(scripted):
+    packets = stream("a", POSES, start_s=0.0)
+    fleet = feed(scripted(), packets[:3])  # hello, keyscan 0, place 0
+    feed(fleet, [Packet("a", 0, 3, 1.0, keyscan("a", 1, 1.0))])
+    transport = InMemoryTransport(fleet.receive)
+    skipped = transport.send(encode(Packet("a", 0, 4, 2.0, keyscan("a", 2, 2.0))))
+    assert "before the motion to keyscan 1" in (skipped.refusal or "")
+    dangling = transport.send(encode(Packet("a", 0, 4, 2.0, place("a", 1))))
+    assert "names keyscan 1" in (dangling.refusal or "")
+    (robot,) = fleet.finalize().robots
+    assert [k.id.number for k in robot.keyscans] == [0]
+
+
+def test_a_robot_without_a_keyscan_is_no_part_of_the_result(scripted):
+    fleet = feed(scripted(), stream("a", POSES, start_s=0.0)[:1])
+    assert InMemoryTransport(fleet.receive).send(encode(Packet("a", 0, 1, 0.0, keyscan("a", 7, 0.0)))).refusal
+    assert fleet.finalize().robots == ()
+
+
+def test_every_packet_is_acknowledged_and_a_place_brings_a_correction(scripted):
+    fleet = scripted(SCRIPT)
+    sequence = {"a": 0, "b": 0}
+    corrected = {}
+    for packet in PACKETS:
+        replies = [decode(data) for data in fleet.receive(encode(packet))]
+        assert replies[0].body == Acknowledgement(packet.robot, 0, packet.sequence)
+        for reply in replies:
+            assert (reply.robot, reply.sequence) == (packet.robot, sequence[packet.robot])
+            sequence[packet.robot] += 1
+        for reply in replies[1:]:
+            corrected[packet.robot] = reply.body
+        assert len(replies) == 1 + hasattr(packet.body, "descriptors")
+    assert {robot: c.map_index for robot, c in corrected.items()} == {"a": 0, "b": 0}
+    assert np.allclose(corrected["b"].T_map_odom, 0.0, atol=1e-6), "both started at the same pose"
+
+
+def test_a_duplicate_is_acknowledged_again(scripted):
+    fleet = feed(scripted(SCRIPT), PACKETS)
+    (reply,) = fleet.receive(encode(PACKETS[0]))
+    assert decode(reply).body == Acknowledgement(PACKETS[0].robot, 0, PACKETS[0].sequence)
+
+
+@pytest.mark.parametrize("changed", [{"keypoints": 0.0}, {"keypoints": 300.0}])
+def test_places_made_to_confuse_are_matched_without_harm(packets, changed):
+    """Through the real matcher: all keypoints in one spot or far away, descriptors all alike."""
+    from fcslam.cloud.fleet import Fleet, FleetConfig
+
+    def poisoned(packet):
+        if not hasattr(packet.body, "descriptors") or packet.robot != "robot_2":
+            return packet
+        count = 200
+        body = replace(
+            packet.body,
+            keypoints=frozen(np.full((count, 2), changed["keypoints"]), np.float32),
+            descriptors=frozen(np.full((count, 32), 170), np.uint8),
+        )
+        return replace(packet, body=body)
+
+    result = feed(Fleet(FleetConfig(), seed=0), map(poisoned, packets)).finalize()
+    others = {robot.robot: robot.map_index for robot in result.robots}
+    assert others["robot_1"] == others["robot_3"] == 0
+    assert KeyscanId("robot_2", 0) in {robot.keyscans[0].id for robot in result.robots}

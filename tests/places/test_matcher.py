@@ -1,0 +1,150 @@
+"""Place in, M_ij out: words or nearness propose, the submaps decide."""
+
+import numpy as np
+import pytest
+from lidar.worlds import corridor, other_room, room, scan_at
+
+from fcslam.features.birdseye import BirdseyeConfig, describe
+from fcslam.geometry import se2
+from fcslam.lidar.submap import build_submap
+from fcslam.places.matcher import MatcherConfig, PlaceMatcher
+from fcslam.places.vocabulary import DynamicVocabularyConfig
+from fcslam.records import Channel, KeyscanId, Place, frozen
+
+STRANGERS, FRIENDS = (lambda _: True), (lambda _: False)
+STEPS = np.array([(0.0, 0.0, 0.0), (0.4, 0.1, 0.1), (0.8, -0.1, 0.2), (1.1, 0.3, -0.2)])
+AHEAD = np.array([(float(k), 0.0, 0.0) for k in range(12)])
+
+
+class Visits:
+    """Robots that look around in drawn rooms: each visit is a place, its submap is kept for the matcher."""
+
+    def __init__(self):
+        self.submaps = {}
+        self.asked = []
+
+    def visit(self, robot, number, world, pose, steps=STEPS):
+        rng = np.random.default_rng(number)
+        poses = se2.compose(np.array(pose), steps)
+        scans = [(scan_at(p, world, noise_m=0.01, rng=rng), s) for p, s in zip(poses, steps, strict=True)]
+        submap = build_submap(scans)
+        features = describe(submap.surface.points, BirdseyeConfig())
+        place = Place(
+            KeyscanId(robot, number), Channel.LIDAR, "v", number, number, features.keypoints_m, features.descriptors
+        )
+        self.submaps[place.id] = submap
+        return place
+
+    def matcher(self, **settings):
+        return PlaceMatcher(MatcherConfig(**settings), self.submap_of, np.random.default_rng(0))
+
+    def submap_of(self, place):
+        self.asked.append(place.id)
+        return self.submaps[place.id]
+
+
+@pytest.fixture
+def visits():
+    return Visits()
+
+
+POSE_A, POSE_B = np.array([-1.5, -1.0, 0.2]), np.array([-0.5, 0.4, 2.0])
+
+
+def test_the_same_room_from_another_pose_is_the_same_place(visits):
+    matcher = visits.matcher()
+    matcher.match(visits.visit("a", 0, room(), POSE_A), {}, STRANGERS)
+    (match,) = matcher.match(visits.visit("b", 0, room(), POSE_B), {}, STRANGERS)
+    assert (match.i, match.j, match.predicted) == (KeyscanId("a", 0), KeyscanId("b", 0), False)
+    assert match.M
+    assert np.all(np.abs(se2.between(se2.between(POSE_A, POSE_B), match.check.T_a_b)) < (0.03, 0.03, 0.01))
+    assert 0.0 < match.similarity <= 1.0
+    assert len(matcher) == 2
+
+
+def test_another_room_is_another_place(visits):
+    matcher = visits.matcher(inliers=4)
+    matcher.match(visits.visit("a", 0, room(), POSE_A), {}, STRANGERS)
+    matches = matcher.match(visits.visit("b", 0, other_room(), (0.5, 0.5, 1.0)), {}, STRANGERS)
+    assert not any(match.M for match in matches)
+
+
+def test_a_bare_corridor_may_be_the_same_place_but_fixes_no_pose(visits):
+    matcher = visits.matcher()
+    first = visits.visit("a", 0, corridor(), (0.0, 0.0, 0.0), AHEAD)
+    matcher.match(first, {}, STRANGERS)
+    second = visits.visit("b", 0, corridor(), (3.0, 0.1, 0.05), AHEAD)
+    (match,) = matcher.match(second, {first.id: np.array([3.0, 0.1, 0.05])}, FRIENDS)
+    assert match.M
+    assert not match.check.informative
+
+
+def test_where_a_map_is_shared_the_prediction_is_refined(visits):
+    matcher = visits.matcher()
+    first = visits.visit("a", 0, room(), POSE_A)
+    matcher.match(first, {}, STRANGERS)
+    guess = se2.between(POSE_A, POSE_B) + np.array([0.15, -0.1, 0.05])
+    (match,) = matcher.match(visits.visit("b", 0, room(), POSE_B), {first.id: guess}, FRIENDS)
+    assert match.predicted
+    assert match.M
+    assert np.all(np.abs(se2.between(se2.between(POSE_A, POSE_B), match.check.T_a_b)) < (0.03, 0.03, 0.01))
+
+
+def test_a_wrong_prediction_does_not_become_a_closure(visits):
+    matcher = visits.matcher()
+    first = visits.visit("a", 0, room(), POSE_A)
+    matcher.match(first, {}, STRANGERS)
+    (match,) = matcher.match(visits.visit("b", 0, other_room(), POSE_B), {first.id: np.zeros(3)}, FRIENDS)
+    assert not match.M
+    assert match.check.reason
+
+
+def test_a_robot_alone_is_never_compared(visits):
+    matcher = visits.matcher()
+    for number in range(3):
+        assert matcher.match(visits.visit("a", number, room(), POSE_A), {}, FRIENDS) == []
+    assert visits.asked == []
+    assert len(matcher) == 3
+
+
+def test_a_place_without_features_matches_nothing_and_harms_nothing(visits):
+    matcher = visits.matcher(small_fleet=0, vocabulary=DynamicVocabularyConfig(train_batch=1))
+    empty = Place(
+        KeyscanId("c", 0), Channel.LIDAR, "v", 0, 0, frozen(np.zeros((0, 2)), np.float32),
+        frozen(np.zeros((0, 32)), np.uint8),
+    )  # fmt: skip
+    assert matcher.match(empty, {}, STRANGERS) == []
+    matcher.match(visits.visit("a", 0, room(), POSE_A), {}, STRANGERS)
+    assert any(m.M for m in matcher.match(visits.visit("b", 0, room(), POSE_B), {}, STRANGERS))
+
+
+def test_words_choose_the_candidates_of_a_large_fleet(visits):
+    """Among twelve visits to another room, one to this: it is among the three that words name."""
+    matcher = visits.matcher(small_fleet=0, candidates=3, vocabulary=DynamicVocabularyConfig(train_batch=4))
+    for number in range(12):
+        matcher.match(visits.visit("a", number, other_room(), (0.2 * number - 1, 0.5, number)), {}, STRANGERS)
+    matcher.match(visits.visit("a", 12, room(), POSE_A), {}, STRANGERS)
+    visits.asked.clear()
+    matches = matcher.match(visits.visit("b", 0, room(), POSE_B), {}, STRANGERS)
+    assert [match.i for match in matches if match.M] == [KeyscanId("a", 12)]
+    assert len(set(visits.asked)) <= 1 + 3
+
+
+def test_places_from_before_the_first_vocabulary_are_found_by_words(visits):
+    matcher = visits.matcher(small_fleet=0, candidates=3, vocabulary=DynamicVocabularyConfig(train_batch=4))
+    matcher.match(visits.visit("a", 0, room(), POSE_A), {}, FRIENDS)
+    for number in range(1, 8):
+        matcher.match(visits.visit("a", number, other_room(), (0.3 * number - 1, 0.5, number)), {}, FRIENDS)
+    matches = matcher.match(visits.visit("b", 0, room(), POSE_B), {}, STRANGERS)
+    assert [match.i for match in matches if match.M] == [KeyscanId("a", 0)]
+
+
+def test_the_same_places_give_the_same_matches(visits):
+    def run():
+        matcher = visits.matcher(small_fleet=0, vocabulary=DynamicVocabularyConfig(train_batch=2))
+        found = []
+        for number, pose in enumerate((POSE_A, POSE_B, POSE_A + 0.3, POSE_B - 0.3)):
+            found += matcher.match(visits.visit(f"r{number}", number, room(), pose), {}, STRANGERS)
+        return [(m.i, m.j, m.similarity, m.check.T_a_b.tobytes()) for m in found]
+
+    assert run() == run()

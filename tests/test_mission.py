@@ -1,0 +1,126 @@
+"""Recordings in, one run out: the same seed gives the same bytes, and what the run says adds up."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from fcslam import mission
+from fcslam.errors import FcslamError, PacketError, SourceError
+from fcslam.mission import MissionConfig, run_mission
+from fcslam.records import ClosureStatus
+from fcslam.runs import write_run
+from fcslam.sources import open_source, write_carmen
+
+
+@pytest.fixture(scope="module")
+def run(logs):
+    return run_mission([open_source(log) for log in logs], MissionConfig(seed=3))
+
+
+def files(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_the_same_seed_gives_the_same_bytes(run, logs, tmp_path):
+    again = run_mission([open_source(log) for log in logs], MissionConfig(seed=3))
+    write_run(run, tmp_path / "one")
+    write_run(again, tmp_path / "two")
+    one, two = files(tmp_path / "one"), files(tmp_path / "two")
+    assert one.keys() == two.keys()
+    assert [name for name in one if one[name] != two[name]] == []
+    assert {"robots.csv", "closures.csv", "pose_graph.g2o", "metrics.json", "config.yaml", "map.pgm", "map.png"} <= set(
+        one
+    )
+
+
+def test_the_order_of_the_recordings_does_not_matter(run, logs):
+    turned = run_mission([open_source(log) for log in reversed(logs)], MissionConfig(seed=3))
+    assert turned.closures
+    assert [str(c) for c in turned.closures] == [str(c) for c in run.closures]
+    assert turned.pose_graph_g2o == run.pose_graph_g2o
+    assert turned.map_files["map.pgm"] == run.map_files["map.pgm"]
+    poses = {t.robot: t.T_map_base.tobytes() for t in run.trajectories}
+    assert {t.robot: t.T_map_base.tobytes() for t in turned.trajectories} == poses
+
+
+def test_trajectories_have_every_scan_of_the_recording(run, drawn):
+    assert [t.robot for t in run.trajectories] == [robot.name for robot in drawn.robots]
+    for trajectory, robot in zip(run.trajectories, drawn.robots, strict=True):
+        assert np.allclose(trajectory.stamps, robot.stamps, atol=1e-6)
+        assert trajectory.T_map_base.shape == (len(robot.stamps), 3)
+
+
+def test_numbers_add_up(run, drawn):
+    values = {metric.name: metric.value for metric in run.metrics}
+    assert values["robots"] == 3
+    assert values["maps"] == len({t.map_index for t in run.trajectories})
+    assert values["scans"] == sum(len(robot.stamps) for robot in drawn.robots)
+    assert values["recorded_time"] == pytest.approx(sum(r.stamps[-1] - r.stamps[0] for r in drawn.robots))
+    assert values["keyscans"] == values["keyscan_packets"] == run.pose_graph_g2o.count("VERTEX_SE2")
+    assert values["hello_packets"] == 3
+    assert values["correction_packets"] == values["place_packets"]
+    packets = sum(values[f"{kind}_packets"] for kind in ("hello", "keyscan", "constraint", "place"))
+    assert values["acknowledgement_packets"] == packets
+    for status in ClosureStatus:
+        between = [c for c in run.closures if c.robot_i != c.robot_j and c.status is status]
+        assert values[f"inter_robot_closures_{status}"] == len(between)
+    assert values["inter_robot_closures_verified"] == 0, "in the end every closure is decided"
+
+
+def test_closures_tell_where_and_why(run):
+    stamps = {t.robot: set(np.round(t.stamps, 6)) for t in run.trajectories}
+    for closure in run.closures:
+        assert round(closure.stamp_i, 6) in stamps[closure.robot_i]
+        assert round(closure.stamp_j, 6) in stamps[closure.robot_j]
+        assert 0.0 <= closure.similarity <= 1.0
+        assert closure.reason
+
+
+def test_the_run_carries_its_configuration(run):
+    assert MissionConfig.model_validate(yaml.safe_load(run.config_yaml)) == MissionConfig(seed=3)
+
+
+def test_progress_goes_forward_to_the_end(logs, drawn):
+    seen = []
+    run_mission([open_source(log) for log in logs], MissionConfig(), seen.append)
+    scans = [progress.scans for progress in seen]
+    assert scans == sorted(scans)
+    assert scans[-1] > 0.9 * sum(len(robot.stamps) for robot in drawn.robots)
+    assert [p.keyscans for p in seen] == sorted(p.keyscans for p in seen)
+    assert seen[-1].closures.keys() == {"within robots", "between robots"}
+    json.dumps(seen[-1].closures)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("a b.clf", None), ("_robot.clf", None), ("(1).log", None), ("Ä.log", None), ("x" * 90 + ".log", SourceError)],
+)
+def test_a_recording_may_have_any_name_that_a_robot_can_bear(tmp_path, drawn, name, error):
+    """Names go over the wire and into file names; one that cannot is refused before the work."""
+    robot = drawn.robots[0]
+    path = tmp_path / name
+    write_carmen(path, list(robot.scans())[:12])
+    sources = [open_source(path)]
+    if error is None:
+        assert len(run_mission(sources, MissionConfig()).trajectories) == 1
+        return
+    with pytest.raises(error, match="rename"):
+        run_mission(sources, MissionConfig(), watch=lambda _: pytest.fail("worked"))
+
+
+def test_two_recordings_of_one_name_are_refused(logs, tmp_path):
+    copy = tmp_path / logs[0].name
+    copy.write_bytes(logs[0].read_bytes())
+    with pytest.raises(SourceError, match="robot_1"):
+        run_mission([open_source(logs[0]), open_source(copy)], MissionConfig())
+
+
+def test_a_refusal_by_the_cloud_is_not_lost(logs, monkeypatch):
+    def refuse(_self, _data):
+        raise PacketError("no room")
+
+    monkeypatch.setattr(mission.Fleet, "receive", refuse)
+    with pytest.raises(FcslamError, match=r"robot_1.*no room"):
+        run_mission([open_source(logs[0])], MissionConfig())
