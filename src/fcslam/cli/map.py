@@ -57,7 +57,7 @@ def map_sources(sources: "Sequence[Source]", settings: "MissionConfig", output: 
     for source in sources:
         if source.faults:
             console.print(f"{source.name}: {source.faults}", highlight=False, soft_wrap=True)
-    _report(Console(), run, time.perf_counter() - began, output)
+    _report(Console(), run, time.perf_counter() - began, output, settings.fleet.join_maps)
     return run
 
 
@@ -110,7 +110,7 @@ def _what(progress: "Progress", elapsed_s: float) -> str:
     return f"{speed:.0f} x real time, {progress.keyscans} keyscans, closures: {closures or 'none'}"
 
 
-def _report(console: "Console", run: "Run", elapsed_s: float, output: Path) -> None:
+def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, joined: bool) -> None:
     from rich.table import Table
 
     values = {metric.name: metric.value for metric in run.metrics}
@@ -129,7 +129,10 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path) -> N
     )
     maps = int(values["maps"])
     if maps > 1:
-        console.print(
-            f"{maps} maps: some robots share no place that geometry confirms (see closures.csv)", highlight=False
+        why = (
+            "some robots share no place that geometry confirms (see closures.csv)"
+            if joined
+            else "one a robot, as asked"
         )
+        console.print(f"{maps} maps: {why}", highlight=False, soft_wrap=True)
     console.print(f"map: {output / 'map.png'}", highlight=False, markup=False, soft_wrap=True)

@@ -229,9 +229,11 @@ class Fleet:
         if b not in self._map_of(a):
             self._join(members, a, b)
         reason = f"in the dominant cluster of {len(members)} closures ({verdict.supporters} places apart)"
-        for entry in members:
-            if entry.edge is None:
+        for entry in entries:
+            if entry in members and entry.edge is None:
                 self._accept(entry, reason)
+            elif entry.closure.status is ClosureStatus.VERIFIED:
+                entry.set(ClosureStatus.VERIFIED, "outside the dominant cluster")
         self._optimize()
 
     def _join(self, members: list[Entry], a: str, b: str) -> None:
