@@ -90,6 +90,6 @@ def test_the_command_is_measured_and_its_failure_ends_the_script(common):
     cost = common.run_fcslam("--version")
     assert cost.cpu_s > 0.0
     assert 0.0 < cost.wall_s < 60.0
-    assert 5.0 < cost.peak_mb < 2000.0
+    assert cost.peak_mb > 5.0  # the system counts what this process held when it forked, so no upper bound
     with pytest.raises(SystemExit, match="failed"):
         common.run_fcslam("map", "no-such-log", "--output", "nowhere")
