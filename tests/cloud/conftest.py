@@ -12,6 +12,7 @@ def scripted(monkeypatch):
 
     def make(*scripts, **settings) -> Fleet:
         monkeypatch.setattr(ScriptedMatcher, "script", [line for script in scripts for line in script])
+        monkeypatch.setattr(ScriptedMatcher, "predictions", {})
         return Fleet(FleetConfig(**settings), seed=0)
 
     return make

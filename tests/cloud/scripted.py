@@ -45,12 +45,14 @@ class ScriptedMatcher:
     """Stands in for PlaceMatcher: finds what the script says."""
 
     script: ClassVar[list[Script]] = []
+    predictions: ClassVar[dict[KeyscanId, dict]] = {}
+    """What each place was to be compared with since its robot shared a map with theirs."""
 
     def __init__(self, *_):
-        self.stored = []
+        pass
 
-    def match(self, place, _, strangers) -> list[PlaceMatch]:
-        self.stored.append(place.id)
+    def match(self, place, predicted, strangers) -> list[PlaceMatch]:
+        self.predictions[place.id] = dict(predicted)
         found = [line for line in self.script if line.j == place.id]
         return [PlaceMatch(s.i, s.j, 0.5, verified(s), predicted=not strangers(s.i)) for s in found]
 

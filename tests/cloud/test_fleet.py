@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 import small_fleet
-from cloud.scripted import ALIAS, closures, motion, rectangle, stream
+from cloud.scripted import ALIAS, ScriptedMatcher, closures, motion, rectangle, stream
 from small_fleet import feed, fingerprint, in_order, map_of
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
@@ -44,6 +44,7 @@ def test_a_true_cluster_joins_two_robots_and_leaves_aliases_out(scripted):
     assert map_of(result) == {"a": 0, "b": 0}
     assert joint_error(result) < 1e-3
     assert len(between(result, ClosureStatus.ACCEPTED)) == len(TRUE)
+    assert len(result.graph.edges) == 2 * (len(POSES) - 1) + len(TRUE), "each closure once"
     rejected = between(result, ClosureStatus.REJECTED)
     assert len(rejected) == 3
     assert all(closure.reason for closure in rejected)
@@ -110,11 +111,61 @@ def test_a_join_on_aliases_is_revoked_when_the_truth_is_twice_as_strong(scripted
 
 
 def test_a_join_on_aliases_does_not_outlive_evidence_that_contradicts_it(scripted):
-    """Three aliases came first, five true closures later: neither cluster is twice the other, so nobody knows."""
+    """Three aliases came first, five true closures later: neither cluster is twice the other, so nobody knows.
+
+    The aliases do not fit perfectly, but nothing of the bend that they made remains.
+    """
     alias = closures(A, B, [(0, 0), (4, 4), (8, 8)], shift=ALIAS)
+    alias[1] = replace(alias[1], T_i_j=alias[1].T_i_j + np.array([0.04, 0.03, 0.01]))
     result = feed(scripted(alias, closures(A, B, [(k, k) for k in range(12, 32, 4)])), two_robots()).finalize()
     assert map_of(result) == {"a": 0, "b": 1}
     assert not between(result, ClosureStatus.ACCEPTED)
+    for robot in result.robots:
+        assert np.allclose(se2.between(se2.between(robot.T_map_base[0], robot.T_map_base), POSES), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("off", [(0.8, 0.0, 0.0), (0.0, 0.0, 0.2)])
+def test_in_a_joint_map_a_surprise_needs_a_cluster(scripted, off):
+    """Too far away or too much turned: unlike a small contradiction it is not even tried."""
+    (surprise,) = closures(A, B, [(20, 20)])
+    surprise = replace(surprise, T_i_j=surprise.T_i_j + np.array(off))
+    fleet = feed(scripted(closures(A, B, TRUE), [surprise]), two_robots())
+    assert fleet.closure_counts()["between robots"] == len(TRUE)
+    (rejected,) = between(fleet.finalize(), ClosureStatus.REJECTED)
+    assert rejected.i.number == 20
+
+
+def test_in_a_joint_map_near_places_of_other_robots_are_predicted(scripted):
+    """The nearest place of each of two visits within sight, where the joint map says it is."""
+    rounds = ("a", rectangle(181))  # passes every spot three times
+    feed(scripted(closures(rounds, B, TRUE)), [*stream(*rounds, start_s=0.0), *stream(*B, start_s=LATER)])
+    assert not ScriptedMatcher.predictions[KeyscanId("b", 8)], "not yet in one map"
+    for number in range(20, 61, 4):
+        predicted = ScriptedMatcher.predictions[KeyscanId("b", number)]
+        assert len(predicted) == 2
+        for place, T_i_j in predicted.items():
+            assert place.robot == "a"
+            assert np.hypot(T_i_j[0], T_i_j[1]) < 0.01
+            assert np.allclose(se2.between(T_i_j, se2.between(rounds[1][place.number], POSES[number])), 0.0, atol=1e-3)
+
+
+def test_what_is_out_of_sight_is_not_predicted(scripted):
+    fleet = scripted(closures(A, B, TRUE), sight_m=1.5)
+    far = POSES.copy()
+    far[40:, :2] += np.array([50.0, 0.0])  # b leaves the building
+    feed(fleet, [*stream(*A, start_s=0.0), *stream("b", far, start_s=LATER)])
+    assert ScriptedMatcher.predictions[KeyscanId("b", 36)]
+    assert not ScriptedMatcher.predictions[KeyscanId("b", 44)]
+
+
+def test_the_older_map_keeps_its_frame_whoever_sees_whom(scripted):
+    """Robot a began first, but it is a who comes to where b was before."""
+    seen_by_a = closures(B, A, [(k - 4, k) for k in range(4, 40, 4)])
+    packets = in_order([*stream(*A, start_s=0.0), *stream(*B, start_s=0.1)])
+    result = feed(scripted(seen_by_a), packets).finalize()
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert np.array_equal(result.robots[0].T_map_base[0], np.zeros(3))
+    assert joint_error(result) < 1e-3
 
 
 def test_a_closure_that_contradicts_the_joint_graph_ends_revoked(scripted):

@@ -1,5 +1,7 @@
 """Evidence for a join, seen from either side."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cloud.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, verified
@@ -71,6 +73,16 @@ def test_the_first_estimate_is_where_the_other_map_lies(turned):
     assert np.allclose(first_estimate(members, ("b", "a"), graph), se2.inverse(T_A_B), atol=1e-6)
 
 
+def test_the_first_estimate_rests_on_the_longest_lever():
+    """Each closure is turned a little, but its place is right: two far places tell the direction better."""
+    graph = graph_of(a=POSES, b=POSES)
+    turned = [
+        entry(e.closure.i, e.closure.j, e.closure.T_i_j + np.array([0.0, 0.0, 0.05]))
+        for e in entries([(0, 0), (1, 1), (30, 30)])
+    ]
+    assert np.allclose(first_estimate(turned, ("a", "b"), graph), T_A_B, atol=1e-9)
+
+
 def test_a_single_closure_gives_the_first_estimate_alone():
     graph = graph_of(a=POSES, b=POSES)
     assert np.allclose(first_estimate(entries([(7, 11)]), ("a", "b"), graph), T_A_B, atol=1e-9)
@@ -105,9 +117,14 @@ def test_the_ledger_books_what_geometry_says():
     assert confirmed.closure.status is ClosureStatus.VERIFIED
     assert ledger.between("a", "b") == ledger.between("b", "a") == [confirmed]
     assert ledger.joined() == []
+    unconfirmed = replace(verified(line), strict=False)
+    assert ledger.add(PlaceMatch(line.i, line.j, 0.4, unconfirmed, False)).closure.status is ClosureStatus.CANDIDATE
+    predicted = ledger.add(PlaceMatch(line.i, line.j, 0.4, unconfirmed, True))
+    assert predicted.closure.status is ClosureStatus.VERIFIED, "the loose gate counts where a map is shared"
+    assert ledger.between("a", "b") == [confirmed, predicted]
     own = motion("a", 1, 9, np.array([1.0, 0.0, 0.0]))
     ledger.add_local(own, edge=8)
-    assert ledger.between("a", "b") == [confirmed]
+    assert ledger.between("a", "b") == [confirmed, predicted]
     assert ledger.accepted_edges() == [8]
     confirmed.edge = 9
     confirmed.set(ClosureStatus.ACCEPTED, "")
