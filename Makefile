@@ -5,6 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed-$(EXTRAS)
 DEMO ?= demo
+BENCHMARKS := $(filter-out benchmarks/common.py,$(wildcard benchmarks/*.py))
 
 .PHONY: help install demo test test-system check bench proto
 .DEFAULT_GOAL := help
@@ -14,7 +15,7 @@ help:
 	@echo "make test         the tests that need nothing but this folder"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make check        linter, formatting, types"
-	@echo "make bench        the benchmarks that need no recordings"
+	@echo "make bench        the benchmarks; those on recordings only if FCSLAM_DATA names their folder"
 	@echo "make install      .venv alone; EXTRAS=dev,train,federated,sim,foxglove for more"
 	@echo "make proto        generate the wire format's Python code anew"
 
@@ -41,7 +42,7 @@ check: $(INSTALLED)
 	@$(BIN)/mypy
 
 bench: $(INSTALLED)
-	@set -e; for script in benchmarks/*.py; do echo "$$script"; $(BIN)/python "$$script"; done
+	@set -e; for script in $(BENCHMARKS); do echo "$$script"; $(BIN)/python "$$script"; done
 
 proto: $(INSTALLED)
 	@cd src && ../$(BIN)/python -m grpc_tools.protoc --proto_path=. --python_out=. --pyi_out=. fcslam/wire/*.proto

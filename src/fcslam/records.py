@@ -124,7 +124,7 @@ class Place:
     first: int
     """Number of the first keyscan of the submap it was seen in."""
     last: int
-    """Index of the last one (inclusive)."""
+    """Number of the last one (inclusive)."""
     keypoints: NDArray[np.float32]
     """Shape (N, 2): metres in the keyscan's base (lidar)."""
     descriptors: Codes
@@ -160,9 +160,11 @@ class LoopClosure:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """What the cloud tells a robot: where its odometry's origin lies in the fleet's map."""
+    """What the cloud tells a robot: where its smooth, drifting frame lies in the fleet's map."""
 
     robot: str
     version: int
     map_index: int
+    """Tells apart maps that are not joined yet; it may change when maps join."""
     T_map_odom: FloatArray
+    """``odom`` here is the chain of the robot's own motions between keyscans, from zero at its first."""

@@ -1,6 +1,5 @@
 """The command line: one module a command. What a command needs is imported when it runs, so that help is quick."""
 
-import sys
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -66,7 +65,3 @@ def _fcslam(
     ] = False,
 ) -> None:
     """Several robots map one building together: one map, every robot's trajectory in it."""
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -155,7 +155,8 @@ class Fleet:
             for other in dict.fromkeys(entry.closure.i.robot for entry in surprises):
                 self._judge_pair(other, place.id.robot)
             self._places.setdefault((place.detector_version, place.id.robot), []).append(place.id)
-        if self._graph.is_due(self._config.solve_every):
+        # A robot alone needs no estimate before the end.
+        if len(self._store.robots) > 1 and self._graph.is_due(self._config.solve_every):
             self._optimize()
 
     def _matcher(self, version: str) -> PlaceMatcher:
@@ -228,9 +229,11 @@ class Fleet:
         if b not in self._map_of(a):
             self._join(members, a, b)
         reason = f"in the dominant cluster of {len(members)} closures ({verdict.supporters} places apart)"
-        for entry in members:
-            if entry.edge is None:
+        for entry in entries:
+            if entry in members and entry.edge is None:
                 self._accept(entry, reason)
+            elif entry.closure.status is ClosureStatus.VERIFIED:
+                entry.set(ClosureStatus.VERIFIED, "outside the dominant cluster")
         self._optimize()
 
     def _join(self, members: list[Entry], a: str, b: str) -> None:

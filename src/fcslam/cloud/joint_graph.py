@@ -19,7 +19,6 @@ class JointGraph:
         self._factors = FactorCache(self.graph)
         self._variables: dict[str, list[int]] = {}
         self._chains: dict[str, list[FloatArray]] = {}
-        self._travel: dict[str, list[float]] = {}
         self._poses = np.zeros((256, 3))
         self._weights = np.ones(0)
         self._unsolved = 0
@@ -46,10 +45,6 @@ class JointGraph:
         """T_odom_base of keyscans first to last (inclusive): the robot's motions alone, before any correction."""
         return np.array(self._chains[robot][first : last + 1])
 
-    def travel_m(self, keyscan: KeyscanId) -> float:
-        """The robot's path length up to the keyscan."""
-        return self._travel[keyscan.robot][keyscan.number]
-
     def T_map_odom(self, robot: str) -> FloatArray:
         """Where the robot's odometry (the chain of its motions) starts in the map, by its newest keyscan."""
         return se2.compose(self._poses[self._variables[robot][-1]], se2.inverse(self._chains[robot][-1]))
@@ -57,7 +52,6 @@ class JointGraph:
     def start(self, robot: str) -> None:
         """First keyscan of a robot: the origin of a map of its own."""
         self._chains[robot] = [np.zeros(3)]
-        self._travel[robot] = [0.0]
         self._variables[robot] = [self._add_variable(np.zeros(3))]
 
     def extend(self, constraint: Constraint) -> None:
@@ -67,8 +61,6 @@ class JointGraph:
         variable = self._add_variable(se2.compose(self._poses[previous], constraint.T_i_j))
         self._variables[robot].append(variable)
         self._chains[robot].append(se2.compose(self._chains[robot][-1], constraint.T_i_j))
-        step = float(np.hypot(constraint.T_i_j[0], constraint.T_i_j[1]))
-        self._travel[robot].append(self._travel[robot][-1] + step)
         self.graph.add_edge(Edge(previous, variable, constraint.T_i_j, constraint.information, robust=False))
 
     def close(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray, information: FloatArray) -> int:

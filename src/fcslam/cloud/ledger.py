@@ -7,7 +7,7 @@ from fcslam.places.matcher import PlaceMatch
 from fcslam.records import Channel, ClosureStatus, Constraint, KeyscanId, LoopClosure, frozen
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Entry:
     """A closure and, once it is in the pose graph, its edge there."""
 

@@ -33,6 +33,8 @@ SWATCH_PX: Final = 34
 GAP_PX: Final = 14
 FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE: Final = 0.75
+MEETINGS_APART_M: Final = 1.5
+"""Closures are drawn no closer than this to one another."""
 SUBPIXEL_BITS: Final = 4
 
 
@@ -80,7 +82,7 @@ def map_png(fused: FusedMap, trajectories: Mapping[str, FloatArray], closures: S
     """PNG of the map, about 1600 pixels on its long side; what is known and where robots were fits in.
 
     ``trajectories`` holds each robot's poses or points in ``map``, shape (N, 2+), drawn from a dot at the first;
-    of ``closures`` those between two robots are drawn.
+    of ``closures`` those between two robots are counted, and drawn as far as they do not crowd.
     """
     view = _view(fused, trajectories.values())
     canvas = _canvas(view)
@@ -88,7 +90,7 @@ def map_png(fused: FusedMap, trajectories: Mapping[str, FloatArray], closures: S
     meetings = [closure for closure in closures if closure.robot_a != closure.robot_b]
     for pixels, color in ways:
         _draw_trajectory(canvas, pixels, color)
-    for meeting in meetings:
+    for meeting in _spread(meetings):
         _draw_line(canvas, view.pixels(np.array((meeting.xy_a, meeting.xy_b))), CLOSURE, 1)
     for pixels, color in ways:
         _draw_start(canvas, pixels, color)
@@ -97,6 +99,16 @@ def map_png(fused: FusedMap, trajectories: Mapping[str, FloatArray], closures: S
         labels.append((f"{len(meetings)} closure{'s' * (len(meetings) > 1)} between robots", CLOSURE))
     picture = np.vstack((canvas, _legend(labels, canvas.shape[1], view.cell_px / view.cell_m)))
     return bytes(cv2.imencode(".png", picture)[1])
+
+
+def _spread(meetings: Sequence[Meeting]) -> list[Meeting]:
+    """The shortest meetings that keep their distance from one another."""
+    drawn: list[Meeting] = []
+    for meeting in sorted(meetings, key=lambda m: float(np.hypot(*(m.xy_b - m.xy_a)))):
+        middle = meeting.xy_a + meeting.xy_b
+        if all(np.hypot(*(middle - (m.xy_a + m.xy_b))) > 2.0 * MEETINGS_APART_M for m in drawn):
+            drawn.append(meeting)
+    return drawn
 
 
 def _view(fused: FusedMap, trajectories: Iterable[FloatArray]) -> _View:

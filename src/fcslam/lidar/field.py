@@ -16,7 +16,7 @@ from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
 CELL_M: Final = 0.05
-TILE: Final = 32
+TILE: Final = 16
 """Cells along one side of a tile."""
 REACH_M: Final = 0.5
 """Cells farther than this from every surfel hold none."""
@@ -24,9 +24,11 @@ MERGE_M: Final = 0.05
 """A return this close to a surfel that faces the same way joins it."""
 MEAN_OVER: Final = 30.0
 """A surfel forgets beyond this many returns, so it can follow its surface."""
-TABLE: Final = 256
+TABLE: Final = 512
 """Tiles along one side of the field: 409.6 m, more than any submap with any laser."""
 EMPTY: Final = -1
+MOST_SURFELS: Final = 32767
+"""As many as a label can tell apart: 1.6 km of walls. What comes after joins surfels or is left out."""
 
 MOST_NEW_TILES: Final = 9
 """One surfel reaches into no more tiles."""
@@ -41,7 +43,7 @@ class FieldArrays(NamedTuple):
     """Lower left corner of the table, shape (2,)."""
     table: NDArray[np.int32]
     """Storage number of each tile, or EMPTY; shape (rows, columns)."""
-    labels: NDArray[np.int32]
+    labels: NDArray[np.int16]
     """Nearest surfel of each cell of each stored tile, or EMPTY; shape (tiles, TILE, TILE)."""
     surfels: FloatArray
     """x, y, normal x, normal y, returns, whether all of them stood alone; shape (capacity, 6)."""
@@ -56,7 +58,7 @@ class SurfelField:
         self.arrays = FieldArrays(
             corner=np.asarray(origin_xy[:2], dtype=np.float64) - 0.5 * TABLE * TILE * CELL_M,
             table=np.full((TABLE, TABLE), EMPTY, np.int32),
-            labels=np.full((64, TILE, TILE), EMPTY, np.int32),
+            labels=np.full((64, TILE, TILE), EMPTY, np.int16),
             surfels=np.zeros((1024, 6)),
             used=np.zeros(2, np.int64),
         )
@@ -149,6 +151,8 @@ def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-unty
         label = label_at(x, y, field)
         ahead = label_at(x + CELL_M * nx, y + CELL_M * ny, field)
         if _merge(x, y, nx, ny, solitary[i], label, field) or _merge(x, y, nx, ny, solitary[i], ahead, field):
+            continue
+        if field.used[1] == MOST_SURFELS:
             continue
         if field.used[1] == len(field.surfels) or len(field.labels) - field.used[0] < MOST_NEW_TILES:
             return i

@@ -1,6 +1,7 @@
 """One scan as points with normals in the robot's base."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -58,28 +59,35 @@ def point_scan(ranges_m: Ranges, laser: LaserModel) -> PointScan:
     if np.shape(ranges_m) != (laser.beam_count,):
         raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {np.shape(ranges_m)}")
     T_base_laser = np.array(laser.T_base_laser)
-    points, normals, solitary = _project(ranges_m, laser.angles_rad(), laser.max_range_m, T_base_laser)
+    beams = _beams(laser)
+    points, normals, solitary = _project(
+        ranges_m, beams, abs(laser.angle_increment_rad), laser.max_range_m, T_base_laser
+    )
     return PointScan(points, normals, solitary, T_base_laser[:2])
 
 
+@lru_cache(maxsize=64)
+def _beams(laser: LaserModel) -> FloatArray:
+    """Direction of each beam in ``base`` as cosine and sine, shape (N, 2)."""
+    angles = laser.angles_rad() + laser.T_base_laser[2]
+    return np.stack((np.cos(angles), np.sin(angles)), axis=1)
+
+
 @njit(cache=True)
-def _project(ranges, angles, max_range, T_base_laser):  # type: ignore[no-untyped-def]
+def _project(ranges, beams, spacing, max_range, T_base_laser):  # type: ignore[no-untyped-def]
     count = len(ranges)
     kept = np.empty(count, np.int64)
     xy = np.empty((count, 2))
     n = 0
-    cos, sin = np.cos(T_base_laser[2]), np.sin(T_base_laser[2])
     for i in range(count):
         r = ranges[i]
         if r > 0.0 and r < max_range:  # false for NaN
-            x, y = r * np.cos(angles[i]), r * np.sin(angles[i])
-            xy[n, 0] = T_base_laser[0] + cos * x - sin * y
-            xy[n, 1] = T_base_laser[1] + sin * x + cos * y
+            xy[n, 0] = T_base_laser[0] + r * beams[i, 0]
+            xy[n, 1] = T_base_laser[1] + r * beams[i, 1]
             kept[n] = i
             n += 1
     points = xy[:n].copy()
     normals = np.zeros((n, 2))
-    spacing = abs(angles[1] - angles[0]) if count > 1 else 0.0
     solitary = np.zeros(n, np.bool_)
     for k in range(n):
         _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals)

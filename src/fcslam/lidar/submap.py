@@ -57,10 +57,9 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
 
 def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
     """Returns a field cell apart, within the radius of the anchor (measured from the robot: the window is short)."""
-    scan = scan.thinned(CELL_M)
     limit = max(1.0, RADIUS_M - float(np.hypot(T_anchor_base[0], T_anchor_base[1])))
     inside = scan.points[:, 0] ** 2 + scan.points[:, 1] ** 2 < limit * limit
-    return scan.only(inside)
+    return (scan if inside.all() else scan.only(inside)).thinned(CELL_M)
 
 
 def _free_space(scans: Sequence[tuple[PointScan, FloatArray]], surface: FloatArray) -> FreeSpace:

@@ -18,23 +18,38 @@ _ALIGNMENT = MatchingConfig(wide_scale_m=0.4)
 
 
 class Gate(Settings):
-    """What a pair of submaps has to show to count as the same place."""
+    """What a pair of submaps has to show to count as the same place where nothing predicts it."""
 
-    explained: float = Field(ge=0, le=1, description="least share of points in known area that lie on a surface")
-    violation: float = Field(ge=0, le=1, description="largest share of points in the other's free space")
+    explained: float = Field(
+        default=0.80, ge=0, le=1, description="least share of points in known area that lie on a surface"
+    )
+    violation: float = Field(default=0.05, ge=0, le=1, description="largest share of points in the other's free space")
     count: int = Field(default=250, ge=0, description="least number of explained points, 0.1 m apart")
     overlap: float = Field(default=0.25, ge=0, le=1, description="least share of points in known area")
+
+
+class LooseGate(Gate):
+    """The same where the estimate predicts the closure."""
+
+    explained: float = Field(default=0.70, ge=0, le=1, description="as in strict")
+    violation: float = Field(default=0.10, ge=0, le=1, description="as in strict")
+
+
+class RichGate(Gate):
+    """The same for half a witness: much is seen, but the submaps are bent (outdoors, on a slope)."""
+
+    explained: float = Field(default=0.65, ge=0, le=1, description="as in strict")
+    violation: float = Field(default=0.22, ge=0, le=1, description="as in strict")
+    count: int = Field(default=500, ge=0, description="as in strict")
+    overlap: float = Field(default=0.5, ge=0, le=1, description="as in strict")
 
 
 class VerificationConfig(Settings):
     """Two-way verification of closures between submaps."""
 
-    strict: Gate = Field(default=Gate(explained=0.80, violation=0.05), description="gate without a prediction")
-    loose: Gate = Field(default=Gate(explained=0.70, violation=0.10), description="gate where a closure is predicted")
-    rich: Gate = Field(
-        default=Gate(explained=0.65, violation=0.22, count=500, overlap=0.5),
-        description="gate for half a witness: much is seen, but the submaps are bent (outdoors, on a slope)",
-    )
+    strict: Gate = Field(default=Gate(), description="gate without a prediction")
+    loose: LooseGate = Field(default=LooseGate(), description="gate where a closure is predicted")
+    rich: RichGate = Field(default=RichGate(), description="gate for half a witness: much is seen, but bent")
     informative: float = Field(
         default=30.0, ge=0, description="least small eigenvalue of the normal tensor: below, it may be a corridor"
     )

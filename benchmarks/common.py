@@ -1,0 +1,197 @@
+"""What every benchmark shares: the recordings' folder, the real command with its cost, and the report that is written.
+
+No benchmark itself. Peak memory counts what the parent held when it started the command, so scripts that measure the
+command import nothing heavy before it.
+"""
+
+import argparse
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import fcslam
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+RESULTS = Path(__file__).resolve().parent / "results"
+
+SPLITS = {"intel": 3, "fr079": 3, "mit-csail": 2}
+"""Logs of the SLAM benchmark and into how many robots each is cut."""
+
+_COMMAND = "import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"
+_PACKAGES = ("numpy", "numba", "gtsam", "scipy", "opencv-python-headless")
+
+
+def recordings(*needed: str) -> Path:
+    """The folder ``$FCSLAM_DATA/lidar``; without FCSLAM_DATA the script ends with one line and succeeds.
+
+    ``needed``: paths below it that must be there, or the script fails with one line.
+    """
+    place = os.environ.get("FCSLAM_DATA")
+    if not place:
+        print("skipped: needs recordings; set FCSLAM_DATA to their folder")
+        sys.exit(0)
+    folder = Path(place) / "lidar"
+    missing = [name for name in needed if not (folder / name).exists()]
+    if missing:
+        sys.exit(f"{folder}: {', '.join(missing)} missing")
+    return folder
+
+
+def log_path(folder: Path, name: str) -> Path:
+    """A log of the SLAM benchmark."""
+    return folder / "slam-benchmark" / f"{name}.clf.xz"
+
+
+def relations_path(folder: Path, name: str) -> Path:
+    """Its reference relations."""
+    return folder / "slam-benchmark" / f"{name}.relations.gz"
+
+
+def slam_benchmark_files() -> list[str]:
+    """What ``recordings`` is asked for by those who use these logs."""
+    return [f"slam-benchmark/{name}.{kind}" for name in SPLITS for kind in ("clf.xz", "relations.gz")]
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What a command took, its own children included."""
+
+    cpu_s: float
+    """User and system."""
+    wall_s: float
+    peak_mb: float
+    """Largest resident set."""
+
+
+def run_fcslam(*arguments: object, environment: Mapping[str, str] | None = None) -> Cost:
+    """Run ``fcslam`` with ``arguments`` in a fresh process and measure it; its own failure ends the script."""
+    package = str(Path(fcslam.__file__).parents[1])
+    process_environment = {**os.environ, "PYTHONPATH": package, **(environment or {})}
+    command = [sys.executable, "-c", _COMMAND, *map(str, arguments)]
+    with tempfile.TemporaryFile() as output:
+        began = time.perf_counter()
+        process = subprocess.Popen(command, env=process_environment, stdout=output, stderr=output)
+        _, status, usage = os.wait4(process.pid, 0)
+        wall_s = time.perf_counter() - began
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            output.seek(0)
+            sys.exit(f"fcslam {' '.join(command[3:])} failed:\n{output.read().decode(errors='replace')}")
+    return Cost(usage.ru_utime + usage.ru_stime, wall_s, usage.ru_maxrss * 1024 / 1e6)
+
+
+def run_fcslam_cold(*arguments: object) -> Cost:
+    """As ``run_fcslam``, with an empty cache of compiled code: the first run after installing."""
+    with tempfile.TemporaryDirectory() as cache:
+        return run_fcslam(*arguments, environment={"NUMBA_CACHE_DIR": cache})
+
+
+def metrics(run: Path) -> dict[str, float]:
+    """metrics.json of a run folder, by name."""
+    rows = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    return {row["name"]: math.nan if row["value"] is None else row["value"] for row in rows}
+
+
+def options(docstring: str) -> argparse.ArgumentParser:
+    """The options that every benchmark has; a script adds its own."""
+    parser = argparse.ArgumentParser(description=docstring, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--date", default=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), help="date in the report")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the report")
+    return parser
+
+
+class Report:
+    """Tables, written as Markdown for readers and as JSON for programs."""
+
+    def __init__(self, script: str, docstring: str, chosen: argparse.Namespace) -> None:
+        self._name = Path(script).stem
+        self._docstring = docstring.strip()
+        self._folder: Path = chosen.results
+        self._setting = {
+            "date": chosen.date,
+            "command": " ".join([f"python benchmarks/{self._name}.py", *sys.argv[1:]]),
+        }
+        self._setting |= machine()
+        self._parts: list[str] = []
+        self._tables: dict[str, list[dict[str, Any]]] = {}
+
+    def say(self, text: str) -> None:
+        """A paragraph."""
+        self._parts.append(text.strip())
+
+    def table(self, title: str, columns: Mapping[str, str], rows: Iterable[Sequence[Any]]) -> None:
+        """A table; ``columns`` maps headings to format specifications, numbers keep all digits in the JSON."""
+        kept = [dict(zip(columns, row, strict=True)) for row in rows]
+        self._tables[title] = [{key: _plain(value) for key, value in row.items()} for row in kept]
+        lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
+        for row in kept:
+            lines.append(f"| {' | '.join(_cell(row[heading], spec) for heading, spec in columns.items())} |")
+        self._parts.append("\n".join([f"## {title}", "", *lines]))
+
+    def write(self) -> None:
+        """Write both files and print the Markdown."""
+        setting = "\n".join(f"- {key}: {value}" for key, value in self._setting.items())
+        text = "\n\n".join([f"# {self._name}", self._docstring, setting, *self._parts]) + "\n"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / f"{self._name}.md").write_text(text, encoding="utf-8")
+        content = {"benchmark": self._name, **self._setting, "tables": self._tables}
+        (self._folder / f"{self._name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        print(text)
+
+
+def machine() -> dict[str, str]:
+    """Where and with what a result was measured."""
+    packages = [f"{name} {_version(name)}" for name in _PACKAGES]
+    busy = ", ".join(f"{load:.2f}" for load in os.getloadavg())
+    return {
+        "machine": f"{_cpu_model()}, {os.cpu_count()} cores, load average {busy} before",
+        "versions": ", ".join(
+            [f"fcslam {fcslam.__version__} ({_commit()})", f"python {platform.python_version()}", *packages]
+        ),
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def _commit() -> str:
+    command = ["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "no repository"
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON has it: NaN is null, numpy's numbers are Python's."""
+    plain = value.item() if hasattr(value, "item") else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
+
+
+def _cell(value: Any, spec: str) -> str:
+    plain = _plain(value)
+    return "-" if plain is None else format(plain, spec)

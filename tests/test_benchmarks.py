@@ -1,0 +1,95 @@
+"""Benchmarks are not run by the tests, but they must start: each names its command, imports, and skips politely."""
+
+import ast
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem != "common")
+
+
+def load(path: Path):
+    """The script as a module of a name that no test folder has."""
+    spec = importlib.util.spec_from_file_location(f"benchmark_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def common(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.delitem(sys.modules, "common", raising=False)
+    yield load(FOLDER / "common.py")
+    sys.modules.pop("common", None)
+
+
+def test_there_are_benchmarks():
+    assert len(SCRIPTS) >= 8
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_the_docstring_names_the_command(path):
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    assert f"python benchmarks/{path.name}" in docstring
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.usefixtures("common")
+def test_imports_without_running(path, capsys):
+    assert callable(load(path).main)
+    assert capsys.readouterr().out == ""
+
+
+def test_without_recordings_one_line_and_success(common, monkeypatch, capsys):
+    monkeypatch.delenv("FCSLAM_DATA", raising=False)
+    with pytest.raises(SystemExit) as ended:
+        common.recordings("slam-benchmark/intel.clf.xz")
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == "skipped: needs recordings; set FCSLAM_DATA to their folder\n"
+
+
+def test_missing_recordings_fail_with_their_names(common, monkeypatch, tmp_path):
+    monkeypatch.setenv("FCSLAM_DATA", str(tmp_path))
+    with pytest.raises(SystemExit, match=r"intel\.clf\.xz missing"):
+        common.recordings("slam-benchmark/intel.clf.xz")
+
+
+def test_a_script_without_recordings_succeeds(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "FCSLAM_DATA"}
+    environment["PYTHONPATH"] = str(FOLDER.parent / "src")
+    command = [sys.executable, FOLDER / "relations.py", "--results", tmp_path]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert ended.stdout.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_report_is_two_files_that_say_the_same(common, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["sample.py"])
+    chosen = common.options("Sample.").parse_args(["--results", str(tmp_path), "--date", "2026-11-05"])
+    report = common.Report("benchmarks/sample.py", "Sample.", chosen)
+    report.table("Numbers", {"what": "", "m": ".2f"}, [("a", 1.23456), ("b", float("nan"))])
+    report.write()
+    markdown = (tmp_path / "sample.md").read_text(encoding="utf-8")
+    assert "| a | 1.23 |" in markdown
+    assert "| b | - |" in markdown
+    assert "- date: 2026-11-05" in markdown
+    assert markdown in capsys.readouterr().out
+    content = json.loads((tmp_path / "sample.json").read_text(encoding="utf-8"))
+    assert content["tables"] == {"Numbers": [{"what": "a", "m": 1.23456}, {"what": "b", "m": None}]}
+    assert {"date", "machine", "versions", "command"} <= set(content)
+
+
+def test_the_command_is_measured_and_its_failure_ends_the_script(common):
+    cost = common.run_fcslam("--version")
+    assert cost.cpu_s > 0.0
+    assert 0.0 < cost.wall_s < 60.0
+    assert cost.peak_mb > 5.0  # the system counts what this process held when it forked, so no upper bound
+    with pytest.raises(SystemExit, match="failed"):
+        common.run_fcslam("map", "no-such-log", "--output", "nowhere")

@@ -1,0 +1,176 @@
+"""What the documentation names exists: files, symbols, commands with their options, make targets, settings, links."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+import typer
+
+from fcslam.cli import app
+from fcslam.config import Settings
+from fcslam.mission import MissionConfig
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "fcslam"
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+PATH = re.compile(r"(?<![\w./<-])(?:\.\./)*(?:[\w.-]+/)*[\w.-]+\.(?:py|md|proto|toml|txt)(?![\w*])")
+LINK = re.compile(r"\]\(([^)\s]+)\)|src=\"([^\"]+)\"")
+SYMBOL = re.compile(r"`(\w+)`(?:(?:,| and) `(\w+)`)? in `([\w/]+\.py)`")
+INLINE_COMMAND = re.compile(r"`(fcslam [^`\n]+)`")
+COMMAND_LINE = re.compile(r"^(?: {4})?(fcslam .+)$", re.MULTILINE)
+TARGET = re.compile(r"(?:^|`| {4})make ([a-z-]+)", re.MULTILINE)
+SETTING = re.compile(r"`((?:robot|fleet|map)\.[a-z][\w.]*)`")
+
+pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+def is_there(name: str, page: Path) -> bool:
+    """Whether a file named in ``page`` exists, seen from the page, the repository or the package."""
+    return any((folder / name).is_file() for folder in (page.parent, ROOT, PACKAGE))
+
+
+def missing_files(text: str, page: Path) -> list[str]:
+    return [name for name in PATH.findall(text) if not is_there(name, page)]
+
+
+def missing_symbols(text: str) -> list[str]:
+    return [
+        f"{symbol} in {path}"
+        for *symbols, path in SYMBOL.findall(text)
+        for symbol in filter(None, symbols)
+        if not re.search(rf"^\s*(?:(?:def|class) {symbol}\b|{symbol}: )", read(path), re.MULTILINE)
+    ]
+
+
+def read(path: str) -> str:
+    return next(folder / path for folder in (PACKAGE, ROOT) if (folder / path).is_file()).read_text(encoding="utf-8")
+
+
+def commands(text: str) -> Iterator[tuple[str, bool]]:
+    """Every command named, and whether it stands on a line of its own: then it must be complete."""
+    yield from ((line, True) for line in COMMAND_LINE.findall(text))
+    yield from ((line, False) for line in INLINE_COMMAND.findall(text))
+
+
+def complaint(line: str, complete: bool) -> str:
+    """What click has against a command line; empty if it would run."""
+    command: click.Command = typer.main.get_command(app)
+    words = shlex.split(line.partition(">")[0], comments=True)
+    context = click.Context(command, info_name=words.pop(0))
+    while isinstance(command, click.Group):
+        if not words:
+            return f"{line}: no such command" if complete else ""
+        found = command.get_command(context, words[0])
+        if found is None:
+            return "" if words[0] in ("--help", "--version") else f"{line}: no command {words[0]}"
+        command, context = found, click.Context(found, parent=context, info_name=words.pop(0))
+    try:
+        command.make_context(context.info_name, words)
+    except click.exceptions.Exit:
+        return ""
+    except click.UsageError as error:
+        unfinished = isinstance(error, click.MissingParameter) or "requires an argument" in error.format_message()
+        return "" if unfinished and not complete else f"{line}: {error.format_message()}"
+    return ""
+
+
+def is_setting(key: str) -> bool:
+    kind: type[Settings] | None = MissionConfig
+    for part in key.split("."):
+        if kind is None or part not in kind.model_fields:
+            return False
+        annotation = kind.model_fields[part].annotation
+        kind = annotation if isinstance(annotation, type) and issubclass(annotation, Settings) else None
+    return True
+
+
+@pages
+def test_every_file_named_exists(page):
+    assert missing_files(page.read_text(encoding="utf-8"), page) == []
+
+
+@pages
+def test_every_link_leads_somewhere(page):
+    links = ["".join(groups).partition("#")[0] for groups in LINK.findall(page.read_text(encoding="utf-8"))]
+    assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
+
+
+@pages
+def test_every_symbol_is_in_its_file(page):
+    assert missing_symbols(page.read_text(encoding="utf-8")) == []
+
+
+@pages
+def test_every_command_parses(page):
+    found = [complaint(line, complete) for line, complete in commands(page.read_text(encoding="utf-8"))]
+    assert [text for text in found if text] == []
+
+
+@pages
+def test_every_make_target_exists(page):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    named = set(TARGET.findall(page.read_text(encoding="utf-8")))
+    assert [target for target in sorted(named) if not re.search(rf"^{target}:", makefile, re.MULTILINE)] == []
+
+
+@pages
+def test_every_setting_exists(page):
+    files = {"map.png", "map.pgm", "map.yaml"}
+    named = set(SETTING.findall(page.read_text(encoding="utf-8"))) - files
+    assert [key for key in sorted(named) if not is_setting(key)] == []
+
+
+def test_readme_is_short_and_starts_with_the_two_commands():
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 150
+    assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in lines[:30]}
+
+
+def test_the_algorithm_page_reads_every_equation_and_line():
+    text = (ROOT / "docs" / "algorithm.md").read_text(encoding="utf-8")
+    assert [
+        name for name in ("eq. (1)", "(2), (3)", "eq. (4)", "eq. (5)", "eq. (6)", "Algorithm 1") if name not in text
+    ] == []
+    assert len(SYMBOL.findall(text)) > 40
+
+
+def test_the_documented_example_writes_a_log_that_can_be_read(tmp_path, monkeypatch):
+    from fcslam.sources import open_source
+
+    text = (ROOT / "docs" / "howto-own-logs.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "howto-own-logs.md", "exec"), {})
+    assert open_source(tmp_path / "robot1.clf.gz").survey().scan_count == 20
+
+
+@pytest.mark.parametrize(
+    ("line", "complete", "fine"),
+    [
+        ("fcslam map a.clf b.clf -o out", True, True),
+        ("fcslam map a.clf", True, False),
+        ("fcslam map", False, True),
+        ("fcslam map --config", False, True),
+        ("fcslam map --pieces 3", False, False),
+        ("fcslam map a.clf -o out --split none", True, False),
+        ("fcslam config dump > mission.yaml", True, True),
+        ("fcslam config print", False, False),
+        ("fcslam fly", False, False),
+        ("fcslam --version", True, True),
+    ],
+)
+def test_the_rule_for_commands(line, complete, fine):
+    assert (complaint(line, complete) == "") is fine
+
+
+def test_the_rules_for_files_symbols_and_settings():
+    page = ROOT / "docs" / "page.md"
+    assert missing_files("see `lidar/field.py`, [wire](wire.md), `../Makefile.toml`", page) == ["../Makefile.toml"]
+    assert missing_symbols("`similarity` in `places/similarity.py`") == []
+    assert missing_symbols("`sameness` in `places/similarity.py`") == ["sameness in places/similarity.py"]
+    assert is_setting("fleet.consistency.lead")
+    assert not is_setting("fleet.consistency.leader")
