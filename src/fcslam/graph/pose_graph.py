@@ -120,7 +120,8 @@ class PoseGraph:
         """Squared Mahalanobis length of every edge's residual at ``poses`` (N, 3), by default the initial ones."""
         x = self.poses() if poses is None else np.asarray(poses, dtype=np.float64)
         edges = self.arrays()
-        residual = se2.between(edges.T_i_j, se2.between(x[edges.i], x[edges.j]))
+        # The residual that the solver minimises: the logarithm, not the difference of coordinates.
+        residual = se2.log(se2.between(edges.T_i_j, se2.between(x[edges.i], x[edges.j])))
         chi2: FloatArray = np.einsum("ea,eab,eb->e", residual, edges.information, residual)
         return chi2
 

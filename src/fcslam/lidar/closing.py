@@ -21,6 +21,8 @@ from fcslam.records import FloatArray
 
 SURPRISE_M, SURPRISE_RAD = 0.15, 0.03
 """A closure this far off its prediction asks for a solve at once."""
+NARROW_M = 0.8
+"""With so little drift to allow for, the prediction starts the alignment, and the loose gate is enough."""
 PENDING_M = 60.0
 """Travel after which a closure that found no support is given up."""
 
@@ -140,7 +142,7 @@ class LoopCloser:
         predicted = se2.between(anchors[earlier], anchors[later])
         radius, angle = self._slack(path_m)
         guess = predicted
-        if radius > 0.6:
+        if radius > NARROW_M:
             window = SearchWindow(radius, angle)
             result = search(b.surface, a.field, predicted, window, self._search)
             if result.score < self._config.least_score:
@@ -169,7 +171,7 @@ class LoopCloser:
     @staticmethod
     def _is_expected(closure: Closure) -> bool:
         """Near the prediction while little drift is to be allowed for."""
-        return closure.check.loose and closure.slack_m < 0.8
+        return closure.check.loose and closure.slack_m <= NARROW_M
 
     @staticmethod
     def _is_plain(closure: Closure) -> bool:

@@ -19,8 +19,9 @@ from fcslam.lidar.tracker import ScanTracker, Tracked, TrackerConfig, odometry_i
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, KeyscanId, LaserScan, Ranges, frozen
 
-SOLVE_EVERY = 20
-"""Closures that may wait for a solve when none of them says that the estimate is off."""
+SOLVE_AFTER, SOLVE_AFTER_SHARE = 20, 0.08
+"""Closures that may wait for a solve when none says that the estimate is off: so many, or this share of the keyscans.
+A solve takes as long as the graph is large, so they become rarer as it grows, and a scan's share stays the same."""
 TURN_AS_TRAVEL_M = 0.1
 """Progress that one radian of turning counts for: a robot that only turns finishes submaps, too."""
 
@@ -194,7 +195,8 @@ class Mapper:
     def _optimize_if_needed(self, closures: list[Closure]) -> None:
         """Solve at once when a closure says that the estimate is off, else only now and then."""
         self._unsolved += len(closures)
-        if self._unsolved >= SOLVE_EVERY or any(c.is_surprising for c in closures):
+        enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._local))
+        if self._unsolved >= enough or any(c.is_surprising for c in closures):
             self._poses = list(optimize(self._graph, self._poses, loss=Loss.CAUCHY, factors=self._factors).poses)
             self._unsolved = 0
 
