@@ -29,7 +29,7 @@ PEERS = (
     ("MRPT ICP", "3.7 / 23, 5 s", "0.93 / 6.8, 3 s", "0.24 / 2.0, 2 s"),
 )
 PEERS_SOURCE = (
-    "Peers: mean error in m / deg over all relations and CPU time, each raw scan posed by its keyscan's correction "
+    "Peers: mean error in m / deg over all relations and seconds, each raw scan posed by its keyscan's correction "
     "carried forward with odometry; one robot. Measured on the same class of machine (2-core x86, AMD EPYC), one "
     "thread each, November 2026."
 )
