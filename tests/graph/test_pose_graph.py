@@ -15,7 +15,7 @@ def edge(i: int, j: int, information: np.ndarray = INFORMATION) -> Edge:
 def test_chi2_is_the_residuals_squared_mahalanobis_length() -> None:
     graph, truth, _ = manhattan(0, steps=20, closures=5)
     for number, known in enumerate(graph.edges):
-        residual = se2.compose(se2.inverse(known.T_i_j), se2.between(truth[known.i], truth[known.j]))
+        residual = se2.log(se2.between(known.T_i_j, se2.between(truth[known.i], truth[known.j])))
         assert graph.chi2(truth)[number] == pytest.approx(residual @ known.information @ residual)
 
 

@@ -98,8 +98,9 @@ def optimize_gnc(
     true. ``initial`` and ``factors`` as in :func:`optimize`; ``initial`` should be the odometry or better.
 
     The steps run here, around GTSAM's solver, and not in ``gtsam.GncLMOptimizer``: that one starts every step again
-    from the initial poses and solves it to the end, while one warm iteration a step decides as well. m3500 with 100
-    random false loops, from odometry, 2 cores: 0.9 to 1.9 s, all rejected, no true loop lost; the library's 16 s.
+    from the initial poses and solves it to the end, while one warm iteration a step decides as well in a
+    tenth of the time (``benchmarks/results/graph.md``, m3500 with 100 random false loops). Neither is sure to find
+    the best set: the odometry's drift may favour a false loop.
 
     Raises:
         ValueError: as :func:`optimize`.
