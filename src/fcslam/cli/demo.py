@@ -36,5 +36,5 @@ def demo(
     rng = np.random.default_rng(seed)
     logs = write_fleet(draw_fleet(FleetSettings(robots=robots), rng), recordings, rng)
     console.print(f"recordings: {', '.join(str(log) for log in logs)}", highlight=False, markup=False, soft_wrap=True)
-    map_sources([open_source(log) for log in logs], MissionConfig(seed=seed), run)
+    map_sources([open_source(log) for log in logs], MissionConfig(seed=seed), run, force=True)
     relations(run, recordings / "ground_truth" / "relations", across_robots=len(logs) > 1)

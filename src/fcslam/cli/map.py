@@ -36,11 +36,14 @@ def map_recordings(
     prepare_output(output, force)
     settings = _settings(config, seed, no_fuse)
     sources = _sources([open_source(log) for log in logs], split)
-    map_sources(sources, settings, output)
+    map_sources(sources, settings, output, force)
 
 
-def map_sources(sources: "Sequence[Source]", settings: "MissionConfig", output: Path) -> "Run":
-    """Run the mission with a progress display, write the run folder, say what came out."""
+def map_sources(sources: "Sequence[Source]", settings: "MissionConfig", output: Path, force: bool) -> "Run":
+    """Run the mission with a progress display, write the run folder, say what came out.
+
+    A run that appeared at ``output`` meanwhile is replaced only by ``force``.
+    """
     from rich.console import Console
 
     from fcslam.mission import run_mission
@@ -53,7 +56,7 @@ def map_sources(sources: "Sequence[Source]", settings: "MissionConfig", output: 
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     with _progress(console, total) as watch:
         run = run_mission(sources, settings, watch)
-    write_run(run, output, force=True)
+    write_run(run, output, force)
     for source in sources:
         if source.faults:
             console.print(f"{source.name}: {source.faults}", highlight=False, soft_wrap=True)
