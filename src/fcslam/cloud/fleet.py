@@ -14,12 +14,12 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger, Entry
 from fcslam.cloud.result import FleetResult, conclude
 from fcslam.cloud.robots import RobotStore
+from fcslam.cloud.submaps import SubmapShelf
+from fcslam.cloud.verdict import reconsider
 from fcslam.config import Settings
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
-from fcslam.lidar.scan import point_scan
-from fcslam.lidar.submap import Submap, build_submap
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
 from fcslam.records import (
     ClosureStatus,
@@ -61,12 +61,15 @@ class Fleet:
         self._store = RobotStore()
         self._graph = JointGraph()
         self._ledger = ClosureLedger()
-        self._submaps: dict[KeyscanId, Submap] = {}
+        self._submaps = SubmapShelf(self._store, self._graph, config.submaps_kept)
         self._matchers: dict[str, PlaceMatcher] = {}
         """By detector version: words of different ones are never compared."""
         self._places: dict[tuple[str, str], list[KeyscanId]] = {}
         """By detector version and robot."""
         self._maps: list[list[str]] = []
+        """Robots by map; maps and the robots in them in the order in which they started."""
+        self._vetoes: set[frozenset[KeyscanId]] = set()
+        self._doubted = False
         self._version = 0
         self._concluded = False
 
@@ -94,7 +97,8 @@ class Fleet:
 
     def _conclude(self) -> FleetResult:
         self._concluded = True
-        return conclude(self._store, self._graph, self._ledger, self._config.consistency, self._version)
+        self._reconsider()
+        return conclude(self._store, self._graph, self._ledger, self._maps, self._version)
 
     def closure_counts(self) -> dict[str, int]:
         """Closures so far by kind, for progress displays."""
@@ -157,12 +161,12 @@ class Fleet:
             self._places.setdefault((place.detector_version, place.id.robot), []).append(place.id)
         # A robot alone needs no estimate before the end.
         if len(self._store.robots) > 1 and self._graph.is_due(self._config.solve_every):
-            self._optimize()
+            (self._reconsider if self._doubted else self._optimize)()
 
     def _matcher(self, version: str) -> PlaceMatcher:
         if version not in self._matchers:
             rng = np.random.default_rng(self._seed)
-            self._matchers[version] = PlaceMatcher(self._config.matcher, self._submap, rng)
+            self._matchers[version] = PlaceMatcher(self._config.matcher, self._submaps.of, rng)
         return self._matchers[version]
 
     def _predicted(self, place: Place) -> dict[KeyscanId, FloatArray]:
@@ -189,48 +193,36 @@ class Fleet:
         """The robots that share a map with this one, itself included."""
         return next(robots for robots in self._maps if robot in robots)
 
-    def _submap(self, place: Place) -> Submap:
-        """The submap around a place, rebuilt from its keyscans and the robot's own motions; kept while in use."""
-        if place.id not in self._submaps:
-            robot = place.id.robot
-            if len(self._submaps) >= self._config.submaps_kept:
-                del self._submaps[next(iter(self._submaps))]
-            laser, anchor = self._store.laser(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
-            poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))
-            keyscans = self._store.keyscans(robot, place.first, place.last)
-            self._submaps[place.id] = build_submap(
-                [(point_scan(keyscan.ranges_m, laser), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]
-            )
-        self._submaps[place.id] = submap = self._submaps.pop(place.id)  # newest last
-        return submap
-
     def _accept_or_wait(self, entry: Entry) -> Entry | None:
         """Accept what fits the joint map; returns the entry if only a cluster may accept it."""
         closure = entry.closure
-        if closure.status is not ClosureStatus.VERIFIED:
+        if closure.status is not ClosureStatus.VERIFIED or entry.vetoed:
             return None
-        if entry.predicted:
+        if closure.i.robot in self._map_of(closure.j.robot):
             off = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
             if np.hypot(off[0], off[1]) < self._config.surprise_m and abs(off[2]) < self._config.surprise_rad:
                 self._accept(entry, "fits the joint map")
                 return None
+        entry.independent = True  # the map did not predict this
         return entry
 
     def _judge_pair(self, a: str, b: str) -> None:
         """Join two robots' maps, or add to their link, if one cluster of closures dominates."""
-        entries = self._ledger.between(a, b)
+        entries = self._ledger.evidence(a, b)
         verdict = judge(entries, (a, b), self._graph, self._config.consistency)
+        joined = b in self._map_of(a)
         if not verdict.dominant:
+            self._doubted |= joined and verdict.contested
             for entry in entries:
                 if entry.closure.status is ClosureStatus.VERIFIED:
                     entry.set(ClosureStatus.VERIFIED, verdict.reason)
             return
         members = [entries[k] for k in verdict.members]
-        if b not in self._map_of(a):
+        if not joined:
             self._join(members, a, b)
         reason = f"in the dominant cluster of {len(members)} closures ({verdict.supporters} places apart)"
         for entry in entries:
-            if entry in members and entry.edge is None:
+            if entry in members and entry.closure.status is not ClosureStatus.ACCEPTED:
                 self._accept(entry, reason)
             elif entry.closure.status is ClosureStatus.VERIFIED:
                 entry.set(ClosureStatus.VERIFIED, "outside the dominant cluster")
@@ -239,16 +231,19 @@ class Fleet:
     def _join(self, members: list[Entry], a: str, b: str) -> None:
         """Move the younger map into the older one's frame."""
         older, younger = self._map_of(a), self._map_of(b)
-        T_a_b = first_estimate(members, (a, b), self._graph)
+        T_a_b = first_estimate(members, (a, b), self._graph, self._config.consistency)
         if self._maps.index(older) > self._maps.index(younger):
             older, younger, T_a_b = younger, older, se2.inverse(T_a_b)
         self._graph.move(younger, T_a_b)
         self._maps.remove(younger)
         older.extend(younger)
+        older.sort(key=self._store.robots.index)
 
     def _accept(self, entry: Entry, reason: str) -> None:
         closure = entry.closure
-        entry.edge = self._graph.close(closure.i, closure.j, closure.T_i_j, closure.information)
+        if entry.edge is None:
+            entry.edge = self._graph.close(closure.i, closure.j, closure.T_i_j, closure.information)
+        self._graph.count(entry.edge, holds=True)
         entry.set(ClosureStatus.ACCEPTED, reason)
 
     def _add_local(self, closure: Constraint) -> None:
@@ -258,6 +253,14 @@ class Fleet:
 
     def _optimize(self) -> None:
         self._graph.optimize()
+        self._version += 1
+
+    def _reconsider(self) -> None:
+        """Decide every closure anew: revoke what is outvoted, part the maps that only that held together."""
+        self._maps = reconsider(self._graph, self._ledger, self._config.consistency)
+        for robots in self._maps:
+            self._graph.move(robots, se2.inverse(self._graph.trajectory(robots[0])[0]))
+        self._doubted = False
         self._version += 1
 
     def _replies(self, packet: Packet) -> list[bytes]:

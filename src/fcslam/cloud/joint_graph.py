@@ -1,12 +1,13 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
-from fcslam.graph.optimizer import optimize, optimize_gnc
+from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.records import Constraint, FloatArray, KeyscanId
 
@@ -20,7 +21,7 @@ class JointGraph:
         self._variables: dict[str, list[int]] = {}
         self._chains: dict[str, list[FloatArray]] = {}
         self._poses = np.zeros((256, 3))
-        self._weights = np.ones(0)
+        self._left_out: set[int] = set()
         self._unsolved = 0
 
     def variable(self, keyscan: KeyscanId) -> int:
@@ -82,45 +83,30 @@ class JointGraph:
         """Whether that many closures came in since the last solve."""
         return self._unsolved >= closures
 
+    def count(self, edge: int, *, holds: bool) -> None:
+        """From now on solve with the closure, or without it."""
+        (self._left_out.discard if holds else self._left_out.add)(edge)
+
     def optimize(self) -> None:
         """Quick solve (Levenberg-Marquardt with a Cauchy loss on closures)."""
-        solution = optimize(self.graph, self._poses[: len(self.graph)], loss=Loss.CAUCHY, factors=self._factors)
-        self._take(solution.poses, solution.weights)
+        kept = np.ones(len(self.graph.edges), dtype=bool)
+        kept[list(self._left_out)] = False
+        start = self._poses[: len(self.graph)]
+        self.take(optimize(self.graph, start, loss=Loss.CAUCHY, kept=kept, factors=self._factors).poses)
 
-    def optimize_robustly(self, dropped: Collection[int] = ()) -> None:
-        """Solve that decides for every closure whether it holds (graduated non-convexity); ``dropped`` ones do not."""
-        if not dropped:
-            solution = optimize_gnc(self.graph, self._poses[: len(self.graph)], factors=self._factors)
-            self._take(solution.poses, solution.weights)
-            return
-        solution = optimize_gnc(self.optimized(dropped))
-        weights = np.zeros(len(self.graph.edges))
-        weights[[number for number in range(len(weights)) if number not in dropped]] = solution.weights
-        self._take(solution.poses, weights)
+    def take(self, poses: FloatArray) -> None:
+        """Take over a solution (N, 3)."""
+        self._poses[: len(poses)] = poses
+        self._unsolved = 0
 
-    def weight(self, edge: int) -> float:
-        """What the closure counted for in the last solve, in [0, 1]; 1 before its first."""
-        return float(self._weights[edge]) if edge < len(self._weights) else 1.0
-
-    def optimized(self, dropped: Collection[int] = ()) -> PoseGraph:
-        """The graph with its present poses, without the edges in ``dropped``: what a run leaves behind."""
-        edges = [edge for number, edge in enumerate(self.graph.edges) if number not in dropped]
+    def held(self) -> PoseGraph:
+        """The present estimate with the constraints that hold: what a run leaves behind."""
+        edges = [edge for number, edge in enumerate(self.graph.edges) if number not in self._left_out]
         return PoseGraph(self._poses[: len(self.graph)], edges)
 
-    def maps(self, accepted: Sequence[int]) -> list[list[str]]:
-        """Robots by map, connected by the given closure edges; the largest map first, then by the robots' order."""
-        kept = ~self.graph.arrays().robust
-        kept[list(accepted)] = True
-        components = self.graph.components(kept) if len(self.graph) else np.zeros(0, np.int64)
-        groups: dict[int, list[str]] = {}
-        for robot, variables in self._variables.items():
-            groups.setdefault(int(components[variables[0]]), []).append(robot)
-        return sorted(groups.values(), key=lambda robots: -len(robots))
-
-    def _take(self, poses: FloatArray, weights: FloatArray) -> None:
-        self._poses[: len(poses)] = poses
-        self._weights = weights
-        self._unsolved = 0
+    def robots(self) -> dict[str, NDArray[np.int64]]:
+        """Variables of every robot in the order of its path; robots in the order in which they started."""
+        return {robot: np.array(variables, dtype=np.int64) for robot, variables in self._variables.items()}
 
     def _add_variable(self, pose: FloatArray) -> int:
         variable = self.graph.add_variable(pose)

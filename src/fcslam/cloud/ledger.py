@@ -12,8 +12,10 @@ class Entry:
     """A closure and, once it is in the pose graph, its edge there."""
 
     closure: LoopClosure
-    predicted: bool
+    independent: bool
+    """Whether it is evidence of how two robots' maps lie: not where that was known and only borne out."""
     edge: int | None = None
+    vetoed: bool = False
 
     @property
     def is_between(self) -> bool:
@@ -41,7 +43,7 @@ class ClosureLedger:
             match.i, match.j, Channel.LIDAR, match.similarity, frozen(match.check.T_a_b),
             frozen(match.check.information), status, match.check.reason, match.check.informative,
         )  # fmt: skip
-        entry = Entry(closure, match.predicted)
+        entry = Entry(closure, independent=not match.predicted)
         self._entries.append(entry)
         return entry
 
@@ -52,34 +54,16 @@ class ClosureLedger:
             i, j, Channel.LIDAR, 0.0, constraint.T_i_j, constraint.information, ClosureStatus.ACCEPTED,
             "found by the robot",
         )  # fmt: skip
-        self._entries.append(Entry(closure, predicted=True, edge=edge))
+        self._entries.append(Entry(closure, independent=False, edge=edge))
 
-    def between(self, a: str, b: str) -> list[Entry]:
-        """Entries confirmed by geometry between two robots."""
+    def evidence(self, a: str, b: str) -> list[Entry]:
+        """What geometry confirms between two robots without having known how they lie, and nobody vetoed."""
         pair = {a, b}
         return [
             entry
             for entry in self._entries
-            if entry.closure.status is not ClosureStatus.CANDIDATE
+            if entry.independent
+            and not entry.vetoed
+            and entry.closure.status is not ClosureStatus.CANDIDATE
             and {entry.closure.i.robot, entry.closure.j.robot} == pair
         ]
-
-    def joined(self) -> list[tuple[str, str]]:
-        """Pairs of robots between whom closures hold at present."""
-        pairs = [
-            (min(c.i.robot, c.j.robot), max(c.i.robot, c.j.robot))
-            for c in (entry.closure for entry in self._entries if entry.is_between)
-            if c.status is ClosureStatus.ACCEPTED
-        ]
-        return list(dict.fromkeys(pairs))
-
-    def accepted_edges(self) -> list[int]:
-        """Edges of the closures that hold at present."""
-        return self._edges(ClosureStatus.ACCEPTED)
-
-    def revoked_edges(self) -> list[int]:
-        """Edges of the closures that did once."""
-        return self._edges(ClosureStatus.REVOKED)
-
-    def _edges(self, status: ClosureStatus) -> list[int]:
-        return [e.edge for e in self._entries if e.edge is not None and e.closure.status is status]

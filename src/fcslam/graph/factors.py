@@ -52,24 +52,31 @@ class FactorCache:
         for (i, j, measured, root), scale in zip(self._closures, np.sqrt(weights).tolist(), strict=True):
             if scale > 0.0:
                 graph.push_back(_between(i, j, measured, _gaussian(root * scale)))
-        kept = np.ones(len(self.graph.edges), dtype=bool)
-        kept[self.graph.arrays().robust] = weights > 0.0
-        _anchor(graph, anchors(self.graph.components(kept)), poses)
+        self._anchor(graph, weights > 0.0, poses)
         return graph
 
-    def robust(self, loss: Loss, poses: FloatArray) -> Any:
-        """Factor graph with every closure under ``loss``, anchored as in :meth:`squared`."""
+    def robust(self, loss: Loss, kept: NDArray[np.bool_], poses: FloatArray) -> Any:
+        """Factor graph with the closures in ``kept`` (closures only) under ``loss``, anchored as in :meth:`squared`."""
         if loss is Loss.SQUARED:
-            return self.squared(np.ones(int(self.graph.arrays().robust.sum())), poses)
+            return self.squared(kept.astype(np.float64), poses)
         self._update()
         estimators = gtsam.noiseModel.mEstimator
         huber = loss is Loss.HUBER
         estimator = estimators.Huber.Create(HUBER_WIDTH) if huber else estimators.Cauchy.Create(CAUCHY_WIDTH)
         graph = gtsam.NonlinearFactorGraph(self._trusted)
-        for i, j, measured, root in self._closures:
-            graph.push_back(_between(i, j, measured, gtsam.noiseModel.Robust.Create(estimator, _gaussian(root))))
-        _anchor(graph, anchors(self.graph.components()), poses)
+        for (i, j, measured, root), keep in zip(self._closures, kept.tolist(), strict=True):
+            if keep:
+                graph.push_back(_between(i, j, measured, gtsam.noiseModel.Robust.Create(estimator, _gaussian(root))))
+        self._anchor(graph, kept, poses)
         return graph
+
+    def _anchor(self, graph: Any, kept: NDArray[np.bool_], poses: FloatArray) -> None:
+        """Hold the first variable of every component that the closures in ``kept`` leave."""
+        connects = np.ones(len(self.graph.edges), dtype=bool)
+        connects[self.graph.arrays().robust] = kept
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
+        for variable in anchors(self.graph.components(connects)).tolist():
+            graph.push_back(gtsam.PriorFactorPose2(variable, gtsam.Pose2(*poses[variable].tolist()), noise))
 
     def _update(self) -> None:
         """Build the factors of edges that are new."""
@@ -105,9 +112,3 @@ def _between(i: int, j: int, measured: Any, noise: Any) -> Any:
 
 def _gaussian(root: FloatArray) -> Any:
     return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-
-
-def _anchor(graph: Any, variables: NDArray[np.int64], poses: FloatArray) -> None:
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
-    for variable in variables.tolist():
-        graph.push_back(gtsam.PriorFactorPose2(variable, gtsam.Pose2(*poses[variable].tolist()), noise))

@@ -3,7 +3,6 @@
 Gauge: each connected component keeps the initial pose of its first variable.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +22,7 @@ _TOLERANCE = 1e-6
 _UNTIL_CONVERGED = 100
 _BINARY = 1e-4
 """Distance from 0 or 1 at which a weight is decided."""
-_POLISH_ROUNDS = 5
+_POLISH_ROUNDS = 20
 
 
 class GncSettings(Settings):
@@ -40,6 +39,11 @@ class GncSettings(Settings):
     maximum_steps: int = Field(
         default=100, ge=1, description="Steps after which undecided closures are decided as they are"
     )
+
+    @property
+    def limit(self) -> float:
+        """The chi-square quantile of ``inlier_probability`` for the three degrees of freedom of a closure."""
+        return float(2.0 * gammaincinv(1.5, self.inlier_probability))
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +69,17 @@ class Solution:
 
 
 def optimize(
-    graph: PoseGraph, initial: ArrayLike | None = None, *, loss: Loss = Loss.SQUARED, factors: FactorCache | None = None
+    graph: PoseGraph,
+    initial: ArrayLike | None = None,
+    *,
+    loss: Loss = Loss.SQUARED,
+    kept: ArrayLike | None = None,
+    factors: FactorCache | None = None,
 ) -> Solution:
     """Levenberg-Marquardt from ``initial`` (N, 3), by default the graph's own poses.
 
-    ``factors``: a cache kept by the caller makes repeated solves of a growing graph cheaper.
+    Closures not in ``kept`` (E,) are left out, by default none. ``factors``: a cache kept by the caller makes repeated
+    solves of a growing graph cheaper.
 
     Raises:
         ValueError: ``initial`` does not fit the graph, or ``factors`` belong to another one.
@@ -77,11 +87,12 @@ def optimize(
     start, cache = _start(graph, initial), _cache(graph, factors)
     if not graph.edges:
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
-    problem, values = cache.robust(loss, start), to_values(start)
+    robust = graph.arrays().robust
+    counts = np.ones(int(robust.sum()), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)[robust]
+    problem, values = cache.robust(loss, counts, start), to_values(start)
     result, iterations = _levenberg_marquardt(problem, values, _UNTIL_CONVERGED)
     poses = from_values(result)
-    robust = graph.arrays().robust
-    weights = loss.weights(graph.chi2(poses)[robust])
+    weights = counts * loss.weights(graph.chi2(poses)[robust])
     return _solution(graph, start, poses, weights, SolveStats(iterations, problem.error(values), problem.error(result)))
 
 
@@ -110,33 +121,41 @@ def optimize_gnc(
     robust = graph.arrays().robust
     if not graph.edges:
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
-    limit = 2.0 * float(gammaincinv(1.5, chosen.inlier_probability))  # chi-square quantile, 3 degrees of freedom
+    limit = chosen.limit
     steps = _Steps(cache, to_values(start))
     steps.solve(np.ones(int(robust.sum())), chosen.first_iterations)
     _graduate(steps, limit, chosen)
-    weights = _polish(steps, limit)
-    poses = from_values(steps.values)
-    stats = SolveStats(
-        steps.iterations, _truncated(graph.chi2(start), robust, limit), _truncated(graph.chi2(poses), robust, limit)
-    )
-    return _solution(graph, start, poses, weights, stats)
+    weights = _polish(steps, limit, (steps.chi2() <= limit).astype(np.float64))
+    return _concluded(graph, start, steps, weights, limit)
 
 
-def optimize_gnc_best(
+def settle(
     graph: PoseGraph,
-    starts: Sequence[ArrayLike],
+    initial: ArrayLike | None,
+    weights: ArrayLike,
     *,
     settings: GncSettings | None = None,
     factors: FactorCache | None = None,
 ) -> Solution:
-    """The cheapest of :func:`optimize_gnc` from several ``starts``: the loss has many minima, its value ranks them.
+    """The last part of :func:`optimize_gnc` alone, from closures that are trusted already.
+
+    Solves with closures of ``weights`` (E,) above one half, then decides every closure by its residual, and so on until
+    no decision changes. For a graph most of whose closures are false, where a start with all of them is no start.
 
     Raises:
-        ValueError: no start, or as :func:`optimize_gnc`.
+        ValueError: the weights do not fit the graph, or as :func:`optimize`.
     """
-    cache = _cache(graph, factors)
-    solutions = [optimize_gnc(graph, start, settings=settings, factors=cache) for start in starts]
-    return min(solutions, key=lambda solution: solution.stats.final_cost)
+    chosen = settings or GncSettings()
+    start, cache = _start(graph, initial), _cache(graph, factors)
+    trusted = np.asarray(weights, dtype=np.float64)
+    if trusted.shape != (len(graph.edges),):
+        raise ValueError(f"weights must be of shape ({len(graph.edges)},), not {trusted.shape}")
+    if not graph.edges:
+        return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
+    robust = graph.arrays().robust
+    steps = _Steps(cache, to_values(start))
+    decided = _polish(steps, chosen.limit, (trusted[robust] > 0.5).astype(np.float64))
+    return _concluded(graph, start, steps, decided, chosen.limit)
 
 
 class _Steps:
@@ -173,9 +192,8 @@ def _graduate(steps: _Steps, limit: float, settings: GncSettings) -> None:
         mu *= settings.control_step
 
 
-def _polish(steps: _Steps, limit: float) -> FloatArray:
+def _polish(steps: _Steps, limit: float, weights: FloatArray) -> FloatArray:
     """Alternate solve and decision until no decision changes; returns the last weights solved with."""
-    weights = (steps.chi2() <= limit).astype(np.float64)
     for _ in range(_POLISH_ROUNDS):
         steps.solve(weights, _UNTIL_CONVERGED)
         decided = (steps.chi2() <= limit).astype(np.float64)
@@ -183,6 +201,12 @@ def _polish(steps: _Steps, limit: float) -> FloatArray:
             break
         weights = decided
     return weights
+
+
+def _concluded(graph: PoseGraph, start: FloatArray, steps: _Steps, weights: FloatArray, limit: float) -> Solution:
+    poses, robust = from_values(steps.values), graph.arrays().robust
+    costs = [_truncated(graph.chi2(x), robust, limit) for x in (start, poses)]
+    return _solution(graph, start, poses, weights, SolveStats(steps.iterations, *costs))
 
 
 def _truncated_weights(chi2: FloatArray, limit: float, mu: float) -> FloatArray:

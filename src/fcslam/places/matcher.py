@@ -4,6 +4,7 @@ Words propose while the fleet is large, every place does while it is small, and 
 nearness does. A proposal is a rigid motion; the submaps laid on each other by it decide.
 """
 
+import heapq
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -28,6 +29,9 @@ class MatcherConfig(Settings):
     )
     candidates: int = Field(default=20, gt=0, description="places that words propose for one place")
     hamming_limit: int = Field(default=60, gt=0, le=256, description="most different bits of matching descriptors")
+    doubts: int = Field(
+        default=2, ge=0, description="places of robots in the same map that are compared wherever the map puts them"
+    )
     inliers: int = Field(default=8, ge=4, description="keypoints that must agree before geometry is asked")
     vocabulary: DynamicVocabularyConfig = Field(default=DynamicVocabularyConfig(), description="dynamic vocabulary")
     hypotheses: HypothesisConfig = Field(default=HypothesisConfig(), description="rigid motions from keypoints")
@@ -78,9 +82,10 @@ class PlaceMatcher:
         comparable = bool(predicted) or any(strangers(i) for i in self._places)
         similarity = self._similarities(place) if comparable else {}  # Algorithm 1, lines 11-13
         matches = [self._near_match(i, place, T_i_j, similarity) for i, T_i_j in predicted.items()]
+        doubtful = self._doubtful(place.id.robot, similarity, predicted, strangers)
         matches += [
             match
-            for i in self._candidates(similarity, strangers)
+            for i in (*self._candidates(similarity, strangers), *doubtful)
             if (match := self._far_match(i, place, similarity)) is not None
         ]
         self._places[place.id] = place
@@ -103,6 +108,17 @@ class PlaceMatcher:
         if len(eligible) <= self._config.small_fleet or not similarity:
             return eligible
         return sorted(eligible, key=lambda i: -similarity.get(i, 0.0))[: self._config.candidates]
+
+    def _doubtful(
+        self,
+        robot: str,
+        similarity: Mapping[KeyscanId, float],
+        predicted: Mapping[KeyscanId, FloatArray],
+        strangers: Callable[[KeyscanId], bool],
+    ) -> list[KeyscanId]:
+        """Places of robots in the same map that look most alike without lying near: the map may be wrong."""
+        known = (i for i in similarity if i.robot != robot and i not in predicted and not strangers(i))
+        return heapq.nlargest(self._config.doubts, known, key=lambda i: similarity[i])
 
     def _near_match(
         self, i: KeyscanId, place: Place, T_i_j: FloatArray, similarity: Mapping[KeyscanId, float]

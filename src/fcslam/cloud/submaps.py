@@ -1,0 +1,37 @@
+"""Submaps of places, built from a robot's keyscans when they are asked for; the latest ones are kept."""
+
+from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.robots import RobotStore
+from fcslam.geometry import se2
+from fcslam.lidar.scan import point_scan
+from fcslam.lidar.submap import Submap, build_submap
+from fcslam.records import KeyscanId, Place
+
+
+class SubmapShelf:
+    """Holds ``capacity`` submaps; the one that was not used for longest goes first."""
+
+    def __init__(self, store: RobotStore, graph: JointGraph, capacity: int) -> None:
+        self._store = store
+        self._graph = graph
+        self._capacity = capacity
+        self._submaps: dict[KeyscanId, Submap] = {}
+
+    def of(self, place: Place) -> Submap:
+        """The submap around a place, in its keyscan's frame, by the robot's own motions."""
+        submap = self._submaps.pop(place.id, None)
+        if submap is None:
+            submap = self._build(place)
+            if len(self._submaps) >= self._capacity:
+                del self._submaps[next(iter(self._submaps))]
+        self._submaps[place.id] = submap  # newest last
+        return submap
+
+    def _build(self, place: Place) -> Submap:
+        robot = place.id.robot
+        laser, anchor = self._store.laser(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
+        poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))
+        keyscans = self._store.keyscans(robot, place.first, place.last)
+        return build_submap(
+            [(point_scan(keyscan.ranges_m, laser), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]
+        )
