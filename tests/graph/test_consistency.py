@@ -4,19 +4,16 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from graph_worlds import INFORMATION, measured, walk
+from graph_worlds import INFORMATION, manhattan, measured, walk
 
 from fcslam.geometry import se2
 from fcslam.graph.clique import maximum_clique
-from fcslam.graph.consistency import (
-    Closures,
-    ConsistencySettings,
-    dominant_cluster,
-    pairwise_chi2,
-    pairwise_consistency,
-)
+from fcslam.graph.cluster import dominant_cluster
+from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_chi2, pairwise_consistency, witnesses
+from fcslam.graph.trajectory import Trajectory, trajectory
 
 SETTINGS = ConsistencySettings(position_drift_m=0.03, heading_drift_rad=0.01)
+STILL = trajectory(np.zeros((1, 3)), SETTINGS)
 T_A_B = np.array([4.0, -7.0, 2.2])
 
 
@@ -30,7 +27,7 @@ def drifted(generator: np.random.Generator, truth: np.ndarray) -> np.ndarray:
     return np.array(poses)
 
 
-def two_robots(seed: int, true: int = 20, false: int = 30, aliases: int = 0) -> tuple[np.ndarray, np.ndarray, Closures]:
+def two_robots(seed: int, true: int = 20, false: int = 30, aliases: int = 0) -> tuple[Trajectory, Trajectory, Closures]:
     """Trajectories of two robots in one town and closures between them: true, random, and a shifted alias group."""
     generator = np.random.default_rng(seed)
     truth_a, truth_b = walk(seed, 120), walk(seed + 100, 120)
@@ -51,13 +48,13 @@ def two_robots(seed: int, true: int = 20, false: int = 30, aliases: int = 0) -> 
         T_i_j=np.array([row[2] for row in rows]).reshape(-1, 3),
         information=np.tile(INFORMATION, (len(rows), 1, 1)),
     )
-    return drifted(generator, truth_a), drifted(generator, truth_b), closures
+    return *(trajectory(drifted(generator, truth), SETTINGS) for truth in (truth_a, truth_b)), closures
 
 
 def verdict_of(seed: int, **counts: int):
     a, b, closures = two_robots(seed, **counts)
     consistent = pairwise_consistency(a, b, closures, SETTINGS)
-    return dominant_cluster(consistent, a[closures.i, :2], np.ones(len(closures.i), dtype=bool), SETTINGS)
+    return dominant_cluster(consistent, a.poses[closures.i, :2], np.ones(len(closures.i), dtype=bool), SETTINGS)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -100,7 +97,7 @@ def test_chi2_of_true_pairs_has_the_distribution_it_claims() -> None:
     values = []
     for seed in range(6):
         a, b, closures = two_robots(seed, true=25, false=0)
-        values.append(pairwise_chi2(a, b, closures, SETTINGS)[np.triu_indices(25, 1)])
+        values.append(pairwise_chi2(a, b, closures)[np.triu_indices(25, 1)])
     sample = np.concatenate(values)
     assert 0.95 < np.mean(sample < 11.345) <= 1.0
     assert 1.8 < np.mean(sample) < 4.2
@@ -111,22 +108,22 @@ def test_drift_is_that_of_simulated_trajectories() -> None:
     ends = np.array([5, 55])
     exact = Closures(ends, np.zeros(2, dtype=np.int64), se2.inverse(truth[ends]), np.tile(np.eye(3) * 1e10, (2, 1, 1)))
     generator = np.random.default_rng(0)
-    still = np.zeros((1, 3))
-    chi2 = [pairwise_chi2(drifted(generator, truth), still, exact, SETTINGS)[0, 1] for _ in range(300)]
+    chi2 = [pairwise_chi2(trajectory(drifted(generator, truth), SETTINGS), STILL, exact)[0, 1] for _ in range(300)]
     assert np.mean(chi2) == pytest.approx(3.0, abs=0.5)
 
 
 def test_consistency_ignores_the_frames_and_the_order() -> None:
     a, b, closures = two_robots(2)
-    here = pairwise_chi2(a, b, closures, SETTINGS)
-    there = pairwise_chi2(se2.compose(T_A_B, a), se2.compose((1.0, 90.0, -3.0), b), closures, SETTINGS)
+    here = pairwise_chi2(a, b, closures)
+    moved = [trajectory(se2.compose(T, x.poses), SETTINGS) for T, x in ((T_A_B, a), ((1.0, 90.0, -3.0), b))]
+    there = pairwise_chi2(*moved, closures)
     assert there == pytest.approx(here, rel=1e-5, abs=1e-6)
     assert np.array_equal(here, here.T)
     assert (np.diag(here) == 0.0).all()
     order = np.random.default_rng(0).permutation(len(closures.i))
     shuffled = Closures(closures.i[order], closures.j[order], closures.T_i_j[order], closures.information[order])
     limit = 11.345
-    forward, backward = here[np.ix_(order, order)] < limit, pairwise_chi2(a, b, shuffled, SETTINGS) < limit
+    forward, backward = here[np.ix_(order, order)] < limit, pairwise_chi2(a, b, shuffled) < limit
     assert np.mean(forward != backward) < 0.01
 
 
@@ -137,8 +134,7 @@ def test_covariance_is_in_the_frame_of_j() -> None:
     for shift, agrees in (((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)):
         T = np.stack((turned, se2.compose(turned, shift)))
         closures = Closures(np.array([0, 0]), np.array([0, 0]), T, np.stack((wide, wide)))
-        still = np.zeros((1, 3))
-        assert bool(pairwise_consistency(still, still, closures, SETTINGS)[0, 1]) is agrees
+        assert bool(pairwise_consistency(STILL, STILL, closures, SETTINGS)[0, 1]) is agrees
 
 
 def test_covariance_turns_with_the_path_between_the_closures() -> None:
@@ -148,7 +144,7 @@ def test_covariance_turns_with_the_path_between_the_closures() -> None:
     for shift, agrees in (((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)):
         T = np.stack((b[0], se2.compose(b[1], shift)))
         closures = Closures(np.array([0, 0]), np.array([0, 1]), T, np.stack((tight, wide)))
-        assert bool(pairwise_consistency(np.zeros((1, 3)), b, closures, SETTINGS)[0, 1]) is agrees
+        assert bool(pairwise_consistency(STILL, trajectory(b, SETTINGS), closures, SETTINGS)[0, 1]) is agrees
 
 
 def test_as_many_closures_from_fewer_places_lead_nothing() -> None:
@@ -179,9 +175,58 @@ def test_supporters_are_places_that_lie_apart_and_one_must_inform() -> None:
 
 def test_a_keyscan_out_of_range_is_refused() -> None:
     a, b, closures = two_robots(0)
-    for cut_a, cut_b, name in ((a[:50], b, "a"), (a, b[:50], "b")):
+    short = [trajectory(x.poses[:50], SETTINGS) for x in (a, b)]
+    for cut_a, cut_b, name in ((short[0], b, "a"), (a, short[1], "b")):
         with pytest.raises(ValueError, match=f"trajectory {name} has keyscans 0 to 49"):
-            pairwise_chi2(cut_a, cut_b, closures, SETTINGS)
+            pairwise_chi2(cut_a, cut_b, closures)
+
+
+def test_a_closure_says_the_same_from_both_ends() -> None:
+    """Told from the other end, closures agree with the same others and make the same errors."""
+    a, b, closures = two_robots(3)
+    there = closures.turned(np.ones(len(closures), dtype=bool))
+    assert pairwise_chi2(b, a, there)[0] == pytest.approx(pairwise_chi2(a, b, closures)[0], rel=0.2, abs=1.0)
+    off = 1e-4 * np.array([1.0, -2.0, 3.0])
+    for k in range(len(closures)):
+        T = se2.compose(closures.T_i_j[k], se2.exp(off))
+        error = se2.log(se2.between(there.T_i_j[k], se2.inverse(T)))
+        assert error @ there.information[k] @ error == pytest.approx(off @ closures.information[k] @ off, rel=1e-5)
+    back = there.turned(np.ones(len(closures), dtype=bool))
+    assert np.allclose(back.T_i_j, closures.T_i_j)
+    assert np.allclose(back.information, closures.information)
+    assert np.array_equal(back.i, closures.i)
+
+
+def test_a_steps_own_covariance_counts_with_the_drift() -> None:
+    """Two closures 1 m apart that differ by 0.3 m agree where the odometry between them is that uncertain."""
+    poses = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
+    tight = np.tile(np.eye(3) * 1e6, (2, 1, 1))
+    closures = Closures(np.array([0, 1]), np.array([0, 0]), np.array([(0, 0, 0), (-1.3, 0, 0)], dtype=float), tight)
+    for variance, agrees in ((0.04, True), (1e-6, False)):
+        path = trajectory(poses, SETTINGS, variance * np.eye(3)[None])
+        assert bool(pairwise_consistency(path, STILL, closures, SETTINGS)[0, 1]) is agrees
+
+
+def test_drift_does_not_depend_on_where_the_frame_lies() -> None:
+    """Map coordinates may be those of a country: levers of a million metres would eat the digits."""
+    truth = walk(0, 80)
+    here = trajectory(truth, SETTINGS)
+    there = trajectory(se2.compose((4.5e5, 5.2e6, 1.0), truth), SETTINGS)
+    ends = np.array([3, 70]), np.array([60, 10])
+    assert there.drift(*ends) == pytest.approx(here.drift(*ends), rel=1e-6)
+
+
+def test_false_closures_have_no_witness_and_true_ones_mostly_do() -> None:
+    graph, _, true = manhattan(4, steps=300, closures=120, outlier_share=0.4)
+    edges = graph.arrays()
+    rows = edges.robust
+    closures = Closures(edges.i[rows], edges.j[rows], edges.T_i_j[rows], edges.information[rows])
+    path = trajectory(graph.poses(), SETTINGS, np.linalg.inv(edges.information[~rows]))
+    counts = witnesses(path, closures, SETTINGS)
+    assert np.mean(counts[true[rows]] > 0) > 0.7
+    assert np.mean(counts[~true[rows]] > 0) < 0.05
+    other_end = closures.turned(np.arange(len(closures)) % 2 == 0)
+    assert np.array_equal(witnesses(path, other_end, SETTINGS), counts), "it does not matter which end is told first"
 
 
 @pytest.mark.parametrize("density", [0.2, 0.5, 0.8])

@@ -5,9 +5,11 @@ import pytest
 from graph_worlds import INFORMATION, gauss_newton, manhattan
 
 from fcslam.geometry import se2
+from fcslam.graph.alone import solve_alone
+from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.initialization import initialize, initialize_robust
-from fcslam.graph.optimizer import GncSettings, Solution, optimize, optimize_gnc, optimize_gnc_best
+from fcslam.graph.optimizer import GncSettings, Solution, optimize, optimize_gnc, settle
 from fcslam.graph.pose_graph import Edge, PoseGraph
 
 
@@ -63,14 +65,49 @@ def test_order_of_edges_does_not_matter_and_repetition_gives_the_same_bytes(solv
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
 @pytest.mark.parametrize("seed", range(3))
-def test_gnc_rejects_false_closures(seed: int, share: float) -> None:
+def test_a_robot_alone_rejects_false_closures(seed: int, share: float) -> None:
     graph, truth, true = manhattan(seed, closures=60, outlier_share=share)
-    solution = optimize_gnc_best(graph, [graph.poses(), initialize_robust(graph)])
+    solution = solve_alone(graph, ConsistencySettings())
     clean = optimize(PoseGraph(graph.poses(), [e for e, known in zip(graph.edges, true, strict=True) if known]))
     assert (solution.weights[~true] == 0.0).all()
     assert (solution.weights[true] == 0.0).sum() <= 4
     assert np.abs(solution.poses[:, :2] - clean.poses[:, :2]).max() < 0.1
     assert np.abs(optimize(graph).poses[:, :2] - truth[:, :2]).max() > 1.0
+
+
+def test_what_stays_of_the_witnessed_start_is_the_cheaper_solution() -> None:
+    """A robot that meets each place but once has no witnesses: all its closures count nevertheless."""
+    truth = np.array([(10.0 * np.cos(a), 10.0 * np.sin(a), a + np.pi / 2) for a in np.linspace(0.0, 2.0 * np.pi, 63)])
+    edges = [
+        Edge(k, k + 1, se2.compose(se2.between(*truth[k : k + 2]), (0.0, 0.0, 0.002)), INFORMATION, False)
+        for k in range(62)
+    ]
+    edges.append(Edge(0, 62, se2.between(truth[0], truth[62]), INFORMATION, True))
+    graph = PoseGraph(truth, edges)
+    solution = solve_alone(graph, ConsistencySettings())
+    assert solution.weights[-1] == 1.0
+    assert np.abs(se2.between(solution.poses[0], solution.poses[62])[:2]).max() < 0.05
+
+
+def test_settling_starts_from_what_is_trusted() -> None:
+    """With seven of ten closures false, the true ones as a start find everything; the false ones find no more."""
+    graph, _, true = manhattan(1, closures=60, outlier_share=0.7)
+    clean = optimize(PoseGraph(graph.poses(), [e for e, known in zip(graph.edges, true, strict=True) if known]))
+    settled = settle(graph, clean.poses, true)
+    assert (settled.weights[~true] == 0.0).all()
+    assert (settled.weights[true] == 0.0).sum() <= 4
+    assert settle(graph, clean.poses, ~true).stats.final_cost > settled.stats.final_cost
+    with pytest.raises(ValueError, match="weights must be of shape"):
+        settle(graph, clean.poses, true[:-1])
+
+
+def test_closures_that_are_left_out_count_for_nothing() -> None:
+    graph, _, true = manhattan(3, outlier_share=0.2)
+    clean = PoseGraph(graph.poses(), [e for e, known in zip(graph.edges, true, strict=True) if known])
+    for loss in Loss:
+        solution = optimize(graph, kept=true, loss=loss)
+        assert apart(solution.poses, optimize(clean, loss=loss).poses) < 1e-6
+        assert (solution.weights[~true] == 0.0).all()
 
 
 def test_a_clean_graph_keeps_every_closure_and_its_optimum() -> None:

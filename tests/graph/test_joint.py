@@ -1,0 +1,229 @@
+"""Robots without a common frame, most closures between them false: who joins, what holds, what each part is for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graph_worlds import INFORMATION, measured, walk
+
+from fcslam.geometry import se2
+from fcslam.graph import joint
+from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.joint import JointEvidence, JointSolution, solve_jointly
+from fcslam.graph.optimizer import optimize
+from fcslam.graph.pose_graph import Edge, PoseGraph
+
+SETTINGS = ConsistencySettings()
+STEPS = 100
+ROBOTS = 3
+STARTS = np.array([(0.0, 0.0, 0.0), (40.0, 5.0, 2.0), (-30.0, 80.0, -1.0)])
+"""Where each robot believes to be: says nothing of how they lie to each other."""
+ALIAS = np.array([5.0, 3.0, 0.0])
+
+
+class World:
+    """Three robots in one town, each with some closures of its own; closures between them are added by a test."""
+
+    def __init__(self, seed: int) -> None:
+        self.generator = np.random.default_rng(seed)
+        self.truth = [walk(seed * 10 + robot, STEPS) for robot in range(ROBOTS)]
+        self.edges: list[Edge] = []
+        self.true: list[bool] = []
+        poses = []
+        for robot, truth in enumerate(self.truth):
+            poses.append(STARTS[robot])
+            for k in range(STEPS):
+                step = measured(self.generator, se2.between(truth[k], truth[k + 1]))
+                self._add(Edge(self.variable(robot, k), self.variable(robot, k + 1), step, INFORMATION, False), True)
+                poses.append(se2.compose(poses[-1], step))
+            for i, j in self._near(robot, robot, 15):
+                if j > i + 5:
+                    self.close(robot, i, robot, j)
+        self.poses = np.array(poses)
+
+    @staticmethod
+    def variable(robot: int, k: int) -> int:
+        return robot * (STEPS + 1) + k
+
+    def meet(self, a: int, b: int, count: int, shift=None) -> None:
+        """Closures where two robots were near each other, or, shifted, where an alias would have them near."""
+        for i, j in self._near(a, b, count, shift):
+            self.close(a, i, b, j, shift)
+
+    def close(self, a: int, i: int, b: int, j: int, shift=None) -> None:
+        there = self.truth[b][j] if shift is None else se2.compose(shift, self.truth[b][j])
+        T = measured(self.generator, se2.between(self.truth[a][i], there))
+        self._add(Edge(self.variable(a, i), self.variable(b, j), T, INFORMATION, True), shift is None)
+
+    def lie(self, a: int, b: int, count: int) -> None:
+        """Closures between random places that measure anything."""
+        for i, j in self.generator.integers(0, STEPS + 1, (count, 2)):
+            T = np.append(self.generator.normal(0.0, 1.0, 2), self.generator.uniform(-np.pi, np.pi))
+            self._add(Edge(self.variable(a, int(i)), self.variable(b, int(j)), T, INFORMATION, True), False)
+
+    def _near(self, a: int, b: int, count: int, shift=None) -> list[tuple[int, int]]:
+        moved = self.truth[b] if shift is None else se2.compose(shift, self.truth[b])
+        distance = np.hypot(*np.moveaxis(self.truth[a][:, None, :2] - moved[None, :, :2], -1, 0))
+        near = np.argwhere(distance < 1.5)
+        chosen = self.generator.choice(len(near), min(count, len(near)), replace=False)
+        return [(int(i), int(j)) for i, j in near[chosen]]
+
+    def _add(self, edge: Edge, true: bool) -> None:
+        self.edges.append(edge)
+        self.true.append(true)
+
+    def evidence(self) -> JointEvidence:
+        count = len(self.edges)
+        robots = tuple(np.arange(STEPS + 1) + robot * (STEPS + 1) for robot in range(ROBOTS))
+        graph = PoseGraph(self.poses, self.edges)
+        return JointEvidence(graph, robots, np.ones(count, bool), np.ones(count, bool), np.zeros(count, bool))
+
+    def error_m(self, solution: JointSolution) -> float:
+        """Largest distance from the optimum without a false closure, both seen from the first pose."""
+        clean = PoseGraph(
+            np.concatenate([se2.between(self.truth[0][0], truth) for truth in self.truth]),
+            [edge for edge, true in zip(self.edges, self.true, strict=True) if true],
+        )
+        best = optimize(clean).poses
+        apart = se2.between(best[0], best)[:, :2] - se2.between(solution.poses[0], solution.poses)[:, :2]
+        return float(np.hypot(*apart.T).max())
+
+
+def lying_world(seed: int, share: float) -> World:
+    """Between every two robots ``share`` of the closures are false, a third of them in groups that agree."""
+    world = World(seed)
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        world.meet(a, b, 30)
+        false = round(30 * share / (1.0 - share))
+        world.lie(a, b, false - 2 * (false // 6))
+        for _ in range(2):
+            shift = np.append(world.generator.uniform(3.0, 6.0, 2), world.generator.uniform(-1.0, 1.0))
+            world.meet(a, b, false // 6, shift)
+    return world
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("share", [0.1, 0.7])
+def test_false_closures_are_found_out_and_true_ones_kept(seed: int, share: float) -> None:
+    world = lying_world(seed, share)
+    solution = solve_jointly(world.evidence(), SETTINGS)
+    robust, true = world.evidence().graph.arrays().robust, np.array(world.true)
+    assert solution.maps == (0, 0, 0)
+    assert world.error_m(solution) < 0.1
+    assert solution.weights[robust & ~true].sum() == 0.0
+    assert solution.weights[robust & true].mean() > 0.9
+
+
+def test_without_the_robust_steps_the_same_world_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mutation check: with least squares in their place false closures bend the map by metres."""
+    evidence = (world := lying_world(0, 0.7)).evidence()
+
+    def least_squares(graph, initial, *_weights, **_settings):
+        return optimize(graph, initial)
+
+    monkeypatch.setattr(joint, "optimize_gnc", least_squares)
+    monkeypatch.setattr(joint, "settle", least_squares)
+    solution = solve_jointly(evidence, SETTINGS)
+    assert solution.maps == (0, 0, 0)
+    assert world.error_m(solution) > 1.0
+
+
+def test_without_pairwise_consistency_liars_join_two_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other mutation check, on the world of the next test: without it and without the second look at links."""
+
+    def everything_agrees(_a, _b, closures, _settings):
+        return np.ones((len(closures), len(closures)), dtype=bool)
+
+    monkeypatch.setattr("fcslam.graph.cluster.pairwise_consistency", everything_agrees)
+    monkeypatch.setattr(joint, "_lasts", lambda *_: True)
+    assert solve_jointly(world_of_two_truths().evidence(), SETTINGS).maps == (0, 0, 1)
+
+
+def world_of_two_truths() -> World:
+    world = World(1)
+    world.meet(0, 1, 12)
+    world.meet(0, 1, 12, ALIAS)
+    return world
+
+
+def test_a_group_of_liars_as_large_as_the_truth_joins_nobody() -> None:
+    solution = solve_jointly((world := world_of_two_truths()).evidence(), SETTINGS)
+    assert solution.maps == (0, 1, 2)
+    (link,) = solution.links
+    assert link.verdict.contested
+    robust = world.evidence().graph.arrays().robust
+    between = robust & (np.arange(len(robust)) >= len(robust) - 24)
+    assert solution.weights[between].sum() == 0.0
+
+
+def test_a_small_group_of_liars_is_outvoted() -> None:
+    world = World(1)
+    world.meet(0, 1, 20)
+    world.meet(0, 1, 6, ALIAS)
+    solution = solve_jointly(world.evidence(), SETTINGS)
+    assert solution.maps == (0, 0, 1)
+    assert solution.weights[-6:].sum() == 0.0
+    assert solution.weights[-26:-6].sum() >= 18
+
+
+def test_a_chain_of_robots_shares_one_map() -> None:
+    """0 met 1 and 1 met 2: one map, in which the first robot's first pose stays."""
+    world = World(1)
+    world.meet(0, 1, 15)
+    world.meet(1, 2, 15)
+    solution = solve_jointly(world.evidence(), SETTINGS)
+    assert solution.maps == (0, 0, 0)
+    assert world.error_m(solution) < 0.1
+    assert np.array_equal(solution.poses[0], STARTS[0])
+
+
+def test_robots_that_never_met_are_mapped_each_in_its_own_frame() -> None:
+    world = World(3)
+    world.lie(0, 1, 40)
+    solution = solve_jointly(world.evidence(), SETTINGS)
+    assert solution.maps == (0, 1, 2)
+    for robot in range(ROBOTS):
+        assert np.allclose(solution.poses[world.variable(robot, 0)], STARTS[robot])
+
+
+@pytest.mark.parametrize("column", ["informative", "independent", "excluded"])
+def test_evidence_that_does_not_count_joins_nobody(column: str) -> None:
+    world = World(2)
+    world.meet(0, 1, 15)
+    evidence = world.evidence()
+    changed = ~getattr(evidence, column)
+    solution = solve_jointly(replace(evidence, **{column: changed}), SETTINGS)
+    assert solution.maps == (0, 1, 2)
+    assert solution.weights[-15:].sum() == 0.0
+
+
+def test_excluded_closures_of_a_robots_own_do_not_hold() -> None:
+    world = World(2)
+    world.close(0, 0, 0, 50, ALIAS)
+    evidence = world.evidence()
+    evidence.excluded[-2:] = True
+    assert solve_jointly(evidence, SETTINGS).weights[-2:].sum() == 0.0
+
+
+def test_a_link_that_the_joint_solution_takes_apart_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two maps do not stay joined on what is left when their cluster falls."""
+    world = World(2)
+    world.meet(0, 1, 15)
+    real = joint.settle
+
+    def keeps_one(graph, initial, weights, **options):
+        solution = real(graph, initial, weights, **options)
+        edges = graph.arrays()
+        between = edges.robust & (edges.i < STEPS + 1) & (edges.j >= STEPS + 1)
+        kept = solution.weights.copy()
+        kept[np.flatnonzero(between)[1:]] = 0.0
+        return replace(solution, weights=kept)
+
+    monkeypatch.setattr(joint, "settle", keeps_one)
+    assert solve_jointly(world.evidence(), SETTINGS).maps == (0, 1, 2)
+
+
+def test_the_same_evidence_gives_the_same_bytes() -> None:
+    first, second = (solve_jointly(lying_world(0, 0.7).evidence(), SETTINGS) for _ in range(2))
+    assert first.poses.tobytes() == second.poses.tobytes()
+    assert first.weights.tobytes() == second.weights.tobytes()
