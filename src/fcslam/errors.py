@@ -3,7 +3,7 @@
 FcslamError
 ├── InputError            something the user gave is wrong: one line says what, where, what to do (exit code 2)
 │   ├── SourceError       a recording cannot be read
-│   ├── ConfigError       a configuration file or key is wrong
+│   ├── ConfigError       a configuration file, a key of it or a veto is wrong
 │   ├── OutputError       the output folder cannot be used
 │   └── EvaluationError   a reference file or a run folder cannot be evaluated
 └── PacketError           bytes received are not a packet that may be trusted
@@ -23,7 +23,7 @@ class SourceError(InputError):
 
 
 class ConfigError(InputError):
-    """A configuration file or one of its keys is wrong."""
+    """A configuration file, one of its keys or a veto is wrong."""
 
 
 class OutputError(InputError):

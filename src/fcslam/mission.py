@@ -15,11 +15,11 @@ from fcslam.cloud.fusion import FusedMap, fuse, map_yaml, pgm_bytes
 from fcslam.cloud.picture import Meeting, map_png
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.config import Settings, dump
-from fcslam.errors import FcslamError, PacketError, SourceError
+from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.records import ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure
+from fcslam.records import ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, check_names
 from fcslam.sources import Source
@@ -53,16 +53,22 @@ class Progress:
 Watch = Callable[[Progress], None]
 
 
-def run_mission(sources: Sequence[Source], config: MissionConfig, watch: Watch = lambda _: None) -> Run:
-    """Map recordings together, one robot each.
+def run_mission(
+    sources: Sequence[Source], config: MissionConfig, watch: Watch = lambda _: None, vetoes: Sequence[Veto] = ()
+) -> Run:
+    """Map recordings together, one robot each, without the closures of ``vetoes``.
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
+        ConfigError: a veto names a robot that is not there.
         OutputError: a robot's name cannot be a file name.
     """
     _check_robots(sources)
+    _check_vetoes(vetoes, [source.name for source in sources])
     robots = [RobotFrontend(source.name, config.robot) for source in sources]
     cloud = Fleet(config.fleet, config.seed)
+    for veto in vetoes:
+        cloud.veto(veto)
     transport = InMemoryTransport(cloud.receive)
     meter = _Meter(watch, cloud)
     streams = [_packets(source, robot, meter) for source, robot in zip(sources, robots, strict=True)]
@@ -119,6 +125,12 @@ def _check_robots(sources: Sequence[Source]) -> None:
         except PacketError as error:
             raise SourceError(f"{error}; a robot is named by its file, so rename it") from error
     check_names(names)
+
+
+def _check_vetoes(vetoes: Sequence[Veto], robots: Sequence[str]) -> None:
+    for name in (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)):
+        if name not in robots:
+            raise ConfigError(f"a veto names '{name}', but the robots are {', '.join(robots)}")
 
 
 def _run_of(

@@ -20,6 +20,9 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 CODE_BYTES = 32
 """A binary descriptor is 256 bits, packed."""
 
+SAME_STAMP_S = 1e-6
+"""Stamps that differ by less are one: files print them with so many digits."""
+
 
 def frozen(array: ArrayLike, dtype: type[Scalar] = np.float64) -> NDArray[Scalar]:  # type: ignore[assignment]
     """A read-only array of ``dtype``; copied only if it has to be."""
@@ -156,6 +159,25 @@ class LoopClosure:
     reason: str
     informative: bool = True
     """Whether the match fixes the pose in every direction (a bare corridor does not)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Veto:
+    """Somebody knows that two robots' places (or two places of one robot) are not the same, whatever they look like."""
+
+    robot_i: str
+    robot_j: str
+    stamps: tuple[float, float] | None = None
+    """Of the keyscans of i and j; None: no place of the one is a place of the other."""
+
+    def forbids(self, robot_i: str, stamp_i: float, robot_j: str, stamp_j: float) -> bool:
+        """Whether it speaks of this closure, told from either end."""
+        ends = ((robot_i, stamp_i), (robot_j, stamp_j))
+        return any(
+            (self.robot_i, self.robot_j) == (i, j)
+            and (self.stamps is None or np.allclose(self.stamps, (at_i, at_j), rtol=0.0, atol=SAME_STAMP_S))
+            for (i, at_i), (j, at_j) in (ends, ends[::-1])
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from fcslam.errors import EvaluationError, OutputError
-from fcslam.records import Channel, ClosureStatus, FloatArray, frozen
+from fcslam.errors import ConfigError, EvaluationError, OutputError
+from fcslam.records import Channel, ClosureStatus, FloatArray, Veto, frozen
 
 TRAJECTORIES, ROBOTS, CLOSURES = "trajectories", "robots.csv", "closures.csv"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
@@ -173,6 +173,30 @@ def open_run(path: Path) -> Run:
         )
     except (OSError, ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: a broken run folder ({error})") from error
+
+
+def read_vetoes(path: Path) -> tuple[Veto, ...]:
+    """Closures that must not count: lines of a run's closures.csv, of which only the two ends are read.
+
+    A line without stamps speaks of every closure between the two robots.
+
+    Raises:
+        ConfigError: the file cannot be read, a column is missing, or a stamp is no number.
+    """
+    try:
+        return tuple(_read_veto(number, row) for number, row in enumerate(_read_csv(path, _CLOSURE_ENDS), start=2))
+    except (OSError, ValueError, csv.Error) as error:
+        raise ConfigError(f"{path}: no list of vetoes ({error}); copy lines of a run's {CLOSURES}") from error
+
+
+def _read_veto(number: int, row: dict[str, str]) -> Veto:
+    stamps = [row["stamp_i"].strip(), row["stamp_j"].strip()]
+    if not any(stamps):
+        return Veto(row["robot_i"], row["robot_j"])
+    try:
+        return Veto(row["robot_i"], row["robot_j"], (float(stamps[0]), float(stamps[1])))
+    except ValueError as error:
+        raise ValueError(f"line {number}: two stamps or none are needed, {error}") from error
 
 
 def write_tum(path: Path, stamps: FloatArray, T_map_base: FloatArray) -> None:

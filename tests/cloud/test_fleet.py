@@ -11,8 +11,8 @@ from small_fleet import feed, fingerprint, in_order, map_of
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.geometry import se2
-from fcslam.records import ClosureStatus, ConstraintKind, KeyscanId
-from fcslam.wire.packets import encode
+from fcslam.records import ClosureStatus, ConstraintKind, Correction, KeyscanId, Place, Veto
+from fcslam.wire.packets import decode, encode
 
 POSES = rectangle()
 A, B, C = ("a", POSES), ("b", POSES), ("c", POSES)
@@ -29,6 +29,10 @@ def two_robots():
 def between(result, status=None):
     found = [c for c in result.closures if c.i.robot != c.j.robot]
     return found if status is None else [c for c in found if c.status is status]
+
+
+def is_place_of(packet, robot):
+    return isinstance(packet.body, Place) and packet.robot == robot
 
 
 def joint_error(result, robot_a="a", robot_b="b", truth=POSES):
@@ -122,6 +126,71 @@ def test_a_join_on_aliases_does_not_outlive_evidence_that_contradicts_it(scripte
     assert not between(result, ClosureStatus.ACCEPTED)
     for robot in result.robots:
         assert np.allclose(se2.between(se2.between(robot.T_map_base[0], robot.T_map_base), POSES), 0.0, atol=1e-6)
+
+
+def test_a_join_on_aliases_is_taken_back_while_the_robots_drive(scripted):
+    """At the next solve after the evidence turned, not only at the end."""
+    pairs = [(k, k) for k in range(12, 61, 4)]
+    fleet = scripted(closures(A, B, [(0, 0), (4, 4), (8, 8)], shift=ALIAS), closures(A, B, pairs), solve_every=1)
+    packets = two_robots()
+    at = {packet.body.id.number: n for n, packet in enumerate(packets) if is_place_of(packet, "b")}
+    accepted, maps = [], []
+    for n, packet in enumerate(packets):
+        replies = [decode(reply).body for reply in fleet.receive(encode(packet))]
+        accepted.append(fleet.closure_counts()["between robots"])
+        maps += [(n, reply.map_index) for reply in replies if isinstance(reply, Correction)]
+    told = dict(maps)
+    assert (accepted[at[4]], told[at[4]]) == (0, 1)
+    assert (accepted[at[8]], told[at[8]]) == (3, 0), "three aliases join the two"
+    assert (accepted[at[20]], told[at[20]]) == (0, 1), "three true closures: nobody knows"
+    assert accepted[-1] == len(pairs)
+    assert told[at[60]] == 0
+
+
+def test_a_veto_parts_what_only_liars_joined(scripted):
+    """Six aliases and no witness of the truth: only somebody who knows can tell. He may say so at any time."""
+    alias = closures(A, B, TRUE, shift=ALIAS)
+    fleet = feed(scripted(alias), two_robots())
+    assert fleet.closure_counts()["between robots"] == 6
+    fleet.veto(Veto("b", "a"))
+    assert fleet.closure_counts()["between robots"] == 0
+    result = fleet.finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    assert {(c.status, c.reason) for c in between(result)} == {(ClosureStatus.REVOKED, "vetoed by hand")}
+    before = scripted(alias)
+    before.veto(Veto("a", "b"))
+    assert fingerprint(feed(before, two_robots()).finalize()) == fingerprint(result)
+
+
+def test_a_veto_of_one_closure_leaves_the_others(scripted):
+    fleet = feed(scripted(closures(A, B, TRUE)), two_robots())
+    fleet.veto(Veto("b", "a", (LATER + 8, 8.0)))
+    result = fleet.finalize()
+    (vetoed,) = between(result, ClosureStatus.REVOKED)
+    assert (vetoed.i.number, vetoed.j.number) == (8, 8)
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert len(between(result, ClosureStatus.ACCEPTED)) == len(TRUE) - 1
+    assert fingerprint(result) == fingerprint(fleet.finalize())
+
+
+def test_a_robots_own_closure_can_be_vetoed(scripted):
+    loop = motion("a", 2, 58, se2.between(POSES[2], POSES[58]), ConstraintKind.CLOSURE)
+    fleet = scripted()
+    fleet.veto(Veto("a", "a", (58.0, 2.0)))
+    (closure,) = feed(fleet, stream(*A, start_s=0.0, local=[loop])).finalize().closures
+    assert (closure.status, closure.reason) == (ClosureStatus.REVOKED, "vetoed by hand")
+
+
+def test_one_surviving_closure_holds_no_maps_together(scripted):
+    """What fits the joint map only because of a join falls with it."""
+    follower = closures(A, B, [(20, 20)], shift=ALIAS)
+    fleet = feed(scripted(closures(A, B, [(0, 0), (8, 8), (16, 16)], shift=ALIAS), follower), two_robots())
+    assert fleet.closure_counts()["between robots"] == 4
+    for number in (0, 8):
+        fleet.veto(Veto("a", "b", (number, LATER + number)))
+    result = fleet.finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    assert not between(result, ClosureStatus.ACCEPTED)
 
 
 @pytest.mark.parametrize("off", [(0.8, 0.0, 0.0), (0.0, 0.0, 0.2)])

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.mission import MissionConfig, Progress, Watch
+    from fcslam.records import Veto
     from fcslam.runs import Run
     from fcslam.sources import Source
 
@@ -23,6 +24,12 @@ def map_recordings(
     output: Annotated[Path, typer.Option("--output", "-o", help="The run folder to write.")],
     split: Annotated[int, typer.Option(min=1, help="Cut one LOG into this many robots of equal scan count.")] = 1,
     no_fuse: Annotated[bool, typer.Option("--no-fuse", help="Map each robot alone.")] = False,
+    veto: Annotated[
+        Path | None,
+        typer.Option(
+            help="Closures known to be false: lines of a run's closures.csv; without stamps, all of two robots."
+        ),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Configuration file; see `fcslam config dump`.")
     ] = None,
@@ -30,16 +37,18 @@ def map_recordings(
     force: Annotated[bool, typer.Option("--force", "-f", help="Replace a run that is there already.")] = False,
 ) -> None:
     """Map recordings together: one map, every robot's trajectory in it, and the closures that hold it together."""
-    from fcslam.runs import prepare_output
+    from fcslam.runs import prepare_output, read_vetoes
     from fcslam.sources import open_source
 
     prepare_output(output, force)
     settings = _settings(config, seed, no_fuse)
     sources = _sources([open_source(log) for log in logs], split)
-    map_sources(sources, settings, output, force)
+    map_sources(sources, settings, output, force, read_vetoes(veto) if veto else ())
 
 
-def map_sources(sources: "Sequence[Source]", settings: "MissionConfig", output: Path, force: bool) -> "Run":
+def map_sources(
+    sources: "Sequence[Source]", settings: "MissionConfig", output: Path, force: bool, vetoes: "Sequence[Veto]" = ()
+) -> "Run":
     """Run the mission with a progress display, write the run folder, say what came out.
 
     A run that appeared at ``output`` meanwhile is replaced only by ``force``.
@@ -55,7 +64,7 @@ def map_sources(sources: "Sequence[Source]", settings: "MissionConfig", output: 
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     with _progress(console, total) as watch:
-        run = run_mission(sources, settings, watch)
+        run = run_mission(sources, settings, watch, vetoes)
     write_run(run, output, force)
     for source in sources:
         if source.faults:

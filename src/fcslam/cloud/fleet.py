@@ -30,6 +30,7 @@ from fcslam.records import (
     Keyscan,
     KeyscanId,
     Place,
+    Veto,
     frozen,
 )
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
@@ -52,6 +53,10 @@ class FleetConfig(Settings):
     consistency: ConsistencySettings = Field(default=ConsistencySettings(), description="pairwise consistency")
 
 
+MORE_DOUBTS = 1.1
+"""Growth of the number of closures after which a doubt that was dispelled is taken up again."""
+
+
 class Fleet:
     """Receives packets; matches, verifies, joins, optimises."""
 
@@ -68,10 +73,14 @@ class Fleet:
         """By detector version and robot."""
         self._maps: list[list[str]] = []
         """Robots by map; maps and the robots in them in the order in which they started."""
-        self._vetoes: set[frozenset[KeyscanId]] = set()
+        self._vetoes: list[Veto] = []
         self._doubted = False
+        """Whether evidence has turned against a join."""
+        self._patience = 0
+        """Closures up to which doubts wait: the same doubts soon again would be dispelled again."""
         self._version = 0
-        self._concluded = False
+        self._disturbed = False
+        """Whether something but a packet left its mark on the graph."""
 
     def receive(self, data: bytes) -> list[bytes]:
         """Take in an encoded packet; returns encoded packets for its sender.
@@ -88,17 +97,27 @@ class Fleet:
 
         Replayed, unless they arrived in it and no earlier result left its mark on the graph.
         """
-        if self._store.arrived_in_canonical_order and not self._concluded:
+        if self._store.arrived_in_canonical_order and not self._disturbed:
             return self._conclude()
         replay = Fleet(self._config, self._seed)
+        for veto in self._vetoes:
+            replay.veto(veto)
         for packet in self._store.canonical():
             replay._admit(packet)
         return replay._conclude()
 
     def _conclude(self) -> FleetResult:
-        self._concluded = True
+        self._disturbed = True
         self._reconsider()
         return conclude(self._store, self._graph, self._ledger, self._maps, self._version)
+
+    def veto(self, veto: Veto) -> None:
+        """From now on these closures count for nothing; maps that only they held together part."""
+        self._vetoes.append(veto)
+        vetoed = [entry for entry in self._ledger if self._is_vetoed(entry)]
+        if any(entry.closure.status is ClosureStatus.ACCEPTED for entry in vetoed):
+            self._disturbed = True
+            self._reconsider()
 
     def closure_counts(self) -> dict[str, int]:
         """Closures so far by kind, for progress displays."""
@@ -155,13 +174,16 @@ class Fleet:
         if self._config.join_maps:
             matcher = self._matcher(place.detector_version)
             matches = matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
-            surprises = [entry for match in matches if (entry := self._accept_or_wait(self._ledger.add(match)))]
+            entries = [self._ledger.add(match) for match in matches]
+            surprises = [entry for entry in entries if not self._is_vetoed(entry) and self._is_surprise(entry)]
             for other in dict.fromkeys(entry.closure.i.robot for entry in surprises):
                 self._judge_pair(other, place.id.robot)
             self._places.setdefault((place.detector_version, place.id.robot), []).append(place.id)
         # A robot alone needs no estimate before the end.
         if len(self._store.robots) > 1 and self._graph.is_due(self._config.solve_every):
-            (self._reconsider if self._doubted else self._optimize)()
+            self._optimize()
+        if self._doubted and len(self._ledger) >= self._patience:
+            self._reconsider()
 
     def _matcher(self, version: str) -> PlaceMatcher:
         if version not in self._matchers:
@@ -193,31 +215,41 @@ class Fleet:
         """The robots that share a map with this one, itself included."""
         return next(robots for robots in self._maps if robot in robots)
 
-    def _accept_or_wait(self, entry: Entry) -> Entry | None:
-        """Accept what fits the joint map; returns the entry if only a cluster may accept it."""
+    def _is_vetoed(self, entry: Entry) -> bool:
+        """Ask the vetoes, and write down what they say."""
+        i, j = entry.closure.i, entry.closure.j
+        stamps = self._store.stamp(i), self._store.stamp(j)
+        entry.vetoed |= any(veto.forbids(i.robot, stamps[0], j.robot, stamps[1]) for veto in self._vetoes)
+        return entry.vetoed
+
+    def _is_surprise(self, entry: Entry) -> bool:
+        """Accept what fits the joint map; tells whether only a cluster may accept it."""
         closure = entry.closure
-        if closure.status is not ClosureStatus.VERIFIED or entry.vetoed:
-            return None
+        if closure.status is not ClosureStatus.VERIFIED:
+            return False
         if closure.i.robot in self._map_of(closure.j.robot):
             off = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
             if np.hypot(off[0], off[1]) < self._config.surprise_m and abs(off[2]) < self._config.surprise_rad:
                 self._accept(entry, "fits the joint map")
-                return None
+                return False
         entry.independent = True  # the map did not predict this
-        return entry
+        return True
 
     def _judge_pair(self, a: str, b: str) -> None:
         """Join two robots' maps, or add to their link, if one cluster of closures dominates."""
         entries = self._ledger.evidence(a, b)
         verdict = judge(entries, (a, b), self._graph, self._config.consistency)
         joined = b in self._map_of(a)
+        members = [entries[k] for k in verdict.members]
+        if joined:
+            held = [entry for entry in entries if entry.closure.status is ClosureStatus.ACCEPTED]
+            outvoted = 2 * sum(entry in members for entry in held) < len(held)
+            self._doubted |= verdict.contested or outvoted
         if not verdict.dominant:
-            self._doubted |= joined and verdict.contested
             for entry in entries:
                 if entry.closure.status is ClosureStatus.VERIFIED:
                     entry.set(ClosureStatus.VERIFIED, verdict.reason)
             return
-        members = [entries[k] for k in verdict.members]
         if not joined:
             self._join(members, a, b)
         reason = f"in the dominant cluster of {len(members)} closures ({verdict.supporters} places apart)"
@@ -249,7 +281,9 @@ class Fleet:
     def _add_local(self, closure: Constraint) -> None:
         """A closure that a robot found within its own map."""
         i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)
-        self._ledger.add_local(closure, self._graph.close(i, j, closure.T_i_j, closure.information))
+        edge = self._graph.close(i, j, closure.T_i_j, closure.information)
+        if self._is_vetoed(self._ledger.add_local(closure, edge)):
+            self._graph.count(edge, holds=False)
 
     def _optimize(self) -> None:
         self._graph.optimize()
@@ -260,7 +294,7 @@ class Fleet:
         self._maps = reconsider(self._graph, self._ledger, self._config.consistency)
         for robots in self._maps:
             self._graph.move(robots, se2.inverse(self._graph.trajectory(robots[0])[0]))
-        self._doubted = False
+        self._doubted, self._patience = False, int(MORE_DOUBTS * len(self._ledger))
         self._version += 1
 
     def _replies(self, packet: Packet) -> list[bytes]:

@@ -36,6 +36,9 @@ class ClosureLedger:
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries)
 
+    def __len__(self) -> int:
+        return len(self._entries)
+
     def add(self, match: PlaceMatch) -> Entry:
         """Book a match as verified or, if geometry does not confirm it, as a candidate."""
         status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
@@ -47,14 +50,16 @@ class ClosureLedger:
         self._entries.append(entry)
         return entry
 
-    def add_local(self, constraint: Constraint, edge: int) -> None:
+    def add_local(self, constraint: Constraint, edge: int) -> Entry:
         """Book a closure that a robot found within its own map; it holds until the joint graph contradicts it."""
         i, j = KeyscanId(constraint.robot, constraint.i), KeyscanId(constraint.robot, constraint.j)
         closure = LoopClosure(
             i, j, Channel.LIDAR, 0.0, constraint.T_i_j, constraint.information, ClosureStatus.ACCEPTED,
             "found by the robot",
         )  # fmt: skip
-        self._entries.append(Entry(closure, independent=False, edge=edge))
+        entry = Entry(closure, independent=False, edge=edge)
+        self._entries.append(entry)
+        return entry
 
     def evidence(self, a: str, b: str) -> list[Entry]:
         """What geometry confirms between two robots without having known how they lie, and nobody vetoed."""

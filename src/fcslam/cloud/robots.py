@@ -132,6 +132,10 @@ class RobotStore:
         end = self._connected[robot] if last is None else last + 1
         return tuple(self._keyscans[robot][first:end])
 
+    def stamp(self, keyscan: KeyscanId) -> float:
+        """When the keyscan was taken."""
+        return self._keyscans[keyscan.robot][keyscan.number].stamp
+
     def laser(self, robot: str) -> LaserModel:
         """The robot's laser."""
         return self._hellos[robot].laser
