@@ -4,6 +4,7 @@ import csv
 import gzip
 import json
 import lzma
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -293,6 +294,25 @@ def test_a_bad_configuration_is_refused(tmp_path, log, capsys, content, reason):
 def test_a_missing_configuration_is_refused(tmp_path, log, capsys):
     arguments = (log, "--config", tmp_path / "none.yaml", "--output", tmp_path / "run")
     assert "cannot read the configuration" in refused(capsys, tmp_path, *arguments)
+
+
+def test_a_veto_parts_the_maps(run, logs, tmp_path, capsys):
+    """A user looks at the run, does not believe two robots' closures, and maps again without them."""
+    names = [path.stem.split(".")[0] for path in logs]
+    vetoes = tmp_path / "vetoes.csv"
+    pairs = [f"{a},,{b}," for a, b in combinations(names, 2)]
+    vetoes.write_text("\n".join(["robot_i,stamp_i,robot_j,stamp_j", *pairs]))
+    assert run_map(*logs, "--output", tmp_path / "run", "--veto", vetoes) == 0
+    assert sorted(maps_of(tmp_path / "run").values()) == list(range(len(logs)))
+    assert maps_of(run) == dict.fromkeys(names, 0)
+    assert "vetoed by hand" in {row["reason"] for row in rows_of(tmp_path / "run" / "closures.csv")}
+    capsys.readouterr()
+
+
+def test_a_veto_of_robots_that_are_not_there_is_refused(tmp_path, log, capsys):
+    vetoes = tmp_path / "vetoes.csv"
+    vetoes.write_text("robot_i,stamp_i,robot_j,stamp_j\nnobody,,robot_1,\n")
+    assert "a veto names 'nobody'" in refused(capsys, tmp_path, log, "--veto", vetoes, "--output", tmp_path / "run")
 
 
 @pytest.mark.parametrize(("force", "reason"), [((), "no run folder"), (("--force",), "no run folder")])
