@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 import small_fleet
+from hypothesis import settings
 
 from fcslam.simulation.drawn_fleet import DrawnFleet, write_fleet
 from fcslam.wire.messages import Packet
+
+# How long an example takes says something of the machine, and of code that is compiled at its first call.
+settings.register_profile("fcslam", deadline=None)
+settings.load_profile("fcslam")
 
 
 @pytest.fixture(scope="session")

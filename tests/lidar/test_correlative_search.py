@@ -61,7 +61,7 @@ def penalised(result, guess, window, scan, config):
     levels=st.integers(1, 6),
     half_side=st.sampled_from([2.0, 6.0]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_best_score_is_that_of_exhaustive_search(seed, radius, angle, levels, half_side):
     """On random worlds; with the small grid, points leave it on every side."""
     rng = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ def test_the_result_lies_in_the_window():
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_every_level_bounds_the_cells_it_covers(seed):
     rng = np.random.default_rng(seed)
     field = field_of([(random_scan(rng, 60, 2.5), np.zeros(3))])

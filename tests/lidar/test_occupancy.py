@@ -48,7 +48,7 @@ def chords(grid, start, end, grow_m):
     return upper - lower
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(beam)
 def test_a_beam_passes_exactly_the_cells_it_crosses(given_beam):
     x, y, heading, length = given_beam
@@ -66,7 +66,7 @@ def test_a_beam_passes_exactly_the_cells_it_crosses(given_beam):
     assert (grid.passes[rows, columns] == 1).all()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(beam)
 def test_a_beam_hits_the_cell_of_its_end(given_beam):
     x, y, heading, length = given_beam
@@ -99,7 +99,7 @@ def test_the_origin_is_the_lower_left_corner():
     assert grid.origin_xy[1] + row * CELL_M <= 5.01 < grid.origin_xy[1] + (row + 1) * CELL_M
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(-4000, 4000), st.integers(-4000, 4000))
 def test_moving_every_pose_by_whole_cells_moves_the_grid(columns, rows):
     scans = room_scans(count=3)
@@ -112,7 +112,7 @@ def test_moving_every_pose_by_whole_cells_moves_the_grid(columns, rows):
     assert (moved.passes != grid.passes).sum() <= 8
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.permutations(range(10)))
 def test_the_order_of_keyscans_does_not_matter(order):
     scans = room_scans(count=5) + room_scans(FRONT, count=5, seed=4)

@@ -58,7 +58,7 @@ INVALID = [np.nan, np.inf, -np.inf, 0.0, -1.0, MAX_RANGE_M, MAX_RANGE_M + 5.0]
 
 
 @given(st.lists(st.sampled_from([*INVALID, 0.5, 3.0, 19.9]), min_size=1, max_size=40))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_only_returns_become_points(found):
     laser = LaserModel(len(found), -1.0, 0.05, MAX_RANGE_M)
     scan = point_scan(frozen(found, np.float32), laser)

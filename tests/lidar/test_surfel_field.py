@@ -27,7 +27,7 @@ def excess(field, queries):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_nearest_agrees_with_a_search_tree(seed):
     """Points too far apart to merge: the label is the nearest to the cell's centre, so within a cell of the nearest."""
     rng = np.random.default_rng(seed)

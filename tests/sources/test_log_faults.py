@@ -197,7 +197,7 @@ def survives(path):
         assert sum(1 for _ in scans_of(source)) <= count
 
 
-fuzz = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+fuzz = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 magic = st.sampled_from(
     [b"", b"\x1f\x8b\x08", b"\xfd7zXZ\x00", b"BZh9", b"FLASER 2 ", b"L 1 2 3 4 5 6 7 8 9 ", b"O 1 2 3 4\n"]
 )

@@ -134,7 +134,7 @@ def test_a_stated_geometry_goes_before_a_guessed_one(tmp_path):
 mountings = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(mountings)
 def test_both_poses_of_the_scans_say_where_the_laser_sits(tmp_path_factory, mounting):
     mounting = tuple(round(value, 3) for value in mounting)

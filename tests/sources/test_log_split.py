@@ -17,7 +17,7 @@ def recording(tmp_path):
     return open_source(save(tmp_path / "run.clf", drive(23)))
 
 
-@settings(max_examples=23, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=23, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(1, 23))
 def test_parts_hold_every_scan_once_in_equal_shares(recording, parts):
     shares = [scans_of(part) for part in split(recording, parts)]
