@@ -28,13 +28,12 @@ def receive(data):
         assert read_label(data).robot == result.robot
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=300))
 def test_random_bytes(data):
     receive(data)
 
 
-@settings(deadline=None, max_examples=500)
+@settings(max_examples=500)
 @given(
     st.sampled_from(VALID),
     st.lists(st.tuples(st.integers(0, 200), st.integers(0, 2), st.binary(min_size=1, max_size=3)), max_size=4),
@@ -46,7 +45,6 @@ def test_mutated_packets(data, edits):
     receive(data)
 
 
-@settings(deadline=None)
 @given(st.sampled_from(VALID), st.data())
 def test_spliced_packets(data, more):
     other = more.draw(st.sampled_from(VALID))
@@ -90,7 +88,7 @@ def values(field):
     }[field.type]
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(messages(pb.Packet.DESCRIPTOR), st.booleans())
 def test_any_protobuf_message(message, known_version):
     message.version = 1 if known_version else message.version

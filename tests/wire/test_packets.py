@@ -16,7 +16,7 @@ from fcslam.wire.messages import Kind, Packet
 from fcslam.wire.packets import Label, decode, encode, read_label
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(packets())
 def test_a_packet_comes_back(sent):
     received = decode(encode(sent))
@@ -30,7 +30,6 @@ def test_a_packet_comes_back(sent):
     assert same(replace(received, body=body), sent)
 
 
-@settings(deadline=None)
 @given(packets())
 def test_what_was_received_is_sent_on_unchanged(sent):
     data = encode(sent)

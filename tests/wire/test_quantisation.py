@@ -5,7 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from wire.strategies import codes
@@ -47,13 +47,11 @@ def test_the_longest_range():
     assert quantise([MAXIMUM_RANGE_M]) == 65535
 
 
-@settings(deadline=None)
 @given(codes())
 def test_packed_ranges_come_back(expected):
     assert np.array_equal(unpack_ranges(pack_ranges(expected)), expected)
 
 
-@settings(deadline=None)
 @given(codes())
 def test_packed_ranges_are_zigzag_varints_of_differences(expected):
     """Read by a plain reader of the published rules."""
@@ -123,7 +121,6 @@ def test_a_decompression_bomb_costs_no_memory():
         tracemalloc.stop()
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=60), st.booleans())
 def test_any_bytes_are_ranges_or_refused(data, compress):
     try:
