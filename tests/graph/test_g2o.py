@@ -91,3 +91,11 @@ def test_ids_must_fit(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="different ids"):
             write_g2o(tmp_path / "a.g2o", graph, ids)
     assert np.isfinite(graph.poses()).all()
+
+
+def test_a_second_edge_between_consecutive_vertices_is_a_closure(tmp_path) -> None:
+    """A false loop may join two neighbours: trusted as odometry it would tear the graph."""
+    (path := tmp_path / "graph.g2o").write_text(
+        "EDGE_SE2 0 1 1 0 0 9 0 0 9 0 9\nEDGE_SE2 1 2 1 0 0 9 0 0 9 0 9\nEDGE_SE2 1 0 5 5 1 9 0 0 9 0 9\n"
+    )
+    assert [edge.robust for edge in read_g2o(path).graph.edges] == [False, False, True]

@@ -14,8 +14,9 @@ _UNMEASURED = 1e6
 
 
 def solve_alone(graph: PoseGraph, consistency: ConsistencySettings, gnc: GncSettings | None = None) -> Solution:
-    """Robust poses of one robot's graph, its variables in the order of its path: the cheaper of two solutions.
+    """Robust poses of one robot's graph, its variables in the order of its path: the cheapest of three solutions.
 
+    - All closures decided by the odometry: right while it has drifted less than closures are uncertain.
     - Graduated non-convexity with every closure, from the odometry: right while false closures are few, or small.
     - The same with those closures only that have witnesses (:func:`fcslam.graph.consistency.witnesses`), then all
       decided by that solution: right where false closures stand alone, however many and however far they reach.
@@ -24,8 +25,9 @@ def solve_alone(graph: PoseGraph, consistency: ConsistencySettings, gnc: GncSett
     """
     robust = graph.arrays().robust
     odometry = initialize(graph, (~robust).astype(float))
+    by_odometry = settle(graph, odometry, ~robust, settings=gnc)
     if not robust.any():
-        return settle(graph, odometry, np.ones(len(graph.edges)), settings=gnc)
+        return by_odometry
     borne_out = ~robust
     edges = graph.arrays()
     closures = Closures(edges.i[robust], edges.j[robust], edges.T_i_j[robust], edges.information[robust])
@@ -35,6 +37,7 @@ def solve_alone(graph: PoseGraph, consistency: ConsistencySettings, gnc: GncSett
     weights = np.zeros(len(robust))
     weights[borne_out] = first.weights
     solutions = (
+        by_odometry,
         settle(graph, first.poses, weights, settings=gnc),
         optimize_gnc(graph, odometry, settings=gnc),
     )

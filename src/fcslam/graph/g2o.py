@@ -4,7 +4,8 @@
     EDGE_SE2 i j x y theta xx xy xt yy yt tt    EDGE2 i j x y theta xx xy yy tt xt yt   (TORO)
     FIX id ...
 
-The formats do not say which edges may be false: one between consecutive ids is read as odometry, others as closures.
+The formats do not say which edges may be false: the first between two consecutive ids is read as odometry, all others as
+closures.
 """
 
 import gzip
@@ -140,11 +141,15 @@ def _assemble(content: _Content, path: Path) -> G2oGraph:
     ids = tuple(sorted(poses))
     number_of = {name: number for number, name in enumerate(ids)}
     graph = PoseGraph([poses[name] for name in ids])
+    odometry: set[tuple[int, int]] = set()
     for line, edge in content.edges:
         missing = [name for name in (edge.i, edge.j) if name not in number_of]
         if missing:
             raise InputError(f"{path}: line {line}: the edge names vertex {missing[0]}, which no line gives")
-        graph.add_edge(Edge(number_of[edge.i], number_of[edge.j], edge.T_i_j, edge.information, edge.robust))
+        ends = min(edge.i, edge.j), max(edge.i, edge.j)
+        robust = edge.robust or ends in odometry
+        odometry.add(ends)
+        graph.add_edge(Edge(number_of[edge.i], number_of[edge.j], edge.T_i_j, edge.information, robust))
     unknown = set(content.fixed) - set(ids)
     if unknown:
         raise InputError(f"{path}: FIX names vertex {min(unknown)}, which no line gives")
