@@ -221,7 +221,8 @@ def csail_row(folder: Path) -> tuple:
     return (
         len(set(solution.maps)), rmse(solution.poses, optimum), int(solution.weights[true].sum()), int(true.sum()),
         int(solution.weights[false].sum()), int(false.sum()), seconds,
-        rmse(optimize(graph, initialize(graph)).poses, optimum), rmse(optimize_gnc(graph, odometry(graph)).poses, optimum),
+        rmse(optimize(graph, initialize(graph)).poses, optimum),
+        rmse(optimize_gnc(graph, odometry(graph)).poses, optimum),
     )  # fmt: skip
 
 
