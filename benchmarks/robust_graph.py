@@ -3,10 +3,10 @@
     FCSLAM_DATA=/path/to/data python benchmarks/robust_graph.py
     FCSLAM_DATA=/path/to/data python benchmarks/robust_graph.py --gtsam    # and GTSAM's own GNC, minutes more
 
-Several robots: the INTEL graph is cut into 3 robots of equal length, each in an odometry frame of its own. False
-closures between robots are added until they are the stated share of all closures between robots. A false closure claims
-that two places of different robots are one, up to N(0, 0.3 m) and N(0, 10 deg), with the information of a random true
-closure:
+Several robots: the INTEL graph is cut into 3 robots of equal length, each in an odometry frame of its own; the odometry
+from the end of one to the beginning of the next is left out. False closures between robots are added until they are the
+stated share of all closures between robots. A false closure claims that two places of different robots are one, up to
+N(0, 0.3 m) and N(0, 10 deg), with the information of a random true closure:
 
 - random: two places drawn at random;
 - local: two places that truly are 1 to 5 m apart, so that the lie is small;
@@ -37,6 +37,7 @@ import common
 import gtsam
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.alone import solve_alone
@@ -104,7 +105,8 @@ def load(folder: Path, name: str) -> PoseGraph:
 # Several robots
 
 
-def joint_runs(name: str, clean: PoseGraph, seeds: int) -> list[tuple]:
+def joint_runs(name: str, whole: PoseGraph, seeds: int) -> list[tuple]:
+    clean = cut(whole, robot_of(whole))
     optimum = optimize_gnc(clean, initialize_robust(clean)).poses
     return [
         (name, share, kind, seed, *joint_run(clean, optimum, share, kind, seed))
@@ -114,9 +116,18 @@ def joint_runs(name: str, clean: PoseGraph, seeds: int) -> list[tuple]:
     ]
 
 
+def robot_of(graph: PoseGraph) -> NDArray[np.int64]:
+    return np.arange(len(graph)) * ROBOTS // len(graph)
+
+
+def cut(graph: PoseGraph, robot: NDArray[np.int64]) -> PoseGraph:
+    """The graph without the odometry from the end of one robot to the beginning of the next."""
+    return PoseGraph(graph.poses(), [edge for edge in graph.edges if edge.robust or robot[edge.i] == robot[edge.j]])
+
+
 def joint_run(clean: PoseGraph, optimum: FloatArray, share: float, kind: str, seed: int) -> tuple:
     rng = np.random.default_rng(seed)
-    robot = np.arange(len(clean)) * ROBOTS // len(clean)
+    robot = robot_of(clean)
     edges = clean.arrays()
     true = np.flatnonzero(edges.robust & (robot[edges.i] != robot[edges.j]))
     lies = draw_lies(clean, optimum, round(len(true) * share / (1.0 - share)), kind, rng)
@@ -161,7 +172,7 @@ def summary(key: tuple, runs: list[tuple]) -> tuple:
 
 
 def draw_lies(graph: PoseGraph, optimum: FloatArray, count: int, kind: str, rng: Generator) -> list[Edge]:
-    robot = np.arange(len(graph)) * ROBOTS // len(graph)
+    robot = robot_of(graph)
     edges = graph.arrays()
     models = np.flatnonzero(edges.robust & (robot[edges.i] != robot[edges.j]))
     draw = {"random": random_lies, "local": local_lies, "groups": group_lies}[kind]
@@ -175,19 +186,19 @@ def draw_lies(graph: PoseGraph, optimum: FloatArray, count: int, kind: str, rng:
     return lies[:count]
 
 
-def random_lies(optimum: FloatArray, robot: np.ndarray, _information: FloatArray, rng: Generator) -> list[tuple]:
+def random_lies(optimum: FloatArray, robot: NDArray[np.int64], _information: FloatArray, rng: Generator) -> list[tuple]:
     i, j = rng.integers(0, len(optimum), 2).tolist()
     return [(i, j, lie(rng))] if robot[i] != robot[j] else []
 
 
-def local_lies(optimum: FloatArray, robot: np.ndarray, _information: FloatArray, rng: Generator) -> list[tuple]:
+def local_lies(optimum: FloatArray, robot: NDArray[np.int64], _information: FloatArray, rng: Generator) -> list[tuple]:
     i = int(rng.integers(len(optimum)))
     distance = np.hypot(*(optimum[:, :2] - optimum[i, :2]).T)
     near = np.flatnonzero((robot != robot[i]) & (distance > 1.0) & (distance < 5.0))
     return [(i, int(rng.choice(near)), lie(rng))] if len(near) else []
 
 
-def group_lies(optimum: FloatArray, robot: np.ndarray, information: FloatArray, rng: Generator) -> list[tuple]:
+def group_lies(optimum: FloatArray, robot: NDArray[np.int64], information: FloatArray, rng: Generator) -> list[tuple]:
     i, j = rng.integers(0, len(optimum), 2).tolist()
     rows = [(i + k, j + k) for k in range(GROUP) if max(i, j) + k < len(optimum)]
     rows = [(a, b) for a, b in rows if robot[a] == robot[i] != robot[j] == robot[b]]
@@ -206,7 +217,8 @@ def lie(rng: Generator) -> FloatArray:
 
 
 def csail_row(folder: Path) -> tuple:
-    clean, graph = (read_g2o(folder / "posegraph-multirobot" / name).graph for name in CSAIL_FILES)
+    whole = [read_g2o(folder / "posegraph-multirobot" / name).graph for name in CSAIL_FILES]
+    clean, graph = (cut(graph, (np.arange(len(graph)) >= CSAIL_FIRST).astype(np.int64)) for graph in whole)
     optimum = optimize_gnc(clean, initialize_robust(clean)).poses
     known = {(edge.i, edge.j, *edge.T_i_j) for edge in clean.edges}
     robust = graph.arrays().robust
