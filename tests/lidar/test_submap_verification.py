@@ -143,3 +143,34 @@ def test_one_wall_is_fixed_in_one_direction_only(slope):
     flat = np.hypot(*a.surface.normals.T) > 0
     assert np.trace(found.normal_tensor[:2, :2]) == pytest.approx(flat.sum())
     assert found.weakest < 0.05 * np.trace(found.normal_tensor)
+
+
+def walking_along(waypoints, seed, stride_m=0.35):
+    """As ``submap_along`` in the room, with somebody who walks beside the robot."""
+    rng = np.random.default_rng(seed)
+    poses = [np.array(pose) for pose in waypoints]
+    anchor = poses[len(poses) // 2]
+    scans = []
+    for k, pose in enumerate(poses):
+        x, y = -1.6 + stride_m * k, 1.4
+        walls = np.vstack((room(), box(x, y, x + 0.3, y + 0.4)))
+        scans.append((scan_at(pose, walls, noise_m=0.01, rng=rng), se2.between(anchor, pose)))
+    return build_submap(scans), anchor
+
+
+def test_somebody_who_walks_by_leaves_no_trace(same_room):
+    """Where one scan had a return and many others looked through, nothing stands; the walls lose next to nothing."""
+    quiet, _ = submap_along(WEST, room(), 3)
+    walked, anchor = walking_along(WEST, 3)
+    where = se2.transform(anchor, walked.surface.points)
+    trail = (where[:, 0] > -1.8) & (where[:, 0] < 1.8) & (where[:, 1] > 1.3) & (where[:, 1] < 1.9)
+    assert trail.mean() < 0.02
+    assert len(walked.surface) > 0.9 * len(quiet.surface)
+    other, anchor_other = same_room[1]
+    assert verify(walked, other, se2.between(anchor, anchor_other), CONFIG).strict
+
+
+def test_somebody_who_stands_is_part_of_the_place():
+    stood, anchor = walking_along(WEST, 3, stride_m=0.0)
+    where = se2.transform(anchor, stood.surface.points)
+    assert (np.hypot(where[:, 0] + 1.45, where[:, 1] - 1.6) < 0.4).sum() >= 5

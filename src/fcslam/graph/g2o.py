@@ -4,8 +4,8 @@
     EDGE_SE2 i j x y theta xx xy xt yy yt tt    EDGE2 i j x y theta xx xy yy tt xt yt   (TORO)
     FIX id ...
 
-The formats do not say which edges may be false: the first between two consecutive ids is read as odometry, all others as
-closures.
+The formats do not say which edges may be false: the first between two consecutive ids is read as odometry, all others
+as closures.
 """
 
 import gzip

@@ -20,6 +20,10 @@ RADIUS_M: Final = 30.0
 """Surfaces and free space farther than this from the anchor are left out: distant ones are seen too sparsely."""
 SPACING_M: Final = 0.1
 """Surfaces are compared at points this far apart."""
+SEEN_THROUGH: Final = 3
+"""Scans whose beams passed where others had a return before that is taken for something that moved ..."""
+SEEN_THROUGH_RATIO: Final = 2
+"""... if they are more than so many times those that had the return: walls seen at a grazing angle are passed, too."""
 EXPLAINED_M: Final = 0.15
 VIOLATION_M: Final = 0.30
 LEVER_M: Final = 3.0
@@ -41,7 +45,7 @@ class Submap:
 
     field: SurfelField
     surface: PointScan
-    """The surfels, about 0.1 m apart."""
+    """The surfels, about 0.1 m apart, without those that later or earlier beams passed through: people who walk by."""
     free: FreeSpace
 
 
@@ -50,9 +54,12 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
     near = [(_near(scan, pose), pose) for scan, pose in scans]
     field = field_of(near)
     surface = _spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
-    free = _free_space(near, surface.points)
+    passes, hits, corner = _beam_counts(near, surface.points)
+    column, row = np.floor((surface.points - corner) / FREE_CELL_M).astype(np.int64).T
+    passed, hit = passes[row, column], hits[row, column]
+    moved = (passed >= SEEN_THROUGH) & (passed > SEEN_THROUGH_RATIO * hit)
     field.compact()
-    return Submap(field, surface, free)
+    return Submap(field, surface.only(~moved), FreeSpace(passes > 0, corner))
 
 
 def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
@@ -62,28 +69,36 @@ def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
     return (scan if inside.all() else scan.only(inside)).thinned(CELL_M)
 
 
-def _free_space(scans: Sequence[tuple[PointScan, FloatArray]], surface: FloatArray) -> FreeSpace:
+def _beam_counts(
+    scans: Sequence[tuple[PointScan, FloatArray]], surface: FloatArray
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16], FloatArray]:
+    """Scans that passed each cell and scans that had a return in it, shape (H, W), and the cells' lower left corner."""
     poses = np.array([pose for _, pose in scans]).reshape(-1, 3)
     around = np.concatenate([surface, poses[:, :2]]) if len(surface) else poses[:, :2]
     corner = around.min(axis=0) - FREE_CELL_M
     columns, rows = np.ceil((around.max(axis=0) - corner) / FREE_CELL_M).astype(np.int64) + 1
-    cells = np.zeros((rows, columns), np.bool_)
-    for scan, pose in scans:
-        _clear(scan.points, scan.origin, pose, corner, cells)
-    return FreeSpace(cells, corner)
+    passes, hits = np.zeros((2, rows, columns), np.uint16)
+    latest = np.full((2, rows, columns), -1, np.int32)
+    for number, (scan, pose) in enumerate(scans):
+        _count_beams(scan.points, scan.origin, pose, corner, number, latest, passes, hits)
+    return passes, hits, corner
 
 
 @njit(cache=True)
-def _clear(points, origin, T, corner, cells):  # type: ignore[no-untyped-def]
-    """Mark the cells between the laser and each return, short of the return itself."""
+def _count_beams(points, origin, T, corner, number, latest, passes, hits):  # type: ignore[no-untyped-def]
+    """Count a scan once in each cell between the laser and a return, short of the return, and in the return's."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
     x0 = T[0] + cos * origin[0] - sin * origin[1] - corner[0]
     y0 = T[1] + sin * origin[0] + cos * origin[1] - corner[1]
-    rows, columns = cells.shape
+    rows, columns = passes.shape
     for i in range(len(points)):
         px, py = points[i, 0] - origin[0], points[i, 1] - origin[1]
         dx = cos * px - sin * py
         dy = sin * px + cos * py
+        x, y = int(np.floor((x0 + dx) / FREE_CELL_M)), int(np.floor((y0 + dy) / FREE_CELL_M))
+        if x >= 0 and y >= 0 and x < columns and y < rows and latest[1, y, x] != number:
+            latest[1, y, x] = number
+            hits[y, x] += 1
         length = np.hypot(dx, dy)
         steps = int((length - FREE_MARGIN_M) / FREE_CELL_M)
         if steps <= 0:
@@ -92,8 +107,9 @@ def _clear(points, origin, T, corner, cells):  # type: ignore[no-untyped-def]
         for k in range(steps + 1):
             x = int(np.floor(x0 / FREE_CELL_M + k * ux))
             y = int(np.floor(y0 / FREE_CELL_M + k * uy))
-            if x >= 0 and y >= 0 and x < columns and y < rows:
-                cells[y, x] = True
+            if x >= 0 and y >= 0 and x < columns and y < rows and latest[0, y, x] != number:
+                latest[0, y, x] = number
+                passes[y, x] += 1
 
 
 def _spaced(surfels: PointScan) -> PointScan:
