@@ -1,5 +1,7 @@
 """Recordings in, sensor records out: ``open_source(path)`` knows every format."""
 
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.writer import write_bag
 from fcslam.sources.carmen_writer import write_carmen
 from fcslam.sources.faults import Fault, Faults, Tally
 from fcslam.sources.opening import FORMATS, Format, open_source
@@ -9,6 +11,7 @@ from fcslam.sources.split import split
 __all__ = [
     "FORMATS",
     "WHOLE",
+    "BagOptions",
     "Fault",
     "Faults",
     "Format",
@@ -18,5 +21,6 @@ __all__ = [
     "Tally",
     "open_source",
     "split",
+    "write_bag",
     "write_carmen",
 ]

@@ -1,0 +1,202 @@
+"""A bag as a stream of raw messages, whatever file or folder holds them.
+
+Of rosbags the readers are used, not the definitions that a bag carries: the few types that are read have had one
+layout for as long as there are bags, and a strange definition of another topic cannot spoil a recording.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from fcslam.errors import SourceError
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
+
+SCAN, ODOMETRY, TRANSFORMS = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "tf2_msgs/TFMessage"
+"""The types that are read."""
+
+_OLD_TRANSFORMS = "tf/tfMessage"
+_ROS1, _MCAP, _SQLITE = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
+_METADATA = "metadata.yaml"
+_LONGEST_REASON = 200
+
+
+class Topic(NamedTuple):
+    """A topic of a bag."""
+
+    name: str
+    type: str
+    """Without ``msg/``, as ROS 1 writes it."""
+    message_count: int
+
+
+class RawMessage(NamedTuple):
+    """One message, not decoded."""
+
+    topic: Topic
+    number: int
+    """Counts the topic's messages from 1."""
+    bag_time_ns: int
+    """When it was recorded."""
+    payload: bytes
+
+
+class _Reader(Protocol):
+    """What the readers of rosbags have in common."""
+
+    @property
+    def connections(self) -> "list[Connection]": ...
+
+    def open(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def messages(self, connections: "Collection[Connection]") -> "Iterator[tuple[Connection, int, bytes]]": ...
+
+
+def is_bag(path: Path, head: bytes) -> bool:
+    """Whether there is a bag at ``path``, a file that starts with ``head`` or a folder."""
+    if path.is_dir():
+        return (path / _METADATA).is_file() or any(_storage_files(path))
+    return head.startswith((_ROS1, _MCAP, _SQLITE))
+
+
+@dataclass(frozen=True)
+class BagFile:
+    """A bag; every pass over its messages opens it anew."""
+
+    path: Path
+
+    @cached_property
+    def topics(self) -> tuple[Topic, ...]:
+        """Sorted by name; a topic of two types is two of them.
+
+        Raises:
+            SourceError: the bag is empty, damaged or has no index.
+        """
+        counts: Counter[tuple[str, str]] = Counter()
+        with self._opened() as reader:
+            for connection in reader.connections:
+                counts[connection.topic, _type_of(connection)] += connection.msgcount
+        return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+    def messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
+        """The messages of ``topics`` in the order in which they were recorded, at equal times in that of ``topics``.
+
+        Memory does not depend on the bag's length, but for the index of a ROS 1 bag.
+
+        Raises:
+            SourceError: the bag cannot be read to its end.
+        """
+        order = {(topic.name, topic.type): topic for topic in topics}
+        numbers: Counter[Topic] = Counter()
+        with self._opened() as reader:
+            named = [(connection.topic, _type_of(connection), connection) for connection in reader.connections]
+            chosen = [connection for key in order for *names, connection in named if tuple(names) == key]
+            topic_of = {connection.id: order[connection.topic, _type_of(connection)] for connection in chosen}
+            if not chosen:
+                return
+            for connection, bag_time_ns, payload in reader.messages(chosen):
+                topic = topic_of[connection.id]
+                numbers[topic] += 1
+                yield RawMessage(topic, numbers[topic], bag_time_ns, payload)
+
+    def decode(self, message: RawMessage) -> Any:
+        """The message as an object of rosbags.
+
+        Raises:
+            ValueError: its bytes are no message of its type.
+        """
+        kind = "tf2_msgs/TFMessage" if message.topic.type == _OLD_TRANSFORMS else message.topic.type
+        name = kind.replace("/", "/msg/")
+        store = typestore(self._is_ros1)
+        try:
+            if self._is_ros1:
+                return store.deserialize_ros1(message.payload, name)
+            return store.deserialize_cdr(message.payload, name)
+        except Exception as error:  # generated code that meets foreign bytes raises whatever it meets
+            raise ValueError("the bytes are no message of this type") from error
+
+    @cached_property
+    def _magic(self) -> bytes:
+        if self.path.is_dir():
+            return b""
+        with self.path.open("rb") as file:
+            return file.read(len(_SQLITE))
+
+    @property
+    def _is_ros1(self) -> bool:
+        return self._magic.startswith(_ROS1)
+
+    @contextmanager
+    def _opened(self) -> Iterator[_Reader]:
+        """A reader; whatever it raises becomes one clear line. rosbags' parsers raise many things on damaged files."""
+        try:
+            reader = _reader(self.path, self._magic)
+            reader.open()
+            try:
+                yield reader
+            finally:
+                reader.close()
+        except SourceError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split())[:_LONGEST_REASON].rstrip(".") or type(error).__name__
+            raise SourceError(f"{self.path}: the bag cannot be read ({reason}); {self._remedy()}") from error
+
+    def _remedy(self) -> str:
+        if self._is_ros1:
+            return "copy it again, or mend it with `rosbag reindex`"
+        if self._magic.startswith(_MCAP):
+            return "copy it again, or mend it with `mcap recover`"
+        return "copy it again, or mend it with `ros2 bag reindex`"
+
+
+def is_transforms(topic: Topic) -> bool:
+    """Whether the topic carries tf."""
+    return topic.type in (TRANSFORMS, _OLD_TRANSFORMS)
+
+
+def _reader(path: Path, magic: bytes) -> _Reader:
+    from rosbags import rosbag1, rosbag2
+
+    if path.is_dir():
+        if not (path / _METADATA).is_file():
+            raise SourceError(
+                f"{path}: has bag files and no {_METADATA}; give one of the files, or make it with `ros2 bag reindex`"
+            )
+        return rosbag2.Reader(path)
+    if magic.startswith(_ROS1):
+        return rosbag1.Reader(path)
+    for start, plugin in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
+        if magic.startswith(start):
+            return rosbag2.Reader.STORAGE_PLUGINS[plugin](path)
+    raise SourceError(f"{path}: the whole bag is compressed; unpack it first")
+
+
+def _storage_files(folder: Path) -> Iterator[Path]:
+    return (path for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
+
+
+def _type_of(connection: "Connection") -> str:
+    kind = connection.msgtype.replace("/msg/", "/")
+    encoding = getattr(connection.ext, "serialization_format", "cdr")
+    return kind if encoding == "cdr" else f"{kind} as {encoding}"
+
+
+@cache
+def typestore(ros1: bool) -> "Typestore":
+    """The types that are read and written, as ROS 1 or ROS 2 lays them out."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if not ros1:
+        return get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return store
