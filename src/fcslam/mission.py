@@ -113,7 +113,9 @@ def _check_robots(sources: Sequence[Source]) -> None:
     names = [source.name for source in sources]
     for name in names:
         if names.count(name) > 1:
-            raise SourceError(f"two recordings are called '{name}'; a robot is named by its file, so name one: NAME=LOG")
+            raise SourceError(
+                f"two recordings are called '{name}'; a robot is named by its file, so name one: NAME=LOG"
+            )
         try:
             check_name(name, "robot")
         except PacketError as error:

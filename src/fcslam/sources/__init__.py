@@ -1,7 +1,7 @@
 """Recordings in, sensor records out: ``open_source(path)`` knows every format."""
 
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.writer import write_bag
+from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.carmen_writer import write_carmen
 from fcslam.sources.faults import Fault, Faults, Tally
 from fcslam.sources.opening import FORMATS, Format, open_source
@@ -9,6 +9,7 @@ from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 from fcslam.sources.split import split
 
 __all__ = [
+    "BAG_SUFFIXES",
     "FORMATS",
     "WHOLE",
     "BagOptions",

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
 
-ROS1_SUFFIX, MCAP_SUFFIX, SQLITE_SUFFIX = ".bag", ".mcap", ".db3"
+_ROS1, _MCAP, _SQLITE, _FOLDER = ".bag", ".mcap", ".db3", ""
+BAG_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
+"""The kinds of bags that can be written: ROS 1, two files of ROS 2, and a folder of ROS 2."""
 
 _ODOM, _BASE, _LASER = "odom", "base_link", "laser"
 _TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, "/scan": SCAN}
@@ -53,18 +55,18 @@ def _opened(path: Path) -> Iterator["_Bag"]:
     """A bag to write to, which takes its place when it is complete."""
     from rosbags import rosbag1, rosbag2
 
-    if path.suffix not in (ROS1_SUFFIX, MCAP_SUFFIX, SQLITE_SUFFIX, ""):
+    if path.suffix not in BAG_SUFFIXES:
         raise OutputError(f"{path}: no kind of bag; end it in .bag, .mcap or .db3, or in nothing for a folder")
     with TemporaryDirectory(prefix=".", dir=path.parent) as staging:
         place = Path(staging, path.stem)
-        if path.suffix == ROS1_SUFFIX:
+        if path.suffix == _ROS1:
             with rosbag1.Writer(place) as writer1:
                 yield _Bag(writer1, ros1=True)
         else:
-            plugin = rosbag2.StoragePlugin.SQLITE3 if path.suffix == SQLITE_SUFFIX else rosbag2.StoragePlugin.MCAP
+            plugin = rosbag2.StoragePlugin.SQLITE3 if path.suffix == _SQLITE else rosbag2.StoragePlugin.MCAP
             with rosbag2.Writer(place, version=9, storage_plugin=plugin) as writer2:
                 yield _Bag(writer2, ros1=False)
-        whole = place / f"{place.name}{path.suffix}" if path.suffix in (MCAP_SUFFIX, SQLITE_SUFFIX) else place
+        whole = place / f"{place.name}{path.suffix}" if path.suffix in (_MCAP, _SQLITE) else place
         whole.replace(path)
 
 
@@ -78,14 +80,18 @@ class _Bag:
         self._connections = {topic: self._connect(topic, kind) for topic, kind in _TOPICS.items()}
         self._bag_time_ns = -1
         self._has_laser = False
+        self._latest_reading: tuple[float, ...] = ()
 
     def write(self, record: SensorRecord) -> None:
         """Write what one record says: its odometry, and its scan if it is one."""
         stamp_ns = _nanoseconds(record.stamp)
         self._bag_time_ns = max(self._bag_time_ns + 1, stamp_ns)
-        odom, pose = self._header(stamp_ns, _ODOM), record.T_odom_base
-        self._put("/odom", self._odometry(odom, pose))
-        self._put("/tf", self._transforms(odom, _BASE, pose))
+        reading = (stamp_ns, *record.T_odom_base.tolist())
+        if reading != self._latest_reading:
+            odom = self._header(stamp_ns, _ODOM)
+            self._put("/odom", self._odometry(odom, record.T_odom_base))
+            self._put("/tf", self._transforms(odom, _BASE, record.T_odom_base))
+            self._latest_reading = reading
         if isinstance(record, LaserScan):
             if not self._has_laser:
                 mounting = np.array(record.laser.T_base_laser)
