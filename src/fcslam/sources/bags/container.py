@@ -25,6 +25,7 @@ _OLD_TRANSFORMS = "tf/tfMessage"
 _ROS1, _MCAP, _SQLITE = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
 _METADATA = "metadata.yaml"
 _LONGEST_REASON = 200
+_SQLITE_HEADER_BYTES = 100
 
 
 class Topic(NamedTuple):
@@ -174,10 +175,23 @@ def _reader(path: Path, magic: bytes) -> _Reader:
         return rosbag2.Reader(path)
     if magic.startswith(_ROS1):
         return rosbag1.Reader(path)
+    if magic.startswith(_SQLITE):
+        _check_length(path)
     for start, plugin in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
         if magic.startswith(start):
             return rosbag2.Reader.STORAGE_PLUGINS[plugin](path)
     raise SourceError(f"{path}: the whole bag is compressed; unpack it first")
+
+
+def _check_length(database: Path) -> None:
+    """Refuse a truncated database: SQLite takes what is missing at its end for empty if nothing points there."""
+    with database.open("rb") as file:
+        header = file.read(_SQLITE_HEADER_BYTES)
+    page_bytes, changes, pages, counted_at = (
+        int.from_bytes(header[start:end], "big") for start, end in ((16, 18), (24, 28), (28, 32), (92, 96))
+    )
+    if changes == counted_at and database.stat().st_size < page_bytes * pages:
+        raise ValueError("the file is truncated")
 
 
 def _storage_files(folder: Path) -> Iterator[Path]:

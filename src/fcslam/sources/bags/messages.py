@@ -1,7 +1,7 @@
 """What the messages of a bag say, checked: hostile or broken ones are refused with a ValueError."""
 
 from collections.abc import Iterator
-from math import inf, isfinite, pi
+from math import degrees, inf, isfinite, pi, radians
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,12 +67,13 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     """A laser scan; one whose beams turn to the right is turned round."""
     ranges = np.asarray(content.ranges, dtype=np.float32)
     count = len(ranges)
-    first_rad, increment_rad = float(content.angle_min), float(content.angle_increment)
+    first_rad, increment_rad = _angle_rad(content.angle_min), _angle_rad(content.angle_increment)
     range_min_m, range_max_m = float(content.range_min), float(content.range_max)
     span_rad = (count - 1) * increment_rad
     if not (count >= 2 and abs(first_rad) <= _FULL_TURN_RAD and 0.0 < abs(span_rad) < _FULL_TURN_RAD):
         raise ValueError("no sane field of view")
-    if not range_max_m > 0.0:
+    range_min_m = range_min_m if range_min_m > 0.0 else 0.0
+    if not range_max_m > range_min_m:
         raise ValueError("no sane range")
     if increment_rad < 0.0:
         first_rad, increment_rad, ranges = first_rad + span_rad, -increment_rad, ranges[::-1]
@@ -87,7 +88,7 @@ def measured_ranges(scan: ScanMessage) -> Ranges:
     """
     raw = scan.raw_ranges_m
     ranges: Ranges = np.where(raw >= np.float32(scan.range_max_m), np.float32(inf), raw)
-    ranges[~(raw >= np.float32(max(scan.range_min_m, 0.0)))] = np.nan
+    ranges[~(raw >= np.float32(scan.range_min_m))] = np.nan
     return ranges
 
 
@@ -105,6 +106,12 @@ def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
         stamp, parent = _header(entry.header, bag_time_ns)
         transform = _transform(entry.transform.translation, entry.transform.rotation)
         yield StampedTransform(stamp, parent, _frame(entry.child_frame_id), transform)
+
+
+def _angle_rad(single: float) -> float:
+    """The angle that was rounded to single precision: most lasers count in whole ten-thousandths of a degree."""
+    rounded = radians(round(degrees(single), 4)) if isfinite(single) else single
+    return rounded if np.float32(rounded) == np.float32(single) else float(single)
 
 
 def _header(header: Any, bag_time_ns: int) -> tuple[float, str]:

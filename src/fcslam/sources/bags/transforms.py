@@ -48,9 +48,9 @@ def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
 
 
 def planar(transform: Transform) -> Pose:
-    """The pose on the floor: x, y, and the heading of the x axis."""
+    """The pose on the floor: x, y, and the heading of the x axis to a nanoradian, free of a quaternion's rounding."""
     x_axis = rotated(transform.rotation, (1.0, 0.0, 0.0))
-    return transform.translation_m[0], transform.translation_m[1], atan2(x_axis[1], x_axis[0])
+    return transform.translation_m[0], transform.translation_m[1], round(atan2(x_axis[1], x_axis[0]), 9)
 
 
 def mounting(T_base_laser: Transform) -> Mounting:
