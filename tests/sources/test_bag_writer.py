@@ -41,7 +41,7 @@ def recordings(draw):
     return records
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(recordings(), st.sampled_from(KINDS))
 def test_what_is_written_reads_back_to_the_last_bit(tmp_path_factory, records, name):
     path = tmp_path_factory.mktemp("bag") / name

@@ -69,7 +69,7 @@ def _candidates(
 
 def _note(bag: BagFile, what: str, option: str, chosen: Topic, candidates: Sequence[Topic]) -> list[str]:
     others = ", ".join(topic.name for topic in candidates if topic != chosen)
-    return [f"{bag.path}: {what} are read from {chosen.name}, not from {others} ({option} chooses)"] if others else []
+    return [f"{bag.path}: reads {what} from {chosen.name}, not from {others} ({option} chooses)"] if others else []
 
 
 def _known(topics: Sequence[Topic]) -> str:
