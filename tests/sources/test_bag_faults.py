@@ -3,6 +3,7 @@
 import gzip
 import math
 import shutil
+import sqlite3
 import struct
 import warnings
 from contextlib import suppress
@@ -278,9 +279,41 @@ def test_folders(tmp_path):
     assert "ros2 bag reindex" in refusal(bag)
 
 
-def test_a_database_that_is_no_bag(tmp_path):
-    import sqlite3
+@pytest.mark.parametrize("name", ["run.db3", "folder"])
+def test_a_database_that_was_not_closed(tmp_path, name):
+    """As when the recorder was killed: what came last is in the journal beside it."""
+    database = save(tmp_path / "run.db3", drive(20))
+    if name == "folder":
+        (tmp_path / "folder").mkdir()
+        database = database.rename(tmp_path / "folder" / "run.db3")
+        (tmp_path / "folder" / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    writer = sqlite3.connect(database)
+    writer.execute("pragma journal_mode=wal")
+    writer.execute("insert into messages (topic_id, timestamp, data) values (1, 1, x'00')")
+    writer.commit()
+    with pytest.raises(SourceError, match=r"was not closed, run\.db3-wal holds its end; close it with"):
+        open_source(tmp_path / name).survey()
+    writer.close()
 
+
+def test_an_old_database_without_definitions(tmp_path):
+    """As the first ROS 2 recorded: neither a schema table nor message definitions."""
+    database = sqlite3.connect(save(tmp_path / "run.db3", drive(20)))
+    for command in (
+        "drop table schema",
+        "drop table message_definitions",
+        "drop table metadata",
+        "alter table topics drop column type_description_hash",
+        "alter table topics drop column offered_qos_profiles",
+        "drop index timestamp_idx",
+    ):
+        database.execute(command)
+    database.commit()
+    database.close()
+    assert open_source(tmp_path / "run.db3").survey().scan_count == 20
+
+
+def test_a_database_that_is_no_bag(tmp_path):
     with sqlite3.connect(tmp_path / "run.db3") as database:
         database.execute("create table messages (id integer)")
     database.close()

@@ -74,6 +74,11 @@ def test_content_decides_not_the_name(tmp_path, name):
     assert open_source(bag).survey().scan_count == 12
 
 
+@pytest.mark.parametrize("name", ["a b#c%20d?e.db3", "a b#c%20d?e.mcap", "a b#c%20d?e.bag", "läufer.db3"])
+def test_strange_letters_in_the_name(tmp_path, name):
+    assert open_source(save(tmp_path / name, drive(12))).survey().scan_count == 12
+
+
 def test_odometry_goes_with_the_scan_before_it(tmp_path):
     said = [mounted(0.5), *(odom(k, (k, 0, 0)) for k in range(1, 8)), *(scan(k + 0.5) for k in range(1, 7))]
     source = open_source(save(tmp_path / "run.bag", said))

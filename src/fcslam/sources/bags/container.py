@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from urllib.parse import quote
 
 from fcslam.errors import SourceError
 
@@ -172,19 +173,28 @@ def _reader(path: Path, magic: bytes) -> _Reader:
             raise SourceError(
                 f"{path}: has bag files and no {_METADATA}; give one of the files, or make it with `ros2 bag reindex`"
             )
+        for database in path.glob("*.db3"):
+            _check_database(database)
         return rosbag2.Reader(path)
     if magic.startswith(_ROS1):
         return rosbag1.Reader(path)
     if magic.startswith(_SQLITE):
-        _check_length(path)
-    for start, plugin in ((_MCAP, ".mcap"), (_SQLITE, ".db3")):
-        if magic.startswith(start):
-            return rosbag2.Reader.STORAGE_PLUGINS[plugin](path)
+        _check_database(path)
+        # rosbags puts the path into a URI as it is
+        return rosbag2.Reader.STORAGE_PLUGINS[".db3"](Path(quote(str(path))))
+    if magic.startswith(_MCAP):
+        return rosbag2.Reader.STORAGE_PLUGINS[".mcap"](path)
     raise SourceError(f"{path}: the whole bag is compressed; unpack it first")
 
 
-def _check_length(database: Path) -> None:
-    """Refuse a truncated database: SQLite takes what is missing at its end for empty if nothing points there."""
+def _check_database(database: Path) -> None:
+    """Refuse a database that was not closed or lacks its end: SQLite would read what is there and say nothing."""
+    journal = database.with_name(f"{database.name}-wal")
+    if journal.exists() and journal.stat().st_size:
+        raise SourceError(
+            f"{database}: was not closed, {journal.name} holds its end; close it with "
+            f'`sqlite3 {database.name} "PRAGMA wal_checkpoint(TRUNCATE)"`'
+        )
     with database.open("rb") as file:
         header = file.read(_SQLITE_HEADER_BYTES)
     page_bytes, changes, pages, counted_at = (

@@ -40,17 +40,18 @@ IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
     """Checked, with the quaternion brought to length 1; raises ValueError when it is no sane transform."""
-    length = sqrt(sum(value * value for value in rotation))
-    if not (all(map(isfinite, translation_m)) and isfinite(length) and abs(length - 1.0) < 0.1):
+    x, y, z, w = rotation
+    length = sqrt(x * x + y * y + z * z + w * w)
+    if not (abs(length - 1.0) < 0.1 and all(map(isfinite, translation_m))):
         raise ValueError("no sane transform")
-    x, y, z, w = (value / length for value in rotation)
-    return Transform(translation_m, (x, y, z, w))
+    return Transform(translation_m, (x / length, y / length, z / length, w / length))
 
 
 def planar(transform: Transform) -> Pose:
     """The pose on the floor: x, y, and the heading of the x axis to a nanoradian, free of a quaternion's rounding."""
-    x_axis = rotated(transform.rotation, (1.0, 0.0, 0.0))
-    return transform.translation_m[0], transform.translation_m[1], round(atan2(x_axis[1], x_axis[0]), 9)
+    x, y, z, w = transform.rotation
+    heading_rad = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return transform.translation_m[0], transform.translation_m[1], round(heading_rad, 9)
 
 
 def mounting(T_base_laser: Transform) -> Mounting:
