@@ -76,7 +76,8 @@ def test_content_decides_not_the_name(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a b#c%20d?e.db3", "a b#c%20d?e.mcap", "a b#c%20d?e.bag", "läufer.db3"])
 def test_strange_letters_in_the_name(tmp_path, name):
-    assert open_source(save(tmp_path / name, drive(12))).survey().scan_count == 12
+    bag = save(tmp_path / f"plain.{name.rsplit('.', 1)[1]}", drive(12)).rename(tmp_path / name)
+    assert open_source(bag).survey().scan_count == 12
 
 
 def test_odometry_goes_with_the_scan_before_it(tmp_path):

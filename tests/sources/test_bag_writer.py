@@ -133,7 +133,7 @@ def test_a_file_is_replaced_when_the_new_one_is_complete(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == set(KINDS[:3])
 
 
-@pytest.mark.parametrize("name", ["missing/run.bag", "missing/run.mcap", "run.zip", "full"])
+@pytest.mark.parametrize("name", ["missing/run.bag", "missing/run.mcap", "run.zip", "full", "missing#1.db3"])
 def test_what_cannot_be_written_is_reported(tmp_path, name):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()

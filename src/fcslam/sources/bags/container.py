@@ -96,15 +96,16 @@ class BagFile:
         Raises:
             SourceError: the bag cannot be read to its end.
         """
-        order = {(topic.name, topic.type): topic for topic in topics}
         numbers: Counter[Topic] = Counter()
         with self._opened() as reader:
-            named = [(connection.topic, _type_of(connection), connection) for connection in reader.connections]
-            chosen = [connection for key in order for *names, connection in named if tuple(names) == key]
-            topic_of = {connection.id: order[connection.topic, _type_of(connection)] for connection in chosen}
-            if not chosen:
-                return
-            for connection, bag_time_ns, payload in reader.messages(chosen):
+            chosen = [
+                (connection, topic)
+                for topic in topics
+                for connection in reader.connections
+                if (connection.topic, _type_of(connection)) == (topic.name, topic.type)
+            ]
+            topic_of = {connection.id: topic for connection, topic in chosen}
+            for connection, bag_time_ns, payload in reader.messages([connection for connection, _ in chosen]):
                 topic = topic_of[connection.id]
                 numbers[topic] += 1
                 yield RawMessage(topic, numbers[topic], bag_time_ns, payload)
@@ -115,7 +116,7 @@ class BagFile:
         Raises:
             ValueError: its bytes are no message of its type.
         """
-        kind = "tf2_msgs/TFMessage" if message.topic.type == _OLD_TRANSFORMS else message.topic.type
+        kind = TRANSFORMS if message.topic.type == _OLD_TRANSFORMS else message.topic.type
         name = kind.replace("/", "/msg/")
         store = typestore(self._is_ros1)
         try:

@@ -57,6 +57,9 @@ def _opened(path: Path) -> Iterator["_Bag"]:
 
     if path.suffix not in BAG_SUFFIXES:
         raise OutputError(f"{path}: no kind of bag; end it in .bag, .mcap or .db3, or in nothing for a folder")
+    if path.suffix == _SQLITE and set("?#%") & set(str(path.absolute())):
+        # rosbags puts the path into a URI as it is
+        raise OutputError(f"{path}: no .db3 can be written where a path holds ?, # or %; choose another path")
     with TemporaryDirectory(prefix=".", dir=path.parent) as staging:
         place = Path(staging, path.stem)
         if path.suffix == _ROS1:
