@@ -83,8 +83,14 @@ def test_no_odometry_in_tf(tmp_path):
             ["topic /lidar is not there", "--scan-topic", "/scan (sensor_msgs/Laser"],
         ),
         (BagOptions(odom_topic="/lidar"), ["topic /lidar is not there", "--odom-topic", "/odom (nav_msgs/Odometry"]),
-        (BagOptions(scan_topic="/odom"), ["/odom carries nav_msgs/Odometry", "not sensor_msgs/LaserScan"]),
-        (BagOptions(odom_topic="/chatter"), ["/chatter carries std_msgs/String", "not nav_msgs/Odometry, or tf"]),
+        (
+            BagOptions(scan_topic="/odom"),
+            ["/odom has 42 messages of type nav_msgs/Odometry", "needs sensor_msgs/LaserScan"],
+        ),
+        (
+            BagOptions(odom_topic="/chatter"),
+            ["/chatter has 1 messages of type std_msgs/String", "needs nav_msgs/Odometry, or tf"],
+        ),
     ],
 )
 def test_a_topic_that_cannot_be_read(tmp_path, options, words):

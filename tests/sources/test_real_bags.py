@@ -40,8 +40,7 @@ def test_published_bags_hold_what_their_description_says(bag, shape, path_m, dur
     assert np.median(np.abs(apart)) < 0.01
 
 
-@pytest.mark.parametrize("log", ["intel", "fr079", "mit-csail"])
-@pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run.db3"])
+@pytest.mark.parametrize(("log", "name"), [("intel", "run.bag"), ("fr079", "run.mcap"), ("mit-csail", "run.db3")])
 def test_a_log_and_its_bag_are_the_same_to_the_last_bit(tmp_path, log, name):
     """Also where the clock runs backwards (intel), and with odometry between the scans (fr079)."""
     source = open_source(DATA / f"slam-benchmark/{log}.clf.xz")

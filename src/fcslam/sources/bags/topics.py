@@ -8,6 +8,7 @@ from fcslam.sources.bags.container import ODOMETRY, SCAN, BagFile, Topic, is_tra
 from fcslam.sources.bags.options import BagOptions
 
 _NAMED_AT_MOST = 15
+_NEEDED = {"--scan-topic": SCAN, "--odom-topic": f"{ODOMETRY}, or tf"}
 
 
 class Topics(NamedTuple):
@@ -21,50 +22,47 @@ class Topics(NamedTuple):
     notes: tuple[str, ...]
 
 
-def choose_topics(bag: BagFile, options: BagOptions, field_of_view: Callable[[Topic], float]) -> Topics:
+def choose_topics(bag: BagFile, options: BagOptions, field_of_view_rad: Callable[[Topic], float]) -> Topics:
     """The topics to read.
 
-    Of several lasers the one with the widest ``field_of_view`` (radians), then with most messages, then the first by
+    Of several lasers the one with the widest field of view, to 0.01 rad, then with most messages, then the first by
     name. Of several odometries one that is called ``odom``, then with most messages, then the first by name.
 
     Raises:
         SourceError: there is no such topic, or one named is not there or of another type.
     """
     heard = [topic for topic in bag.topics if topic.message_count]
-    scans = _candidates(bag, options.scan_topic, "--scan-topic", [topic for topic in heard if topic.type == SCAN], SCAN)
+    scans = _candidates(bag, [topic for topic in heard if topic.type == SCAN], options.scan_topic, "--scan-topic")
     if not scans:
         raise SourceError(f"{bag.path}: no laser scans ({SCAN}); record them; {_known(bag.topics)}")
-    transforms = [topic for topic in heard if is_transforms(topic)]
+    transforms = tuple(topic for topic in heard if is_transforms(topic))
     measured = [topic for topic in heard if topic.type == ODOMETRY]
-    expected = f"{ODOMETRY}, or tf"
-    odometries = _candidates(bag, options.odom_topic, "--odom-topic", [*measured, *transforms], expected)
-    odometries = [topic for topic in odometries if topic.type == ODOMETRY] or odometries
+    odometries = _candidates(bag, [*measured, *transforms], options.odom_topic, "--odom-topic")
     if not odometries:
         raise SourceError(
             f"{bag.path}: no odometry ({ODOMETRY}, or tf from odom to base); record it; {_known(bag.topics)}"
         )
-    views = {topic: field_of_view(topic) if len(scans) > 1 else 0.0 for topic in scans}
-    scan = min(scans, key=lambda topic: (-views[topic], -topic.message_count, topic.name))
-    odometry = min(odometries, key=lambda topic: (_basename(topic) != "odom", -topic.message_count, topic.name))
+    views_rad = {topic: round(field_of_view_rad(topic), 2) if len(scans) > 1 else 0.0 for topic in scans}
+    scan = min(scans, key=lambda topic: (-views_rad[topic], -topic.message_count, topic.name))
     notes = _note(bag, "laser scans", "--scan-topic", scan, scans)
-    if is_transforms(odometry):
-        return Topics(scan, tuple(odometries), tuple(transforms), tuple(notes))
-    notes += _note(bag, "odometry", "--odom-topic", odometry, odometries)
-    return Topics(scan, (odometry,), tuple(transforms), tuple(notes))
+    measured = [topic for topic in odometries if topic.type == ODOMETRY]
+    if not measured:
+        return Topics(scan, tuple(odometries), transforms, tuple(notes))
+    odometry = min(measured, key=lambda topic: (_basename(topic) != "odom", -topic.message_count, topic.name))
+    notes += _note(bag, "odometry", "--odom-topic", odometry, measured)
+    return Topics(scan, (odometry,), transforms, tuple(notes))
 
 
-def _candidates(
-    bag: BagFile, wanted: str | None, option: str, candidates: Sequence[Topic], expected: str
-) -> list[Topic]:
+def _candidates(bag: BagFile, candidates: Sequence[Topic], wanted: str | None, option: str) -> list[Topic]:
     """The candidates, or the one of them that the user wants."""
     if wanted is None:
         return list(candidates)
     chosen = [topic for topic in candidates if _slashed(topic.name) == _slashed(wanted)]
-    if chosen:
-        return chosen[:1]
-    there = [topic for topic in bag.topics if _slashed(topic.name) == _slashed(wanted)]
-    what = f"carries {there[0].type} in {there[0].message_count} messages, not {expected}" if there else "is not there"
-    raise SourceError(f"{bag.path}: topic {wanted} {what}; choose another by {option}; {_known(bag.topics)}")
+    if not chosen:
+        there = [topic for topic in bag.topics if _slashed(topic.name) == _slashed(wanted)]
+        what = f"has {there[0].message_count} messages of type {there[0].type}" if there else "is not there"
+        raise SourceError(f"{bag.path}: topic {wanted} {what}; {option} needs {_NEEDED[option]}; {_known(bag.topics)}")
+    return chosen[:1]
 
 
 def _note(bag: BagFile, what: str, option: str, chosen: Topic, candidates: Sequence[Topic]) -> list[str]:
