@@ -61,6 +61,7 @@ def test_a_robot_on_a_line_is_where_the_line_says(readings, scans, late_s):
             assert not held or entry.T_odom_base == reading(nearest).T_odom_base
 
 
+@settings(deadline=None)
 @given(st.floats(-3.1, 3.1), st.floats(-3.0, 3.0), st.floats(0.01, 0.99))
 def test_headings_turn_the_shortest_way(start, turn, share):
     end = math.remainder(start + turn, math.tau)

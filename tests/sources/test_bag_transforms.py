@@ -46,6 +46,7 @@ def test_any_two_frames_of_a_tree(chain, data):
         np.testing.assert_allclose(rotated(found.rotation, tuple(axis)), column, atol=1e-9)
 
 
+@settings(deadline=None)
 @given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.booleans())
 def test_mountings(yaw, tilt, upside_down):
     rotation = Rotation.from_euler("ZY", [yaw, tilt]) * Rotation.from_euler("x", math.pi * upside_down)
@@ -56,8 +57,9 @@ def test_mountings(yaw, tilt, upside_down):
     assert math.remainder(found.T_base_laser[2] - yaw, math.tau) == pytest.approx(0.0, abs=1e-6)
 
 
-@given(st.floats(-3.14, 3.14), st.floats(-3.0, 3.0))
-def test_the_heading_is_that_of_the_x_axis_whatever_the_sign(yaw, scale):
+@settings(deadline=None)
+@given(st.floats(-3.14, 3.14))
+def test_the_heading_is_that_of_the_x_axis_whatever_the_sign(yaw):
     q = Rotation.from_euler("z", yaw).as_quat()
     for signed in (q, -q):
         assert planar(transform_of((0.0, 0.0, 0.0), tuple(signed.tolist())))[2] == pytest.approx(yaw, abs=1e-9)
