@@ -119,11 +119,13 @@ def _check_robots(sources: Sequence[Source]) -> None:
     names = [source.name for source in sources]
     for name in names:
         if names.count(name) > 1:
-            raise SourceError(f"two recordings are called '{name}'; a robot is named by its file, so rename one")
+            raise SourceError(
+                f"two recordings are called '{name}'; a robot is named by its file, so name one: NAME=LOG"
+            )
         try:
             check_name(name, "robot")
         except PacketError as error:
-            raise SourceError(f"{error}; a robot is named by its file, so rename it") from error
+            raise SourceError(f"{error}; a robot is named by its file, so rename it, or give NAME=LOG") from error
     check_names(names)
 
 

@@ -35,7 +35,7 @@ def written(path: Path, content: bytes) -> Path:
     [
         (b"", "empty"),
         (gzip.compress(b""), "empty"),
-        (b"#ROSBAG V2.0\nE\x00\x00\x00", "known format"),
+        (b"#ROSBAG V2.0\nE\x00\x00\x00", "bag cannot be read"),
         (bytes(range(256)) * 300, "known format"),
         (b"\x00" * 5000, "known format"),
         (b"It was a dark and stormy night\n", "known format"),

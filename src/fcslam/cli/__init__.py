@@ -8,6 +8,7 @@ import typer
 
 import fcslam
 from fcslam.cli import config, demo, evaluate
+from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.errors import FcslamError
 
@@ -24,6 +25,11 @@ app = typer.Typer(
 app.command("map", epilog="Example: fcslam map robot1.clf.gz robot2.clf.gz --output runs/building")(
     mapping.map_recordings
 )
+app.command(
+    "convert",
+    epilog="Example: fcslam convert robot1.clf.gz robot1.bag, fcslam convert robot2.mcap robot2.clf.gz "
+    "--scan-topic /front/scan",
+)(conversion.convert)
 app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo.demo)
 app.add_typer(config.app, name="config")
 app.add_typer(evaluate.app, name="evaluate")

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.recordings import LaserPose, OdomTopic, ScanTopic, bag_options, open_recording, show_faults, show_notes
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -19,7 +21,10 @@ if TYPE_CHECKING:
 
 
 def map_recordings(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="One recording a robot.")],
+    logs: Annotated[
+        list[str],
+        typer.Argument(metavar="LOG...", help="One recording a robot, which is named after it; NAME=LOG names it so."),
+    ],
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="The run folder to write.")],
     split: Annotated[int, typer.Option(min=1, help="Cut one LOG into this many robots of equal scan count.")] = 1,
@@ -33,17 +38,21 @@ def map_recordings(
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Configuration file; see `fcslam config dump`.")
     ] = None,
+    scan_topic: ScanTopic = None,
+    odom_topic: OdomTopic = None,
+    laser_pose: LaserPose = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the run; the configuration's if not given.")] = None,
     force: Annotated[bool, typer.Option("--force", "-f", help="Replace a run that is there already.")] = False,
 ) -> None:
     """Map recordings together: one map, every robot's trajectory in it, and the closures that hold it together."""
     from fcslam.runs import prepare_output, read_vetoes
-    from fcslam.sources import open_source
 
     prepare_output(output, force)
     settings = _settings(config, seed, no_fuse)
-    sources = _sources([open_source(log) for log in logs], split)
-    map_sources(sources, settings, output, force, read_vetoes(veto) if veto else ())
+    vetoes = read_vetoes(veto) if veto else ()
+    options = bag_options(scan_topic, odom_topic, laser_pose)
+    sources = _sources([open_recording(log, options) for log in logs], split)
+    map_sources(sources, settings, output, force, vetoes)
 
 
 def map_sources(
@@ -59,16 +68,15 @@ def map_sources(
     from fcslam.runs import write_run
 
     console = Console(stderr=True)
-    total = sum(source.survey().scan_count for source in sources)  # refuses bad recordings before the work
+    surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
+    show_notes(console, (note for survey in surveys for note in survey.notes))
     began = time.perf_counter()
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
-    with _progress(console, total) as watch:
+    with _progress(console, sum(survey.scan_count for survey in surveys)) as watch:
         run = run_mission(sources, settings, watch, vetoes)
     write_run(run, output, force)
-    for source in sources:
-        if source.faults:
-            console.print(f"{source.name}: {source.faults}", highlight=False, soft_wrap=True)
+    show_faults(console, sources)
     _report(Console(), run, time.perf_counter() - began, output, settings.fleet.join_maps)
     return run
 

@@ -1,5 +1,7 @@
 """Recordings in, sensor records out: ``open_source(path)`` knows every format."""
 
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.carmen_writer import write_carmen
 from fcslam.sources.faults import Fault, Faults, Tally
 from fcslam.sources.opening import FORMATS, Format, open_source
@@ -7,8 +9,10 @@ from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 from fcslam.sources.split import split
 
 __all__ = [
+    "BAG_SUFFIXES",
     "FORMATS",
     "WHOLE",
+    "BagOptions",
     "Fault",
     "Faults",
     "Format",
@@ -18,5 +22,6 @@ __all__ = [
     "Tally",
     "open_source",
     "split",
+    "write_bag",
     "write_carmen",
 ]

@@ -19,13 +19,13 @@ MAX_LINE_BYTES = 1 << 18
 
 _HEAD_BYTES = 1 << 16
 _BUFFER_BYTES = 1 << 17
-_LOG_SUFFIX = re.compile(r"\.(gz|xz|bz2|clf|log|txt|carmen|bag|mcap|db3)$", re.IGNORECASE)
+_LOG_SUFFIX = re.compile(r"\.(gz|xz|bz2|clf|log|txt|carmen|bag|mcap|db3|active)$", re.IGNORECASE)
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
 def robot_name(path: Path) -> str:
     """The file's name without log suffixes, fit for file names: ``intel.clf.xz`` gives ``intel``."""
-    stem = path.name
+    stem = path.name or path.resolve().name
     while match := _LOG_SUFFIX.search(stem):
         stem = stem[: match.start()]
     return _UNSAFE.sub("_", stem).strip("._-") or "robot"

@@ -10,7 +10,12 @@ class Fault(StrEnum):
     """A kind of fault that is tolerated, counted and reported."""
 
     BROKEN_LINE = "broken lines skipped"
+    BROKEN_MESSAGE = "broken messages skipped"
     BEAM_COUNT = "scans with another beam count skipped"
+    RESAMPLED = "scans with another beam count brought to the usual beams"
+    NO_ODOMETRY = "scans without odometry within 1 s skipped"
+    HELD_ODOMETRY = "scans beyond the odometry's ends given its nearest pose"
+    ODOMETRY_GAP = "scans in gaps of the odometry of more than 1 s kept"
     MISPLACED_SCAN = "scans recorded far back in time skipped"
     TIME_REVERSAL = "steps back in time kept"
     REPEATED_STAMP = "scans with the stamp of the scan before kept"
@@ -24,7 +29,7 @@ class Tally:
 
     count: int = 0
     first_line: int = 0
-    """Line (or message) of the recording, counted from 1, with the first one; 0 when there is none."""
+    """Line of the recording (or message of its topic), counted from 1, with the first one; 0 when there is none."""
     largest_s: float = 0.0
     """Largest step back in time, of the kinds that have one."""
 
@@ -34,6 +39,8 @@ class Faults:
     """The faults of one pass over a recording; false when there are none, its text is one line for people."""
 
     tallies: Mapping[Fault, Tally]
+    unit: str = "line"
+    """What the recording is made of and ``Tally.first_line`` counts."""
 
     def __getitem__(self, kind: Fault) -> Tally:
         return self.tallies.get(kind, Tally())
@@ -42,13 +49,19 @@ class Faults:
         return bool(self.tallies)
 
     def __str__(self) -> str:
-        return ", ".join(_describe(kind, self.tallies[kind]) for kind in Fault if kind in self.tallies) or "no faults"
+        return ", ".join(self._describe(kind) for kind in Fault if kind in self.tallies) or "no faults"
+
+    def _describe(self, kind: Fault) -> str:
+        tally = self.tallies[kind]
+        largest = f", largest {tally.largest_s:.3g} s" if tally.largest_s else ""
+        return f"{kind}: {tally.count} (first: {self.unit} {tally.first_line}{largest})"
 
 
 class Audit:
     """Counts faults while a recording is read."""
 
-    def __init__(self) -> None:
+    def __init__(self, unit: str = "line") -> None:
+        self._unit = unit
         self._tallies: dict[Fault, Tally] = {}
 
     def add(self, kind: Fault, line: int, count: int = 1, step_s: float = 0.0) -> None:
@@ -62,9 +75,4 @@ class Audit:
 
     def faults(self) -> Faults:
         """The faults counted so far."""
-        return Faults(MappingProxyType(dict(self._tallies)))
-
-
-def _describe(kind: Fault, tally: Tally) -> str:
-    largest = f", largest {tally.largest_s:.3g} s" if tally.largest_s else ""
-    return f"{kind}: {tally.count} (first: line {tally.first_line}{largest})"
+        return Faults(MappingProxyType(dict(self._tallies)), self._unit)

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fcslam.errors import SourceError
-from fcslam.sources.archive import head
+from fcslam.sources.archive import head, robot_name
+from fcslam.sources.bags.container import is_bag
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.carmen import CARMEN
 from fcslam.sources.cmu import CMU
 from fcslam.sources.dialect import Dialect
@@ -20,30 +23,45 @@ class Format:
     name: str
     recognises: Callable[[Path, bytes], bool]
     """Told by the path and the first bytes (decompressed; none of a folder)."""
-    open: Callable[[Path], Source]
+    open: Callable[[Path, str, BagOptions | None], Source]
+    """By path, the robot's name, and options, which only bags are given."""
+    takes_options: bool = False
 
 
 def _text_format(dialect: Dialect) -> Format:
-    return Format(dialect.name, lambda _, head: dialect.recognises(head), lambda path: TextLog(path, dialect))
+    return Format(
+        dialect.name, lambda _, head: dialect.recognises(head), lambda path, name, _: TextLog(path, name, dialect)
+    )
 
 
-FORMATS: tuple[Format, ...] = (_text_format(CARMEN), _text_format(CMU))
+FORMATS: tuple[Format, ...] = (
+    _text_format(CARMEN),
+    _text_format(CMU),
+    Format("ROS bag", is_bag, RosBag, takes_options=True),
+)
 """Asked in this order; a new format is one more entry."""
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path, options: BagOptions | None = None, name: str | None = None) -> Source:
     """The recording at ``path``; what it holds decides the format, not its name.
 
-    Reads only the beginning: ``Source.survey`` finds what is wrong further on.
+    Reads only the beginning: ``Source.survey`` finds what is wrong further on. ``name`` is the robot's, the file's
+    if not given.
 
     Raises:
-        SourceError: the file is missing, empty, unreadable, a damaged archive, or of no known format.
+        SourceError: the file is missing, empty, unreadable, a damaged archive, or of no known format; or it is no
+            bag and ``options`` are given.
     """
     path = Path(path)
     content = b"" if path.is_dir() else head(path)
     for kind in FORMATS:
         if kind.recognises(path, content):
-            return kind.open(path)
+            if options is not None and not kind.takes_options:
+                raise SourceError(
+                    f"{path}: a {kind.name} has neither topics nor tf; options of bags (--scan-topic, --odom-topic, "
+                    "--laser-pose) go with ROS bags only, leave them out"
+                )
+            return kind.open(path, name or robot_name(path), options)
     known = " or ".join(kind.name for kind in FORMATS)
     if path.is_dir():
         raise SourceError(f"{path}: is a folder and no recording; give the file of a recording ({known})")

@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 from fcslam.errors import SourceError
 from fcslam.sources.dialect import Line, OdometryLine, ParameterLine, ScanLine
-from fcslam.sources.faults import Fault, Faults
+from fcslam.sources.faults import Faults
+from fcslam.sources.gate import TOLERATED_SHARE, refuse_misfits
 from fcslam.sources.laser import laser_model, parameter
 from fcslam.sources.pose import Pose, relative_pose
 from fcslam.sources.source import Survey
 
-TOLERATED_SHARE = 0.01
-"""Share of a log's scans that may not fit the rest."""
 SCANS_THAT_MUST_MOVE = 10
 
 _MOUNTING_TOLERANCE = 0.01
@@ -115,7 +114,7 @@ class Overview:
             SourceError: it cannot be mapped.
         """
         assert self._scan is not None
-        self._refuse_damage(path, faults, self._scan.beam_count)
+        refuse_misfits(path, faults, self._scans.count, self._odometry.count, self._scan.beam_count)
         pose_from_odometry = not self._scans.moves and self._odometry.moves
         if not (self._scans.moves or pose_from_odometry) and self._scans.count >= SCANS_THAT_MUST_MOVE:
             raise SourceError(
@@ -126,26 +125,3 @@ class Overview:
         laser = laser_model(self._scan, self._parameters, self._mounting.T_base_laser(offset_m))
         length_m = self._odometry.length_m if pose_from_odometry else self._scans.length_m
         return Reading(Survey(self._scans.count, self._scans.duration_s, length_m, laser, faults), pose_from_odometry)
-
-    def _refuse_damage(self, path: Path, faults: Faults, beam_count: int) -> None:
-        count = self._scans.count
-        tolerated = TOLERATED_SHARE * count
-        broken, other = faults[Fault.BROKEN_LINE], faults[Fault.BEAM_COUNT]
-        misplaced, reversals = faults[Fault.MISPLACED_SCAN], faults[Fault.TIME_REVERSAL]
-        if broken.count > count + self._odometry.count:
-            raise SourceError(f"{path}: most lines are damaged, {faults}; copy or export the log again")
-        if other.count > tolerated:
-            raise SourceError(
-                f"{path}: line {other.first_line}: the beam count changes ({other.count} scans do not have the "
-                f"{beam_count} beams of the first ones); give one log for each laser"
-            )
-        if misplaced.count > tolerated:
-            raise SourceError(
-                f"{path}: line {misplaced.first_line}: time jumps back by up to {misplaced.largest_s:.6g} s, as if two "
-                "recordings had been put together; cut the log there and give both parts"
-            )
-        if 2 * reversals.count > count:
-            raise SourceError(
-                f"{path}: line {reversals.first_line}: time runs backwards in {reversals.count} of {count} scans; "
-                "give the log in the order in which it was recorded"
-            )

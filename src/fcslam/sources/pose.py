@@ -16,6 +16,12 @@ def relative_pose(T_a_b: Pose, T_a_c: Pose) -> Pose:
     return c * dx + s * dy, c * dy - s * dx, remainder(T_a_c[2] - T_a_b[2], tau)
 
 
+def interpolated_pose(T_a_b: Pose, T_a_c: Pose, share: float) -> Pose:
+    """The pose that lies ``share`` (0 to 1) of the way from b to c: a straight line, and the shortest arc."""
+    x, y = (before + share * (after - before) for before, after in zip(T_a_b[:2], T_a_c[:2], strict=True))
+    return x, y, remainder(T_a_b[2] + share * remainder(T_a_c[2] - T_a_b[2], tau), tau)
+
+
 def pose_array(pose: Pose) -> FloatArray:
     """The pose as a read-only array, shape (3,)."""
     array = np.array(pose, dtype=np.float64)

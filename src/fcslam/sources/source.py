@@ -32,6 +32,8 @@ class Survey:
     laser: LaserModel
     faults: Faults
     """Of this pass, so without those of the ranges."""
+    notes: tuple[str, ...] = ()
+    """What was chosen where the recording leaves a choice, in sentences for people."""
 
     @property
     def beam_count(self) -> int:

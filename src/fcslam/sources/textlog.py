@@ -1,13 +1,7 @@
 """A text log as a source: survey it once, then stream its records.
 
-What is tolerated, counted and reported, and what is refused:
+What is tolerated, counted and reported, and what is refused, is decided in ``gate``, and here:
 
-- Clocks of one robot disagree by up to a second (the Intel log: 631 steps back, largest 0.9 s): scans stay in file
-  order, which is the order that the odometry makes sense in. A scan more than 2 s before both scans before it is
-  misplaced and skipped (both: one of them may carry a damaged stamp, far ahead). When more than 1 % are misplaced,
-  two recordings were put together, which is refused. So is a log in which more than half of the steps go back.
-- A scan with another beam count than the rest is skipped; more than 1 % of them are a change of sensor: refused.
-- Equal stamps are kept: some logs were printed with too few digits, or without a clock.
 - A log of ten scans or more in which neither the scans' poses nor odometry messages ever change has no odometry:
   refused. When only the odometry messages change, a scan takes its pose from the one before it.
 """
@@ -16,31 +10,29 @@ from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import islice
-from math import inf, nan
+from math import nan
 from pathlib import Path
 
 import numpy as np
 
 from fcslam.errors import SourceError
 from fcslam.records import LaserScan, Odometry, Ranges, SensorRecord
-from fcslam.sources.archive import numbered_lines, robot_name
+from fcslam.sources.archive import numbered_lines
 from fcslam.sources.dialect import Dialect, Line, OdometryLine, ScanLine
 from fcslam.sources.faults import Audit, Fault, Faults
+from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, window
 from fcslam.sources.overview import Overview, Reading, Track
 from fcslam.sources.pose import pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
-MAX_STEP_BACK_S = 2.0
-
-_SCANS_THAT_VOTE = 20
 _LONGEST_RANGE_M = 1e6
 
 
 class TextLog:
     """A log of one message a line, perhaps compressed."""
 
-    def __init__(self, path: Path, dialect: Dialect) -> None:
-        self.name = robot_name(path)
+    def __init__(self, path: Path, name: str, dialect: Dialect) -> None:
+        self.name = name
         self._path = path
         self._dialect = dialect
         self._audit = Audit()
@@ -90,7 +82,7 @@ class TextLog:
     def _usual_beam_count(self) -> int:
         audit = Audit()
         scans = (line for _, line in self._lines(audit) if isinstance(line, ScanLine))
-        counts = Counter(scan.beam_count for scan in islice(scans, _SCANS_THAT_VOTE))
+        counts = Counter(scan.beam_count for scan in islice(scans, SCANS_THAT_VOTE))
         if not counts:
             seen = f"; {audit.faults()}" if audit.faults() else ""
             raise SourceError(f"{self._path}: no laser scan in this {self._dialect.name}{seen}; give a log with scans")
@@ -108,49 +100,19 @@ class TextLog:
 
     def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, ScanLine | OdometryLine]]:
         """Scans and odometry of the range, with the poses to use; in the end ``audit`` holds this range's faults."""
+        return window(self._posed(audit), scans, lambda line: isinstance(line, ScanLine), audit)
+
+    def _posed(self, audit: Audit) -> Iterator[tuple[int, ScanLine | OdometryLine]]:
         reading = self._reading
         gate = ScanGate(reading.survey.beam_count, audit)
-        end = inf if scans.end is None else scans.end
-        seen, latest = 0, None
+        latest = None
         for number, line in self._lines(audit):
             if isinstance(line, OdometryLine):
                 latest = line
-                if seen > scans.first or scans.first == 0:
-                    yield number, line
+                yield number, line
             elif isinstance(line, ScanLine) and gate.admits(number, line):
-                if seen >= end:
-                    return
-                if seen == scans.first > 0:
-                    audit.clear()
-                seen += 1
-                if seen > scans.first:
-                    late = latest if reading.pose_from_odometry else None
-                    yield number, line if late is None else line._replace(T_odom_base=late.T_odom_base)
-
-
-class ScanGate:
-    """Lets scans pass that fit the log and counts those that do not; both passes use the same rule."""
-
-    def __init__(self, beam_count: int, audit: Audit) -> None:
-        self._beam_count = beam_count
-        self._audit = audit
-        self._previous = self._before_previous = -inf
-
-    def admits(self, number: int, scan: ScanLine) -> bool:
-        """Whether the scan on line ``number`` is one of the log's."""
-        if scan.beam_count != self._beam_count:
-            self._audit.add(Fault.BEAM_COUNT, number)
-            return False
-        step_back_s = self._previous - scan.stamp
-        if min(self._previous, self._before_previous) - scan.stamp > MAX_STEP_BACK_S:
-            self._audit.add(Fault.MISPLACED_SCAN, number, step_s=step_back_s)
-            return False
-        if step_back_s > 0.0:
-            self._audit.add(Fault.TIME_REVERSAL, number, step_s=step_back_s)
-        elif step_back_s == 0.0:
-            self._audit.add(Fault.REPEATED_STAMP, number)
-        self._before_previous, self._previous = self._previous, scan.stamp
-        return True
+                late = latest if reading.pose_from_odometry else None
+                yield number, line if late is None else line._replace(T_odom_base=late.T_odom_base)
 
 
 def _ranges(scan: ScanLine, metres_per_unit: float, number: int, audit: Audit) -> Ranges:

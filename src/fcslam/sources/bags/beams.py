@@ -1,0 +1,43 @@
+"""Lasers whose beams vary from scan to scan, brought to the same beams."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from fcslam.sources.bags.messages import Beams, ScanMessage
+
+_SAME_FIELD_OF_VIEW_RAD = 0.05
+
+
+class UsualBeams:
+    """The beams that most of the first scans have."""
+
+    def __init__(self, first_scans: Sequence[ScanMessage]) -> None:
+        count, _ = Counter(scan.beam_count for scan in first_scans).most_common(1)[0]
+        self.beams = next(scan.beams for scan in first_scans if scan.beam_count == count)
+
+    def brought(self, scan: ScanMessage) -> ScanMessage | None:
+        """The scan if it has the usual beams; if it sees about the same, its nearest range for each of them; else None.
+
+        A usual beam that lies outside the scan is invalid (NaN).
+        """
+        if scan.beams == self.beams:
+            return scan
+        apart_rad = _apart_rad(scan.beams, self.beams)
+        if scan.beam_count == self.beams.beam_count and apart_rad < 0.25 * self.beams.angle_increment_rad:
+            return scan
+        if apart_rad > _SAME_FIELD_OF_VIEW_RAD:
+            return None
+        angles_rad = self.beams.angle_min_rad + self.beams.angle_increment_rad * np.arange(self.beams.beam_count)
+        nearest = np.rint((angles_rad - scan.beams.angle_min_rad) / scan.beams.angle_increment_rad).astype(np.intp)
+        inside = (nearest >= 0) & (nearest < scan.beam_count)
+        ranges = np.full(self.beams.beam_count, np.nan, dtype=np.float32)
+        ranges[inside] = scan.raw_ranges_m[nearest[inside]]
+        return scan._replace(beams=self.beams, raw_ranges_m=ranges)
+
+
+def _apart_rad(a: Beams, b: Beams) -> float:
+    """How far the first and the last beams lie apart."""
+    first = a.angle_min_rad - b.angle_min_rad
+    return max(abs(first), abs(first + a.span_rad - b.span_rad))

@@ -1,0 +1,227 @@
+"""A bag as a stream of raw messages, whatever file or folder holds them.
+
+Of rosbags the readers are used, not the definitions that a bag carries: the few types that are read have had one
+layout for as long as there are bags, and a strange definition of another topic cannot spoil a recording.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from urllib.parse import quote
+
+from fcslam.errors import SourceError
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
+
+SCAN, ODOMETRY, TRANSFORMS = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "tf2_msgs/TFMessage"
+"""The types that are read."""
+
+_OLD_TRANSFORMS = "tf/tfMessage"
+_ROS1, _MCAP, _SQLITE = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
+_METADATA = "metadata.yaml"
+_LONGEST_REASON = 200
+_SQLITE_HEADER_BYTES = 100
+
+
+class Topic(NamedTuple):
+    """A topic of a bag."""
+
+    name: str
+    type: str
+    """Without ``msg/``, as ROS 1 writes it."""
+    message_count: int
+
+
+class RawMessage(NamedTuple):
+    """One message, not decoded."""
+
+    topic: Topic
+    number: int
+    """Counts the topic's messages from 1."""
+    bag_time_ns: int
+    """When it was recorded."""
+    payload: bytes
+
+
+class _Reader(Protocol):
+    """What the readers of rosbags have in common."""
+
+    @property
+    def connections(self) -> "list[Connection]": ...
+
+    def open(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def messages(self, connections: "Collection[Connection]") -> "Iterator[tuple[Connection, int, bytes]]": ...
+
+
+def is_bag(path: Path, head: bytes) -> bool:
+    """Whether there is a bag at ``path``, a file that starts with ``head`` or a folder."""
+    if path.is_dir():
+        return (path / _METADATA).is_file() or any(_storage_files(path))
+    return head.startswith((_ROS1, _MCAP, _SQLITE))
+
+
+@dataclass(frozen=True)
+class BagFile:
+    """A bag; every pass over its messages opens it anew."""
+
+    path: Path
+
+    @cached_property
+    def topics(self) -> tuple[Topic, ...]:
+        """Sorted by name; a topic of two types is two of them.
+
+        Raises:
+            SourceError: the bag is empty, damaged or has no index.
+        """
+        counts: Counter[tuple[str, str]] = Counter()
+        with self._opened() as reader:
+            for connection in reader.connections:
+                counts[connection.topic, _type_of(connection)] += connection.msgcount
+        return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+    def messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
+        """The messages of ``topics`` in the order in which they were recorded, at equal times in that of ``topics``.
+
+        Memory does not depend on the bag's length, but for the index of a ROS 1 bag.
+
+        Raises:
+            SourceError: the bag cannot be read to its end.
+        """
+        numbers: Counter[Topic] = Counter()
+        with self._opened() as reader:
+            chosen = [
+                (connection, topic)
+                for topic in topics
+                for connection in reader.connections
+                if (connection.topic, _type_of(connection)) == (topic.name, topic.type)
+            ]
+            topic_of = {connection.id: topic for connection, topic in chosen}
+            for connection, bag_time_ns, payload in reader.messages([connection for connection, _ in chosen]):
+                topic = topic_of[connection.id]
+                numbers[topic] += 1
+                yield RawMessage(topic, numbers[topic], bag_time_ns, payload)
+
+    def decode(self, message: RawMessage) -> Any:
+        """The message as an object of rosbags.
+
+        Raises:
+            ValueError: its bytes are no message of its type.
+        """
+        kind = TRANSFORMS if message.topic.type == _OLD_TRANSFORMS else message.topic.type
+        name = kind.replace("/", "/msg/")
+        store = typestore(self._is_ros1)
+        try:
+            if self._is_ros1:
+                return store.deserialize_ros1(message.payload, name)
+            return store.deserialize_cdr(message.payload, name)
+        except Exception as error:  # generated code that meets foreign bytes raises whatever it meets
+            raise ValueError("the bytes are no message of this type") from error
+
+    @cached_property
+    def _magic(self) -> bytes:
+        if self.path.is_dir():
+            return b""
+        with self.path.open("rb") as file:
+            return file.read(len(_SQLITE))
+
+    @property
+    def _is_ros1(self) -> bool:
+        return self._magic.startswith(_ROS1)
+
+    @contextmanager
+    def _opened(self) -> Iterator[_Reader]:
+        """A reader; whatever it raises becomes one clear line. rosbags' parsers raise many things on damaged files."""
+        try:
+            reader = _reader(self.path, self._magic)
+            reader.open()
+            try:
+                yield reader
+            finally:
+                reader.close()
+        except SourceError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split())[:_LONGEST_REASON].rstrip(".") or type(error).__name__
+            raise SourceError(f"{self.path}: the bag cannot be read ({reason}); {self._remedy()}") from error
+
+    def _remedy(self) -> str:
+        if self._is_ros1:
+            return "copy it again, or mend it with `rosbag reindex`"
+        if self._magic.startswith(_MCAP):
+            return "copy it again, or mend it with `mcap recover`"
+        return "copy it again, or mend it with `ros2 bag reindex`"
+
+
+def is_transforms(topic: Topic) -> bool:
+    """Whether the topic carries tf."""
+    return topic.type in (TRANSFORMS, _OLD_TRANSFORMS)
+
+
+def _reader(path: Path, magic: bytes) -> _Reader:
+    from rosbags import rosbag1, rosbag2
+
+    if path.is_dir():
+        if not (path / _METADATA).is_file():
+            raise SourceError(
+                f"{path}: has bag files and no {_METADATA}; give one of the files, or make it with `ros2 bag reindex`"
+            )
+        for database in path.glob("*.db3"):
+            _check_database(database)
+        return rosbag2.Reader(path)
+    if magic.startswith(_ROS1):
+        return rosbag1.Reader(path)
+    if magic.startswith(_SQLITE):
+        _check_database(path)
+        # rosbags puts the path into a URI as it is
+        return rosbag2.Reader.STORAGE_PLUGINS[".db3"](Path(quote(str(path))))
+    if magic.startswith(_MCAP):
+        return rosbag2.Reader.STORAGE_PLUGINS[".mcap"](path)
+    raise SourceError(f"{path}: the whole bag is compressed; unpack it first")
+
+
+def _check_database(database: Path) -> None:
+    """Refuse a database that was not closed or lacks its end: SQLite would read what is there and say nothing."""
+    journal = database.with_name(f"{database.name}-wal")
+    if journal.exists() and journal.stat().st_size:
+        raise SourceError(
+            f"{database}: was not closed, {journal.name} holds its end; close it with "
+            f'`sqlite3 {database.name} "PRAGMA wal_checkpoint(TRUNCATE)"`'
+        )
+    with database.open("rb") as file:
+        header = file.read(_SQLITE_HEADER_BYTES)
+    page_bytes, changes, pages, counted_at = (
+        int.from_bytes(header[start:end], "big") for start, end in ((16, 18), (24, 28), (28, 32), (92, 96))
+    )
+    if changes == counted_at and database.stat().st_size < page_bytes * pages:
+        raise ValueError("the file is truncated")
+
+
+def _storage_files(folder: Path) -> Iterator[Path]:
+    return (path for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
+
+
+def _type_of(connection: "Connection") -> str:
+    kind = connection.msgtype.replace("/msg/", "/")
+    encoding = getattr(connection.ext, "serialization_format", "cdr")
+    return kind if encoding == "cdr" else f"{kind} as {encoding}"
+
+
+@cache
+def typestore(ros1: bool) -> "Typestore":
+    """The types that are read and written, as ROS 1 or ROS 2 lays them out."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if not ros1:
+        return get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return store

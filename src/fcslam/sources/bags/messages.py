@@ -1,0 +1,134 @@
+"""What the messages of a bag say, checked: hostile or broken ones are refused with a ValueError."""
+
+from collections.abc import Iterator
+from math import degrees, inf, isfinite, pi, radians
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fcslam.records import Ranges
+from fcslam.sources.bags.transforms import Transform, planar, transform_of
+from fcslam.sources.pose import Pose
+
+_LONGEST_RANGE_M = 1000.0
+_FULL_TURN_RAD = 2.0 * pi + 0.1
+_MAX_COORDINATE_M = 1e7
+_NANOSECONDS = 10**9
+
+
+class Beams(NamedTuple):
+    """The directions of a scan's beams; they turn to the left."""
+
+    beam_count: int
+    angle_min_rad: float
+    angle_increment_rad: float
+
+    @property
+    def span_rad(self) -> float:
+        """Between the first and the last beam."""
+        return (self.beam_count - 1) * self.angle_increment_rad
+
+
+class ScanMessage(NamedTuple):
+    """sensor_msgs/LaserScan."""
+
+    stamp: float
+    frame: str
+    beams: Beams
+    range_min_m: float
+    range_max_m: float
+    raw_ranges_m: Ranges
+    """As sent, shape (beam_count,)."""
+
+    @property
+    def beam_count(self) -> int:
+        """Ranges in the scan."""
+        return self.beams.beam_count
+
+
+class OdometryReading(NamedTuple):
+    """One pose of the wheel odometry, from nav_msgs/Odometry or tf."""
+
+    stamp: float
+    T_odom_base: Pose
+    base_frame: str
+
+
+class StampedTransform(NamedTuple):
+    """One transform of a tf message."""
+
+    stamp: float
+    parent: str
+    child: str
+    T_parent_child: Transform
+
+
+def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
+    """A laser scan; one whose beams turn to the right is turned round."""
+    ranges = np.asarray(content.ranges, dtype=np.float32)
+    count = len(ranges)
+    first_rad, increment_rad = _angle_rad(content.angle_min), _angle_rad(content.angle_increment)
+    range_min_m, range_max_m = float(content.range_min), float(content.range_max)
+    span_rad = (count - 1) * increment_rad
+    if not (count >= 2 and abs(first_rad) <= _FULL_TURN_RAD and 0.0 < abs(span_rad) < _FULL_TURN_RAD):
+        raise ValueError("no sane field of view")
+    range_min_m = range_min_m if range_min_m > 0.0 else 0.0
+    if not range_max_m > range_min_m:
+        raise ValueError("no sane range")
+    if increment_rad < 0.0:
+        first_rad, increment_rad, ranges = first_rad + span_rad, -increment_rad, ranges[::-1]
+    stamp, frame = _header(content.header, bag_time_ns)
+    beams = Beams(count, first_rad, increment_rad)
+    return ScanMessage(stamp, frame, beams, range_min_m, min(range_max_m, _LONGEST_RANGE_M), ranges)
+
+
+def measured_ranges(scan: ScanMessage) -> Ranges:
+    """Ranges by REP 117: at or beyond the maximum nothing was hit (inf); else what is below the minimum or no
+    number is invalid (NaN).
+    """
+    raw = scan.raw_ranges_m
+    ranges: Ranges = np.where(raw >= np.float32(scan.range_max_m), np.float32(inf), raw)
+    ranges[~(raw >= np.float32(scan.range_min_m))] = np.nan
+    return ranges
+
+
+def odometry_of(content: Any, bag_time_ns: int) -> OdometryReading:
+    """An odometry message; the base is its child frame."""
+    stamp, _ = _header(content.header, bag_time_ns)
+    pose = content.pose.pose
+    transform = _transform(pose.position, pose.orientation)
+    return OdometryReading(stamp, planar(transform), _frame(content.child_frame_id))
+
+
+def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
+    """The transforms of a tf message."""
+    for entry in content.transforms:
+        stamp, parent = _header(entry.header, bag_time_ns)
+        transform = _transform(entry.transform.translation, entry.transform.rotation)
+        yield StampedTransform(stamp, parent, _frame(entry.child_frame_id), transform)
+
+
+def _angle_rad(single: float) -> float:
+    """The angle that was rounded to single precision: most lasers count in whole ten-thousandths of a degree."""
+    rounded = radians(round(degrees(single), 4)) if isfinite(single) else single
+    return rounded if np.float32(rounded) == np.float32(single) else float(single)
+
+
+def _header(header: Any, bag_time_ns: int) -> tuple[float, str]:
+    """Stamp and frame; a stamp that was never set is replaced by the time of recording."""
+    stamp_ns = header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
+    return (stamp_ns or bag_time_ns) / _NANOSECONDS, _frame(header.frame_id)
+
+
+def _frame(name: str) -> str:
+    """Without the slash that ROS 1 used to put before it."""
+    return name.lstrip("/")
+
+
+def _transform(translation: Any, rotation: Any) -> Transform:
+    x, y, z = translation.x, translation.y, translation.z
+    if not max(abs(x), abs(y), abs(z)) < _MAX_COORDINATE_M:
+        raise ValueError("no sane position")
+    if not all(map(isfinite, (x, y, z))):
+        raise ValueError("no finite position")
+    return transform_of((x, y, z), (rotation.x, rotation.y, rotation.z, rotation.w))

@@ -1,0 +1,120 @@
+"""Scans and the odometry around them: each scan gets the pose at its own stamp.
+
+Between two readings of the odometry the pose is interpolated, the shortest way round; a scan with the very stamp of a
+reading gets that reading's pose, to the last bit. Odometry may come later than the scan: scans wait for it, in the
+recording's order. What decides is the pair of readings nearest in the recording, not in time, so that a clock that
+steps back does not mix what came before with what came after.
+
+Beyond the first and the last reading (and where the odometry's clock steps back) a scan takes the nearest reading's
+pose if that is at most 1 s away, and else has none.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+from fcslam.sources.bags.messages import OdometryReading, ScanMessage
+from fcslam.sources.faults import Fault
+from fcslam.sources.pose import Pose, interpolated_pose
+
+MAX_GAP_S = 1.0
+
+_READINGS_KEPT = 1000
+"""A scan that comes later than so many readings after its stamp finds none."""
+_LONGEST_QUEUE = 1000
+"""Scans and readings that wait; beyond, the oldest scan goes on without later odometry."""
+
+
+class PosedScan(NamedTuple):
+    """A scan with the odometry at its stamp."""
+
+    scan: ScanMessage
+    T_odom_base: Pose
+    fault: Fault | None
+    """What is wrong with the pose; with NO_ODOMETRY there is none, and it is the identity."""
+
+
+class _Match(NamedTuple):
+    T_odom_base: Pose
+    fault: Fault | None
+
+
+@dataclass(slots=True)
+class _Waiting:
+    number: int
+    item: ScanMessage | OdometryReading
+    match: _Match | None
+
+
+def paired(
+    items: Iterable[tuple[int, ScanMessage | OdometryReading]],
+) -> Iterator[tuple[int, PosedScan | OdometryReading]]:
+    """The items in their order, each with its number, scans with their poses."""
+    readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
+    queue: deque[_Waiting] = deque()
+    for number, item in items:
+        if isinstance(item, OdometryReading):
+            _tell(queue, readings[-1] if readings else None, item)
+            readings.append(item)
+            queue.append(_Waiting(number, item, _Match(item.T_odom_base, None)))
+        else:
+            queue.append(_Waiting(number, item, _look_back(readings, item.stamp)))
+        while queue and (queue[0].match or len(queue) > _LONGEST_QUEUE):
+            yield _leave(queue.popleft(), readings)
+    for waiting in queue:
+        yield _leave(waiting, readings)
+
+
+def _leave(waiting: _Waiting, readings: deque[OdometryReading]) -> tuple[int, PosedScan | OdometryReading]:
+    if isinstance(waiting.item, OdometryReading):
+        return waiting.number, waiting.item
+    match = waiting.match or _hold(readings, waiting.item.stamp)
+    return waiting.number, PosedScan(waiting.item, *match)
+
+
+def _tell(queue: deque[_Waiting], previous: OdometryReading | None, newest: OdometryReading) -> None:
+    """A new reading has come: some that wait have their pose now."""
+    for waiting in queue:
+        stamp = waiting.item.stamp
+        if waiting.match is not None:
+            continue
+        if previous is not None and previous.stamp <= stamp <= newest.stamp:
+            waiting.match = _between(previous, newest, stamp)
+        elif previous is not None and newest.stamp < previous.stamp:
+            waiting.match = _hold([previous, newest], stamp)
+        elif stamp <= newest.stamp:
+            waiting.match = _hold([newest], stamp)
+
+
+def _look_back(readings: deque[OdometryReading], stamp: float) -> _Match | None:
+    """The pose if the readings so far have it; None: wait for later ones."""
+    if not readings or stamp > readings[-1].stamp:
+        return None
+    if stamp == readings[-1].stamp:
+        return _Match(readings[-1].T_odom_base, None)
+    oldest = readings[-1]
+    for after, before in pairwise(reversed(readings)):
+        if before.stamp > after.stamp:
+            break
+        if before.stamp <= stamp:
+            return _between(before, after, stamp)
+        oldest = before
+    return _hold([oldest], stamp)
+
+
+def _between(before: OdometryReading, after: OdometryReading, stamp: float) -> _Match:
+    for reading in (after, before):
+        if stamp == reading.stamp:
+            return _Match(reading.T_odom_base, None)
+    span_s = after.stamp - before.stamp
+    pose = interpolated_pose(before.T_odom_base, after.T_odom_base, (stamp - before.stamp) / span_s)
+    return _Match(pose, Fault.ODOMETRY_GAP if span_s > MAX_GAP_S else None)
+
+
+def _hold(readings: Iterable[OdometryReading], stamp: float) -> _Match:
+    nearest = min(readings, key=lambda reading: abs(reading.stamp - stamp), default=None)
+    if nearest is None or abs(nearest.stamp - stamp) > MAX_GAP_S:
+        return _Match((0.0, 0.0, 0.0), Fault.NO_ODOMETRY)
+    return _Match(nearest.T_odom_base, Fault.HELD_ODOMETRY if nearest.stamp != stamp else None)

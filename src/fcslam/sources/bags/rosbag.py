@@ -1,0 +1,151 @@
+"""A ROS bag as a source: choose its topics, survey it once, then stream its records.
+
+Scans come in the order in which they were recorded, with the odometry at their own header stamps (``pairing``). What
+is tolerated and what is refused is decided in ``gate``; damaged messages are skipped and counted. A robot that stands
+still is a recording like any other: here a topic says that there is odometry.
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+from math import degrees, radians
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fcslam.errors import SourceError
+from fcslam.records import LaserModel, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.sources.bags.messages import OdometryReading, measured_ranges
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.pairing import PosedScan
+from fcslam.sources.bags.stream import BagStream
+from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
+from fcslam.sources.faults import Audit, Fault, Faults
+from fcslam.sources.gate import refuse_misfits, window
+from fcslam.sources.overview import Track
+from fcslam.sources.pose import pose_array
+from fcslam.sources.source import WHOLE, ScanRange, Survey
+
+_LEVEL_RAD = radians(2.0)
+_STEEPEST_RAD = radians(10.0)
+_USUAL_BASES = ("base_footprint", "base_link")
+
+
+class _Reading(NamedTuple):
+    """How a bag is to be read."""
+
+    survey: Survey
+    upside_down: bool
+
+
+class RosBag:
+    """A bag of one robot."""
+
+    def __init__(self, path: Path, name: str, options: BagOptions | None = None) -> None:
+        self.name = name
+        self._options = options or BagOptions()
+        self._stream = BagStream(path, self._options)
+        self._audit = _audit()
+
+    @property
+    def faults(self) -> Faults:
+        """As in Source."""
+        return self._audit.faults()
+
+    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+        """As in Source; the pass over the whole bag is made once."""
+        whole = self._reading.survey
+        if scans == WHOLE:
+            return whole
+        audit, track = _audit(), Track()
+        for _, entry in self._entries(scans, audit):
+            if isinstance(entry, PosedScan):
+                track.add(entry.scan.stamp, entry.T_odom_base)
+        return Survey(track.count, track.duration_s, track.length_m, whole.laser, audit.faults(), whole.notes)
+
+    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+        """As in Source."""
+        audit = self._audit = _audit()
+        reading = self._reading
+        for _, entry in self._entries(scans, audit):
+            T_odom_base = pose_array(entry.T_odom_base)
+            if isinstance(entry, PosedScan):
+                ranges_m = _turned(measured_ranges(entry.scan), reading.upside_down)
+                yield LaserScan(entry.scan.stamp, ranges_m, reading.survey.laser, T_odom_base)
+            else:
+                yield Odometry(entry.stamp, T_odom_base)
+
+    def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, PosedScan | OdometryReading]]:
+        return window(self._stream.entries(audit), scans, lambda entry: isinstance(entry, PosedScan), audit)
+
+    @cached_property
+    def _reading(self) -> _Reading:
+        """How to read this bag, from one pass over all of it; refuses what cannot be mapped."""
+        audit, tree = _audit(), TransformTree()
+        scans, odometry = Track(), Track()
+        base_frame = ""
+        for _, entry in self._stream.entries(audit, tree):
+            if isinstance(entry, PosedScan):
+                scans.add(entry.scan.stamp, entry.T_odom_base)
+            else:
+                odometry.add(entry.stamp, entry.T_odom_base)
+                base_frame = base_frame or entry.base_frame
+        self._refuse(audit.faults(), scans, odometry)
+        mounted = self._mounting(tree, base_frame)
+        notes = (*self._stream.topics.notes, *self._tilt_note(mounted))
+        laser = self._laser(mounted)
+        survey = Survey(scans.count, scans.duration_s, scans.length_m, laser, audit.faults(), notes)
+        return _Reading(survey, mounted.upside_down)
+
+    def _refuse(self, faults: Faults, scans: Track, odometry: Track) -> None:
+        path, topics, first = self._stream.path, self._stream.topics, self._stream.first_scans[0]
+        refuse_misfits(path, faults, scans.count, odometry.count, first.beam_count)
+        alone = faults[Fault.NO_ODOMETRY].count
+        if alone > scans.count:
+            raise SourceError(
+                f"{path}: {alone} of {alone + scans.count} scans in {topics.scan.name} have no odometry within 1 s: "
+                f"the first scan has the stamp {first.stamp:.3f} s, {topics.odometry[0].name} goes from "
+                f"{odometry.earliest:.3f} s to {odometry.latest:.3f} s; record both by one clock, all the way"
+            )
+
+    def _laser(self, mounted: Mounting) -> LaserModel:
+        beams = self._stream.usual.beams
+        angle_min_rad = -(beams.angle_min_rad + beams.span_rad) if mounted.upside_down else beams.angle_min_rad
+        max_range_m = self._stream.first_scans[0].range_max_m
+        return LaserModel(beams.beam_count, angle_min_rad, beams.angle_increment_rad, max_range_m, mounted.T_base_laser)
+
+    def _mounting(self, tree: TransformTree, base_frame: str) -> Mounting:
+        if self._options.laser_pose is not None:
+            return Mounting(self._options.laser_pose, upside_down=False, tilt_rad=0.0)
+        topic, laser_frame = self._stream.topics.scan.name, self._stream.first_scans[0].frame
+        base_frame = base_frame or next((frame for frame in _USUAL_BASES if frame in tree), _USUAL_BASES[-1])
+        try:
+            mounted = mounting(tree.fixed(base_frame, laser_frame))
+        except NoTransformError as error:
+            raise SourceError(
+                f"{self._stream.path}: tf has {error}, so it does not say where the laser of {topic} sits; say it by "
+                "--laser-pose X,Y,THETA (metres, radians)"
+            ) from error
+        if mounted.tilt_rad > _STEEPEST_RAD:
+            raise SourceError(
+                f"{self._stream.path}: the laser of {topic} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and "
+                "does not look along the floor; choose a level one by --scan-topic, or say its pose by --laser-pose"
+            )
+        return mounted
+
+    def _tilt_note(self, mounted: Mounting) -> tuple[str, ...]:
+        if mounted.tilt_rad <= _LEVEL_RAD:
+            return ()
+        return (f"{self._stream.path}: the laser is tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level",)
+
+
+def _audit() -> Audit:
+    return Audit("message")
+
+
+def _turned(ranges_m: Ranges, upside_down: bool) -> Ranges:
+    """A laser upside down turns the other way."""
+    if upside_down:
+        ranges_m = np.ascontiguousarray(ranges_m[::-1])
+    ranges_m.setflags(write=False)
+    return ranges_m

@@ -1,0 +1,158 @@
+"""The scans of a bag with their odometry, in the order in which they were recorded."""
+
+from collections.abc import Iterator
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+
+from fcslam.errors import SourceError
+from fcslam.sources.bags.beams import UsualBeams
+from fcslam.sources.bags.container import ODOMETRY, BagFile, RawMessage, Topic
+from fcslam.sources.bags.messages import (
+    OdometryReading,
+    ScanMessage,
+    StampedTransform,
+    odometry_of,
+    scan_of,
+    transforms_of,
+)
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.pairing import PosedScan, paired
+from fcslam.sources.bags.topics import Topics, choose_topics
+from fcslam.sources.bags.transforms import TransformTree, planar
+from fcslam.sources.faults import Audit, Fault
+from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate
+
+_EDGES_NAMED = 10
+
+
+class BagStream:
+    """The chosen topics of a bag, decoded and put together."""
+
+    def __init__(self, path: Path, options: BagOptions) -> None:
+        self.path = path
+        self._bag = BagFile(path)
+        self._options = options
+
+    @cached_property
+    def topics(self) -> Topics:
+        """The topics to read.
+
+        Raises:
+            SourceError: the bag cannot be read, or has no such topics.
+        """
+        return choose_topics(self._bag, self._options, self._field_of_view_rad)
+
+    @cached_property
+    def first_scans(self) -> list[ScanMessage]:
+        """Those that decide what is usual, at least one.
+
+        Raises:
+            SourceError: no scan can be read.
+        """
+        topic = self.topics.scan
+        scans = list(islice(self._scans_of(topic), SCANS_THAT_VOTE))
+        if not scans:
+            raise SourceError(
+                f"{self.path}: none of the {topic.message_count} scans in {topic.name} can be read; record it again"
+            )
+        return scans
+
+    @cached_property
+    def usual(self) -> UsualBeams:
+        """The beams to which all scans are brought."""
+        return UsualBeams(self.first_scans)
+
+    def entries(
+        self, audit: Audit, tree: TransformTree | None = None
+    ) -> Iterator[tuple[int, PosedScan | OdometryReading]]:
+        """Odometry, and the scans that fit the rest and have odometry, each with its message's number.
+
+        ``tree`` hears all tf on the way, if it is given.
+        """
+        gate = ScanGate(self.usual.beams.beam_count, audit)
+        for number, entry in paired(self._items(audit, tree)):
+            if isinstance(entry, OdometryReading):
+                yield number, entry
+            elif gate.admits(number, entry.scan):
+                if entry.fault is not None:
+                    audit.add(entry.fault, number)
+                if entry.fault is not Fault.NO_ODOMETRY:
+                    yield number, entry
+
+    def _items(self, audit: Audit, tree: TransformTree | None) -> Iterator[tuple[int, ScanMessage | OdometryReading]]:
+        topics = self.topics
+        heard = () if tree is None else topics.transforms
+        for message in self._bag.messages(list(dict.fromkeys((*topics.odometry, *heard, topics.scan)))):
+            try:
+                items = self._items_in(message, tree)
+            except ValueError:
+                audit.add(Fault.BROKEN_MESSAGE, message.number)
+                continue
+            for item in items:
+                fitting = self._fitting(item, message.number, audit)
+                if fitting is not None:
+                    yield message.number, fitting
+
+    def _fitting(
+        self, item: ScanMessage | OdometryReading, number: int, audit: Audit
+    ) -> ScanMessage | OdometryReading | None:
+        """Odometry as it is, a scan with the usual beams, or None."""
+        if isinstance(item, OdometryReading):
+            return item
+        scan = self.usual.brought(item)
+        if scan is not item:
+            audit.add(Fault.BEAM_COUNT if scan is None else Fault.RESAMPLED, number)
+        return scan
+
+    def _items_in(self, message: RawMessage, tree: TransformTree | None) -> list[ScanMessage | OdometryReading]:
+        """What one message says; raises ValueError when it is broken."""
+        if message.topic == self.topics.scan:
+            return [scan_of(self._bag.decode(message), message.bag_time_ns)]
+        if message.topic.type == ODOMETRY:
+            return [odometry_of(self._bag.decode(message), message.bag_time_ns)]
+        transforms = self._transforms_in(message)
+        if tree is not None:
+            for transform in transforms:
+                tree.add(transform.parent, transform.child, transform.T_parent_child)
+        if message.topic not in self.topics.odometry:
+            return []
+        return [
+            OdometryReading(transform.stamp, planar(transform.T_parent_child), transform.child)
+            for transform in transforms
+            if (transform.parent, transform.child) == self._odometry_edge
+        ]
+
+    @cached_property
+    def _odometry_edge(self) -> tuple[str, str]:
+        """The frames of the transform that is the odometry: the first one from a frame that is called after it."""
+        seen: set[str] = set()
+        for message in self._bag.messages(self.topics.odometry):
+            try:
+                transforms = self._transforms_in(message)
+            except ValueError:
+                continue
+            for transform in transforms:
+                if "odom" in transform.parent.rsplit("/", 1)[-1]:
+                    return transform.parent, transform.child
+                seen.add(f"{transform.parent} -> {transform.child}")
+        known = ", ".join(sorted(seen)[:_EDGES_NAMED]) or "nothing that can be read"
+        raise SourceError(
+            f"{self.path}: no odometry: no topic of type {ODOMETRY}, and in tf no transform from odom to base, but "
+            f"{known}; record the odometry"
+        )
+
+    def _transforms_in(self, message: RawMessage) -> list[StampedTransform]:
+        return list(transforms_of(self._bag.decode(message), message.bag_time_ns))
+
+    def _scans_of(self, topic: Topic) -> Iterator[ScanMessage]:
+        for message in self._bag.messages([topic]):
+            try:
+                scan = scan_of(self._bag.decode(message), message.bag_time_ns)
+            except ValueError:
+                continue
+            yield scan
+
+    def _field_of_view_rad(self, topic: Topic) -> float:
+        scan = next(self._scans_of(topic), None)
+        return 0.0 if scan is None else scan.beams.span_rad

@@ -1,0 +1,156 @@
+"""The tree of transforms (tf) that a bag carries, and where the laser sits by it."""
+
+from collections.abc import Iterator
+from math import acos, atan2, isfinite, pi, sqrt
+from typing import NamedTuple
+
+from fcslam.errors import FcslamError
+from fcslam.sources.pose import Pose
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+"""(x, y, z, w), of length 1."""
+
+_STILL = 0.01
+"""Metres or quaternion units by which a fixed transform may differ from message to message."""
+
+
+class NoTransformError(FcslamError):
+    """Two frames are not connected, or not by fixed transforms; the message says which."""
+
+
+class Transform(NamedTuple):
+    """``T_a_b`` in three dimensions."""
+
+    translation_m: Vector
+    rotation: Quaternion
+
+
+class Mounting(NamedTuple):
+    """Where a laser sits on its robot, seen from above."""
+
+    T_base_laser: Pose
+    upside_down: bool
+    tilt_rad: float
+    """Angle between the laser's plane and the floor, 0 to pi / 2."""
+
+
+IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
+    """Checked, with the quaternion brought to length 1; raises ValueError when it is no sane transform."""
+    x, y, z, w = rotation
+    length = sqrt(x * x + y * y + z * z + w * w)
+    if not (abs(length - 1.0) < 0.1 and all(map(isfinite, translation_m))):
+        raise ValueError("no sane transform")
+    return Transform(translation_m, (x / length, y / length, z / length, w / length))
+
+
+def planar(transform: Transform) -> Pose:
+    """The pose on the floor: x, y, and the heading of the x axis to a nanoradian, free of a quaternion's rounding."""
+    x, y, z, w = transform.rotation
+    heading_rad = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return transform.translation_m[0], transform.translation_m[1], round(heading_rad, 9)
+
+
+def mounting(T_base_laser: Transform) -> Mounting:
+    """How a laser with this pose looks at the floor's plane."""
+    up = min(1.0, max(-1.0, rotated(T_base_laser.rotation, (0.0, 0.0, 1.0))[2]))
+    lean_rad = acos(up)
+    return Mounting(planar(T_base_laser), up < 0.0, min(lean_rad, pi - lean_rad))
+
+
+class TransformTree:
+    """Which frame hangs on which, as far as it was heard."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Transform]] = {}
+        self._moving: set[str] = set()
+
+    def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
+        """Take one transform. The first one counts; a frame whose transform changes later is moving."""
+        first_parent, first = self._parents.setdefault(child, (parent, T_parent_child))
+        if first is not T_parent_child and (parent != first_parent or _differ(first, T_parent_child)):
+            self._moving.add(child)
+
+    def __contains__(self, frame: str) -> bool:
+        return frame in self._parents or any(parent == frame for parent, _ in self._parents.values())
+
+    def fixed(self, base: str, frame: str) -> Transform:
+        """``T_base_frame``.
+
+        Raises:
+            NoTransformError: the frames are not connected, or one moves against the other.
+        """
+        above_base, above_frame = list(self._above(base)), list(self._above(frame))
+        meeting = next((ancestor for ancestor in above_frame if ancestor in above_base), None)
+        if meeting is None:
+            raise NoTransformError(f"no transform from '{base}' to '{frame}'")
+        down = above_frame[: above_frame.index(meeting)]
+        up = above_base[: above_base.index(meeting)]
+        for child in (*up, *down):
+            if child in self._moving:
+                raise NoTransformError(
+                    f"no fixed transform from '{base}' to '{frame}' ('{child}' moves in '{self._parents[child][0]}')"
+                )
+        return _compose(_inverse(self._chain(up)), self._chain(down))
+
+    def _above(self, frame: str) -> Iterator[str]:
+        """The frame and its ancestors; a ring of frames ends where it closes."""
+        seen: set[str] = set()
+        while frame not in seen:
+            seen.add(frame)
+            yield frame
+            frame = self._parents[frame][0] if frame in self._parents else frame
+
+    def _chain(self, frames: list[str]) -> Transform:
+        """The transform from the parent of the last frame to the first."""
+        result = IDENTITY
+        for frame in frames:
+            result = _compose(self._parents[frame][1], result)
+        return result
+
+
+def rotated(rotation: Quaternion, vector: Vector) -> Vector:
+    """The vector turned by the rotation."""
+    x, y, z, w = rotation
+    twice = tuple(2.0 * value for value in _cross((x, y, z), vector))
+    turned = _cross((x, y, z), (twice[0], twice[1], twice[2]))
+    a, b, c = (v + w * t + u for v, t, u in zip(vector, twice, turned, strict=True))
+    return a, b, c
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _compose(T_a_b: Transform, T_b_c: Transform) -> Transform:
+    turned = rotated(T_a_b.rotation, T_b_c.translation_m)
+    x, y, z = (a + b for a, b in zip(T_a_b.translation_m, turned, strict=True))
+    return Transform((x, y, z), _product(T_a_b.rotation, T_b_c.rotation))
+
+
+def _inverse(transform: Transform) -> Transform:
+    x, y, z, w = transform.rotation
+    back: Quaternion = (-x, -y, -z, w)
+    a, b, c = rotated(back, transform.translation_m)
+    return Transform((-a, -b, -c), back)
+
+
+def _product(p: Quaternion, q: Quaternion) -> Quaternion:
+    px, py, pz, pw = p
+    qx, qy, qz, qw = q
+    return (
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+        pw * qw - px * qx - py * qy - pz * qz,
+    )
+
+
+def _differ(first: Transform, second: Transform) -> bool:
+    """Whether they are further apart than noise; q and -q are one rotation."""
+    apart = max(abs(a - b) for a, b in zip(first.translation_m, second.translation_m, strict=True))
+    alike = abs(sum(a * b for a, b in zip(first.rotation, second.rotation, strict=True)))
+    return apart > _STILL or alike < 1.0 - _STILL * _STILL

@@ -1,0 +1,111 @@
+"""Which scans fit the rest of a recording, and when too many do not: one rule for all formats.
+
+- Clocks of one robot disagree by up to a second (the Intel log: 631 steps back, largest 0.9 s): scans stay in the
+  recording's order, which is the order that the odometry makes sense in. A scan more than 2 s before both scans
+  before it is misplaced and skipped (both: one of them may carry a damaged stamp, far ahead). When more than 1 % are
+  misplaced, two recordings were put together, which is refused. So is one in which more than half of the steps go back.
+- A scan with another beam count than the rest is skipped; more than 1 % of them are a change of sensor: refused.
+- Equal stamps are kept: some logs were printed with too few digits, or without a clock.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from math import inf
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from fcslam.errors import SourceError
+from fcslam.sources.faults import Audit, Fault, Faults
+from fcslam.sources.source import ScanRange
+
+MAX_STEP_BACK_S = 2.0
+TOLERATED_SHARE = 0.01
+"""Share of a recording's scans that may not fit the rest."""
+SCANS_THAT_VOTE = 20
+"""So many of the first scans decide what is usual."""
+
+Entry = TypeVar("Entry")
+
+
+class StampedScan(Protocol):
+    """What the gate looks at."""
+
+    @property
+    def stamp(self) -> float:
+        """Seconds of the recording's clock."""
+
+    @property
+    def beam_count(self) -> int:
+        """Ranges in the scan."""
+
+
+class ScanGate:
+    """Lets scans pass that fit the recording and counts those that do not; every pass uses the same rule."""
+
+    def __init__(self, beam_count: int, audit: Audit) -> None:
+        self._beam_count = beam_count
+        self._audit = audit
+        self._previous = self._before_previous = -inf
+
+    def admits(self, number: int, scan: StampedScan) -> bool:
+        """Whether the scan on line (or in message) ``number`` is one of the recording's."""
+        if scan.beam_count != self._beam_count:
+            self._audit.add(Fault.BEAM_COUNT, number)
+            return False
+        step_back_s = self._previous - scan.stamp
+        if min(self._previous, self._before_previous) - scan.stamp > MAX_STEP_BACK_S:
+            self._audit.add(Fault.MISPLACED_SCAN, number, step_s=step_back_s)
+            return False
+        if step_back_s > 0.0:
+            self._audit.add(Fault.TIME_REVERSAL, number, step_s=step_back_s)
+        elif step_back_s == 0.0:
+            self._audit.add(Fault.REPEATED_STAMP, number)
+        self._before_previous, self._previous = self._previous, scan.stamp
+        return True
+
+
+def window(
+    entries: Iterable[tuple[int, Entry]], scans: ScanRange, is_scan: Callable[[Entry], bool], audit: Audit
+) -> Iterator[tuple[int, Entry]]:
+    """The entries of a range of scans; odometry goes with the scan before it.
+
+    In the end ``audit`` holds the faults of this range alone.
+    """
+    seen = 0
+    for number, entry in entries:
+        if is_scan(entry):
+            if scans.end is not None and seen >= scans.end:
+                return
+            if seen == scans.first > 0:
+                audit.clear()
+            seen += 1
+        if seen > scans.first or scans.first == 0:
+            yield number, entry
+
+
+def refuse_misfits(path: Path, faults: Faults, scan_count: int, odometry_count: int, beam_count: int) -> None:
+    """Refuse a recording of which too much does not fit the rest.
+
+    Raises:
+        SourceError: it is mostly damaged, its beam count changes, or its time jumps or runs back.
+    """
+    broken = faults[Fault.BROKEN_LINE].count + faults[Fault.BROKEN_MESSAGE].count
+    other, misplaced, reversals = (
+        faults[kind] for kind in (Fault.BEAM_COUNT, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
+    )
+    if broken > scan_count + odometry_count:
+        raise SourceError(f"{path}: most {faults.unit}s are damaged, {faults}; copy or export the recording again")
+    if other.count > TOLERATED_SHARE * scan_count:
+        raise SourceError(
+            f"{path}: {faults.unit} {other.first_line}: the beam count changes ({other.count} scans do not have the "
+            f"{beam_count} beams of the first ones); give one recording for each laser"
+        )
+    if misplaced.count > TOLERATED_SHARE * scan_count:
+        raise SourceError(
+            f"{path}: {faults.unit} {misplaced.first_line}: time jumps back by up to {misplaced.largest_s:.6g} s, as "
+            "if two recordings had been put together; cut it there and give both parts"
+        )
+    if 2 * reversals.count > scan_count:
+        raise SourceError(
+            f"{path}: {faults.unit} {reversals.first_line}: time runs backwards in {reversals.count} of {scan_count} "
+            "scans; give the recording in the order in which it was made"
+        )

@@ -1,0 +1,194 @@
+"""`fcslam map` on bags, names for robots, and `fcslam convert`."""
+
+import csv
+
+import numpy as np
+import pytest
+from sources import carmen_text
+from sources.bag_messages import drive, mounted, odom, save, scan, text
+
+from fcslam.cli import main
+from fcslam.runs import read_tum
+from fcslam.sources import open_source
+
+
+def run(*arguments):
+    return main([*map(str, arguments)])
+
+
+def refused(capsys, *arguments):
+    """The one line of a command that is refused."""
+    capsys.readouterr()
+    assert run(*arguments) == 2
+    out, error = capsys.readouterr()
+    assert out == ""
+    assert error.startswith("fcslam: ")
+    assert error.count("\n") == 1
+    return error
+
+
+def robots(folder):
+    with (folder / "robots.csv").open(newline="") as file:
+        return {row["robot"]: int(row["scans"]) for row in csv.DictReader(file)}
+
+
+@pytest.fixture
+def bag(tmp_path):
+    return save(tmp_path / "run1.bag", drive(40))
+
+
+# Bags and logs are the same recordings
+
+
+@pytest.fixture(scope="module")
+def from_log(logs, tmp_path_factory):
+    """One drawn robot's trajectory from its log."""
+    output = tmp_path_factory.mktemp("runs") / "run"
+    assert run("map", f"robot={logs[0]}", "-o", output) == 0
+    return read_tum(output / "trajectories" / "robot.tum")
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run.db3", "run"])
+def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path, name):
+    assert run("convert", logs[0], tmp_path / name) == 0
+    assert run("map", f"robot={tmp_path / name}", "-o", tmp_path / "out") == 0
+    stamps, poses = read_tum(tmp_path / "out" / "trajectories" / "robot.tum")
+    np.testing.assert_allclose(stamps, from_log[0], atol=1e-9)
+    assert np.hypot(*(poses - from_log[1])[:, :2].T).max() < 1e-3
+
+
+def test_a_robot_that_stands_still_makes_one_small_map(tmp_path):
+    ranges = (2.0, 3.0, 2.0, 3.0, 2.0, 3.0, 2.0, 3.0)
+    said = [m for k in range(40) for m in (odom(100 + 0.2 * k, (1, 2, 0)), scan(100 + 0.2 * k, ranges))]
+    assert run("map", save(tmp_path / "still.bag", [mounted(), *said]), "-o", tmp_path / "out") == 0
+    assert robots(tmp_path / "out") == {"still": 40}
+    _, poses = read_tum(tmp_path / "out" / "trajectories" / "still.tum")
+    assert np.abs(poses).max() < 0.01
+    assert not (tmp_path / "out" / "map_1.pgm").exists()
+
+
+def test_choices_and_faults_are_said(tmp_path, capsys):
+    said = [*drive(40), *(odom(100 + k, (9, 9, 0), topic="/filtered") for k in range(9))]
+    bag = save(tmp_path / "run.bag", said[1:])
+    assert run("map", bag, "--laser-pose", "-0.1,0,0", "-o", tmp_path / "out") == 0
+    error = capsys.readouterr().err
+    assert f"{bag}: reads odometry from /odom, not from /filtered (--odom-topic chooses)\n" in error
+    assert run("map", bag, "--laser-pose", "0,0,0", "--split", 2, "-o", tmp_path / "two") == 0
+    assert capsys.readouterr().err.count("reads odometry from") == 1
+
+
+# Names
+
+
+def test_names_tell_equal_files_apart(tmp_path, bag, capsys):
+    twin = save(tmp_path / "run1.mcap", drive(30))
+    assert "NAME=LOG" in refused(capsys, "map", bag, twin, "-o", tmp_path / "out")
+    assert "NAME=LOG" in refused(capsys, "map", bag, bag, "-o", tmp_path / "out")
+    assert run("map", f"anna={bag}", f"ben={twin}", bag, "-o", tmp_path / "out") == 0
+    assert robots(tmp_path / "out") == {"anna": 40, "ben": 30, "run1": 40}
+
+
+def test_a_name_works_for_logs_too(tmp_path):
+    log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40))
+    assert run("map", f"anna={log}", "--split", 2, "-o", tmp_path / "out") == 0
+    assert robots(tmp_path / "out") == {"anna_1": 20, "anna_2": 20}
+
+
+def test_a_file_with_an_equals_sign_is_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save(tmp_path / "speed=2.bag", drive(40))
+    assert run("map", "speed=2.bag", "slow=speed=2.bag", "-o", "out") == 0
+    assert robots(tmp_path / "out") == {"speed_2": 40, "slow": 40}
+
+
+@pytest.mark.parametrize("name", ["an/na", "x" * 80, "+", " "])
+def test_a_bad_name_is_refused(tmp_path, bag, capsys, name):
+    assert "name" in refused(capsys, "map", f"{name}={bag}", "-o", tmp_path / "out")
+
+
+def test_a_name_without_a_file(tmp_path, capsys):
+    assert "none.bag: no such file" in refused(capsys, "map", f"anna={tmp_path}/none.bag", "-o", tmp_path / "out")
+    assert "no such file" in refused(capsys, "map", f"={tmp_path}/none.bag", "-o", tmp_path / "out")
+
+
+# Refusals
+
+
+@pytest.mark.parametrize("options", [("--scan-topic", "/scan"), ("--odom-topic", "/odom"), ("--laser-pose", "0,0,0")])
+def test_options_of_bags_go_with_bags_only(tmp_path, bag, capsys, options):
+    log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40))
+    assert "a.log: a CARMEN log" in refused(capsys, "map", bag, log, *options, "-o", tmp_path / "out")
+    assert "a.log: a CARMEN log" in refused(capsys, "convert", log, tmp_path / "a.bag", *options)
+
+
+@pytest.mark.parametrize("pose", ["1,2", "1,2,3,4", "a,b,c", "nan,0,0", "inf,0,0", ""])
+def test_a_pose_that_is_none(tmp_path, bag, capsys, pose):
+    assert "is no pose; give metres" in refused(capsys, "map", bag, "--laser-pose", pose, "-o", tmp_path / "out")
+
+
+def test_bad_bags_leave_nothing(tmp_path, capsys):
+    (tmp_path / "unindexed.bag").write_bytes(b"#ROSBAG V2.0\n")
+    bad = {
+        save(tmp_path / "nothing.bag", [text(1.0)]): "no laser scans",
+        save(tmp_path / "no_tf.mcap", drive(20)[1:]): "--laser-pose",
+        tmp_path / "unindexed.bag": "rosbag reindex",
+    }
+    for path, reason in bad.items():
+        assert reason in refused(capsys, "map", path, "-o", tmp_path / "out")
+        assert reason in refused(capsys, "convert", path, tmp_path / "out.clf")
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in bad}
+
+
+# fcslam convert
+
+
+@pytest.mark.parametrize("name", ["a.clf", "a.log.gz", "a.clf.xz", "a.clf.bz2", "a.bag", "a.mcap", "a.db3", "folder"])
+def test_every_format_can_be_written_and_read(tmp_path, bag, name, capsys):
+    output = tmp_path / "deep" / name
+    assert run("convert", bag, output) == 0
+    assert capsys.readouterr().out == f"40 scans: {output}\n"
+    assert open_source(output).survey().scan_count == 40
+    assert [path.name for path in output.parent.iterdir()] == [name]
+
+
+def test_options_choose_what_is_converted(tmp_path):
+    said = [*drive(40), *(scan(100 + k, topic="/other") for k in range(7))]
+    bag = save(tmp_path / "run.bag", said)
+    options = ("--scan-topic", "/other", "--laser-pose", "1,0,0")
+    assert run("convert", bag, tmp_path / "other.clf", *options) == 0
+    assert open_source(tmp_path / "other.clf").survey().scan_count == 7
+
+
+@pytest.mark.parametrize("name", ["a.clf", "a.bag", "folder"])
+def test_only_force_replaces(tmp_path, bag, capsys, name):
+    output = tmp_path / name
+    assert run("convert", bag, output) == 0
+    assert "--force" in refused(capsys, "convert", bag, output)
+    shorter = save(tmp_path / "short.mcap", drive(12))
+    assert run("convert", shorter, output, "--force") == 0
+    assert open_source(output).survey().scan_count == 12
+    assert run("convert", output, output, "--force") == 0
+    assert open_source(output).survey().scan_count == 12
+
+
+def test_what_convert_refuses(tmp_path, bag, capsys):
+    assert "a.zip: unknown format" in refused(capsys, "convert", bag, tmp_path / "a.zip")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "main.tex").touch()
+    assert "no bag" in refused(capsys, "convert", bag, tmp_path / "thesis", "--force")
+    assert (tmp_path / "thesis" / "main.tex").exists()
+    (tmp_path / "dir.bag").mkdir()
+    assert "is a folder" in refused(capsys, "convert", bag, tmp_path / "dir.bag", "--force")
+    assert "cannot be written" in refused(capsys, "convert", bag, bag / "a.clf")
+    assert "no such file" in refused(capsys, "convert", tmp_path / "none.bag", tmp_path / "a.clf")
+
+
+def test_a_log_without_a_clock_before_zero_cannot_be_a_bag(tmp_path, capsys):
+    log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40, start_stamp=-5.0))
+    assert "ROS counts from 0 s" in refused(capsys, "convert", log, tmp_path / "a.bag")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.log"}
+
+
+def test_the_help_has_examples(capsys):
+    assert run("convert", "--help") == 0
+    assert "Example: fcslam convert robot1.clf.gz robot1.bag" in capsys.readouterr().out

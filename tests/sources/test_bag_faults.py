@@ -1,0 +1,347 @@
+"""Bags that are damaged, incomplete or strange: one clear line, or a counted fault."""
+
+import gzip
+import math
+import shutil
+import sqlite3
+import struct
+import warnings
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from bag_messages import (
+    Said,
+    drive,
+    mounted,
+    odom,
+    pose_at,
+    quaternion,
+    save,
+    scan,
+    text,
+    tf,
+)
+from carmen_text import scans_of
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fcslam.errors import SourceError
+from fcslam.sources import BagOptions, Fault, Tally, open_source
+
+FILES = ["run.bag", "run.mcap", "run.db3"]
+KINDS = [*FILES, "run"]
+
+
+def refusal(path, options=None):
+    """The line that refuses the bag before any record is read."""
+    with pytest.raises(SourceError) as caught:
+        open_source(path, options).survey()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    assert ";" in message, "says nothing on what to do"
+    return message
+
+
+def without(said, topic):
+    return [message for message in said if message.topic != topic]
+
+
+# What is not in the bag
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_an_empty_bag(tmp_path, name):
+    assert "the bag has no topics" in refusal(save(tmp_path / name, []))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_no_scans(tmp_path, name):
+    message = refusal(save(tmp_path / name, without(drive(20), "/scan")))
+    assert "no laser scans (sensor_msgs/LaserScan)" in message
+    assert "/odom (nav_msgs/Odometry, 42)" in message
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_no_odometry(tmp_path, name):
+    message = refusal(save(tmp_path / name, [*without(without(drive(20), "/odom"), "/tf_static"), text(100.0)]))
+    assert "no odometry (nav_msgs/Odometry, or tf from odom to base)" in message
+    assert "/chatter (std_msgs/String, 1), /scan (sensor_msgs/LaserScan, 20)" in message
+
+
+def test_no_odometry_in_tf(tmp_path):
+    message = refusal(save(tmp_path / "run.bag", without(drive(20), "/odom")))
+    assert "in tf no transform from odom to base, but base_link -> laser" in message
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            BagOptions(scan_topic="/lidar"),
+            ["topic /lidar is not there", "--scan-topic", "/scan (sensor_msgs/Laser"],
+        ),
+        (BagOptions(odom_topic="/lidar"), ["topic /lidar is not there", "--odom-topic", "/odom (nav_msgs/Odometry"]),
+        (
+            BagOptions(scan_topic="/odom"),
+            ["/odom has 42 messages of type nav_msgs/Odometry", "needs sensor_msgs/LaserScan"],
+        ),
+        (
+            BagOptions(odom_topic="/chatter"),
+            ["/chatter has 1 messages of type std_msgs/String", "needs nav_msgs/Odometry, or tf"],
+        ),
+    ],
+)
+def test_a_topic_that_cannot_be_read(tmp_path, options, words):
+    message = refusal(save(tmp_path / "run.mcap", [*drive(20), text(100.0)]), options)
+    assert all(word in message for word in words)
+
+
+def test_many_topics_are_not_all_named(tmp_path):
+    said = [text(100.0, f"/chatter_{k:03}") for k in range(80)]
+    assert "and 65 more" in refusal(save(tmp_path / "run.bag", said))
+
+
+def test_a_missing_transform_is_named_with_the_way_out(tmp_path):
+    message = refusal(save(tmp_path / "run.bag", drive(20)[1:]))
+    assert "no transform from 'base_link' to 'laser'" in message
+    assert "--laser-pose" in message
+
+
+def test_a_laser_that_moves_on_the_robot(tmp_path):
+    said = [tf(100 + k, "base_link", "laser", (0.1 * k, 0.0, 0.0)) for k in range(4)]
+    assert "'laser' moves in 'base_link'" in refusal(save(tmp_path / "run.bag", drive(20)[1:] + said))
+
+
+def test_a_tilted_laser(tmp_path):
+    tilted = tf(99, "base_link", "laser", rotation=quaternion(pitch=math.radians(30)), topic="/tf_static")
+    bag = save(tmp_path / "run.bag", [tilted, *drive(20)[1:]])
+    assert "tilted by 30 degrees" in refusal(bag)
+    assert open_source(bag, BagOptions(laser_pose=(0.0, 0.0, 0.0))).survey().scan_count == 20
+
+
+def test_clocks_that_differ(tmp_path):
+    said = [message._replace(fields={**message.fields, "stamp": message.fields["stamp"] + 5e8})
+            if message.topic == "/scan" else message for message in drive(20)]  # fmt: skip
+    message = refusal(save(tmp_path / "run.bag", said))
+    assert "20 of 20 scans in /scan have no odometry" in message
+    assert "500000100.050 s, /odom goes from 99.900 s to 104.000 s" in message
+
+
+# Time
+
+
+def test_two_recordings_put_together(tmp_path):
+    again = [message._replace(bag_time=message.bag_time + 100) for message in drive(60)]
+    message = refusal(save(tmp_path / "run.bag", drive(60) + again))
+    assert "message 61: time jumps back by up to 11.8 s" in message
+
+
+def test_time_that_runs_backwards(tmp_path):
+    said = [message._replace(bag_time=300 - message.bag_time) for message in drive(20)]
+    assert "time runs backwards" in refusal(save(tmp_path / "run.bag", said))
+
+
+def test_a_jump_ahead_is_kept_and_the_gap_is_said(tmp_path):
+    source = open_source(save(tmp_path / "run.bag", drive(20) + drive(20, start=5000.0)[1:]))
+    assert source.survey().scan_count == 40
+    assert source.survey().duration_s == pytest.approx(4903.8)
+    assert not source.survey().faults
+
+
+def test_a_gap_in_the_odometry_is_counted(tmp_path):
+    said = [message for message in drive(60) if message.topic != "/odom" or not 104.0 < message.bag_time < 107.0]
+    source = open_source(save(tmp_path / "run.bag", said))
+    assert len(scans_of(source)) == 60
+    assert source.faults[Fault.ODOMETRY_GAP].count == 15
+    assert source.survey().faults.tallies == source.faults.tallies
+
+
+def test_scans_before_the_odometry_are_left_out_and_counted(tmp_path):
+    said = [message for message in drive(60) if message.topic != "/odom" or message.bag_time > 104.0]
+    source = open_source(save(tmp_path / "run.bag", said))
+    assert len(scans_of(source)) == 60 - 16 == source.survey().scan_count
+    assert source.faults[Fault.NO_ODOMETRY] == Tally(16, 1)
+    assert source.faults[Fault.HELD_ODOMETRY].count == 5
+
+
+# Beams
+
+
+def test_a_change_of_sensor(tmp_path):
+    other = [scan(108.05 + 0.2 * k, (1.0,) * 5) for k in range(10)]
+    said = [*drive(40), *other, *(odom(108 + 0.1 * k, pose_at(8 + 0.1 * k)) for k in range(30))]
+    assert "message 41: the beam count changes" in refusal(save(tmp_path / "run.bag", said))
+
+
+def test_a_few_other_scans_are_skipped_and_counted(tmp_path):
+    said = [*drive(200), scan(110.0, (1.0,) * 5, bag_time=110.08), scan(111.0, angle_min=0.0, bag_time=111.08)]
+    source = open_source(save(tmp_path / "run.bag", said))
+    assert len(scans_of(source)) == 200
+    assert source.faults[Fault.BEAM_COUNT].count == 2
+    assert "scans with another beam count skipped: 2 (first: message 52)" in str(source.faults)
+
+
+# Broken messages
+
+
+def payload(topic, kind, bag_time, content):
+    return Said(topic, kind, bag_time, {"payload": content})
+
+
+def hostile(time):
+    """Messages that are none, lie about their sizes, or hold numbers that are none."""
+    nan, inf = math.nan, math.inf
+    scan_kind, odom_kind = scan(0.0).kind, odom(0.0, (0, 0, 0)).kind
+    sizes = struct.pack("<IIII", 0, 1, 1, 0xFFFFFFFF)
+    yield from (payload("/scan", scan_kind, time, content) for content in (b"", b"\x00" * 7, b"\xff" * 90, sizes * 9))
+    yield from (payload("/odom", odom_kind, time, content) for content in (b"", b"\xff" * 400, sizes * 30))
+    yield odom(time, (nan, 0.0, 0.0))
+    yield odom(time, (0.0, inf, 0.0))
+    yield odom(time, (1e300, 0.0, 0.0))
+    yield odom(time, (0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0, 0.0))
+    yield odom(time, (0.0, 0.0, 0.0), rotation=(nan, 0.0, 0.0, 1.0))
+    yield scan(time, ())
+    yield scan(time, (1.0,))
+    yield scan(time, angle_min=nan)
+    yield scan(time, angle_min=1e6)
+    yield scan(time, angle_increment=0.0)
+    yield scan(time, angle_increment=inf)
+    yield scan(time, angle_increment=3.0)
+    yield scan(time, range_max=nan)
+    yield scan(time, range_max=-1.0)
+    yield scan(time, range_min=inf)
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.db3"])
+def test_broken_messages_are_skipped_and_counted(tmp_path, name):
+    broken = [list(hostile(100.03 + 0.2 * k))[k] for k in range(22)]
+    source = open_source(save(tmp_path / name, [*drive(60), *broken]))
+    assert len(scans_of(source)) == 60
+    assert source.faults[Fault.BROKEN_MESSAGE].count == 22
+    assert source.faults.tallies.keys() == {Fault.BROKEN_MESSAGE}
+    assert "broken messages skipped: 22 (first: message 1)" in str(source.faults)
+
+
+def test_mostly_broken_messages_are_refused(tmp_path):
+    broken = [payload("/odom", odom(0.0, (0, 0, 0)).kind, 100.0, b"")] * 200
+    assert "most messages are damaged" in refusal(save(tmp_path / "run.bag", [*drive(20), *broken]))
+    nothing = [mounted(), *(payload("/scan", scan(0.0).kind, 100 + k, b"") for k in range(30)), odom(100, (0, 0, 0))]
+    assert "none of the 30 scans in /scan can be read" in refusal(save(tmp_path / "no.bag", nothing))
+
+
+def test_a_laser_that_claims_to_see_for_ever(tmp_path):
+    said = [message._replace(fields={**message.fields, "range_max": math.inf, "range_min": math.nan})
+            if message.topic == "/scan" else message for message in drive(12)]  # fmt: skip
+    source = open_source(save(tmp_path / "run.bag", said))
+    assert source.survey().laser.max_range_m == 1000.0
+    assert np.isfinite(scans_of(source)[0].ranges_m).all()
+
+
+# Files
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("run.bag", "rosbag reindex"), ("run.mcap", "mcap recover"), ("run.db3", "ros2 bag reindex")]
+)
+@pytest.mark.parametrize("kept", [0.01, 0.3, 0.9, 0.999])
+def test_a_truncated_bag_is_refused_wherever_it_ends(tmp_path, name, remedy, kept):
+    bag = save(tmp_path / name, drive(400))
+    content = bag.read_bytes()
+    bag.write_bytes(content[: int(kept * len(content))])
+    message = refusal(bag)
+    assert "the bag cannot be read" in message
+    assert remedy in message
+
+
+def test_a_bag_that_was_not_closed(tmp_path):
+    bag = save(tmp_path / "run.bag", drive(40))
+    content = bytearray(bag.read_bytes())
+    at = content.index(b"index_pos=") + len(b"index_pos=")
+    content[at : at + 8] = bytes(8)
+    active = tmp_path / "run.bag.active"
+    active.write_bytes(content)
+    message = refusal(active)
+    assert "not indexed" in message
+    assert "rosbag reindex" in message
+    assert open_source(active).name == "run"
+
+
+def test_a_bag_that_is_compressed_as_a_whole(tmp_path):
+    packed = tmp_path / "run.bag.gz"
+    packed.write_bytes(gzip.compress(save(tmp_path / "run.bag", drive(20)).read_bytes()))
+    assert "unpack it first" in refusal(packed)
+
+
+def test_folders(tmp_path):
+    bag = save(tmp_path / "run", drive(20))
+    shutil.copytree(bag, tmp_path / "no_metadata")
+    (tmp_path / "no_metadata" / "metadata.yaml").unlink()
+    assert "no metadata.yaml; give one of the files" in refusal(tmp_path / "no_metadata")
+    (bag / "run.mcap").unlink()
+    assert "run.mcap" in refusal(bag)
+    (bag / "metadata.yaml").write_text("{")
+    assert "ros2 bag reindex" in refusal(bag)
+
+
+@pytest.mark.parametrize("name", ["run.db3", "folder"])
+def test_a_database_that_was_not_closed(tmp_path, name):
+    """As when the recorder was killed: what came last is in the journal beside it."""
+    database = save(tmp_path / "run.db3", drive(20))
+    if name == "folder":
+        (tmp_path / "folder").mkdir()
+        database = database.rename(tmp_path / "folder" / "run.db3")
+        (tmp_path / "folder" / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    writer = sqlite3.connect(database)
+    writer.execute("pragma journal_mode=wal")
+    writer.execute("insert into messages (topic_id, timestamp, data) values (1, 1, x'00')")
+    writer.commit()
+    with pytest.raises(SourceError, match=r"was not closed, run\.db3-wal holds its end; close it with"):
+        open_source(tmp_path / name).survey()
+    writer.close()
+
+
+def test_an_old_database_without_definitions(tmp_path):
+    """As the first ROS 2 recorded: neither a schema table nor message definitions."""
+    database = sqlite3.connect(save(tmp_path / "run.db3", drive(20)))
+    for command in (
+        "drop table schema",
+        "drop table message_definitions",
+        "drop table metadata",
+        "alter table topics drop column type_description_hash",
+        "alter table topics drop column offered_qos_profiles",
+        "drop index timestamp_idx",
+    ):
+        database.execute(command)
+    database.commit()
+    database.close()
+    assert open_source(tmp_path / "run.db3").survey().scan_count == 20
+
+
+def test_a_database_that_is_no_bag(tmp_path):
+    with sqlite3.connect(tmp_path / "run.db3") as database:
+        database.execute("create table messages (id integer)")
+    database.close()
+    assert "the bag cannot be read" in refusal(tmp_path / "run.db3")
+
+
+fuzz = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@pytest.mark.parametrize("name", FILES)
+@fuzz
+@given(data=st.data())
+def test_a_flipped_bag_never_breaks_the_reader(tmp_path, name, data):
+    """Reads or refuses, with no warning and nothing left open; anything else is an error of the reader."""
+    good = tmp_path / f"good_{name}"
+    content = bytearray((good if good.exists() else save(good, drive(12))).read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(16, len(content) - 1))] ^= data.draw(st.integers(1, 255))
+    bag = tmp_path / name
+    bag.write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with suppress(SourceError):
+            source = open_source(bag)
+            assert len(scans_of(source)) <= source.survey().scan_count

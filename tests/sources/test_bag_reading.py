@@ -1,0 +1,302 @@
+"""Bags of every kind, as robots record them."""
+
+import dataclasses
+import math
+import tracemalloc
+from copy import copy
+
+import numpy as np
+import pytest
+from bag_messages import (
+    ANGLE_MIN,
+    BEAMS,
+    INCREMENT,
+    LASER_POSE,
+    drive,
+    mounted,
+    odom,
+    pose_at,
+    quaternion,
+    save,
+    scan,
+    text,
+    tf,
+)
+from carmen_text import drive as drive_log
+from carmen_text import save as save_log
+from carmen_text import scans_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from fcslam.errors import SourceError
+from fcslam.records import LaserScan, Odometry
+from fcslam.sources import BagOptions, Fault, open_source, split
+
+KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_kind_of_bag_says_the_same(tmp_path, name):
+    source = open_source(save(tmp_path / name, [*drive(40), text(101.0)]))
+    survey = source.survey()
+    assert source.name == "run"
+    assert (survey.scan_count, survey.beam_count, bool(survey.faults), survey.notes) == (40, BEAMS, False, ())
+    assert survey.duration_s == pytest.approx(39 * 0.2)
+    assert survey.laser.T_base_laser == pytest.approx(LASER_POSE, abs=1e-9)
+    assert survey.laser.max_range_m == 20.0
+    np.testing.assert_allclose(survey.laser.angles_rad(), ANGLE_MIN + INCREMENT * np.arange(BEAMS), atol=1e-12)
+    for step, record in enumerate(scans_of(source)):
+        at = 0.2 * step + 0.05
+        assert record.stamp == pytest.approx(100.0 + at, abs=1e-9)
+        np.testing.assert_allclose(record.T_odom_base, pose_at(at), atol=1e-3)
+        np.testing.assert_allclose(record.ranges_m, [1.0 + 0.01 * step + 0.1 * b for b in range(BEAMS)], rtol=1e-6)
+        assert not record.ranges_m.flags.writeable
+    assert not source.faults
+
+
+@pytest.mark.parametrize(
+    ("name", "compression"),
+    [("run.bag", "bz2"), ("run.bag", "lz4"), ("run", "storage"), ("run", "message"), ("run", "file")],
+)
+def test_compression_changes_nothing(tmp_path, name, compression):
+    (tmp_path / "plain").mkdir()
+    plain = open_source(save(tmp_path / "plain" / name, drive(30)))
+    packed = open_source(save(tmp_path / name, drive(30), compression))
+    for before, after in zip(plain.records(), packed.records(), strict=True):
+        assert before.stamp == after.stamp
+        np.testing.assert_array_equal(before.T_odom_base, after.T_odom_base)
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run.db3"])
+def test_content_decides_not_the_name(tmp_path, name):
+    bag = save(tmp_path / name, drive(12)).rename(tmp_path / "other.clf")
+    assert open_source(bag).survey().scan_count == 12
+
+
+@pytest.mark.parametrize("name", ["a b#c%20d?e.db3", "a b#c%20d?e.mcap", "a b#c%20d?e.bag", "läufer.db3"])
+def test_strange_letters_in_the_name(tmp_path, name):
+    bag = save(tmp_path / f"plain.{name.rsplit('.', 1)[1]}", drive(12)).rename(tmp_path / name)
+    assert open_source(bag).survey().scan_count == 12
+
+
+def test_odometry_goes_with_the_scan_before_it(tmp_path):
+    said = [mounted(0.5), *(odom(k, (k, 0, 0)) for k in range(1, 8)), *(scan(k + 0.5) for k in range(1, 7))]
+    source = open_source(save(tmp_path / "run.bag", said))
+    kinds = "".join("S" if isinstance(record, LaserScan) else "o" for record in source.records())
+    assert kinds == "o" + "So" * 6
+    assert all(isinstance(record, LaserScan | Odometry) for record in source.records())
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_parts_and_copies_are_read_side_by_side(tmp_path, name):
+    source = open_source(save(tmp_path / name, drive(40)))
+    whole = [scan.stamp for scan in scans_of(source)]
+    robots = split(source, 3)
+    assert [robot.survey().scan_count for robot in robots] == [13, 13, 14]
+    together = list(zip(*(robot.records() for robot in robots), strict=False))
+    assert together[0][1].stamp == whole[13]
+    assert [scan.stamp for robot in robots for scan in scans_of(robot)] == whole
+    np.testing.assert_array_equal(scans_of(robots[2])[0].T_odom_base, 0.0)
+    assert len(list(zip(source.records(), copy(source).records(), strict=True))) > 40
+
+
+def test_memory_does_not_grow_with_the_recording(tmp_path):
+    def peak(path):
+        source = open_source(path)
+        source.survey()
+        tracemalloc.start()
+        for _ in source.records():
+            pass
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    short, long = (save(tmp_path / f"{scans}.db3", drive(scans)) for scans in (600, 1500))
+    peak(short)
+    assert peak(long) < 1.2 * peak(short) + 20_000
+
+
+# Odometry
+
+
+def test_odometry_at_the_scans_stamp_is_the_scans_to_the_last_bit(tmp_path):
+    poses = [(0.1 * k / 3, -0.7 / (k + 1), round(0.1 * k, 6)) for k in range(20)]
+    said = [mounted(0.5)]
+    for k, pose in enumerate(poses, start=1):
+        said += [odom(k, pose), scan(k)]
+    for name in KINDS:
+        read = [scan.T_odom_base.tolist() for scan in scans_of(open_source(save(tmp_path / name, said)))]
+        assert read == [list(pose) for pose in poses]
+
+
+def test_odometry_from_tf(tmp_path):
+    said = [mounted(), tf(99.0, "map", "odom")]
+    for k in range(30):
+        said.append(tf(100 + k, "odom", "base_link", (0.1 * k, 0.0, 0.0), quaternion(0.01 * k)))
+        said.append(scan(100.5 + k))
+    source = open_source(save(tmp_path / "run.mcap", [*said, tf(130, "odom", "base_link", (3.0, 0.0, 0.0))]))
+    assert source.survey().laser.T_base_laser == pytest.approx(LASER_POSE, abs=1e-9)
+    expected = [(0.1 * k + 0.05, 0.0, 0.01 * k + 0.005) for k in range(29)]
+    np.testing.assert_allclose([scan.T_odom_base for scan in scans_of(source)][:29], expected, atol=1e-9)
+
+
+def test_a_topic_of_odometry_is_preferred_to_tf_unless_tf_is_asked_for(tmp_path):
+    said = [*drive(20), *(tf(100 + k, "odom", "base_link", (7.0, 0.0, 0.0)) for k in range(5))]
+    bag = save(tmp_path / "run.bag", said)
+    assert scans_of(open_source(bag))[0].T_odom_base[0] < 1.0
+    assert scans_of(open_source(bag, BagOptions(odom_topic="tf")))[0].T_odom_base[0] == 7.0
+
+
+def test_stamps_that_were_never_set_are_those_of_the_recording(tmp_path):
+    said = [message._replace(fields={**message.fields, "stamp": 0.0}) for message in drive(20)]
+    source = open_source(save(tmp_path / "run.bag", said))
+    assert [scan.stamp for scan in scans_of(source)] == pytest.approx([100.07 + 0.2 * k for k in range(20)], abs=1e-9)
+
+
+def test_the_readings_near_in_the_recording_count_when_the_clock_steps_back(tmp_path):
+    """Two rides through the same second: each scan belongs to the odometry beside it."""
+    said = [mounted(0.0)]
+    for ride, start in enumerate((10.0, 10.05)):
+        for k in range(10):
+            at = 1.0 + ride + 0.1 * k
+            said.append(odom(start + 0.1 * k, (5.0 * ride + 0.1 * k, 0, 0), bag_time=at))
+            said.append(scan(start + 0.1 * k, bag_time=at + 0.01))
+    source = open_source(save(tmp_path / "run.bag", said))
+    read = [scan.T_odom_base[0] for scan in scans_of(source)]
+    assert read == pytest.approx([5.0 * ride + 0.1 * k for ride in (0, 1) for k in range(10)])
+    assert source.faults[Fault.TIME_REVERSAL].count == 1
+
+
+def test_a_robot_that_stands_still_is_a_recording(tmp_path):
+    said = [mounted(), *(message for k in range(40) for message in (odom(100 + k, (1, 2, 0)), scan(100 + k)))]
+    survey = open_source(save(tmp_path / "run.bag", said)).survey()
+    assert (survey.scan_count, survey.path_length_m) == (40, 0.0)
+
+
+# Ranges and beams
+
+
+def test_ranges_by_rep_117(tmp_path):
+    ranges = (0.05, 0.1, 19.9, 20.0, 25.0, math.inf, -math.inf, math.nan)
+    source = open_source(save(tmp_path / "run.bag", [mounted(), odom(100, (0, 0, 0)), scan(100, ranges)]))
+    expected = np.array([math.nan, 0.1, 19.9, *(math.inf,) * 3, *(math.nan,) * 2], dtype=np.float32)
+    np.testing.assert_array_equal(scans_of(source)[0].ranges_m, expected)
+
+
+def test_a_laser_whose_beams_vary_is_brought_to_the_usual_ones(tmp_path):
+    """As an RPLidar: one turn, now 360, now 358 beams, of a room in which the range tells the direction."""
+
+    def turn(stamp, beams):
+        increment = math.tau / beams
+        angles = -math.pi + increment * np.arange(beams)
+        return scan(stamp, 5.0 + angles, angle_min=-math.pi, angle_increment=increment)
+
+    counts = [360, 360, 358, 361, 360, 360, 360]
+    said = [mounted(), *(odom(100 + k, (k, 0, 0)) for k in range(7))]
+    source = open_source(save(tmp_path / "run.bag", said + [turn(100 + k, n) for k, n in enumerate(counts)]))
+    scans = scans_of(source)
+    assert len(scans) == 7
+    for read in scans:
+        seen = np.isfinite(read.ranges_m)
+        assert seen.sum() >= 358
+        assert np.abs(read.ranges_m - 5.0 - read.laser.angles_rad())[seen].max() < math.radians(1.1) / 2
+    assert source.faults[Fault.RESAMPLED].count == 2
+
+
+def test_a_laser_that_turns_to_the_right_is_turned_round(tmp_path):
+    said = [mounted(), odom(100, (0, 0, 0)), scan(100, range(1, 9), angle_min=-ANGLE_MIN, angle_increment=-INCREMENT)]
+    (read,) = scans_of(open_source(save(tmp_path / "run.bag", said)))
+    np.testing.assert_array_equal(read.ranges_m, np.arange(8, 0, -1))
+    np.testing.assert_allclose(read.laser.angles_rad(), -ANGLE_MIN - INCREMENT * np.arange(8)[::-1], atol=1e-7)
+
+
+# Where the laser sits
+
+angles = st.floats(-3.0, 3.0)
+lengths = st.floats(-5.0, 5.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.tuples(lengths, lengths, angles), st.tuples(lengths, lengths, angles), st.booleans())
+def test_what_the_laser_sees_is_where_tf_says(tmp_path_factory, mast, turned, upside_down):
+    """base <- mast -> laser, turned and perhaps upside down; rotations by SciPy."""
+    roll = math.pi if upside_down else 0.0
+    said = [
+        tf(99, "/mast", "/base_link", (*mast[:2], 0.7), quaternion(mast[2])),
+        tf(99, "mast", "laser", (*turned[:2], 1.1), quaternion(turned[2], roll), topic="/tf_static"),
+        odom(100, (0, 0, 0)),
+        scan(100, np.arange(1, 9)),
+    ]
+    (read,) = scans_of(open_source(save(tmp_path_factory.mktemp("bag") / "run.bag", said)))
+    beams = ANGLE_MIN + INCREMENT * np.arange(8)
+    points = np.column_stack((np.arange(1, 9) * np.cos(beams), np.arange(1, 9) * np.sin(beams), np.zeros(8)))
+    in_mast = Rotation.from_euler("xyz", [roll, 0, turned[2]]).apply(points) + np.array([*turned[:2], 1.1])
+    in_base = Rotation.from_euler("z", mast[2]).inv().apply(in_mast - np.array([*mast[:2], 0.7]))
+    x, y, theta = read.laser.T_base_laser
+    directions = theta + read.laser.angles_rad()
+    seen = np.column_stack((x + read.ranges_m * np.cos(directions), y + read.ranges_m * np.sin(directions)))
+    order = slice(None, None, -1 if upside_down else 1)
+    np.testing.assert_allclose(seen, in_base[order, :2], atol=1e-5)
+
+
+def test_a_laser_on_the_base_itself_needs_no_tf(tmp_path):
+    said = [message for message in drive(12) if message.topic != "/tf_static"]
+    for message in said:
+        message.fields.update({"frame": "base_link"} if message.topic == "/scan" else {})
+    assert open_source(save(tmp_path / "run.bag", said)).survey().laser.T_base_laser == (0.0, 0.0, 0.0)
+
+
+def test_the_users_pose_replaces_tf(tmp_path):
+    options = BagOptions(laser_pose=(0.5, -0.25, 1.5))
+    for said in (drive(12), drive(12)[1:]):
+        source = open_source(save(tmp_path / f"{len(said)}.bag", said), options)
+        assert source.survey().laser.T_base_laser == (0.5, -0.25, 1.5)
+
+
+@pytest.mark.parametrize(("tilt_deg", "noted"), [(1.0, False), (5.0, True)])
+def test_a_slight_tilt_is_read_as_level(tmp_path, tilt_deg, noted):
+    tilted = tf(99, "base_link", "laser", rotation=quaternion(pitch=math.radians(tilt_deg)), topic="/tf_static")
+    notes = open_source(save(tmp_path / "run.bag", [tilted, *drive(12)[1:]])).survey().notes
+    assert [f"tilted by {tilt_deg:.1f} degrees" in note for note in notes] == [True] * noted
+
+
+# Choices
+
+
+def several():
+    """A narrow laser that is heard more often, a wide one, and two odometries."""
+    said = drive(20)
+    said += [scan(100.05 + 0.1 * k, topic="/narrow", angle_increment=INCREMENT / 2) for k in range(30)]
+    return said + [odom(100 + 0.05 * k, (9, 9, 0), topic="/filtered") for k in range(90)]
+
+
+def test_the_widest_laser_is_chosen_and_said(tmp_path):
+    bag = save(tmp_path / "run.bag", several())
+    source = open_source(bag)
+    assert source.survey().scan_count == 20
+    first, second = source.survey().notes
+    assert "from /scan, not from /narrow (--scan-topic" in first
+    assert "from /odom, not from /filtered (--odom-topic" in second
+    assert str(bag) in first
+
+
+def test_the_user_chooses(tmp_path):
+    bag = save(tmp_path / "run.bag", several())
+    source = open_source(bag, BagOptions(scan_topic="/narrow", odom_topic="filtered"))
+    assert source.survey().scan_count == 30
+    assert source.survey().notes == ()
+    assert scans_of(source)[0].T_odom_base[0] == 9.0
+
+
+def test_options_of_bags_are_refused_for_logs(tmp_path):
+    log = save_log(tmp_path / "run.log", drive_log(12))
+    with pytest.raises(SourceError, match="a CARMEN log has neither topics nor tf"):
+        open_source(log, BagOptions(scan_topic="/scan"))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        BagOptions().scan_topic = "/scan"
+
+
+def test_a_name_may_be_given(tmp_path):
+    assert open_source(save(tmp_path / "run.bag", drive(12)), name="anna").name == "anna"
+    assert open_source(save_log(tmp_path / "run.log", drive_log(12)), name="ben").name == "ben"

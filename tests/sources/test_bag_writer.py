@@ -1,0 +1,156 @@
+"""What is written as a bag reads back the same, and is a bag for others."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from bag_messages import BEAMS, ROS1, ROS2, drive, save
+from carmen_text import pose_at
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+
+from fcslam.errors import OutputError, SourceError
+from fcslam.records import LaserModel, LaserScan, Odometry, frozen
+from fcslam.sources import open_source, write_bag
+
+KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
+SICK = LaserModel(181, -90 * math.radians(1.0), math.radians(1.0), 50.0, (0.25, 0.0, 0.0))
+ROUND = LaserModel(12, -math.pi, math.tau / 12, 12.5, (-0.1, 0.05, 0.4))
+
+coordinates = st.floats(-1000, 1000).map(lambda value: round(value, 6))
+poses = st.tuples(coordinates, coordinates, st.floats(-3.1, 3.1).map(lambda value: round(value, 6)))
+ranges = st.one_of(st.floats(0, 60, width=32), st.just(math.nan), st.just(math.inf))
+
+
+@st.composite
+def recordings(draw):
+    """Records at stamps of microseconds, whose clock steps back now and then."""
+    laser = draw(st.sampled_from([SICK, ROUND]))
+    records, stamp = [], draw(st.sampled_from([0.2, 1e6, 1.3e9]))
+    for _ in range(draw(st.integers(3, 10))):
+        stamp = round(stamp + draw(st.sampled_from([-0.3, 0.0, 0.1, 0.7, 0.9])), 6)
+        pose, stamp = frozen(draw(poses)), max(stamp, 1e-6)
+        if draw(st.booleans()):
+            records.append(Odometry(stamp, pose))
+            pose = frozen(draw(poses))
+        values = draw(st.lists(ranges, min_size=4, max_size=4))
+        filled = np.resize(np.array(values, dtype=np.float32), laser.beam_count)
+        records.append(LaserScan(stamp, frozen(filled, np.float32), laser, pose))
+    return records
+
+
+@settings(max_examples=30, deadline=None)
+@given(recordings(), st.sampled_from(KINDS))
+def test_what_is_written_reads_back_to_the_last_bit(tmp_path_factory, records, name):
+    path = tmp_path_factory.mktemp("bag") / name
+    write_bag(path, records)
+    source = open_source(path)
+    written = [record for record in records if isinstance(record, LaserScan)]
+    if 2 * sum(after.stamp < before.stamp for before, after in pairwise(written)) > len(written):
+        with pytest.raises(SourceError, match="time runs backwards"):
+            source.survey()
+        return
+    read = [record for record in source.records() if isinstance(record, LaserScan)]
+    assert len(read) == len(written)
+    for before, after in zip(written, read, strict=True):
+        assert after.stamp == before.stamp
+        assert after.T_odom_base.tolist() == before.T_odom_base.tolist()
+        assert after.laser == before.laser
+        beyond = before.ranges_m >= before.laser.max_range_m
+        np.testing.assert_array_equal(after.ranges_m, np.where(beyond, np.inf, before.ranges_m))
+
+
+def straight(count=20, laser=ROUND):
+    one = frozen(np.full(laser.beam_count, 2.0), np.float32)
+    return [LaserScan(100.0 + 0.2 * k, one, laser, frozen(pose_at(k))) for k in range(count)]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_equal_records_give_equal_bytes(tmp_path, name):
+    contents = []
+    for folder in "ab":
+        (tmp_path / folder).mkdir()
+        write_bag(tmp_path / folder / name, straight(300))
+        files = sorted(path for path in (tmp_path / folder).rglob("*") if path.is_file())
+        assert len(files) == (2 if name == "run" else 1)
+        contents.append([path.read_bytes() for path in files])
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_others_read_it(tmp_path, name):
+    """By rosbags' own reader: topics, types, frames; the time of recording only grows, header stamps may not."""
+    records = straight()
+    records[5], records[6] = records[6], records[5]
+    write_bag(tmp_path / name, records)
+    with AnyReader([tmp_path / name], default_typestore=ROS1 if name == "run.bag" else ROS2) as reader:
+        assert {topic: (info.msgtype, info.msgcount) for topic, info in reader.topics.items()} == {
+            "/scan": ("sensor_msgs/msg/LaserScan", 20),
+            "/odom": ("nav_msgs/msg/Odometry", 20),
+            "/tf": ("tf2_msgs/msg/TFMessage", 20),
+            "/tf_static": ("tf2_msgs/msg/TFMessage", 1),
+        }
+        messages = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+    times = [bag_time for topic, bag_time, _ in messages if topic == "/scan"]
+    assert times == sorted(set(times))
+    scans = [message for topic, _, message in messages if topic == "/scan"]
+    stamps = [scan.header.stamp.sec + scan.header.stamp.nanosec * 1e-9 for scan in scans]
+    assert stamps == pytest.approx([record.stamp for record in records], abs=1e-9)
+    (static,) = [message.transforms[0] for topic, _, message in messages if topic == "/tf_static"]
+    assert (static.header.frame_id, static.child_frame_id) == ("base_link", scans[0].header.frame_id)
+    assert static.transform.translation.x == ROUND.T_base_laser[0]
+    odometry = next(message for topic, _, message in messages if topic == "/odom")
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
+    assert scans[0].angle_max == pytest.approx(math.pi - math.tau / 12, abs=1e-6)
+
+
+def test_a_bag_of_a_bag_has_no_more_messages(tmp_path):
+    source = open_source(save(tmp_path / "run.bag", drive(20)))
+    counts = []
+    for name in ("once.bag", "twice.bag"):
+        write_bag(tmp_path / name, source.records())
+        source = open_source(tmp_path / name)
+        counts.append(sum(1 for _ in source.records()))
+    assert counts[0] == counts[1]
+    assert source.survey().beam_count == BEAMS
+
+
+def test_a_file_is_replaced_when_the_new_one_is_complete(tmp_path):
+    def interrupted():
+        yield from straight(5)
+        raise KeyboardInterrupt
+
+    for name in KINDS[:3]:
+        path = tmp_path / name
+        path.write_text("old")
+        with pytest.raises(KeyboardInterrupt):
+            write_bag(path, interrupted())
+        assert path.read_text() == "old"
+        write_bag(path, straight(5))
+        assert open_source(path).survey().scan_count == 5
+    assert {path.name for path in tmp_path.iterdir()} == set(KINDS[:3])
+
+
+@pytest.mark.parametrize("name", ["missing/run.bag", "missing/run.mcap", "run.zip", "full", "missing#1.db3"])
+def test_what_cannot_be_written_is_reported(tmp_path, name):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    with pytest.raises(OutputError, match=r"full|missing|run\.zip"):
+        write_bag(tmp_path / name, straight(2))
+
+
+@pytest.mark.parametrize("stamp", [-1.0, 2.0**31, math.nan])
+def test_stamps_that_ros_does_not_have(tmp_path, stamp):
+    one = frozen(np.ones(12), np.float32)
+    with pytest.raises(OutputError, match="ROS counts from 0 s"):
+        write_bag(tmp_path / "run.bag", [LaserScan(stamp, one, ROUND, frozen((0, 0, 0)))])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_faults_of_the_source_are_not_hidden(tmp_path):
+    bag = save(tmp_path / "run.bag", drive(20)[1:])
+    with pytest.raises(SourceError, match="no transform"):
+        write_bag(tmp_path / "out.mcap", open_source(bag).records())
+    assert list(tmp_path.iterdir()) == [bag]

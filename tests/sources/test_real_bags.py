@@ -1,0 +1,82 @@
+"""Real recordings as bags: the published ones, and the logs written as bags of every kind."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from carmen_text import scans_of
+
+from fcslam.cli import main
+from fcslam.runs import read_tum
+from fcslam.sources import Fault, open_source, write_bag
+
+DATA = Path(os.environ.get("FCSLAM_DATA", "")) / "lidar"
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif("FCSLAM_DATA" not in os.environ, reason="needs the real logs: set FCSLAM_DATA"),
+]
+
+
+@pytest.mark.parametrize(
+    ("bag", "shape", "path_m", "duration_s", "laser_x_m"),
+    [("fr079", (4934, 360), 392, 1061, 0.04), ("mit-csail", (1988, 361), 374, 424, 0.0)],
+)
+def test_published_bags_hold_what_their_description_says(bag, shape, path_m, duration_s, laser_x_m):
+    start = time.process_time()
+    source = open_source(DATA / f"rosbag1/{bag}.sort.bag")
+    survey = source.survey()
+    assert (survey.scan_count, survey.beam_count) == shape
+    assert survey.path_length_m == pytest.approx(path_m, rel=0.01)
+    assert survey.duration_s == pytest.approx(duration_s, abs=1.0)
+    assert survey.laser.T_base_laser == pytest.approx((laser_x_m, 0.0, 0.0), abs=1e-4)
+    assert survey.notes == ()
+    scans = scans_of(source)
+    assert time.process_time() - start < 10.0
+    log = scans_of(open_source(DATA / f"slam-benchmark/{bag}.clf.xz"))
+    assert len(scans) == len(log)
+    apart = np.array([a.T_odom_base - b.T_odom_base for a, b in zip(scans, log, strict=True)])
+    assert np.median(np.abs(apart)) < 0.01
+
+
+@pytest.mark.parametrize(("log", "name"), [("intel", "run.bag"), ("fr079", "run.mcap"), ("mit-csail", "run.db3")])
+def test_a_log_and_its_bag_are_the_same_to_the_last_bit(tmp_path, log, name):
+    """Also where the clock runs backwards (intel), and with odometry between the scans (fr079)."""
+    source = open_source(DATA / f"slam-benchmark/{log}.clf.xz")
+    write_bag(tmp_path / name, source.records())
+    bag = open_source(tmp_path / name)
+    assert bag.survey().laser == source.survey().laser
+    for before, after in zip(scans_of(source), scans_of(bag), strict=True):
+        assert after.stamp == before.stamp
+        assert after.T_odom_base.tolist() == before.T_odom_base.tolist()
+        beyond = before.ranges_m >= before.laser.max_range_m
+        np.testing.assert_array_equal(after.ranges_m, np.where(beyond, np.inf, before.ranges_m))
+    assert bag.faults[Fault.TIME_REVERSAL].count == source.faults[Fault.TIME_REVERSAL].count
+
+
+def test_a_log_and_its_bag_give_the_same_trajectory(tmp_path):
+    log = DATA / "slam-benchmark/mit-csail.clf.xz"
+    trajectories = {}
+    for name in ("log", "run.bag", "run.mcap", "run.db3"):
+        recording = log if name == "log" else tmp_path / name
+        if name != "log":
+            assert main(["convert", str(log), str(recording)]) == 0
+        output = tmp_path / f"from_{name}"
+        assert main(["map", f"robot={recording}", "--output", str(output)]) == 0
+        trajectories[name] = read_tum(output / "trajectories" / "robot.tum")
+    stamps, poses = trajectories.pop("log")
+    for other_stamps, other_poses in trajectories.values():
+        np.testing.assert_allclose(other_stamps, stamps, atol=1e-9)
+        assert np.hypot(*(other_poses - poses)[:, :2].T).max() < 1e-3
+
+
+@pytest.mark.parametrize(("bag", "mean_m"), [("fr079", 0.07), ("mit-csail", 0.03)])
+def test_published_bags_map_well(tmp_path, capsys, bag, mean_m):
+    """The bag of fr079 says that the laser sits ahead of the base; the log says behind, and maps better."""
+    assert main(["map", str(DATA / f"rosbag1/{bag}.sort.bag"), "--output", str(tmp_path / "run")]) == 0
+    capsys.readouterr()
+    relations = DATA / f"slam-benchmark/{bag}.relations.gz"
+    assert main(["evaluate", "relations", str(tmp_path / "run"), str(relations), "--csv", str(tmp_path / "e.csv")]) == 0
+    rows = dict(line.split(",")[:2] for line in (tmp_path / "e.csv").read_text().splitlines())
+    assert float(rows["translation_error_mean"]) < mean_m
