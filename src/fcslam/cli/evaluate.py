@@ -127,12 +127,13 @@ def _explain_closures(console: "Console", report: "ClosureReport", criteria: "Cl
         f"maximum {residual_m.max():.3f} m, {residual_deg.max():.2f} deg.",
         f"Wrong: off by more than {criteria.wrong_m:g} m or {criteria.wrong_deg:g} deg. Errors: median / maximum; up "
         f"to {criteria.bridge_s:g} s to the relations' stamps are bridged by the run's own trajectory.",
-        "Chain: relations from one end to the other, median / maximum; a long one adds its own error. One relation: closures "
-        "covered by a single one.",
+        "Chain: relations from one end to the other, median / maximum; a long one adds its own error.",
+        "One relation: closures that a single relation covers.",
         "A robot reports only closures that it accepts, so candidates within robots are not known.",
     ]
     if contradicted:
-        lines.insert(2, f"The relations contradict each other: {contradicted} were left out by the robust solve.")
+        left_out = f"{contradicted} of {len(graph.relations)} left out by the robust solve"
+        lines.insert(2, f"The relations contradict each other: {left_out}.")
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True)
 

@@ -187,9 +187,8 @@ def _gather(
 
 
 def _placed_reference(graph: RelationGraph, node_rows: Rows, poses: PoseTable, bridge_s: float) -> PlacedReference:
-    """The graph's poses at the rows of the run, in their order."""
+    """The graph's poses at which the run has one, too."""
     known = np.flatnonzero(node_rows >= 0)
-    known = known[np.argsort(node_rows[known], kind="stable")]
     return PlacedReference(poses, bridge_s, node_rows[known], graph.T_component_base[known], graph.components[known])
 
 

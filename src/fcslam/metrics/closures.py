@@ -60,7 +60,7 @@ class PlacedReference:
     run: PoseTable
     bridge_s: float
     rows: Rows
-    """Where in the run the poses are, ascending, shape (M,)."""
+    """Where in the run the poses are, shape (M,)."""
     T_component_base: FloatArray
     """Shape (M, 3)."""
     components: NDArray[np.int64]
