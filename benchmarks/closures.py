@@ -16,7 +16,7 @@ from pathlib import Path
 import common
 import numpy as np
 
-from fcslam.evaluation.closures import STAGES, ClosureReport, Within, evaluate_closures
+from fcslam.evaluation.closures import STAGES, ClosureReport, Within, closure_metrics, evaluate_closures
 from fcslam.metrics.closures import ClosureCriteria
 
 SETS = {"log": "", "closures": "", "stage": ""}
@@ -73,11 +73,12 @@ def table_rows(log: str, report: ClosureReport) -> list[tuple[tuple, tuple, tupl
 
 
 def reference_row(log: str, report: ClosureReport) -> tuple:
-    graph = report.relations
-    sizes = graph.component_sizes
-    residuals = [f(r) for r in (graph.residual_m, graph.residual_deg) for f in (np.nanmedian, np.nanmax)]
-    contradicted = int(np.sum(~graph.holds))
-    return log, len(graph.relations), contradicted, len(sizes), len(graph.stamps), int(sizes[0]), *residuals
+    value = {metric.name: metric.value for metric in closure_metrics(report)}
+    counts = ("relations", "relations_contradicted", "relation_components", "relation_stamps",
+              "relation_stamps_in_largest_component")  # fmt: skip
+    kinds = (f"{what}_{which}" for what in ("translation", "rotation") for which in ("median", "max"))
+    names = (*counts, *(f"relation_residual_{kind}" for kind in kinds))
+    return log, *(value[name] for name in names)
 
 
 if __name__ == "__main__":

@@ -102,6 +102,9 @@ def test_closures_say_when_the_relations_contradict_each_other(run_and_relations
     (tmp_path / "torn").write_text("0 100 1 0 0 0 0 0\n0 100 1.01 0 0 0 0 0\n100 0 3 0 0 0 0 0\n")
     assert main(["evaluate", "closures", run, str(tmp_path / "torn")]) == 0
     assert "The relations contradict each other: 1 of 3 left out" in capsys.readouterr().out
+    (tmp_path / "torn").write_text("0 100 1 0 0 0 0 0\n100 0 3 0 0 0 0 0\n")
+    assert main(["evaluate", "closures", run, str(tmp_path / "torn")]) == 0
+    assert "The relations contradict each other: 2 of 2 left out" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

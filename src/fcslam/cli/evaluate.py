@@ -115,24 +115,24 @@ def _show_closures(report: "ClosureReport", criteria: "ClosureCriteria") -> None
 
 def _explain_closures(console: "Console", report: "ClosureReport", criteria: "ClosureCriteria") -> None:
     """What the tables rest on."""
-    import numpy as np
+    from fcslam.evaluation.closures import closure_metrics
 
-    graph = report.relations
-    contradicted, sizes = int(np.sum(~graph.holds)), graph.component_sizes
-    residual_m, residual_deg = (r[np.isfinite(r)] for r in (graph.residual_m, graph.residual_deg))
+    value = {metric.name: metric.value for metric in closure_metrics(report)}
     lines = [
-        f"Reference: {len(graph.relations)} relations optimised together; {len(sizes)} components of "
-        f"{len(graph.stamps)} stamps ({report.stamps_in_run} in the run), {sizes.max(initial=0)} in the largest.",
-        f"Residuals of the relations: median {np.median(residual_m):.3f} m, {np.median(residual_deg):.2f} deg; "
-        f"maximum {residual_m.max():.3f} m, {residual_deg.max():.2f} deg.",
+        f"Reference: {value['relations']} relations optimised together; {value['relation_components']} components of "
+        f"{value['relation_stamps']} stamps ({value['relation_stamps_in_run']} in the run), "
+        f"{value['relation_stamps_in_largest_component']} in the largest.",
+        f"Residuals of the relations: median {value['relation_residual_translation_median']:.3f} m, "
+        f"{value['relation_residual_rotation_median']:.2f} deg; maximum "
+        f"{value['relation_residual_translation_max']:.3f} m, {value['relation_residual_rotation_max']:.2f} deg.",
         f"Wrong: off by more than {criteria.wrong_m:g} m or {criteria.wrong_deg:g} deg. Errors: median / maximum; up "
         f"to {criteria.bridge_s:g} s to the relations' stamps are bridged by the run's own trajectory.",
         "Chain: relations from one end to the other, median / maximum; a long one adds its own error.",
         "One relation: closures that a single relation covers.",
         "A robot reports only closures that it accepts, so candidates within robots are not known.",
     ]
-    if contradicted:
-        left_out = f"{contradicted} of {len(graph.relations)} left out by the robust solve"
+    if value["relations_contradicted"]:
+        left_out = f"{value['relations_contradicted']} of {value['relations']} left out by the robust solve"
         lines.insert(2, f"The relations contradict each other: {left_out}.")
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True)
