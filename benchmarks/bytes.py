@@ -39,8 +39,8 @@ DOWN = (Kind.CORRECTION, Kind.ACKNOWLEDGEMENT)
 UP = tuple(kind for kind in Kind if kind not in DOWN)
 STATED_DESCRIPTORS = 300
 SPACINGS_M = (2.0, 4.0, 8.0, 16.0)
-KINDS = {"log": "", "kind": "", "packets": ",", "bytes": ",", "bytes a packet": ".0f", "share": ".1%", "B/s": ".1f",
-         "B/m": ".0f"}  # fmt: skip
+KINDS = {"log": "", "kind": "", "packets": ",", "bytes": ",", "bytes a packet": ".0f", "share": ".1%",
+         "B/s a robot": ".1f", "B/m": ".0f"}  # fmt: skip
 ROBOTS = {"robot": "", "recorded, s": ".0f", "path, m": ".0f", **{f"{kind}, kB": ".1f" for kind in Kind},
           "up, B/s": ".0f", "up, B/m": ".0f", "down, B/s": ".0f", "down, B/m": ".0f"}  # fmt: skip
 PLACES = {"log": "", "places": "", "descriptors: least": "", "mean": ".0f", "most": "", "bytes a place": ".0f",
@@ -163,27 +163,27 @@ def thinned_row(run: Path, reference: Path) -> tuple:
 
 
 def draw(rows: list[tuple]) -> Any:
-    """Mean error across robots against bytes a second, a line for each log; hollow where maps stayed apart."""
+    """Mean error across robots against bytes a second, a line for each log; hollow where some maps stayed apart."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 4.2))
-    axes = figure.subplots()
-    columns = list(THINNED)
-    spacing, up, maps, error = (columns.index(name) for name in
-                                ("a place every, m", "up, B/s a robot", "maps", "mean, m"))  # fmt: skip
+    axes = (figure := Figure(figsize=(7.0, 4.2))).subplots()
+    names = ("a place every, m", "up, B/s a robot", "maps", "mean, m")
+    spacing, up, maps, error = (list(THINNED).index(name) for name in names)
     for log in common.SPLITS:
-        of_log = [row for row in rows if row[0] == log]
-        (line,) = axes.plot([row[up] for row in of_log], [row[error] for row in of_log], label=log)
-        for row in of_log:
-            whole = row[maps] == 1
-            face = line.get_color() if whole else "white"
+        points = [row for row in rows if row[0] == log and np.isfinite(row[error])]
+        (line,) = axes.plot([row[up] for row in points], [row[error] for row in points], label=log)
+        for row in points:
+            face = line.get_color() if row[maps] == 1 else "white"
             axes.plot(row[up], row[error], "o", color=line.get_color(), markerfacecolor=face)
-            axes.annotate(f"{row[spacing]:g} m", (row[up], row[error]), textcoords="offset points", xytext=(5, 5))
-    axes.set_xlabel("uplink of a robot, B/s of recording")
-    axes.set_ylabel("mean error across robots, m")
-    axes.set_xscale("log")
-    axes.set_ylim(bottom=0.0)
-    axes.set_title("A place every 2, 4, 8, 16 m (hollow: several maps)", fontsize=10)
+            place = (row[up], row[error])
+            axes.annotate(f"{row[spacing]:g} m", place, textcoords="offset points", xytext=(-8, 7), fontsize=8)
+    axes.set(
+        xscale="log", yscale="log", xlabel="uplink of a robot, B/s of recording", ylabel="mean error across robots, m"
+    )
+    axes.set_xticks([500, 1000, 2000, 5000], ["500", "1,000", "2,000", "5,000"])
+    axes.set_yticks([0.01, 0.03, 0.1, 0.3, 1.0], ["0.01", "0.03", "0.1", "0.3", "1"])
+    axes.minorticks_off()
+    axes.set_title("A place every 2, 4, 8, 16 m (missing: no joint map)", fontsize=10)
     axes.legend()
     return figure
 

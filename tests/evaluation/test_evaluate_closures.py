@@ -1,10 +1,13 @@
 """Closures of run folders made here, against relations drawn from the truth."""
 
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fcslam.cli import main
 from fcslam.errors import EvaluationError
 from fcslam.evaluation.closures import Within, closure_metrics, closure_rows, evaluate_closures
 from fcslam.evaluation.relation_graph import build_relation_graph
@@ -224,3 +227,18 @@ def test_the_optimised_graph_averages_what_scatters():
     error = se2.between(se2.between(truth(steps[0]), truth(steps[1:])), motion)
     assert np.hypot(error[:, 0], error[:, 1]).mean() < 0.02
     assert np.median(graph.residual_m) == pytest.approx(0.03 * np.sqrt(2 * np.log(2)), rel=0.1)
+
+
+@pytest.mark.system
+@pytest.mark.skipif("FCSLAM_DATA" not in os.environ, reason="FCSLAM_DATA is not set")
+def test_no_accepted_closure_of_a_real_fleet_is_wrong(tmp_path):
+    logs = Path(os.environ["FCSLAM_DATA"]) / "lidar" / "slam-benchmark"
+    assert main(["map", str(logs / "fr079.clf.xz"), "--split", "3", "--output", str(tmp_path / "run")]) == 0
+    report = evaluate_closures(tmp_path / "run", logs / "fr079.relations.gz", CRITERIA)
+    assert report.relations.holds.all()
+    for within in Within:
+        score = report.scores[within, ACCEPTED]
+        assert score.graph.wrong == score.single.wrong == 0
+        assert score.graph.covered >= 0.8 * score.graph.closures
+        assert score.single.covered >= 20
+    assert report.scores[Within.FLEET, CANDIDATE].graph.wrong > 0  # so the reference can tell
