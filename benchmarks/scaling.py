@@ -4,9 +4,9 @@
 
 **Again and again**: one robot drives the intel recording 8 times without a break, stamps and odometry continued.
 The recording ends 0.3 m from where it begins; between two rounds the odometry makes this step, by the relation of the
-two poses in the first round's result. So the building stays the same while scans, keyscans and closures add up; "off the
-first round" says how far the last round's scans lie from the same scans in the first. Without FCSLAM_DATA this part is
-left out.
+two poses in the first round's result. So the building stays the same while scans, keyscans and closures add up; "off
+the first round" says how far the last round's scans lie from the same scans in the first. Without FCSLAM_DATA this part
+is left out.
 
 **One building, more robots**: 1 to 16 drawn robots of 60 m each in one drawn building. **More buildings, more robots**:
 the same, two robots in each building, and none may meet a robot of another one; here the map grows with the fleet.

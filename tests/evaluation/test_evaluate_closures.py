@@ -138,7 +138,7 @@ def test_what_no_relations_join_is_not_covered(tmp_path):
 
 
 def test_a_false_relation_is_left_out_and_said(tmp_path, relations):
-    run = write(tmp_path / "run", [closure((0, 11), (1, 11), ACCEPTED), closure((0, 79), (1, 79), ACCEPTED)])
+    run = write(tmp_path / "run", [closure((0, 11), (1, 11), ACCEPTED), closure((0, 61), (1, 61), ACCEPTED)])
     true = relations_between([*RELATIONS, ((0, 80), (1, 80)), ((0, 60), (1, 60))])
     T_1_2 = np.array(true.T_1_2)
     T_1_2[-1] += (3.0, 0.0, 0.0)
@@ -148,12 +148,28 @@ def test_a_false_relation_is_left_out_and_said(tmp_path, relations):
     assert np.flatnonzero(~graph.holds).tolist() == [len(true) - 1]
     assert graph.residual_m[-1] == pytest.approx(3.0, abs=1e-3)
     assert graph.residual_m[:-1].max() < 1e-5
-    assert report.scores[Within.FLEET, ACCEPTED].graph.wrong == 0
-    assert report.scores[Within.FLEET, ACCEPTED].graph.translation_m[1] < 1e-5
+    score = report.scores[Within.FLEET, ACCEPTED]
+    assert (score.graph.covered, score.graph.wrong, score.single.covered, score.recall.revisits) == (2, 0, 1, 3)
+    assert score.graph.translation_m[1] < 1e-5
+    assert score.chain == (5, 9)  # of 1 and 9: not over the false one
     values = {metric.name: metric.value for metric in closure_metrics(report)}
     assert values["relations_contradicted"] == 1
     assert values["inter_robot_accepted_covered"] == 2
     assert evaluate_closures(run, relations, CRITERIA).relations.holds.all()
+
+
+def test_where_nothing_tells_which_relation_is_false_none_counts(tmp_path):
+    true = relations_between([*chain(0), *chain(1), ((0, 10), (1, 10)), ((0, 10), (1, 10))])
+    T_1_2 = np.array(true.T_1_2)
+    T_1_2[-1] += (3.0, 0.0, 0.0)
+    write_relations(tmp_path / "relations", Relations(true.stamps, T_1_2))
+    run = write(tmp_path / "run", [closure((0, 11), (1, 11), ACCEPTED)])
+    report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
+    assert np.flatnonzero(~report.relations.holds).tolist() == [len(true) - 2, len(true) - 1]
+    assert report.relations.component_sizes.tolist() == [20, 20]
+    assert np.isnan(report.relations.residual_m[-2:]).all()
+    score = report.scores[Within.FLEET, ACCEPTED]
+    assert (score.graph.covered, score.single.covered, score.recall.revisits) == (0, 0, 0)
 
 
 def test_stamps_with_five_digits_are_found(tmp_path):

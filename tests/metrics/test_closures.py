@@ -126,6 +126,14 @@ def test_a_gap_is_bridged_up_to_one_second(gap, covered):
         assert errors.correct(CRITERIA).tolist() == [covered]
 
 
+def test_of_several_relations_the_nearest_counts():
+    truth, run = fleet(5)
+    ends = np.array([[18, 82], [81, 20], [22, 80]])
+    single = SingleRelations(run, 1.0, ends, se2.between(truth[ends[:, 0]], truth[ends[:, 1]]))
+    errors = closure_errors(np.array([[20, 80]]), se2.between(truth[[20]], truth[[80]]), run, single)
+    assert errors.ends.tolist() == [[20, 81]]
+
+
 def test_another_robots_stamp_or_another_component_covers_nothing():
     truth, run = fleet(6)
     closure, T_i_j = np.array([[20, 80]]), se2.between(truth[[20]], truth[[80]])
@@ -172,8 +180,10 @@ def test_revisits_by_hand():
     run = PoseTable.of(np.arange(2.0 * count), poses, robots=np.repeat([0, 1], count))
     np.testing.assert_allclose(path_lengths(run), np.tile(np.arange(count), 2))
     correct = np.array([[10, 50], [5, 30]])
-    revisits = np.array([[10, 50], [12, 48], [13, 50], [48, 9], [50, 90 - 78], [30, 5], [5, 10], [28, 8], [30, 70]])
-    expected = [True, True, False, True, True, True, False, False, False]
-    assert revisits_found(revisits, correct, run, 2.0).tolist() == expected
-    assert not revisits_found(revisits, np.empty((0, 2), dtype=np.int64), run, 2.0).any()
-    assert revisits_found(revisits, correct, run, 100.0).tolist() == [True] * 9
+    revisits = np.array(
+        [[10, 50], [12, 48], [13, 50], [48, 9], [50, 90 - 78], [30, 5], [5, 10], [28, 8], [30, 70], [10, 11]]
+    )
+    expected = [True, True, False, True, True, True, False, False, False, False]
+    assert revisits_found(np.array(revisits), correct, run, 2.0).tolist() == expected
+    assert not revisits_found(np.array(revisits), np.empty((0, 2), dtype=np.int64), run, 2.0).any()
+    assert revisits_found(np.array(revisits), correct, run, 100.0).tolist() == [True] * 10
