@@ -170,9 +170,7 @@ class _Evidence:
         return Recall(len(revisits), int(found.sum()))
 
 
-def _gather(
-    run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows, criteria: ClosureCriteria
-) -> _Evidence:  # fmt: skip
+def _gather(run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows, criteria: ClosureCriteria) -> _Evidence:
     pairs = closure_rows(run, poses)
     T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
     ends = node_rows[graph.ends]

@@ -62,9 +62,8 @@ def build_relation_graph(relations: Relations) -> RelationGraph:
     ends = numbers.reshape(-1, 2)
     information = np.diag([SIGMA_M**-2, SIGMA_M**-2, np.radians(SIGMA_DEG) ** -2])
     edges = [
-        Edge(i, j, T_1_2, information, robust=True)
-        for (i, j), T_1_2 in zip(ends.tolist(), useful.T_1_2, strict=True)
-    ]  # fmt: skip
+        Edge(i, j, T_1_2, information, robust=True) for (i, j), T_1_2 in zip(ends.tolist(), useful.T_1_2, strict=True)
+    ]
     graph = PoseGraph(np.zeros((len(stamps), 3)), edges)
     solution = optimize_gnc(graph, initialize_robust(graph))
     holds = solution.weights > 0.5
