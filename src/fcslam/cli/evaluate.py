@@ -128,8 +128,8 @@ def _explain_closures(console: "Console", report: "ClosureReport", criteria: "Cl
         f"{value['relation_residual_translation_max']:.3f} m, {value['relation_residual_rotation_max']:.2f} deg.",
         f"Wrong: off by more than {criteria.wrong_m:g} m or {criteria.wrong_deg:g} deg. Errors: median / maximum; up "
         f"to {criteria.bridge_s:g} s to the relations' stamps are bridged by the run's own trajectory.",
-        f"Revisits: relations over more than {criteria.within_gap_s:g} s within a robot, {ACROSS_ROBOTS_GAP_S:g} s between "
-        f"robots; found if a correct closure ends within {criteria.reach_m:g} m of path at both sides.",
+        f"Revisits: relations over more than {criteria.within_gap_s:g} s within a robot, {ACROSS_ROBOTS_GAP_S:g} s "
+        f"between robots; found if a correct closure ends within {criteria.reach_m:g} m of path at both sides.",
         "Chain: relations from one end to the other, median / maximum; a long one adds its own error.",
         "One relation: closures that a single relation covers.",
         "A robot reports only closures that it accepts, so candidates within robots are not known.",
