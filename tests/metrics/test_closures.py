@@ -55,7 +55,7 @@ def matrix(pose):
 frames = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3))
 
 
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), frames, frames, frames)
 def test_true_closures_have_no_error_in_whatever_frames(seed, frame_1, frame_2, frame_reference):
     truth, run = fleet(seed, (frame_1, frame_2))
@@ -72,7 +72,7 @@ def test_true_closures_have_no_error_in_whatever_frames(seed, frame_1, frame_2, 
     assert closure_errors(pairs, T_i_j, run, placed(run, truth, rows)).covered.all()
 
 
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000))
 def test_told_from_the_other_end_a_closure_gets_the_same_verdict(seed):
     truth, run = fleet(seed)
