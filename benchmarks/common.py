@@ -139,6 +139,12 @@ class Report:
             lines.append(f"| {' | '.join(_cell(row[heading], spec) for heading, spec in columns.items())} |")
         self._parts.append("\n".join([f"## {title}", "", *lines]))
 
+    def picture(self, title: str, figure: Any) -> None:
+        """A Matplotlib figure, written beside the report as a PNG of its name."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        figure.savefig(self._folder / f"{self._name}.png", dpi=120, bbox_inches="tight", metadata={"Software": None})
+        self._parts.append(f"![{title}]({self._name}.png)")
+
     def write(self) -> None:
         """Write both files and print the Markdown."""
         setting = "\n".join(f"- {key}: {value}" for key, value in self._setting.items())

@@ -86,6 +86,20 @@ def test_a_report_is_two_files_that_say_the_same(common, tmp_path, monkeypatch, 
     assert {"date", "machine", "versions", "command"} <= set(content)
 
 
+def test_a_picture_lies_beside_the_report(common, tmp_path, monkeypatch, capsys):
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(sys, "argv", ["sample.py"])
+    chosen = common.options("Sample.").parse_args(["--results", str(tmp_path / "results")])
+    report = common.Report("benchmarks/sample.py", "Sample.", chosen)
+    figure = Figure()
+    figure.subplots().plot([1, 2])
+    report.picture("A line", figure)
+    report.write()
+    assert (tmp_path / "results" / "sample.png").read_bytes().startswith(b"\x89PNG")
+    assert "![A line](sample.png)" in capsys.readouterr().out
+
+
 def test_the_command_is_measured_and_its_failure_ends_the_script(common):
     cost = common.run_fcslam("--version")
     assert cost.cpu_s > 0.0

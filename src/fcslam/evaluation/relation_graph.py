@@ -1,0 +1,78 @@
+"""Relations as a pose graph: optimised together, they place stamps to each other that no single relation joins."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import shortest_path
+
+from fcslam.geometry import se2
+from fcslam.graph.initialization import initialize_robust
+from fcslam.graph.optimizer import optimize_gnc
+from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.metrics.relations import Relations
+from fcslam.records import FloatArray, frozen
+
+SIGMA_M, SIGMA_DEG = 0.05, 1.0
+"""Stated standard deviation of a hand-made relation, the same for all: it says when relations contradict each other,
+and where they merely scatter it cancels out."""
+
+
+@dataclass(frozen=True, slots=True)
+class RelationGraph:
+    """The stamps of relations at the poses that fit the relations best."""
+
+    stamps: FloatArray
+    """Every stamp that a relation names, ascending, shape (M,)."""
+    T_component_base: FloatArray
+    """Shape (M, 3); each component has a coordinate frame of its own."""
+    components: NDArray[np.int64]
+    """Which component a stamp belongs to, joined by relations that hold, shape (M,)."""
+    relations: Relations
+    """Those that the graph was built of; one that names the same stamp twice says nothing and is left out."""
+    ends: NDArray[np.int64]
+    """Numbers of the stamps that each relation joins, shape (R, 2)."""
+    holds: NDArray[np.bool_]
+    """Which relations the robust solve kept, shape (R,)."""
+    residual_m: FloatArray
+    """How far each relation is from the optimised poses, shape (R,); NaN across components."""
+    residual_deg: FloatArray
+
+    @property
+    def component_sizes(self) -> NDArray[np.int64]:
+        """Stamps in each component, the largest first."""
+        return np.sort(np.bincount(self.components))[::-1]
+
+    def chain_lengths(self, pairs: NDArray[np.int64]) -> FloatArray:
+        """The fewest relations from one stamp to another for numbers of stamps (K, 2): shape (K,), inf if none lead."""
+        joined = self.ends[self.holds]
+        links = coo_array((np.ones(len(joined)), tuple(joined.T)), shape=(len(self.stamps), len(self.stamps)))
+        sources, row = np.unique(pairs[:, 0], return_inverse=True)
+        if not len(sources):
+            return np.empty(0)
+        lengths = shortest_path(links.tocsr(), directed=False, unweighted=True, indices=sources)
+        return np.asarray(lengths[row, pairs[:, 1]])
+
+
+def build_relation_graph(relations: Relations) -> RelationGraph:
+    """Optimise ``relations``, each of which may be false: graduated non-convexity decides."""
+    useful = relations.where(relations.stamps[:, 0] != relations.stamps[:, 1])
+    stamps, numbers = np.unique(useful.stamps, return_inverse=True)
+    ends = numbers.reshape(-1, 2)
+    information = np.diag([SIGMA_M**-2, SIGMA_M**-2, np.radians(SIGMA_DEG) ** -2])
+    edges = [
+        Edge(i, j, T_1_2, information, robust=True) for (i, j), T_1_2 in zip(ends.tolist(), useful.T_1_2, strict=True)
+    ]
+    graph = PoseGraph(np.zeros((len(stamps), 3)), edges)
+    solution = optimize_gnc(graph, initialize_robust(graph))
+    holds = solution.weights > 0.5
+    components = graph.components(holds)
+    first, second = ends.T
+    residual = se2.between(useful.T_1_2, se2.between(solution.poses[first], solution.poses[second]))
+    residual[components[first] != components[second]] = np.nan
+    return RelationGraph(
+        frozen(stamps), solution.poses, frozen(components, np.int64), useful, frozen(ends, np.int64),
+        frozen(holds, np.bool_), frozen(np.hypot(residual[:, 0], residual[:, 1])),
+        frozen(np.degrees(np.abs(residual[:, 2]))),
+    )  # fmt: skip
