@@ -107,7 +107,7 @@ def load(folder: Path, name: str) -> PoseGraph:
 
 def joint_runs(name: str, whole: PoseGraph, seeds: int) -> list[tuple]:
     clean = cut(whole, robot_of(whole))
-    optimum = optimize_gnc(clean, initialize_robust(clean)).poses
+    optimum = optimize(clean, initialize_robust(clean)).poses
     return [
         (name, share, kind, seed, *joint_run(clean, optimum, share, kind, seed))
         for share in SHARES
@@ -121,8 +121,9 @@ def robot_of(graph: PoseGraph) -> NDArray[np.int64]:
 
 
 def cut(graph: PoseGraph, robot: NDArray[np.int64]) -> PoseGraph:
-    """The graph without the odometry from the end of one robot to the beginning of the next."""
-    return PoseGraph(graph.poses(), [edge for edge in graph.edges if edge.robust or robot[edge.i] == robot[edge.j]])
+    """The graph without poses, and without the odometry from the end of one robot to the beginning of the next."""
+    kept = [edge for edge in graph.edges if edge.robust or robot[edge.i] == robot[edge.j]]
+    return PoseGraph(np.zeros((len(graph), 3)), kept)
 
 
 def joint_run(clean: PoseGraph, optimum: FloatArray, share: float, kind: str, seed: int) -> tuple:
@@ -219,7 +220,7 @@ def lie(rng: Generator) -> FloatArray:
 def csail_row(folder: Path) -> tuple:
     whole = [read_g2o(folder / "posegraph-multirobot" / name).graph for name in CSAIL_FILES]
     clean, graph = (cut(graph, (np.arange(len(graph)) >= CSAIL_FIRST).astype(np.int64)) for graph in whole)
-    optimum = optimize_gnc(clean, initialize_robust(clean)).poses
+    optimum = optimize(clean, initialize_robust(clean)).poses
     known = {(edge.i, edge.j, *edge.T_i_j) for edge in clean.edges}
     robust = graph.arrays().robust
     true = robust & np.array([(edge.i, edge.j, *edge.T_i_j) in known for edge in graph.edges])

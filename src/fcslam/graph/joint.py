@@ -15,6 +15,7 @@ from fcslam.geometry import se2
 from fcslam.graph.alone import path_of, solve_alone
 from fcslam.graph.cluster import ClusterVerdict, apart, judge, places_of, relative_frame
 from fcslam.graph.consistency import Closures, ConsistencySettings
+from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, settle
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.trajectory import Trajectory
@@ -163,7 +164,8 @@ def _decide(
     """Decide every closure within a map; closures between maps count for nothing.
 
     Graduated non-convexity runs with the closures that each robot alone or a link bears out, so that false ones,
-    even if they are most, do not pull at its start; then the solution decides about all.
+    even if they are most, do not pull at its start; then the solution decides about all. It starts from the robots' own
+    solutions, and once more from the chordal one, which drift does not matter to; the cheaper result counts.
     """
     graph = evidence.graph
     edges, (owner, _) = graph.arrays(), _owners(evidence)
@@ -177,7 +179,9 @@ def _decide(
         borne_out |= weights > HOLDS
     for link in links:
         borne_out[link.members] = True
-    first = optimize_gnc(_part(graph, borne_out & inside), start, settings=gnc)
+    placed = PoseGraph(start, _part(graph, borne_out & inside).edges)
+    solutions = [optimize_gnc(placed, poses, settings=gnc) for poses in (start, initialize(placed))]
+    first = min(solutions, key=lambda solution: solution.stats.final_cost)
     trusted = np.zeros(len(edges.i))
     trusted[borne_out & inside] = first.weights
     solution = settle(_part(graph, inside), first.poses, trusted[inside], settings=gnc)
