@@ -8,7 +8,7 @@ from graph_worlds import INFORMATION, manhattan, measured, walk
 
 from fcslam.geometry import se2
 from fcslam.graph.clique import maximum_clique
-from fcslam.graph.cluster import dominant_cluster
+from fcslam.graph.cluster import apart, dominant_cluster
 from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_chi2, pairwise_consistency, witnesses
 from fcslam.graph.trajectory import Trajectory, trajectory
 
@@ -171,6 +171,16 @@ def test_supporters_are_places_that_lie_apart_and_one_must_inform() -> None:
     assert "1 supporters" in one_place.reason
     corridor = dominant_cluster(agree, far, np.zeros(6, dtype=bool), SETTINGS)
     assert "information in every direction" in corridor.reason
+
+
+def test_places_apart_are_counted_at_their_best() -> None:
+    """Taken in the order of the robot's way, the middle place would spoil both ends."""
+    line = np.array([[(x, 0.0), (x, 5.0)] for x in (2.0, 0.0, 4.0)])
+    assert apart(line, 3.0) == 2
+    same_on_one_side = line.copy()
+    same_on_one_side[:, 1] = 0.0
+    assert apart(same_on_one_side, 3.0) == 1
+    assert apart(line[:0], 3.0) == 0
 
 
 def test_a_keyscan_out_of_range_is_refused() -> None:

@@ -15,6 +15,9 @@ from fcslam.records import FloatArray
 DIRECTION_M = 1.0
 """Two points as far apart as this, each known to a few centimetres, give a direction."""
 
+_APART_BUDGET = 500
+"""Branches looked at for the largest set of places that lie apart; a set that is not proven is a lower bound."""
+
 
 @dataclass(frozen=True, slots=True)
 class ClusterVerdict:
@@ -103,13 +106,10 @@ def dominant_cluster(
     )
 
 
-def apart(xy: FloatArray, separation_m: float) -> int:
-    """How many of the places (K, S, 2), taken in order, lie ``separation_m`` or more from all before, on every side.
+def apart(places: FloatArray, separation_m: float) -> int:
+    """How many of the places (K, S, 2) lie ``separation_m`` or more from one another, on every side.
 
     One place of b that looks like three of a is one witness, not three.
     """
-    taken: list[FloatArray] = []
-    for point in xy:
-        if all(np.hypot(*(point - other).T).min() >= separation_m for other in taken):
-            taken.append(point)
-    return len(taken)
+    gaps = np.hypot(*np.moveaxis(places[:, None] - places[None], -1, 0)).min(axis=-1, initial=np.inf)
+    return len(maximum_clique(gaps >= separation_m, _APART_BUDGET).members)
