@@ -24,7 +24,7 @@ ALIAS = np.array([5.0, 3.0, 0.0])
 class World:
     """Three robots in one town, each with some closures of its own; closures between them are added by a test."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, own: int = 15) -> None:
         self.generator = np.random.default_rng(seed)
         self.truth = [walk(seed * 10 + robot, STEPS) for robot in range(ROBOTS)]
         self.edges: list[Edge] = []
@@ -36,7 +36,7 @@ class World:
                 step = measured(self.generator, se2.between(truth[k], truth[k + 1]))
                 self._add(Edge(self.variable(robot, k), self.variable(robot, k + 1), step, INFORMATION, False), True)
                 poses.append(se2.compose(poses[-1], step))
-            for i, j in self._near(robot, robot, 15):
+            for i, j in self._near(robot, robot, own):
                 if j > i + 5:
                     self.close(robot, i, robot, j)
         self.poses = np.array(poses)
@@ -109,7 +109,7 @@ def test_false_closures_are_found_out_and_true_ones_kept(seed: int, share: float
     solution = solve_jointly(world.evidence(), SETTINGS)
     robust, true = world.evidence().graph.arrays().robust, np.array(world.true)
     assert solution.maps == (0, 0, 0)
-    assert world.error_m(solution) < 0.1
+    assert world.error_m(solution) < (0.1 if share < 0.5 else 0.2), "among liars a lone true closure is not believed"
     assert solution.weights[robust & ~true].sum() == 0.0
     assert solution.weights[robust & true].mean() > 0.9
 
@@ -164,6 +164,20 @@ def test_a_small_group_of_liars_is_outvoted() -> None:
     assert solution.maps == (0, 0, 1)
     assert solution.weights[-6:].sum() == 0.0
     assert solution.weights[-26:-6].sum() >= 18
+
+
+@pytest.mark.parametrize("liars", [0, 60])
+def test_among_liars_a_lone_closure_counts_only_if_the_rest_predicts_it(liars: int) -> None:
+    """It ties down the end of a path, 0.4 m from where it should be: the odometry of 40 m could be that wrong."""
+    world = World(1, own=0)
+    meetings = [(i, j) for i, j in world._near(0, 1, 10_000) if i <= 60]
+    for k in world.generator.choice(len(meetings), 25, replace=False):
+        world.close(0, meetings[k][0], 1, meetings[k][1])
+    world.lie(0, 1, liars)
+    world.close(0, 100, 1, 50, np.array([0.3, -0.3, 0.0]))
+    solution = solve_jointly(world.evidence(), SETTINGS)
+    assert solution.maps[:2] == (0, 0)
+    assert solution.weights[-1] == (0.0 if liars else 1.0)
 
 
 def test_a_chain_of_robots_shares_one_map() -> None:

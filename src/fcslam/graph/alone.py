@@ -31,7 +31,8 @@ def solve_alone(graph: PoseGraph, consistency: ConsistencySettings, gnc: GncSett
     borne_out = ~robust
     edges = graph.arrays()
     closures = Closures(edges.i[robust], edges.j[robust], edges.T_i_j[robust], edges.information[robust])
-    borne_out[robust] = witnesses(path_of(graph, odometry, consistency), closures, consistency) > 0
+    path = path_of(graph, odometry, consistency)
+    borne_out[robust] = witnesses(path, path, closures, consistency) > 0
     witnessed = PoseGraph(graph.poses(), [edge for edge, kept in zip(graph.edges, borne_out, strict=True) if kept])
     first = optimize_gnc(witnessed, initialize_robust(witnessed), settings=gnc)
     weights = np.zeros(len(robust))

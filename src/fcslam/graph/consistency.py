@@ -26,7 +26,7 @@ class ConsistencySettings(DriftSettings):
     separation_m: float = Field(default=3.0, ge=0.0, description="Distance from which two places lie apart")
     lead: float = Field(default=2.0, ge=1.0, description="Size needed, as a multiple of the second largest cluster")
     witness_m: float = Field(
-        default=10.0, ge=0.0, description="Closures of one robot are witnesses to each other up to this path length"
+        default=10.0, ge=0.0, description="Closures are witnesses to each other up to this path length at both ends"
     )
 
     @property
@@ -88,19 +88,20 @@ def pairwise_consistency(
     return agree
 
 
-def witnesses(path: Trajectory, closures: Closures, settings: ConsistencySettings) -> NDArray[np.int64]:
-    """How many other closures of the same robot bear each one out, shape (K,).
+def witnesses(a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings) -> NDArray[np.int64]:
+    """How many other closures bear each one out, shape (K,). For closures within one robot, a and b are its path.
 
-    A witness agrees and is near along the path at both ends, where hardly any drift could explain an agreement: a
-    robot that comes back to a place closes more than one loop there, while a false closure stands alone.
+    A witness agrees and is near along the path at both ends, where hardly any drift could explain an agreement:
+    where robots meet they close more than one loop, while a false closure stands alone.
     """
-    earlier = closures.turned(closures.i > closures.j)
+    if a is b:
+        closures = closures.turned(closures.i > closures.j)
     near = np.ones((len(closures), len(closures)), dtype=bool)
-    for end in (earlier.i, earlier.j):
+    for path, end in ((a, closures.i), (b, closures.j)):
         metres = path.metres[end]
         near &= np.abs(metres[:, None] - metres[None]) <= settings.witness_m
     k, m = np.nonzero(np.triu(near, 1))
-    agree = _loop_chi2(path, path, earlier, k, m) <= settings.limit
+    agree = _loop_chi2(a, b, closures, k, m) <= settings.limit
     return np.bincount(np.concatenate((k[agree], m[agree])), minlength=len(closures))
 
 

@@ -4,17 +4,16 @@ Most closures between robots may be false, and false ones may agree with one ano
 robots' frames lie to each other. Pairwise consistency says it, graduated non-convexity decides every closure.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.alone import path_of, solve_alone
-from fcslam.graph.cluster import ClusterVerdict, apart, judge, places_of, relative_frame
-from fcslam.graph.consistency import Closures, ConsistencySettings
+from fcslam.graph.cluster import ClusterVerdict, judge, relative_frame
+from fcslam.graph.consistency import Closures, ConsistencySettings, witnesses
 from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, settle
 from fcslam.graph.pose_graph import Edge, PoseGraph
@@ -80,15 +79,22 @@ def solve_jointly(
 ) -> JointSolution:
     """Poses, maps and closures that hold, from the evidence alone: no earlier estimate plays a part.
 
-    A link whose cluster loses too many members in the joint solution is taken back, and the rest solved again.
+    A link whose cluster loses a third of its members in the joint solution is taken back, and the rest solved again.
     """
     own = [_own_solution(evidence, robot, consistency, gnc) for robot in evidence.robots]
-    links = _links(evidence, [path for path, _ in own], consistency)
+    paths = [path for path, _ in own]
+    links = _links(evidence, paths, consistency)
     holding = [link for link in links if link.verdict.dominant]
     while True:
         frames, maps = _frames(len(own), holding)
-        solution = _decide(evidence, own, frames, maps, holding, gnc)
-        lasting = [link for link in holding if _lasts(link, own, solution, evidence.informative, consistency)]
+        inside = _inside(evidence, maps)
+        likely = inside & _borne_out(evidence, [weights for _, weights in own], holding)
+        solution = _graduated(evidence, likely, paths, frames, gnc)
+        solution = _settled(evidence.graph, inside, solution, gnc)
+        for closure in _lone(evidence, paths, solution, consistency):
+            others = np.arange(len(inside)) != closure
+            solution = _settled(evidence.graph, inside, replace(solution, weights=solution.weights * others), gnc)
+        lasting = [link for link in holding if _lasts(link, solution, evidence.informative)]
         if len(lasting) == len(holding):
             return JointSolution(solution.poses, solution.weights, tuple(maps), tuple(links))
         holding = lasting
@@ -118,22 +124,26 @@ def _own_solution(
 
 def _links(evidence: JointEvidence, own: Sequence[Trajectory], settings: ConsistencySettings) -> list[Link]:
     """Pairwise consistency for every two robots (PCM), on their own trajectories."""
-    edges = evidence.graph.arrays()
-    owner, place = _owners(evidence)
-    usable = edges.robust & evidence.independent & ~evidence.excluded
     links = []
-    for a, b in combinations(range(len(own)), 2):
-        rows = np.flatnonzero(usable & np.isin(owner[edges.i], (a, b)) & np.isin(owner[edges.j], (a, b)))
-        rows = rows[owner[edges.i[rows]] != owner[edges.j[rows]]]
-        if not len(rows):
-            continue
-        told = Closures(place[edges.i[rows]], place[edges.j[rows]], edges.T_i_j[rows], edges.information[rows])
-        closures = told.turned(owner[edges.i[rows]] == b)
+    for a, b, rows, closures in _pairs(evidence, evidence.independent & ~evidence.excluded):
         verdict = judge(own[a], own[b], closures, evidence.informative[rows], settings)
         members = closures.only(np.array(verdict.members, dtype=np.int64))
         T_a_b = relative_frame(own[a], own[b], members) if verdict.dominant else None
         links.append(Link(a, b, rows, verdict, closures, T_a_b))
     return links
+
+
+def _pairs(
+    evidence: JointEvidence, chosen: NDArray[np.bool_]
+) -> Iterator[tuple[int, int, NDArray[np.int64], Closures]]:
+    """Every two robots with chosen closures between them: a, b, the closures' edges, the closures seen from a."""
+    edges, (owner, place) = evidence.graph.arrays(), _owners(evidence)
+    between = np.flatnonzero(edges.robust & chosen & (owner[edges.i] != owner[edges.j]))
+    ends = np.sort(np.stack((owner[edges.i[between]], owner[edges.j[between]])), axis=0)
+    for a, b in np.unique(ends, axis=1).T.tolist():
+        rows = between[(ends[0] == a) & (ends[1] == b)]
+        told = Closures(place[edges.i[rows]], place[edges.j[rows]], edges.T_i_j[rows], edges.information[rows])
+        yield a, b, rows, told.turned(owner[edges.i[rows]] == b)
 
 
 def _frames(count: int, links: Sequence[Link]) -> tuple[list[FloatArray], list[int]]:
@@ -153,55 +163,92 @@ def _frames(count: int, links: Sequence[Link]) -> tuple[list[FloatArray], list[i
     return frames, [order[first] for first in maps]
 
 
-def _decide(
-    evidence: JointEvidence,
-    own: Sequence[tuple[Trajectory, FloatArray]],
-    frames: Sequence[FloatArray],
-    maps: Sequence[int],
-    links: Sequence[Link],
-    gnc: GncSettings | None,
-) -> Solution:
-    """Decide every closure within a map; closures between maps count for nothing.
-
-    Graduated non-convexity runs with the closures that each robot alone or a link bears out, so that false ones,
-    even if they are most, do not pull at its start; then the solution decides about all. It starts from the robots' own
-    solutions, and once more from the chordal one, which drift does not matter to; the cheaper result counts.
-    """
-    graph = evidence.graph
-    edges, (owner, _) = graph.arrays(), _owners(evidence)
-    start = graph.poses()
-    for robot, (path, _), frame in zip(evidence.robots, own, frames, strict=True):
-        start[robot] = se2.compose(frame, path.poses)
+def _inside(evidence: JointEvidence, maps: Sequence[int]) -> NDArray[np.bool_]:
+    """Edges (E,) that may count: closures between maps do not, nor do excluded ones."""
+    edges, (owner, _) = evidence.graph.arrays(), _owners(evidence)
     map_of = np.array(maps)[owner]
-    inside = ~edges.robust | (map_of[edges.i] == map_of[edges.j]) & ~evidence.excluded
-    borne_out = ~edges.robust
-    for _, weights in own:
+    within: NDArray[np.bool_] = map_of[edges.i] == map_of[edges.j]
+    return ~edges.robust | (within & ~evidence.excluded)
+
+
+def _borne_out(evidence: JointEvidence, own: Sequence[FloatArray], links: Sequence[Link]) -> NDArray[np.bool_]:
+    """Odometry, and the closures that a robot alone or a link bears out, (E,)."""
+    borne_out = ~evidence.graph.arrays().robust
+    for weights in own:
         borne_out |= weights > HOLDS
     for link in links:
         borne_out[link.members] = True
-    placed = PoseGraph(start, _part(graph, borne_out & inside).edges)
+    return borne_out
+
+
+def _graduated(
+    evidence: JointEvidence,
+    likely: NDArray[np.bool_],
+    own: Sequence[Trajectory],
+    frames: Sequence[FloatArray],
+    gnc: GncSettings | None,
+) -> Solution:
+    """Graduated non-convexity with likely closures only: false ones, even if they are most, must not pull at its start.
+
+    From the robots' own solutions, and once more from the chordal one, which drift does not matter to; the cheaper
+    result counts. Other closures have weight 0.
+    """
+    graph = evidence.graph
+    start = graph.poses()
+    for robot, path, frame in zip(evidence.robots, own, frames, strict=True):
+        start[robot] = se2.compose(frame, path.poses)
+    placed = _part(graph, start, likely)
     solutions = [optimize_gnc(placed, poses, settings=gnc) for poses in (start, initialize(placed))]
-    first = min(solutions, key=lambda solution: solution.stats.final_cost)
-    trusted = np.zeros(len(edges.i))
-    trusted[borne_out & inside] = first.weights
-    solution = settle(_part(graph, inside), first.poses, trusted[inside], settings=gnc)
-    weights = np.zeros(len(edges.i))
-    weights[inside] = solution.weights
-    return Solution(solution.poses, frozen(weights), solution.stats)
+    best = min(solutions, key=lambda solution: solution.stats.final_cost)
+    return _spread(best, likely)
 
 
-def _lasts(
-    link: Link,
-    own: Sequence[tuple[Trajectory, FloatArray]],
-    solution: Solution,
-    informative: NDArray[np.bool_],
-    settings: ConsistencySettings,
-) -> bool:
-    """Whether what is left of the link's cluster in the joint solution would still be enough to join the two."""
-    held = np.array([k for k in link.verdict.members if solution.weights[link.edges[k]] > HOLDS], dtype=np.int64)
-    places = places_of(own[link.a][0], own[link.b][0], link.closures.only(held))
-    supporters = apart(places, settings.separation_m)
-    return supporters >= settings.minimum_closures and bool(informative[link.edges[held]].any())
+def _settled(graph: PoseGraph, inside: NDArray[np.bool_], trusted: Solution, gnc: GncSettings | None) -> Solution:
+    """Every closure inside decided by the solution with those that are trusted."""
+    part = _part(graph, trusted.poses, inside)
+    return _spread(settle(part, None, trusted.weights[inside], settings=gnc), inside)
+
+
+def _lone(
+    evidence: JointEvidence, own: Sequence[Trajectory], solution: Solution, settings: ConsistencySettings
+) -> list[int]:
+    """Closures that hold, without a witness, alone in tying down a piece of path, between robots most of whose
+    closures do not hold.
+
+    Of very many false closures one may hit where a path is loose enough to follow it. Where they are many, a lone one
+    counts only if the rest predicts it.
+    """
+    held = solution.weights > HOLDS
+    loose = _next_tie_m(evidence, own, held) >= settings.separation_m
+    lone: list[int] = []
+    for a, b, rows, closures in _pairs(evidence, ~evidence.excluded):
+        kept = np.flatnonzero(held[rows])
+        if 2 * len(kept) < len(rows):
+            alone = witnesses(own[a], own[b], closures.only(kept), settings) == 0
+            lone += rows[kept[alone & loose[rows[kept]]]].tolist()
+    return lone
+
+
+def _next_tie_m(evidence: JointEvidence, own: Sequence[Trajectory], held: NDArray[np.bool_]) -> FloatArray:
+    """Path from the worse end of each closure that holds to the next end of another one, (E,); 0 for other edges."""
+    edges, (owner, place) = evidence.graph.arrays(), _owners(evidence)
+    closures = np.flatnonzero(edges.robust & held)
+    ends = np.concatenate((edges.i[closures], edges.j[closures]))
+    gap = np.full(len(ends), np.inf)
+    for robot, path in enumerate(own):
+        mine = np.flatnonzero(owner[ends] == robot)
+        mine = mine[np.argsort(path.metres[place[ends[mine]]], kind="stable")]
+        between = np.diff(path.metres[place[ends[mine]]])
+        gap[mine] = np.minimum(np.append(between, np.inf), np.append(np.inf, between))
+    tie = np.zeros(len(edges.i))
+    tie[closures] = gap.reshape(2, -1).max(axis=0)
+    return tie
+
+
+def _lasts(link: Link, solution: Solution, informative: NDArray[np.bool_]) -> bool:
+    """Whether more than two thirds of the link's cluster hold in the joint solution, an informative one among them."""
+    held = link.members[solution.weights[link.members] > HOLDS]
+    return 3 * len(held) > 2 * len(link.members) and bool(informative[held].any())
 
 
 def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -212,6 +259,13 @@ def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int6
     return owner, place
 
 
-def _part(graph: PoseGraph, kept: NDArray[np.bool_]) -> PoseGraph:
-    """All variables and some of the edges."""
-    return PoseGraph(graph.poses(), [edge for edge, keep in zip(graph.edges, kept, strict=True) if keep])
+def _part(graph: PoseGraph, poses: FloatArray, kept: NDArray[np.bool_]) -> PoseGraph:
+    """All variables, at ``poses``, and some of the edges."""
+    return PoseGraph(poses, [edge for edge, keep in zip(graph.edges, kept.tolist(), strict=True) if keep])
+
+
+def _spread(solution: Solution, kept: NDArray[np.bool_]) -> Solution:
+    """The solution of a part, told of the whole graph: edges left out have weight 0."""
+    weights = np.zeros(len(kept))
+    weights[kept] = solution.weights
+    return replace(solution, weights=frozen(weights))
