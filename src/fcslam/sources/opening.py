@@ -9,6 +9,8 @@ from fcslam.sources.archive import head
 from fcslam.sources.carmen import CARMEN
 from fcslam.sources.cmu import CMU
 from fcslam.sources.dialect import Dialect
+from fcslam.sources.duke import DUKE
+from fcslam.sources.mines import MINES
 from fcslam.sources.source import Source
 from fcslam.sources.textlog import TextLog
 
@@ -27,7 +29,7 @@ def _text_format(dialect: Dialect) -> Format:
     return Format(dialect.name, lambda _, head: dialect.recognises(head), lambda path: TextLog(path, dialect))
 
 
-FORMATS: tuple[Format, ...] = (_text_format(CARMEN), _text_format(CMU))
+FORMATS: tuple[Format, ...] = tuple(map(_text_format, (CARMEN, CMU, DUKE, MINES)))
 """Asked in this order; a new format is one more entry."""
 
 
@@ -44,7 +46,8 @@ def open_source(path: Path) -> Source:
     for kind in FORMATS:
         if kind.recognises(path, content):
             return kind.open(path)
-    known = " or ".join(kind.name for kind in FORMATS)
+    *others, last = (kind.name for kind in FORMATS)
+    known = f"{', '.join(others)} or {last}"
     if path.is_dir():
         raise SourceError(f"{path}: is a folder and no recording; give the file of a recording ({known})")
     raise SourceError(f"{path}: no recording of a known format (it starts with {content[:16]!r}); give a {known}")

@@ -8,6 +8,7 @@ What is tolerated, counted and reported, and what is refused:
   two recordings were put together, which is refused. So is a log in which more than half of the steps go back.
 - A scan with another beam count than the rest is skipped; more than 1 % of them are a change of sensor: refused.
 - Equal stamps are kept: some logs were printed with too few digits, or without a clock.
+- A dialect without stamps gets made ones, 1 s from scan to scan; every scan is counted.
 - A log of ten scans or more in which neither the scans' poses nor odometry messages ever change has no odometry:
   refused. When only the odometry messages change, a scan takes its pose from the one before it.
 """
@@ -83,8 +84,11 @@ class TextLog:
         overview = Overview()
         gate = ScanGate(self._usual_beam_count(), audit)
         for number, line in self._lines(audit):
-            if not isinstance(line, ScanLine) or gate.admits(number, line):
-                overview.add(line)
+            if isinstance(line, ScanLine):
+                if not gate.admits(number, line):
+                    continue
+                self._note_clock(number, audit)
+            overview.add(line)
         return overview.conclude(self._path, audit.faults())
 
     def _usual_beam_count(self) -> int:
@@ -97,9 +101,10 @@ class TextLog:
         return counts.most_common(1)[0][0]
 
     def _lines(self, audit: Audit) -> Iterator[tuple[int, Line]]:
+        parse = self._dialect.parser()
         for number, text in numbered_lines(self._path):
             try:
-                line = self._dialect.parse(text)
+                line = parse(text)
             except ValueError:
                 audit.add(Fault.BROKEN_LINE, number)
                 continue
@@ -124,8 +129,13 @@ class TextLog:
                     audit.clear()
                 seen += 1
                 if seen > scans.first:
+                    self._note_clock(number, audit)
                     late = latest if reading.pose_from_odometry else None
                     yield number, line if late is None else line._replace(T_odom_base=late.T_odom_base)
+
+    def _note_clock(self, number: int, audit: Audit) -> None:
+        if not self._dialect.timed:
+            audit.add(Fault.NO_STAMP, number)
 
 
 class ScanGate:
