@@ -36,6 +36,7 @@ FRAME_PX = (17, 4, 2, 2)
 FIGURE = common.REPOSITORY / "docs" / "images" / "wean-hall.png"
 
 PAPER = (236, 239, 241)
+"""Red, green, blue."""
 
 CELL_M = 0.1
 COARSE_M = 0.2
@@ -279,7 +280,7 @@ def draw(plan: Plan, together: Run, reference: Plan, T_reference_map: FloatArray
 
     top, bottom, left, right = FRAME_PX
     pixels = cv2.imread(str(picture), cv2.IMREAD_COLOR)[top:-bottom, left:-right]
-    pixels[np.ptp(pixels, axis=2) > 40] = PAPER
+    pixels[np.ptp(pixels, axis=2) > 40] = PAPER[::-1]
     height_m, width_m = (size * reference.cell_m for size in pixels.shape[:2])
     joined = [trajectory for trajectory in together.trajectories if trajectory.map_index == 0]
     figure, (upper, lower) = plt.subplots(2, 1, figsize=(9.0, 10.2), layout="constrained")
