@@ -3,8 +3,8 @@
     time battery left right (21 more) r1..r682
     time left right x y heading (7 more) r1..r682
 
-The number of words says which of the two it is. In the second, the right encoder counts down as the robot drives ahead;
-the pose is passed over: it was already corrected. Odometry is integrated from the ticks, from the identity.
+The number of words says which of the two it is. In the second, the right encoder counts down as the robot drives
+ahead. Odometry is integrated from the ticks, from the identity; a pose in the line is passed over.
 
 The laser is a Hokuyo URG-04LX, 1024 steps a turn, from right to left, beam 340 straight ahead. A range below 20 mm is
 an error code, and the robot's body hides the first and the last 70 beams.
@@ -17,7 +17,7 @@ from collections import deque
 from math import cos, pi, sin
 from typing import NamedTuple
 
-from fcslam.sources.dialect import Dialect, LineParser, ScanLine, StatedLaser, check_beams
+from fcslam.sources.dialect import Dialect, ScanLine, StatedLaser, check_beams
 from fcslam.sources.pose import Pose
 
 _METRES = 0.001
@@ -34,7 +34,9 @@ _INCREMENT_RAD = 2.0 * pi / 1024.0
 _LASER = StatedLaser((_HIDDEN_BEAMS - _MIDDLE_BEAM) * _INCREMENT_RAD, _INCREMENT_RAD, _MAX_RANGE_M)
 
 _MAX_COUNT = 1e15
+"""Of ticks or microseconds; a larger one is damage."""
 _POSES_KEPT = 8
+"""Enough to look back over ``_SCAN_AGE_S`` at 10 to 50 lines a second."""
 _MAX_STEP_M = 10.0
 """A wheel that went farther between two lines is damage."""
 _NUMBER_LETTERS = b"0123456789.+-eE"
@@ -122,8 +124,4 @@ def _recognises(head: bytes) -> bool:
     )
 
 
-def _parser() -> LineParser:
-    return _Parser()
-
-
-MINES = Dialect("CoreSLAM log", _recognises, _parser, _METRES)
+MINES = Dialect("CoreSLAM log", _recognises, _Parser, _METRES)
