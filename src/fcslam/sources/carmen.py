@@ -103,4 +103,4 @@ _PARSERS: dict[bytes, Callable[[bytes], Line]] = {
     b"PARAM": _parse_parameter,
 }
 
-CARMEN = Dialect("CARMEN log", lambda head: _KNOWN.search(head) is not None, _parse)
+CARMEN = Dialect("CARMEN log", lambda head: _KNOWN.search(head) is not None, lambda: _parse)

@@ -48,6 +48,10 @@ class ParameterLine(NamedTuple):
 Line = ScanLine | OdometryLine | ParameterLine
 
 
+LineParser = Callable[[bytes], Line | None]
+"""A line's content; None: nothing of interest. Raises ValueError for a broken line. Ranges stay text."""
+
+
 @dataclass(frozen=True, slots=True)
 class Dialect:
     """How one kind of text log is read."""
@@ -55,9 +59,15 @@ class Dialect:
     name: str
     recognises: Callable[[bytes], bool]
     """Whether a log that starts with these bytes is of this kind."""
-    parse: Callable[[bytes], Line | None]
-    """A line's content; None: nothing of interest. Raises ValueError for a broken line. Ranges stay text."""
+    parser: Callable[[], LineParser]
+    """A parser for one pass over a log, told its lines in order: what a line means may depend on those before it."""
     metres_per_range_unit: float = 1.0
+    timed: bool = True
+    """Whether the log states stamps; otherwise the parser makes them, ``UNTIMED_STEP_S`` from scan to scan."""
+
+
+UNTIMED_STEP_S = 1.0
+"""Time between the scans of a log that states none."""
 
 
 def pose_of(tokens: list[bytes], metres_per_unit: float = 1.0) -> Pose:

@@ -18,6 +18,7 @@ class Fault(StrEnum):
     ODOMETRY_GAP = "scans in gaps of the odometry of more than 1 s kept"
     MISPLACED_SCAN = "scans recorded far back in time skipped"
     TIME_REVERSAL = "steps back in time kept"
+    NO_STAMP = "scans without a stamp taken as 1 s apart"
     REPEATED_STAMP = "scans with the stamp of the scan before kept"
     NON_FINITE_RANGE = "ranges that are no finite number made invalid"
     NEGATIVE_RANGE = "negative ranges made invalid"

@@ -12,6 +12,8 @@ from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.carmen import CARMEN
 from fcslam.sources.cmu import CMU
 from fcslam.sources.dialect import Dialect
+from fcslam.sources.duke import DUKE
+from fcslam.sources.mines import MINES
 from fcslam.sources.source import Source
 from fcslam.sources.textlog import TextLog
 
@@ -35,8 +37,7 @@ def _text_format(dialect: Dialect) -> Format:
 
 
 FORMATS: tuple[Format, ...] = (
-    _text_format(CARMEN),
-    _text_format(CMU),
+    *map(_text_format, (CARMEN, CMU, DUKE, MINES)),
     Format("ROS bag", is_bag, RosBag, takes_options=True),
 )
 """Asked in this order; a new format is one more entry."""
@@ -62,7 +63,8 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
                     "--laser-pose) go with ROS bags only, leave them out"
                 )
             return kind.open(path, name or robot_name(path), options)
-    known = " or ".join(kind.name for kind in FORMATS)
+    *others, last = (kind.name for kind in FORMATS)
+    known = f"{', '.join(others)} or {last}"
     if path.is_dir():
         raise SourceError(f"{path}: is a folder and no recording; give the file of a recording ({known})")
     raise SourceError(f"{path}: no recording of a known format (it starts with {content[:16]!r}); give a {known}")

@@ -2,6 +2,7 @@
 
 What is tolerated, counted and reported, and what is refused, is decided in ``gate``, and here:
 
+- A dialect without stamps gets made ones, 1 s from scan to scan; every scan is counted.
 - A log of ten scans or more in which neither the scans' poses nor odometry messages ever change has no odometry:
   refused. When only the odometry messages change, a scan takes its pose from the one before it.
 """
@@ -75,8 +76,11 @@ class TextLog:
         overview = Overview()
         gate = ScanGate(self._usual_beam_count(), audit)
         for number, line in self._lines(audit):
-            if not isinstance(line, ScanLine) or gate.admits(number, line):
-                overview.add(line)
+            if isinstance(line, ScanLine):
+                if not gate.admits(number, line):
+                    continue
+                self._note_clock(number, audit)
+            overview.add(line)
         return overview.conclude(self._path, audit.faults())
 
     def _usual_beam_count(self) -> int:
@@ -89,9 +93,10 @@ class TextLog:
         return counts.most_common(1)[0][0]
 
     def _lines(self, audit: Audit) -> Iterator[tuple[int, Line]]:
+        parse = self._dialect.parser()
         for number, text in numbered_lines(self._path):
             try:
-                line = self._dialect.parse(text)
+                line = parse(text)
             except ValueError:
                 audit.add(Fault.BROKEN_LINE, number)
                 continue
@@ -100,7 +105,10 @@ class TextLog:
 
     def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, ScanLine | OdometryLine]]:
         """Scans and odometry of the range, with the poses to use; in the end ``audit`` holds this range's faults."""
-        return window(self._posed(audit), scans, lambda line: isinstance(line, ScanLine), audit)
+        for number, line in window(self._posed(audit), scans, lambda line: isinstance(line, ScanLine), audit):
+            if isinstance(line, ScanLine):
+                self._note_clock(number, audit)
+            yield number, line
 
     def _posed(self, audit: Audit) -> Iterator[tuple[int, ScanLine | OdometryLine]]:
         reading = self._reading
@@ -113,6 +121,10 @@ class TextLog:
             elif isinstance(line, ScanLine) and gate.admits(number, line):
                 late = latest if reading.pose_from_odometry else None
                 yield number, line if late is None else line._replace(T_odom_base=late.T_odom_base)
+
+    def _note_clock(self, number: int, audit: Audit) -> None:
+        if not self._dialect.timed:
+            audit.add(Fault.NO_STAMP, number)
 
 
 def _ranges(scan: ScanLine, metres_per_unit: float, number: int, audit: Audit) -> Ranges:
