@@ -223,6 +223,9 @@ def test_a_veto_without_stamps_speaks_of_two_robots(tmp_path):
         ("robot_i,robot_j\na,b\n", "expected the columns robot_i, stamp_i"),
         ("robot_i,stamp_i,robot_j,stamp_j\na,1.0,b,\n", "line 2: two stamps or none"),
         ("robot_i,stamp_i,robot_j,stamp_j\na,1.0,b,x\n", "line 2: two stamps or none"),
+        ("robot_i,stamp_i,robot_j,stamp_j\na,1.0,b,nan\n", "line 2: two stamps or none"),
+        ("", "expected the columns"),
+        ("foo,bar\n", "expected the columns"),
         (None, "No such file"),
     ],
 )

@@ -174,10 +174,13 @@ class Veto:
         """Whether it speaks of this closure, told from either end."""
         ends = ((robot_i, stamp_i), (robot_j, stamp_j))
         return any(
-            (self.robot_i, self.robot_j) == (i, j)
-            and (self.stamps is None or np.allclose(self.stamps, (at_i, at_j), rtol=0.0, atol=SAME_STAMP_S))
+            (self.robot_i, self.robot_j) == (i, j) and (self.stamps is None or _same_stamps(self.stamps, (at_i, at_j)))
             for (i, at_i), (j, at_j) in (ends, ends[::-1])
         )
+
+
+def _same_stamps(a: tuple[float, float], b: tuple[float, float]) -> bool:
+    return abs(a[0] - b[0]) <= SAME_STAMP_S and abs(a[1] - b[1]) <= SAME_STAMP_S
 
 
 @dataclass(frozen=True, slots=True)

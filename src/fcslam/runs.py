@@ -194,9 +194,12 @@ def _read_veto(number: int, row: dict[str, str]) -> Veto:
     if not any(stamps):
         return Veto(row["robot_i"], row["robot_j"])
     try:
-        return Veto(row["robot_i"], row["robot_j"], (float(stamps[0]), float(stamps[1])))
-    except ValueError as error:
-        raise ValueError(f"line {number}: two stamps or none are needed, {error}") from error
+        stamp_i, stamp_j = map(float, stamps)
+    except ValueError:
+        stamp_i = stamp_j = math.nan
+    if not (math.isfinite(stamp_i) and math.isfinite(stamp_j)):
+        raise ValueError(f"line {number}: two stamps or none are needed, not '{stamps[0]}' and '{stamps[1]}'")
+    return Veto(row["robot_i"], row["robot_j"], (stamp_i, stamp_j))
 
 
 def write_tum(path: Path, stamps: FloatArray, T_map_base: FloatArray) -> None:
@@ -322,7 +325,10 @@ def _write_csv(path: Path, columns: list[str], rows: Iterable[list[Any]]) -> Non
 
 def _read_csv(path: Path, columns: list[str]) -> list[dict[str, str]]:
     with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+        reader = csv.DictReader(file)
+        rows, heading = list(reader), list(reader.fieldnames or ())
+    if not rows and not set(columns) <= set(heading):
+        raise ValueError(f"{path.name}, line 1: expected the columns {', '.join(columns)}")
     for number, row in enumerate(rows, start=2):
         if any(row.get(column) is None for column in columns):
             raise ValueError(f"{path.name}, line {number}: expected the columns {', '.join(columns)}")

@@ -11,6 +11,7 @@ from small_fleet import feed, fingerprint, in_order, map_of
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.geometry import se2
+from fcslam.graph.consistency import ConsistencySettings
 from fcslam.records import ClosureStatus, ConstraintKind, Correction, KeyscanId, Place, Veto
 from fcslam.wire.packets import decode, encode
 
@@ -160,6 +161,32 @@ def test_a_veto_parts_what_only_liars_joined(scripted):
     before = scripted(alias)
     before.veto(Veto("a", "b"))
     assert fingerprint(feed(before, two_robots()).finalize()) == fingerprint(result)
+
+
+def test_a_veto_clears_the_way_for_the_truth_whenever_it_comes(scripted):
+    """Four aliases keep six true closures from joining; vetoed, before or after, they do so no more."""
+    alias = closures(A, B, OTHERS[:4], shift=ALIAS)
+    vetoes = [Veto("a", "b", (float(i), LATER + j)) for i, j in OTHERS[:4]]
+    late = feed(scripted(alias, closures(A, B, TRUE)), two_robots())
+    assert late.closure_counts()["between robots"] == 0
+    for veto in vetoes:
+        late.veto(veto)
+    assert late.closure_counts()["between robots"] == len(TRUE)
+    early = scripted(alias, closures(A, B, TRUE))
+    for veto in vetoes:
+        early.veto(veto)
+    result = late.finalize()
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert fingerprint(result) == fingerprint(feed(early, two_robots()).finalize())
+
+
+def test_a_turn_on_the_spot_drifts_as_its_odometry_says(scripted):
+    """On the way as in the end: a robot that turned much without moving may be off by what its odometry claims."""
+    fleet = feed(scripted(closures(A, B, TRUE)), two_robots())
+    path = fleet._graph.path("a", ConsistencySettings())
+    steps = np.diag(np.linalg.inv(motion("a", 0, 1, np.zeros(3)).information))
+    drift = path.drift(np.array([0]), np.array([1]))[0]
+    assert drift[2, 2] == pytest.approx(steps[2] + ConsistencySettings().heading_drift_rad ** 2, rel=0.01)
 
 
 def test_a_veto_of_one_closure_leaves_the_others(scripted):

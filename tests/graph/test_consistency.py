@@ -9,7 +9,7 @@ from graph_worlds import INFORMATION, manhattan, measured, walk
 from fcslam.geometry import se2
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.cluster import apart, dominant_cluster
-from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_chi2, pairwise_consistency, witnesses
+from fcslam.graph.consistency import Closures, ConsistencySettings, loop_chi2, pairwise_consistency, witnesses
 from fcslam.graph.trajectory import Trajectory, trajectory
 
 SETTINGS = ConsistencySettings(position_drift_m=0.03, heading_drift_rad=0.01)
@@ -49,6 +49,14 @@ def two_robots(seed: int, true: int = 20, false: int = 30, aliases: int = 0) -> 
         information=np.tile(INFORMATION, (len(rows), 1, 1)),
     )
     return *(trajectory(drifted(generator, truth), SETTINGS) for truth in (truth_a, truth_b)), closures
+
+
+def pairwise_chi2(a: Trajectory, b: Trajectory, closures: Closures) -> np.ndarray:
+    """Of all loops, (K, K), symmetric."""
+    k, m = np.triu_indices(len(closures), 1)
+    chi2 = np.zeros((len(closures), len(closures)))
+    chi2[k, m] = loop_chi2(a, b, closures, k, m)
+    return chi2 + chi2.T
 
 
 def verdict_of(seed: int, **counts: int):
@@ -188,7 +196,17 @@ def test_a_keyscan_out_of_range_is_refused() -> None:
     short = [trajectory(x.poses[:50], SETTINGS) for x in (a, b)]
     for cut_a, cut_b, name in ((short[0], b, "a"), (a, short[1], "b")):
         with pytest.raises(ValueError, match=f"trajectory {name} has keyscans 0 to 49"):
-            pairwise_chi2(cut_a, cut_b, closures)
+            pairwise_consistency(cut_a, cut_b, closures, SETTINGS)
+
+
+def test_pairs_in_parts_are_pairs_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b, closures = two_robots(0)
+    whole = pairwise_consistency(a, b, closures, SETTINGS)
+    assert np.array_equal(whole, pairwise_chi2(a, b, closures) <= SETTINGS.limit)
+    monkeypatch.setattr("fcslam.graph.consistency._PAIRS_AT_ONCE", 7)
+    assert np.array_equal(pairwise_consistency(a, b, closures, SETTINGS), whole)
+    none = closures.only(np.zeros(0, dtype=np.int64))
+    assert pairwise_consistency(a, b, none, SETTINGS).shape == (0, 0)
 
 
 def test_a_closure_says_the_same_from_both_ends() -> None:

@@ -10,8 +10,9 @@ from fcslam.geometry import se2
 from fcslam.graph import joint
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.joint import JointEvidence, JointSolution, solve_jointly
-from fcslam.graph.optimizer import optimize
+from fcslam.graph.optimizer import Solution, SolveStats, optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.graph.trajectory import trajectory
 
 SETTINGS = ConsistencySettings()
 STEPS = 100
@@ -235,6 +236,29 @@ def test_a_link_that_the_joint_solution_takes_apart_is_taken_back(monkeypatch: p
 
     monkeypatch.setattr(joint, "settle", keeps_one)
     assert solve_jointly(world.evidence(), SETTINGS).maps == (0, 1, 2)
+
+
+@pytest.mark.parametrize(("dropped", "lasts"), [(0, True), (1, True), (2, False), (3, False)])
+def test_a_link_lasts_on_most_of_its_cluster_from_enough_places(dropped: int, lasts: bool) -> None:
+    """Eight closures from four places; without the last two of them it would join nobody, however many remain."""
+    truth = np.array([(4.0 * k, 0.0, 0.0) for k in range(4)])
+    pairs = [0, 0, 0, 1, 1, 1, 2, 3]
+    robots = np.arange(4), np.arange(4, 8)
+    edges = [Edge(r[k], r[k] + 1, np.array([4.0, 0.0, 0.0]), INFORMATION, False) for r in robots for k in range(3)]
+    edges += [Edge(k, k + 4, np.zeros(3), INFORMATION, True) for k in pairs]
+    graph = PoseGraph(np.tile(truth, (2, 1)), edges)
+    ones, zeros = np.ones(len(edges), bool), np.zeros(len(edges), bool)
+    evidence = JointEvidence(graph, robots, ones, ones, zeros)
+    (link,) = solve_jointly(evidence, SETTINGS).links
+    assert link.verdict.supporters == 4
+    weights = np.ones(len(edges))
+    weights[len(edges) - dropped :] = 0.0
+    own = [trajectory(truth, SETTINGS)] * 2
+    solution = Solution(graph.poses(), weights, SolveStats(0, 0.0, 0.0))
+    assert joint._lasts(link, own, solution, ones, SETTINGS) is lasts
+    one_place = np.ones(len(edges))
+    one_place[-5:] = 0.0
+    assert not joint._lasts(link, own, replace(solution, weights=one_place), ones, SETTINGS)
 
 
 def test_the_same_evidence_gives_the_same_bytes() -> None:

@@ -114,8 +114,9 @@ class Fleet:
     def veto(self, veto: Veto) -> None:
         """From now on these closures count for nothing; maps that only they held together part."""
         self._vetoes.append(veto)
-        vetoed = [entry for entry in self._ledger if self._is_vetoed(entry)]
-        if any(entry.closure.status is ClosureStatus.ACCEPTED for entry in vetoed):
+        before = [entry for entry in self._ledger if not entry.vetoed]
+        vetoed = [entry for entry in before if self._is_vetoed(entry)]
+        if any(entry.closure.status is not ClosureStatus.CANDIDATE for entry in vetoed):
             self._disturbed = True
             self._reconsider()
 
@@ -241,10 +242,7 @@ class Fleet:
         verdict = judge(entries, (a, b), self._graph, self._config.consistency)
         joined = b in self._map_of(a)
         members = [entries[k] for k in verdict.members]
-        if joined:
-            held = [entry for entry in entries if entry.closure.status is ClosureStatus.ACCEPTED]
-            outvoted = 2 * sum(entry in members for entry in held) < len(held)
-            self._doubted |= verdict.contested or outvoted
+        self._doubted |= joined and verdict.contested
         if not verdict.dominant:
             for entry in entries:
                 if entry.closure.status is ClosureStatus.VERIFIED:
@@ -253,12 +251,14 @@ class Fleet:
         if not joined:
             self._join(members, a, b)
         reason = f"in the dominant cluster of {len(members)} closures ({verdict.supporters} places apart)"
+        fresh = [entry for entry in members if entry.closure.status is not ClosureStatus.ACCEPTED]
+        for entry in fresh:
+            self._accept(entry, reason)
         for entry in entries:
-            if entry in members and entry.closure.status is not ClosureStatus.ACCEPTED:
-                self._accept(entry, reason)
-            elif entry.closure.status is ClosureStatus.VERIFIED:
+            if entry.closure.status is ClosureStatus.VERIFIED:
                 entry.set(ClosureStatus.VERIFIED, "outside the dominant cluster")
-        self._optimize()
+        if fresh:
+            self._optimize()
 
     def _join(self, members: list[Entry], a: str, b: str) -> None:
         """Move the younger map into the older one's frame."""
@@ -292,8 +292,6 @@ class Fleet:
     def _reconsider(self) -> None:
         """Decide every closure anew: revoke what is outvoted, part the maps that only that held together."""
         self._maps = reconsider(self._graph, self._ledger, self._config.consistency)
-        for robots in self._maps:
-            self._graph.move(robots, se2.inverse(self._graph.trajectory(robots[0])[0]))
         self._doubted, self._patience = False, int(MORE_DOUBTS * len(self._ledger))
         self._version += 1
 

@@ -9,7 +9,6 @@ from fcslam.cloud.ledger import Entry
 from fcslam.graph import cluster
 from fcslam.graph.cluster import ClusterVerdict
 from fcslam.graph.consistency import Closures, ConsistencySettings
-from fcslam.graph.trajectory import trajectory
 from fcslam.records import FloatArray
 
 
@@ -17,7 +16,7 @@ def judge(
     entries: Sequence[Entry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
 ) -> ClusterVerdict:
     """The dominant cluster among the closures of two robots, on the trajectories as they are estimated now."""
-    a, b = (trajectory(graph.trajectory(robot), settings) for robot in robots)
+    a, b = (graph.path(robot, settings) for robot in robots)
     informative = [entry.closure.informative for entry in entries]
     return cluster.judge(a, b, _closures(entries, robots[0]), informative, settings)
 
@@ -26,7 +25,7 @@ def first_estimate(
     members: Sequence[Entry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
 ) -> FloatArray:
     """T_a_b of the two robots' maps, from the two matched places that lie farthest apart."""
-    a, b = (trajectory(graph.trajectory(robot), settings) for robot in robots)
+    a, b = (graph.path(robot, settings) for robot in robots)
     return cluster.relative_frame(a, b, _closures(members, robots[0]))
 
 

@@ -9,6 +9,7 @@ from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.graph.trajectory import DriftSettings, Trajectory, trajectory
 from fcslam.records import Constraint, FloatArray, KeyscanId
 
 
@@ -20,6 +21,7 @@ class JointGraph:
         self._factors = FactorCache(self.graph)
         self._variables: dict[str, list[int]] = {}
         self._chains: dict[str, list[FloatArray]] = {}
+        self._step_covariance: dict[str, list[FloatArray]] = {}
         self._poses = np.zeros((256, 3))
         self._left_out: set[int] = set()
         self._unsolved = 0
@@ -42,6 +44,11 @@ class JointGraph:
         trajectory: FloatArray = self._poses[self._variables[robot]]
         return trajectory
 
+    def path(self, robot: str, settings: DriftSettings) -> Trajectory:
+        """The robot's trajectory as consistency sees it, with the drift that its odometry claims."""
+        steps = np.array(self._step_covariance[robot]).reshape(-1, 3, 3)
+        return trajectory(self.trajectory(robot), settings, steps)
+
     def chain(self, robot: str, first: int, last: int) -> FloatArray:
         """T_odom_base of keyscans first to last (inclusive): the robot's motions alone, before any correction."""
         return np.array(self._chains[robot][first : last + 1])
@@ -53,6 +60,7 @@ class JointGraph:
     def start(self, robot: str) -> None:
         """First keyscan of a robot: the origin of a map of its own."""
         self._chains[robot] = [np.zeros(3)]
+        self._step_covariance[robot] = []
         self._variables[robot] = [self._add_variable(np.zeros(3))]
 
     def extend(self, constraint: Constraint) -> None:
@@ -61,6 +69,7 @@ class JointGraph:
         previous = self._variables[robot][-1]
         variable = self._add_variable(se2.compose(self._poses[previous], constraint.T_i_j))
         self._variables[robot].append(variable)
+        self._step_covariance[robot].append(np.asarray(np.linalg.inv(constraint.information)))
         self._chains[robot].append(se2.compose(self._chains[robot][-1], constraint.T_i_j))
         self.graph.add_edge(Edge(previous, variable, constraint.T_i_j, constraint.information, robust=False))
 

@@ -33,7 +33,7 @@ STAGES: Mapping[ClosureStatus, frozenset[ClosureStatus]] = {
     ClosureStatus.ACCEPTED: frozenset({ClosureStatus.ACCEPTED}),
 }
 """By which last status a closure has passed a stage. What was rejected or revoked was verified before; what was revoked
-was accepted once, but the graph does without it."""
+was accepted once or vetoed by hand: the graph does without it."""
 
 TURNED_DOWN = (ClosureStatus.REJECTED, ClosureStatus.REVOKED)
 """Shown beside the stages."""

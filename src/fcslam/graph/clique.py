@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 NODE_BUDGET = 50_000
-"""Branches looked at before the best clique so far is returned as not proven."""
+"""Branches looked at, at most, before the best clique so far is returned as not proven ..."""
+
+VERTEX_BUDGET = 4_000_000
+"""... and branches times vertices: a branch of a large graph takes longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +44,7 @@ def maximum_clique(adjacent: NDArray[np.bool_], node_budget: int = NODE_BUDGET) 
     matrix = matrix & ~np.eye(size, dtype=bool)
     order = np.argsort(-matrix.sum(axis=1), kind="stable")
     neighbours = [_to_bits(row) for row in matrix[np.ix_(order, order)]]
-    best, exact = _search(neighbours, node_budget)
+    best, exact = _search(neighbours, min(node_budget, VERTEX_BUDGET // size))
     return Clique(tuple(sorted(int(order[vertex]) for vertex in _bits(best))), exact)
 
 

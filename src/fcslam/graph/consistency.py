@@ -15,6 +15,8 @@ from fcslam.geometry import se2
 from fcslam.graph.trajectory import DriftSettings, Trajectory, carried
 from fcslam.records import FloatArray
 
+_PAIRS_AT_ONCE = 100_000
+
 
 class ConsistencySettings(DriftSettings):
     """When closures between two trajectories agree, and when their agreement is enough to join two maps."""
@@ -66,8 +68,10 @@ class Closures:
         return Closures(self.i[rows], self.j[rows], self.T_i_j[rows], self.information[rows])
 
 
-def pairwise_chi2(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
-    """Squared Mahalanobis length of the loop that each two closures form, (K, K), symmetric, 0 on the diagonal.
+def pairwise_consistency(
+    a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings
+) -> NDArray[np.bool_]:
+    """Which closures agree, (K, K), symmetric, true on the diagonal.
 
     Raises:
         ValueError: a closure names a keyscan that its trajectory does not have.
@@ -75,17 +79,10 @@ def pairwise_chi2(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArra
     _check(closures.i, len(a), "a")
     _check(closures.j, len(b), "b")
     k, m = np.triu_indices(len(closures), 1)
-    chi2 = np.zeros((len(closures), len(closures)))
-    chi2[k, m] = _loop_chi2(a, b, closures, k, m)
-    return chi2 + chi2.T
-
-
-def pairwise_consistency(
-    a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings
-) -> NDArray[np.bool_]:
-    """Which closures agree, (K, K), symmetric, true on the diagonal; arguments as in :func:`pairwise_chi2`."""
-    agree: NDArray[np.bool_] = pairwise_chi2(a, b, closures) <= settings.limit
-    return agree
+    agree = np.eye(len(closures), dtype=bool)
+    for part in np.array_split(np.arange(len(k)), len(k) // _PAIRS_AT_ONCE + 1):  # memory must not follow K^2
+        agree[k[part], m[part]] = loop_chi2(a, b, closures, k[part], m[part]) <= settings.limit
+    return agree | agree.T
 
 
 def witnesses(a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings) -> NDArray[np.int64]:
@@ -101,11 +98,11 @@ def witnesses(a: Trajectory, b: Trajectory, closures: Closures, settings: Consis
         metres = path.metres[end]
         near &= np.abs(metres[:, None] - metres[None]) <= settings.witness_m
     k, m = np.nonzero(np.triu(near, 1))
-    agree = _loop_chi2(a, b, closures, k, m) <= settings.limit
+    agree = loop_chi2(a, b, closures, k, m) <= settings.limit
     return np.bincount(np.concatenate((k[agree], m[agree])), minlength=len(closures))
 
 
-def _loop_chi2(
+def loop_chi2(
     a: Trajectory, b: Trajectory, closures: Closures, k: NDArray[np.int64], m: NDArray[np.int64]
 ) -> FloatArray:
     """Squared Mahalanobis length (P,) of the loops: back over closure k, along a, over closure m, back along b."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.alone import path_of, solve_alone
-from fcslam.graph.cluster import ClusterVerdict, judge, relative_frame
+from fcslam.graph.cluster import ClusterVerdict, apart, judge, places_of, relative_frame
 from fcslam.graph.consistency import Closures, ConsistencySettings, witnesses
 from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, settle
@@ -79,7 +79,8 @@ def solve_jointly(
 ) -> JointSolution:
     """Poses, maps and closures that hold, from the evidence alone: no earlier estimate plays a part.
 
-    A link whose cluster loses a third of its members in the joint solution is taken back, and the rest solved again.
+    A link whose cluster loses a third of its members in the joint solution, or its last but two places, is taken back,
+    and the rest solved again.
     """
     own = [_own_solution(evidence, robot, consistency, gnc) for robot in evidence.robots]
     paths = [path for path, _ in own]
@@ -91,10 +92,11 @@ def solve_jointly(
         likely = inside & _borne_out(evidence, [weights for _, weights in own], holding)
         solution = _graduated(evidence, likely, paths, frames, gnc)
         solution = _settled(evidence.graph, inside, solution, gnc)
-        for closure in _lone(evidence, paths, solution, consistency):
-            others = np.arange(len(inside)) != closure
-            solution = _settled(evidence.graph, inside, replace(solution, weights=solution.weights * others), gnc)
-        lasting = [link for link in holding if _lasts(link, solution, evidence.informative)]
+        lone = _lone(evidence, paths, solution, consistency)
+        if lone.any():
+            trusted = replace(solution, weights=solution.weights * ~lone)
+            solution = _settled(evidence.graph, inside, trusted, gnc)
+        lasting = [link for link in holding if _lasts(link, paths, solution, evidence.informative, consistency)]
         if len(lasting) == len(holding):
             return JointSolution(solution.poses, solution.weights, tuple(maps), tuple(links))
         holding = lasting
@@ -211,21 +213,21 @@ def _settled(graph: PoseGraph, inside: NDArray[np.bool_], trusted: Solution, gnc
 
 def _lone(
     evidence: JointEvidence, own: Sequence[Trajectory], solution: Solution, settings: ConsistencySettings
-) -> list[int]:
+) -> NDArray[np.bool_]:
     """Closures that hold, without a witness, alone in tying down a piece of path, between robots most of whose
-    closures do not hold.
+    closures do not hold, (E,).
 
     Of very many false closures one may hit where a path is loose enough to follow it. Where they are many, a lone one
     counts only if the rest predicts it.
     """
     held = solution.weights > HOLDS
     loose = _next_tie_m(evidence, own, held) >= settings.separation_m
-    lone: list[int] = []
+    lone = np.zeros(len(held), dtype=bool)
     for a, b, rows, closures in _pairs(evidence, ~evidence.excluded):
         kept = np.flatnonzero(held[rows])
         if 2 * len(kept) < len(rows):
             alone = witnesses(own[a], own[b], closures.only(kept), settings) == 0
-            lone += rows[kept[alone & loose[rows[kept]]]].tolist()
+            lone[rows[kept]] = alone & loose[rows[kept]]
     return lone
 
 
@@ -245,10 +247,19 @@ def _next_tie_m(evidence: JointEvidence, own: Sequence[Trajectory], held: NDArra
     return tie
 
 
-def _lasts(link: Link, solution: Solution, informative: NDArray[np.bool_]) -> bool:
-    """Whether more than two thirds of the link's cluster hold in the joint solution, an informative one among them."""
-    held = link.members[solution.weights[link.members] > HOLDS]
-    return 3 * len(held) > 2 * len(link.members) and bool(informative[held].any())
+def _lasts(
+    link: Link,
+    own: Sequence[Trajectory],
+    solution: Solution,
+    informative: NDArray[np.bool_],
+    settings: ConsistencySettings,
+) -> bool:
+    """Whether more than two thirds of the link's cluster hold in the joint solution, and would be enough to join."""
+    holds = np.flatnonzero(solution.weights[link.members] > HOLDS)
+    held = np.array(link.verdict.members, dtype=np.int64)[holds]
+    supporters = apart(places_of(own[link.a], own[link.b], link.closures.only(held)), settings.separation_m)
+    enough = supporters >= settings.minimum_closures and bool(informative[link.edges[held]].any())
+    return 3 * len(held) > 2 * len(link.members) and enough
 
 
 def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

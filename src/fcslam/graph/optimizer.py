@@ -22,7 +22,7 @@ _TOLERANCE = 1e-6
 _UNTIL_CONVERGED = 100
 _BINARY = 1e-4
 """Distance from 0 or 1 at which a weight is decided."""
-_POLISH_ROUNDS = 20
+_POLISH_ROUNDS = 200
 
 
 class GncSettings(Settings):
@@ -193,13 +193,17 @@ def _graduate(steps: _Steps, limit: float, settings: GncSettings) -> None:
 
 
 def _polish(steps: _Steps, limit: float, weights: FloatArray) -> FloatArray:
-    """Alternate solve and decision until no decision changes; returns the last weights solved with."""
+    """Alternate solve and decision until no decision changes; returns the weights of the last solve.
+
+    Each round lowers the truncated loss, so it ends by itself; the bound is for the tolerance of the solver.
+    """
     for _ in range(_POLISH_ROUNDS):
         steps.solve(weights, _UNTIL_CONVERGED)
         decided = (steps.chi2() <= limit).astype(np.float64)
         if np.array_equal(decided, weights):
-            break
+            return weights
         weights = decided
+    steps.solve(weights, _UNTIL_CONVERGED)
     return weights
 
 
