@@ -16,7 +16,7 @@ N(0, 0.3 m) and N(0, 10 deg), with the information of a random true closure:
 A closure that happens to be right within 0.5 m and 10 deg is drawn again. Compared with the optimum of the graph
 without false closures, both held at the first pose: the root mean square distance of all poses of all robots. Passed:
 at most 0.05 m, and at least 90 % of the true closures between robots kept. Beside it: least squares from the chordal
-solution of all edges (the first three draws), and graduated non-convexity (GNC) from the odometry, both with every
+solution of all edges (the first draw), and graduated non-convexity (GNC) from the odometry, both with every
 closure and nothing else.
 
 Two robots: the CSAIL graph cut in two with 250 false closures added, within robots and between them, as published with
@@ -58,8 +58,10 @@ SHARES, KINDS = (0.1, 0.7), ("random", "local", "groups")
 WRONG_M, WRONG_RAD = 0.5, np.radians(10.0)
 LIE_SIGMA = np.array([0.3, 0.3, np.radians(10.0)])
 GROUP = 10
-PLAIN_SEEDS = 3
+PLAIN_SEEDS = 1
 """Least squares never converges on such a graph and takes longer than all the rest."""
+REPORTED_SEEDS = 3
+"""Of graphs that nothing is required of."""
 FALSE_LOOPS = 100
 PASS_RMSE_M, PASS_KEPT, PASS_LOST = 0.05, 0.9, 5
 
@@ -85,7 +87,8 @@ def main() -> None:
     files = [f"posegraph/{name}.g2o.gz" for name in (*chosen.graphs, "m3500")]
     folder = common.recordings(*files, *(f"posegraph-multirobot/{name}" for name in CSAIL_FILES))
     report = common.Report(__file__, __doc__, chosen)
-    runs = [row for name in chosen.graphs for row in joint_runs(name, load(folder, name), chosen.seeds)]
+    draws = {name: chosen.seeds if name == INTEL[0] else min(chosen.seeds, REPORTED_SEEDS) for name in chosen.graphs}
+    runs = [row for name, seeds in draws.items() for row in joint_runs(name, load(folder, name), seeds)]
     report.table("Three robots", JOINT, [summary(key, group) for key, group in grouped(runs).items()])
     report.say(
         "intel_1228 is reported, not required: its information matrices are ill-conditioned (its closures claim 0.3 m "
@@ -255,6 +258,8 @@ def loop_rows(clean: PoseGraph, chosen: argparse.Namespace) -> list[tuple]:
     for seed in range(chosen.seeds):
         graph = with_false_loops(clean, np.random.default_rng(seed))
         for solver, solve in solvers.items():
+            if solver == "least squares" and seed >= PLAIN_SEEDS:
+                continue
             began = time.process_time()
             solution = solve(graph)
             rows.append((seed, solver, time.process_time() - began, *decisions(graph, solution, truth)))
