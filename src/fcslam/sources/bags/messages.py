@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fcslam.records import Ranges
-from fcslam.sources.bags.transforms import Transform, planar, transform_of
+from fcslam.records import Ranges, Transform
+from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.sources.pose import Pose
 
 _LONGEST_RANGE_M = 1000.0

@@ -5,6 +5,7 @@ from math import acos, atan2, isfinite, pi, sqrt
 from typing import NamedTuple
 
 from fcslam.errors import FcslamError
+from fcslam.records import Transform
 from fcslam.sources.pose import Pose
 
 Vector = tuple[float, float, float]
@@ -17,13 +18,6 @@ _STILL = 0.01
 
 class NoTransformError(FcslamError):
     """Two frames are not connected, or not by fixed transforms; the message says which."""
-
-
-class Transform(NamedTuple):
-    """``T_a_b`` in three dimensions."""
-
-    translation_m: Vector
-    rotation: Quaternion
 
 
 class Mounting(NamedTuple):

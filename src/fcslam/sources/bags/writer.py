@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fcslam.errors import OutputError
-from fcslam.records import FloatArray, LaserModel, LaserScan, SensorRecord
+from fcslam.records import CameraImage, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord
 from fcslam.sources.bags.container import ODOMETRY, SCAN, TRANSFORMS, typestore
 
 if TYPE_CHECKING:
@@ -45,7 +45,8 @@ def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
     try:
         with _opened(path) as bag:
             for record in records:
-                bag.write(record)
+                if not isinstance(record, CameraImage):
+                    bag.write(record)
     except (OSError, sqlite3.Error, rosbag1.WriterError, rosbag2.WriterError) as error:
         raise OutputError(f"{path}: cannot be written ({error}); choose another path") from error
 
@@ -85,7 +86,7 @@ class _Bag:
         self._has_laser = False
         self._latest_reading: tuple[float, ...] = ()
 
-    def write(self, record: SensorRecord) -> None:
+    def write(self, record: LaserScan | Odometry) -> None:
         """Write what one record says: its odometry, and its scan if it is one."""
         stamp_ns = _nanoseconds(record.stamp)
         self._bag_time_ns = max(self._bag_time_ns + 1, stamp_ns)
