@@ -12,6 +12,7 @@ from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.carmen import CARMEN
 from fcslam.sources.cmu import CMU
 from fcslam.sources.dialect import Dialect
+from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
 from fcslam.sources.textlog import TextLog
 
@@ -37,6 +38,7 @@ def _text_format(dialect: Dialect) -> Format:
 FORMATS: tuple[Format, ...] = (
     _text_format(CARMEN),
     _text_format(CMU),
+    Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
     Format("ROS bag", is_bag, RosBag, takes_options=True),
 )
 """Asked in this order; a new format is one more entry."""
