@@ -19,7 +19,7 @@ def png(width=CAMERA.width, height=CAMERA.height, shade=0):
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    rows = zlib.compress((b"\x00" + bytes([shade]) * width) * height)
+    rows = zlib.compress((b"\x00" + bytes([shade]) * width) * height, 0)  # stored: the same bytes from every zlib
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
