@@ -68,7 +68,55 @@ class LaserScan:
     T_odom_base: FloatArray
 
 
-SensorRecord = LaserScan | Odometry
+class Transform(NamedTuple):
+    """``T_a_b`` in three dimensions."""
+
+    translation_m: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+    """Quaternion (x, y, z, w) of length 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """Pinhole geometry of one camera, constant over a recording; its images are free of distortion."""
+
+    width: int
+    height: int
+    fx: float
+    """Pixels, as fy, cx and cy; (0, 0) is the centre of the first pixel."""
+    fy: float
+    cx: float
+    cy: float
+    T_base_camera: Transform
+    """Of the optical frame as in ROS REP 103: z ahead, x to the right, y down."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraImage:
+    """One image of a camera, kept encoded."""
+
+    stamp: float
+    encoded: bytes
+    """A JPEG or PNG file of camera.width x camera.height pixels."""
+    camera: CameraModel
+    T_odom_base: FloatArray | None
+    """The odometry at the stamp; None: not known."""
+
+
+SensorRecord = LaserScan | Odometry | CameraImage
+"""What a robot senses."""
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """Where the robot really was, in the frame of the building. No robot is ever told."""
+
+    stamp: float
+    T_building_base: FloatArray
+
+
+RecordedItem = SensorRecord | GroundTruth
+"""What a recording can hold."""
 
 
 class KeyscanId(NamedTuple):

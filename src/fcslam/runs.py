@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -202,7 +202,7 @@ def _read_veto(number: int, row: dict[str, str]) -> Veto:
     return Veto(row["robot_i"], row["robot_j"], (stamp_i, stamp_j))
 
 
-def write_tum(path: Path, stamps: FloatArray, T_map_base: FloatArray) -> None:
+def write_tum(path: Path | BinaryIO, stamps: FloatArray, T_map_base: FloatArray) -> None:
     """Write poses (N, 3) as TUM lines ``stamp x y 0 0 0 qz qw``, nine digits after the point."""
     half = T_map_base[:, 2] / 2.0
     zeros = np.zeros(len(half))

@@ -34,7 +34,7 @@ class RobotFrontend:
     def process(self, record: SensorRecord) -> list[Packet]:
         """The packets that the next record of the recording causes."""
         if not isinstance(record, LaserScan):
-            return []  # a scan brings its own odometry
+            return []  # a scan brings its own odometry; images never leave the robot
         self._time = max(self._time, record.stamp)
         # The robot works with the ranges that the cloud will see, to the last bit.
         scan = replace(record, ranges_m=dequantise(quantise(record.ranges_m)))

@@ -5,6 +5,8 @@ from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.carmen_writer import write_carmen
 from fcslam.sources.faults import Fault, Faults, Tally
 from fcslam.sources.opening import FORMATS, Format, open_source
+from fcslam.sources.recording.reader import Recording
+from fcslam.sources.recording.writer import RecordingWriter, write_recording
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 from fcslam.sources.split import split
 
@@ -16,6 +18,8 @@ __all__ = [
     "Fault",
     "Faults",
     "Format",
+    "Recording",
+    "RecordingWriter",
     "ScanRange",
     "Source",
     "Survey",
@@ -24,4 +28,5 @@ __all__ = [
     "split",
     "write_bag",
     "write_carmen",
+    "write_recording",
 ]

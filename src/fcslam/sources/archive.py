@@ -19,7 +19,7 @@ MAX_LINE_BYTES = 1 << 18
 
 _HEAD_BYTES = 1 << 16
 _BUFFER_BYTES = 1 << 17
-_LOG_SUFFIX = re.compile(r"\.(gz|xz|bz2|clf|log|dat|txt|carmen|bag|mcap|db3|active)$", re.IGNORECASE)
+_LOG_SUFFIX = re.compile(r"\.(gz|xz|bz2|clf|log|dat|txt|carmen|bag|mcap|db3|active|fcslam)$", re.IGNORECASE)
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 

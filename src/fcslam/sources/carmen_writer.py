@@ -1,4 +1,4 @@
-"""Sensor records written as a CARMEN log."""
+"""Scans and odometry written as a CARMEN log."""
 
 import bz2
 import gzip
@@ -13,7 +13,7 @@ import numpy as np
 
 from fcslam.errors import OutputError
 from fcslam.geometry import se2
-from fcslam.records import LaserModel, LaserScan, Odometry, SensorRecord
+from fcslam.records import CameraImage, LaserModel, LaserScan, Odometry, SensorRecord
 from fcslam.sources.laser import assumed_laser
 
 _HEADER = """\
@@ -29,7 +29,7 @@ def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
 
     Ranges are written in millimetres' precision, poses and stamps to 1e-6; no return (inf) as just above the
     laser's maximum. A laser whose geometry readers of old logs would guess is written as FLASER, any other as
-    ROBOTLASER1.
+    ROBOTLASER1. Images are left out: such a log has no place for them.
 
     Raises:
         OutputError: the file cannot be written.
@@ -38,7 +38,8 @@ def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
         with path.open("wb") as file, closing(_compressed(file, path.suffix)) as stream:
             stream.write(_HEADER.encode())
             for record in records:
-                stream.write((_line(record) + "\n").encode())
+                if not isinstance(record, CameraImage):
+                    stream.write((_line(record) + "\n").encode())
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error}); choose another folder") from error
 
@@ -55,7 +56,7 @@ def _compressed(file: BinaryIO, suffix: str) -> BinaryIO | gzip.GzipFile | lzma.
             return file
 
 
-def _line(record: SensorRecord) -> str:
+def _line(record: LaserScan | Odometry) -> str:
     match record:
         case Odometry(stamp, T_odom_base):
             return f"ODOM {_numbers(T_odom_base)} 0 0 0 {_tail(stamp)}"

@@ -11,6 +11,9 @@ class Fault(StrEnum):
 
     BROKEN_LINE = "broken lines skipped"
     BROKEN_MESSAGE = "broken messages skipped"
+    BROKEN_RECORD = "damaged records skipped"
+    CUT_RECORD = "records cut off at the end of a file skipped"
+    BROKEN_IMAGE = "missing or damaged images skipped"
     BEAM_COUNT = "scans with another beam count skipped"
     RESAMPLED = "scans with another beam count brought to the usual beams"
     NO_ODOMETRY = "scans without odometry within 1 s skipped"
@@ -30,7 +33,9 @@ class Tally:
 
     count: int = 0
     first_line: int = 0
-    """Line of the recording (or message of its topic), counted from 1, with the first one; 0 when there is none."""
+    """Line of the recording (message of its topic, record of its file), counted from 1, with the first one; 0 when
+    there is none.
+    """
     largest_s: float = 0.0
     """Largest step back in time, of the kinds that have one."""
 

@@ -88,7 +88,7 @@ def refuse_misfits(path: Path, faults: Faults, scan_count: int, odometry_count: 
     Raises:
         SourceError: it is mostly damaged, its beam count changes, or its time jumps or runs back.
     """
-    broken = faults[Fault.BROKEN_LINE].count + faults[Fault.BROKEN_MESSAGE].count
+    broken = sum(faults[kind].count for kind in (Fault.BROKEN_LINE, Fault.BROKEN_MESSAGE, Fault.BROKEN_RECORD))
     other, misplaced, reversals = (
         faults[kind] for kind in (Fault.BEAM_COUNT, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
     )

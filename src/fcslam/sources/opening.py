@@ -14,6 +14,7 @@ from fcslam.sources.cmu import CMU
 from fcslam.sources.dialect import Dialect
 from fcslam.sources.duke import DUKE
 from fcslam.sources.mines import MINES
+from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
 from fcslam.sources.textlog import TextLog
 
@@ -38,6 +39,7 @@ def _text_format(dialect: Dialect) -> Format:
 
 FORMATS: tuple[Format, ...] = (
     *map(_text_format, (CARMEN, CMU, DUKE, MINES)),
+    Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
     Format("ROS bag", is_bag, RosBag, takes_options=True),
 )
 """Asked in this order; a new format is one more entry."""
@@ -60,7 +62,7 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
             if options is not None and not kind.takes_options:
                 raise SourceError(
                     f"{path}: a {kind.name} has neither topics nor tf; options of bags (--scan-topic, --odom-topic, "
-                    "--laser-pose) go with ROS bags only, leave them out"
+                    "--camera-topic, --laser-pose) go with ROS bags only, leave them out"
                 )
             return kind.open(path, name or robot_name(path), options)
     *others, last = (kind.name for kind in FORMATS)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from fcslam.records import LaserModel, SensorRecord
+from fcslam.records import CameraModel, LaserModel, SensorRecord
 from fcslam.sources.faults import Faults
 
 
@@ -34,6 +34,8 @@ class Survey:
     """Of this pass, so without those of the ranges."""
     notes: tuple[str, ...] = ()
     """What was chosen where the recording leaves a choice, in sentences for people."""
+    camera: CameraModel | None = None
+    """None: ``records`` yields no images."""
 
     @property
     def beam_count(self) -> int:
@@ -61,7 +63,7 @@ class Source(Protocol):
         """
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """Stream scans and odometry in file order; odometry goes with the scan before it.
+        """Stream scans, odometry and images in file order; what is no scan goes with the scan before it.
 
         Memory does not depend on the recording's length. Every call starts a new pass.
 

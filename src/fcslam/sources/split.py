@@ -47,14 +47,14 @@ class Part:
         return self._whole.survey(self._within(scans))
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """As in Source; the first record is a scan at the identity, odometry before it is left out."""
+        """As in Source; the first record is a scan at the identity, what comes before it is left out."""
         origin: Pose | None = None
         for record in self._whole.records(self._within(scans)):
-            pose: Pose = tuple(record.T_odom_base.tolist())
+            pose: Pose | None = None if record.T_odom_base is None else tuple(record.T_odom_base.tolist())
             if origin is None and isinstance(record, LaserScan):
                 origin = pose
             if origin is not None:
-                yield replace(record, T_odom_base=pose_array(relative_pose(origin, pose)))
+                yield record if pose is None else replace(record, T_odom_base=pose_array(relative_pose(origin, pose)))
 
     def _within(self, scans: ScanRange) -> ScanRange:
         ends = [self._scans.end] if scans.end is None else [self._scans.end, self._scans.first + scans.end]

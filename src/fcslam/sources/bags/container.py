@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 SCAN, ODOMETRY, TRANSFORMS = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "tf2_msgs/TFMessage"
+COMPRESSED_IMAGE, IMAGE = "sensor_msgs/CompressedImage", "sensor_msgs/Image"
+CAMERA_INFO = "sensor_msgs/CameraInfo"
 """The types that are read."""
 
 _OLD_TRANSFORMS = "tf/tfMessage"

@@ -11,8 +11,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fcslam.errors import OutputError
-from fcslam.records import FloatArray, LaserModel, LaserScan, SensorRecord
-from fcslam.sources.bags.container import ODOMETRY, SCAN, TRANSFORMS, typestore
+from fcslam.records import (
+    CameraImage,
+    CameraModel,
+    FloatArray,
+    GroundTruth,
+    LaserModel,
+    LaserScan,
+    RecordedItem,
+    Transform,
+)
+from fcslam.sources.bags.container import CAMERA_INFO, COMPRESSED_IMAGE, ODOMETRY, SCAN, TRANSFORMS, typestore
+from fcslam.sources.images import image_suffix
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Writer as Writer1
@@ -22,20 +32,30 @@ _ROS1, _MCAP, _SQLITE, _FOLDER = ".bag", ".mcap", ".db3", ""
 BAG_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
 """The kinds of bags that can be written: ROS 1, two files of ROS 2, and a folder of ROS 2."""
 
-_ODOM, _BASE, _LASER = "odom", "base_link", "laser"
+_ODOM, _BASE, _LASER, _CAMERA, _BUILDING = "odom", "base_link", "laser", "camera_optical_frame", "building"
 _TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, "/scan": SCAN}
 """Odometry first: at equal times it is read before the scan."""
+_IMAGE_TOPIC, _CAMERA_INFO_TOPIC, _GROUND_TRUTH_TOPIC = (
+    "/camera/image_raw/compressed",
+    "/camera/camera_info",
+    "/ground_truth",
+)
+_TOPICS_OF_SOME = {_IMAGE_TOPIC: COMPRESSED_IMAGE, _CAMERA_INFO_TOPIC: CAMERA_INFO, _GROUND_TRUTH_TOPIC: ODOMETRY}
+"""Only where there is something to write."""
+_IMAGE_FORMATS = {"jpg": "jpeg", "png": "png"}
 _END_OF_TIME_S = 2**31
 _NANOSECONDS = 10**9
 
 
-def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
+def write_bag(path: Path, records: Iterable[RecordedItem]) -> None:
     """Write ``records`` to ``path``; equal records give equal bytes.
 
     ``.bag`` is a ROS 1 bag, ``.mcap`` and ``.db3`` are files of ROS 2, a path without suffix is a new folder of
-    ROS 2 with an MCAP file in it. Scans go to /scan; odometry, and that of each scan at its stamp, to /odom and /tf
-    (odom -> base_link); the laser's pose to /tf_static (base_link -> laser). Header stamps are the records' own, to
-    the nanosecond; the time of recording only ever grows.
+    ROS 2 with an MCAP file in it. Scans go to /scan; odometry, and that of each scan and image at its stamp, to /odom
+    and /tf (odom -> base_link); images, as they are encoded, to /camera/image_raw/compressed, each with its
+    /camera/camera_info; where laser and camera sit to /tf_static (base_link -> laser, camera_optical_frame); ground
+    truth to /ground_truth (building -> base_link). Header stamps are the records' own, to the nanosecond; the time of
+    recording only ever grows.
 
     Raises:
         OutputError: the bag cannot be written, its kind is not known, or ROS has no such stamp.
@@ -82,32 +102,59 @@ class _Bag:
         self._ros1 = ros1
         self._connections = {topic: self._connect(topic, kind) for topic, kind in _TOPICS.items()}
         self._bag_time_ns = -1
-        self._has_laser = False
+        self._mounted: set[str] = set()
         self._latest_reading: tuple[float, ...] = ()
 
-    def write(self, record: SensorRecord) -> None:
-        """Write what one record says: its odometry, and its scan if it is one."""
-        stamp_ns = _nanoseconds(record.stamp)
+    def write(self, item: RecordedItem) -> None:
+        """Write what one record says: its odometry, and its scan or image if it is one."""
+        stamp_ns = _nanoseconds(item.stamp)
         self._bag_time_ns = max(self._bag_time_ns + 1, stamp_ns)
-        reading = (stamp_ns, *record.T_odom_base.tolist())
+        if isinstance(item, GroundTruth):
+            header = self._header(stamp_ns, _BUILDING)
+            self._put(_GROUND_TRUTH_TOPIC, self._odometry(header, item.T_building_base))
+            return
+        if item.T_odom_base is not None:
+            self._put_odometry(stamp_ns, item.T_odom_base)
+        if isinstance(item, LaserScan):
+            self._mount(stamp_ns, _LASER, _in_space(np.array(item.laser.T_base_laser)))
+            self._put("/scan", self._scan(self._header(stamp_ns, _LASER), item))
+        elif isinstance(item, CameraImage):
+            self._put_image(stamp_ns, item)
+
+    def _put_odometry(self, stamp_ns: int, T_odom_base: FloatArray) -> None:
+        reading = (stamp_ns, *T_odom_base.tolist())
         if reading != self._latest_reading:
             odom = self._header(stamp_ns, _ODOM)
-            self._put("/odom", self._odometry(odom, record.T_odom_base))
-            self._put("/tf", self._transforms(odom, _BASE, record.T_odom_base))
+            self._put("/odom", self._odometry(odom, T_odom_base))
+            self._put("/tf", self._transforms(odom, _BASE, _in_space(T_odom_base)))
             self._latest_reading = reading
-        if isinstance(record, LaserScan):
-            if not self._has_laser:
-                mounting = np.array(record.laser.T_base_laser)
-                self._put("/tf_static", self._transforms(self._header(stamp_ns, _BASE), _LASER, mounting))
-                self._has_laser = True
-            self._put("/scan", self._scan(self._header(stamp_ns, _LASER), record))
+
+    def _put_image(self, stamp_ns: int, image: CameraImage) -> None:
+        try:
+            encoding = _IMAGE_FORMATS[image_suffix(image.encoded)]
+        except ValueError as error:
+            raise OutputError(f"an image at {image.stamp} s cannot be written ({error})") from error
+        header = self._header(stamp_ns, _CAMERA)
+        self._mount(stamp_ns, _CAMERA, image.camera.T_base_camera)
+        self._put(_CAMERA_INFO_TOPIC, self._camera_info(header, image.camera))
+        data = np.frombuffer(image.encoded, dtype=np.uint8)
+        self._put(_IMAGE_TOPIC, self._make(COMPRESSED_IMAGE, header=header, format=encoding, data=data))
+
+    def _mount(self, stamp_ns: int, frame: str, T_base_frame: Transform) -> None:
+        """Say once where a sensor sits."""
+        if frame not in self._mounted:
+            self._put("/tf_static", self._transforms(self._header(stamp_ns, _BASE), frame, T_base_frame))
+            self._mounted.add(frame)
 
     def _connect(self, topic: str, kind: str) -> Any:
         return self._writer.add_connection(topic, _full(kind), typestore=self._store)
 
     def _put(self, topic: str, message: Any) -> None:
+        kind = _TOPICS.get(topic) or _TOPICS_OF_SOME[topic]
+        if topic not in self._connections:
+            self._connections[topic] = self._connect(topic, kind)
         serialize = self._store.serialize_ros1 if self._ros1 else self._store.serialize_cdr
-        payload = serialize(message, _full(_TOPICS[topic]))
+        payload = serialize(message, _full(kind))
         self._writer.write(self._connections[topic], self._bag_time_ns, payload)
 
     def _make(self, kind: str, **fields: Any) -> Any:
@@ -119,17 +166,18 @@ class _Bag:
         count = {"seq": 0} if self._ros1 else {}
         return self._make("std_msgs/Header", stamp=stamp, frame_id=frame, **count)
 
-    def _rotation(self, pose: FloatArray) -> Any:
-        half_rad = 0.5 * float(pose[2])
-        return self._make("geometry_msgs/Quaternion", x=0.0, y=0.0, z=sin(half_rad), w=cos(half_rad))
+    def _rotation(self, transform: Transform) -> Any:
+        x, y, z, w = transform.rotation
+        return self._make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
 
-    def _vector(self, kind: str, x: float = 0.0, y: float = 0.0) -> Any:
-        return self._make(f"geometry_msgs/{kind}", x=x, y=y, z=0.0)
+    def _vector(self, kind: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
+        return self._make(f"geometry_msgs/{kind}", x=x, y=y, z=z)
 
-    def _odometry(self, header: Any, T_odom_base: FloatArray) -> Any:
+    def _odometry(self, header: Any, T_parent_base: FloatArray) -> Any:
         unknown = np.zeros(36)
-        position = self._vector("Point", *T_odom_base[:2].tolist())
-        pose = self._make("geometry_msgs/Pose", position=position, orientation=self._rotation(T_odom_base))
+        transform = _in_space(T_parent_base)
+        position = self._vector("Point", *transform.translation_m)
+        pose = self._make("geometry_msgs/Pose", position=position, orientation=self._rotation(transform))
         twist = self._make("geometry_msgs/Twist", linear=self._vector("Vector3"), angular=self._vector("Vector3"))
         return self._make(
             ODOMETRY,
@@ -139,8 +187,8 @@ class _Bag:
             twist=self._make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
         )
 
-    def _transforms(self, header: Any, child: str, T_parent_child: FloatArray) -> Any:
-        translation = self._vector("Vector3", *T_parent_child[:2].tolist())
+    def _transforms(self, header: Any, child: str, T_parent_child: Transform) -> Any:
+        translation = self._vector("Vector3", *T_parent_child.translation_m)
         transform = self._make(
             "geometry_msgs/Transform", translation=translation, rotation=self._rotation(T_parent_child)
         )
@@ -162,6 +210,30 @@ class _Bag:
             ranges=np.where(scan.ranges_m >= laser.max_range_m, np.float32(np.inf), scan.ranges_m),
             intensities=np.zeros(0, dtype=np.float32),
         )
+
+    def _camera_info(self, header: Any, camera: CameraModel) -> Any:
+        """Pinhole, without distortion; ROS 1 writes the matrices' names in capitals."""
+        K = np.array([camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0])
+        P = np.insert(K, (3, 6, 9), 0.0)
+        matrices = {"D": np.zeros(5), "K": K, "R": np.eye(3).ravel(), "P": P}
+        region = self._make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        return self._make(
+            CAMERA_INFO,
+            header=header,
+            height=camera.height,
+            width=camera.width,
+            distortion_model="plumb_bob",
+            binning_x=0,
+            binning_y=0,
+            roi=region,
+            **{name if self._ros1 else name.lower(): matrix for name, matrix in matrices.items()},
+        )
+
+
+def _in_space(pose: FloatArray) -> Transform:
+    """A pose on the floor in three dimensions."""
+    x, y, heading_rad = pose.tolist()
+    return Transform((x, y, 0.0), (0.0, 0.0, sin(0.5 * heading_rad), cos(0.5 * heading_rad)))
 
 
 def _nanoseconds(stamp: float) -> int:

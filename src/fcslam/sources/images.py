@@ -1,0 +1,82 @@
+"""Encoded images at the border: what kind of file the bytes are and how large the picture is, without decoding it."""
+
+import struct
+from struct import unpack_from
+
+from fcslam.records import CameraModel
+
+MAX_IMAGE_BYTES = 1 << 25
+"""A larger file is no camera's."""
+MAX_SIDE_PX = 1 << 14
+
+_FAR = 1e6
+_UNIT = 1e-6
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_PNG_SIZE = 16
+_SEGMENT = 0xFF
+_FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})
+
+
+def image_suffix(encoded: bytes) -> str:
+    """``jpg`` or ``png``, told by the first bytes; raises ValueError when it is neither."""
+    if encoded.startswith(_JPEG):
+        return "jpg"
+    if encoded.startswith(_PNG):
+        return "png"
+    raise ValueError("neither JPEG nor PNG")
+
+
+def image_size(encoded: bytes) -> tuple[int, int]:
+    """Width and height in pixels that the header states; raises ValueError when there is no sane header."""
+    try:
+        if image_suffix(encoded) == "png":
+            width, height = unpack_from(">II", encoded, _PNG_SIZE)
+        else:
+            width, height = _jpeg_size(encoded)
+    except struct.error as error:
+        raise ValueError("the image ends in its header") from error
+    return width, height
+
+
+def check_image(encoded: bytes, camera: CameraModel) -> None:
+    """Raises ValueError when ``encoded`` is no image of ``camera``."""
+    if len(encoded) > MAX_IMAGE_BYTES:
+        raise ValueError(f"an image has at most {MAX_IMAGE_BYTES} bytes")
+    width, height = image_size(encoded)
+    if (width, height) != (camera.width, camera.height):
+        raise ValueError(f"the image has {width} x {height} pixels, its camera {camera.width} x {camera.height}")
+
+
+def check_camera(camera: CameraModel) -> None:
+    """Raises ValueError when ``camera`` is no camera's model."""
+    if not (0 < camera.width <= MAX_SIDE_PX and 0 < camera.height <= MAX_SIDE_PX):
+        raise ValueError(f"width and height must be 1 to {MAX_SIDE_PX} pixels")
+    if not (0.0 < camera.fx < _FAR and 0.0 < camera.fy < _FAR):
+        raise ValueError("fx and fy must be positive numbers of pixels")
+    if not (abs(camera.cx) < _FAR and abs(camera.cy) < _FAR):
+        raise ValueError("cx and cy must be numbers of pixels")
+    translation_m, rotation = camera.T_base_camera
+    if not all(abs(value) < _FAR for value in translation_m):
+        raise ValueError("the camera's position must be finite")
+    if not abs(sum(value * value for value in rotation) - 1.0) < _UNIT:
+        raise ValueError("the camera's quaternion must have length 1")
+
+
+def _jpeg_size(encoded: bytes) -> tuple[int, int]:
+    """From the first frame header; every segment before it says how long it is."""
+    at = 2
+    while True:
+        fill, marker = unpack_from(">BB", encoded, at)
+        if fill != _SEGMENT:
+            raise ValueError("no JPEG segment where one must be")
+        if marker in _FRAME_HEADERS:
+            height, width = unpack_from(">HH", encoded, at + 5)
+            return width, height
+        if marker == _SEGMENT:
+            at += 1
+        elif marker in _BARE_MARKERS:
+            at += 2
+        else:
+            (length,) = unpack_from(">H", encoded, at + 2)
+            at += 2 + length

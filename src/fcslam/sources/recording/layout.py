@@ -1,0 +1,155 @@
+"""What lies in a recording's folder: file names, the layout of frames, and the sensors' geometry in meta.yaml.
+
+``scans.bin``, ``odometry.bin`` and ``images.bin`` are a header and frames of one size, each with a checksum: what is
+damaged is lost alone, and what a crash cut off is told by the file's length. The frames of all files count on one
+sequence, which is the order of the recording.
+"""
+
+import os
+from dataclasses import dataclass
+from math import isfinite, pi
+from pathlib import Path
+from struct import Struct
+from typing import Any, Literal, Self
+from zlib import crc32
+
+import numpy as np
+import yaml
+from pydantic import ValidationError, model_validator
+
+from fcslam.config import Settings
+from fcslam.errors import SourceError
+from fcslam.records import CameraModel, LaserModel
+from fcslam.sources.images import check_camera
+
+META = "meta.yaml"
+SCANS = "scans.bin"
+IMAGES = "images"
+GROUND_TRUTH = "ground_truth.tum"
+VERSION = 1
+
+_HEADER = Struct("<8sII")
+HEADER_BYTES = _HEADER.size
+CRC_BYTES = 4
+
+_MAX_META_BYTES = 1 << 16
+_MAX_BEAMS = 1 << 16
+_MAX_RANGE_M = 1e6
+_FULL_TURN_RAD = 2.0 * pi + 0.1
+_LONGEST_REASON = 200
+
+_ENTRY: list[Any] = [("sequence", "<u8"), ("stamp", "<f8"), ("T_odom_base", "<f8", (3,))]
+_CRC: list[Any] = [("crc32", "<u4")]
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """One of the files of frames."""
+
+    name: str
+    magic: bytes
+    frame: np.dtype[np.void]
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of a frame with its checksum."""
+        return self.frame.itemsize
+
+    @property
+    def header(self) -> bytes:
+        """The first bytes of the file."""
+        return _HEADER.pack(self.magic, VERSION, self.frame_bytes)
+
+    def packed(self, *values: Any) -> bytes:
+        """A frame of ``values``, in the order of its fields, and its checksum."""
+        frame = np.zeros((), dtype=self.frame)
+        for name, value in zip(self.frame.names or (), values, strict=False):
+            frame[name] = value
+        content = frame.tobytes()[:-CRC_BYTES]
+        return content + crc32(content).to_bytes(CRC_BYTES, "little")
+
+
+def is_whole(frame: bytes | memoryview) -> bool:
+    """Whether a frame's checksum is right."""
+    return crc32(frame[:-CRC_BYTES]) == int.from_bytes(frame[-CRC_BYTES:], "little")
+
+
+ODOMETRY_FILE = FrameFile("odometry.bin", b"FCSLAMod", np.dtype([*_ENTRY, *_CRC]))
+IMAGES_FILE = FrameFile(
+    "images.bin", b"FCSLAMim", np.dtype([*_ENTRY, ("suffix", "S4"), ("size", "<u4"), ("file_crc32", "<u4"), *_CRC])
+)
+
+
+def scans_file(laser: LaserModel) -> FrameFile:
+    """The file of the scans of ``laser``."""
+    return FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, ("ranges_m", "<f4", (laser.beam_count,)), *_CRC]))
+
+
+def image_path(folder: Path, index: int, suffix: str) -> Path:
+    """The file of the image whose frame is number ``index`` (from 0) of images.bin."""
+    return folder / IMAGES / f"{index:08d}.{suffix}"
+
+
+class Meta(Settings):
+    """Which sensors the robot carries."""
+
+    version: Literal[1] = 1
+    laser: LaserModel
+    camera: CameraModel | None = None
+
+    @model_validator(mode="after")
+    def _is_sane(self) -> Self:
+        laser = self.laser
+        if not 2 <= laser.beam_count <= _MAX_BEAMS:
+            raise ValueError(f"a laser has 2 to {_MAX_BEAMS} beams")
+        span_rad = (laser.beam_count - 1) * laser.angle_increment_rad
+        if not (abs(laser.angle_min_rad) <= _FULL_TURN_RAD and 0.0 < span_rad <= _FULL_TURN_RAD):
+            raise ValueError("no sane field of view of the laser")
+        if not 0.0 < laser.max_range_m <= _MAX_RANGE_M or not all(map(isfinite, laser.T_base_laser)):
+            raise ValueError("no sane range or pose of the laser")
+        if self.camera is not None:
+            check_camera(self.camera)
+        return self
+
+
+def write_meta(folder: Path, meta: Meta) -> None:
+    """Write meta.yaml, which is whole or not there."""
+    content = meta.model_dump(mode="json", exclude_none=True)
+    if meta.camera is not None:
+        translation_m, rotation = meta.camera.T_base_camera
+        content["camera"]["T_base_camera"] = {"translation_m": list(translation_m), "rotation": list(rotation)}
+    unfinished = folder / f".{META}"
+    unfinished.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")
+    os.replace(unfinished, folder / META)
+
+
+def read_meta(folder: Path) -> Meta:
+    """The sensors of the recording in ``folder``.
+
+    Raises:
+        SourceError: meta.yaml is missing, damaged, too large or of another version.
+    """
+    path = folder / META
+    try:
+        with path.open("rb") as file:
+            text = file.read(_MAX_META_BYTES + 1)
+        content = yaml.safe_load(text) if len(text) <= _MAX_META_BYTES else None
+    except FileNotFoundError as error:
+        raise SourceError(f"{path}: is missing; it says how the laser measures, so copy the whole folder") from error
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise SourceError(f"{path}: cannot be read ({_one_line(error)}); copy it again") from error
+    version = content.get("version") if isinstance(content, dict) else None
+    if type(version) is not int:
+        raise SourceError(f"{path}: does not describe a recording (no version); copy it again")
+    if version != VERSION:
+        raise SourceError(f"{path}: is of version {str(version)[:20]}, but {VERSION} is read here; update fcslam")
+    try:
+        return Meta.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or META
+        raise SourceError(f"{path}: {where}: {_one_line(first['msg'])}; copy it again") from error
+
+
+def _one_line(reason: object) -> str:
+    return " ".join(str(reason).split())[:_LONGEST_REASON]

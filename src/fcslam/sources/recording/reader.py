@@ -1,0 +1,194 @@
+"""A recording folder as a source.
+
+What is damaged is skipped and counted: a frame whose checksum is wrong or whose stamp or pose is no sane number, an
+image whose file is missing or is another one, and what a crash cut off at the end of a file. Without the camera's
+calibration its images are left out and the rest is read. Which scans fit the others is decided in ``gate``.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+from math import isnan, nan
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+
+from fcslam.errors import SourceError
+from fcslam.records import (
+    CameraImage,
+    CameraModel,
+    GroundTruth,
+    LaserScan,
+    Odometry,
+    Ranges,
+    SensorRecord,
+    frozen,
+)
+from fcslam.runs import read_tum
+from fcslam.sources.faults import Audit, Fault, Faults
+from fcslam.sources.gate import ScanGate, refuse_misfits, window
+from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
+from fcslam.sources.overview import Track
+from fcslam.sources.pose import pose_array
+from fcslam.sources.recording.frames import Frame, frame_count, merged_frames
+from fcslam.sources.recording.layout import (
+    GROUND_TRUTH,
+    IMAGES_FILE,
+    META,
+    ODOMETRY_FILE,
+    SCANS,
+    Meta,
+    image_path,
+    read_meta,
+    scans_file,
+)
+from fcslam.sources.source import WHOLE, ScanRange, Survey
+
+_MAX_COORDINATE = 1e7
+"""Metres, or radians of a heading that was never wrapped."""
+_MAX_STAMP_S = 1e12
+_SUFFIXES = (b"jpg", b"png")
+
+
+def is_recording(path: Path, _: bytes) -> bool:
+    """Whether there is a recording folder at ``path``."""
+    return (path / META).is_file() or (path / SCANS).is_file()
+
+
+class Recording:
+    """What one robot recorded, in a folder."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.name = name
+        self._path = path
+        self._audit = _audit()
+
+    @property
+    def faults(self) -> Faults:
+        """As in Source."""
+        return self._audit.faults()
+
+    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+        """As in Source; images are not opened."""
+        whole = self._survey
+        if scans == WHOLE:
+            return whole
+        track, audit = Track(), _audit()
+        for _, frame in self._entries(scans, audit):
+            if frame.is_scan:
+                track.add(frame.stamp, frame.T_odom_base)
+        return replace(
+            whole, scan_count=track.count, duration_s=track.duration_s, path_length_m=track.length_m,
+            faults=audit.faults(),
+        )  # fmt: skip
+
+    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+        """As in Source."""
+        audit = self._audit = _audit()
+        laser, camera = self._survey.laser, self._survey.camera
+        for number, frame in self._entries(scans, audit):
+            if frame.is_scan:
+                yield LaserScan(frame.stamp, _ranges(frame, audit), laser, pose_array(frame.T_odom_base))
+            elif frame.file is ODOMETRY_FILE:
+                yield Odometry(frame.stamp, pose_array(frame.T_odom_base))
+            elif camera is not None:
+                try:
+                    yield self._image(frame, camera)
+                except (OSError, ValueError):
+                    audit.add(Fault.BROKEN_IMAGE, number)
+
+    def ground_truth(self) -> Iterator[GroundTruth]:
+        """Where the robot really was, in the order in which it was written; none if that was not recorded.
+
+        Raises:
+            EvaluationError: ground_truth.tum is damaged.
+        """
+        path = self._path / GROUND_TRUTH
+        if path.is_file() and path.stat().st_size:
+            for stamp, pose in zip(*read_tum(path), strict=True):
+                yield GroundTruth(float(stamp), frozen(pose))
+
+    @cached_property
+    def _meta(self) -> Meta:
+        return read_meta(self._path)
+
+    @cached_property
+    def _survey(self) -> Survey:
+        """From one pass over all of it; refuses what cannot be mapped."""
+        audit, scans, odometry = _audit(), Track(), Track()
+        for _, frame in self._checked(audit):
+            if frame.is_scan:
+                scans.add(frame.stamp, frame.T_odom_base)
+            elif frame.file is ODOMETRY_FILE:
+                odometry.add(frame.stamp, frame.T_odom_base)
+        laser, faults = self._meta.laser, audit.faults()
+        refuse_misfits(self._path, faults, scans.count, odometry.count, laser.beam_count)
+        if not scans.count:
+            seen = f"; {faults}" if faults else ""
+            raise SourceError(f"{self._path}: no laser scan in this recording{seen}; give one with scans")
+        camera, notes = self._camera_and_notes()
+        return Survey(scans.count, scans.duration_s, scans.length_m, laser, faults, notes, camera)
+
+    def _camera_and_notes(self) -> tuple[CameraModel | None, tuple[str, ...]]:
+        camera, count = self._meta.camera, frame_count(self._path, IMAGES_FILE)
+        if camera is None and count:
+            return None, (f"{self._path}: no calibration of the camera in {META}, so its {count} images are left out",)
+        if camera is not None and not (self._path / IMAGES_FILE.name).is_file():
+            return None, (f"{self._path}: {IMAGES_FILE.name} is missing, so the camera's images are left out",)
+        return camera, ()
+
+    def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, Frame]]:
+        return window(self._checked(audit), scans, lambda frame: frame.is_scan, audit)
+
+    def _checked(self, audit: Audit) -> Iterator[tuple[int, Frame]]:
+        """The frames that can be used, each with its number."""
+        files = [scans_file(self._meta.laser), ODOMETRY_FILE]
+        if self._camera_and_notes()[0] is not None:
+            files.append(IMAGES_FILE)
+        gate = ScanGate(self._meta.laser.beam_count, audit)
+        for frame in merged_frames(self._path, files):
+            if frame.fault is not None or not _is_sane(frame):
+                audit.add(frame.fault or Fault.BROKEN_RECORD, frame.number)
+            elif not frame.is_scan or gate.admits(frame.number, frame):
+                yield frame.number, frame
+
+    def _is_scan(self, frame: Frame) -> bool:
+        return frame.file.name == "scans.bin"
+
+    def _image(self, frame: Frame, camera: CameraModel) -> CameraImage:
+        """Raises OSError or ValueError when the image's file is missing or is another one."""
+        size, suffix = int(frame.content["size"]), bytes(frame.content["suffix"])
+        if suffix not in _SUFFIXES or size > MAX_IMAGE_BYTES:
+            raise ValueError("no image of this kind")
+        path = image_path(self._path, frame.number - 1, suffix.decode())
+        if not path.is_file():
+            raise ValueError("no file")
+        with path.open("rb") as file:
+            encoded = file.read(size + 1)
+        if len(encoded) != size or crc32(encoded) != frame.content["file_crc32"]:
+            raise ValueError("another file")
+        check_image(encoded, camera)
+        pose = frame.T_odom_base
+        return CameraImage(frame.stamp, encoded, camera, None if isnan(pose[0]) else pose_array(pose))
+
+
+def _is_sane(frame: Frame) -> bool:
+    pose = frame.T_odom_base
+    unknown = frame.file is IMAGES_FILE and all(map(isnan, pose))
+    return abs(frame.stamp) < _MAX_STAMP_S and (unknown or all(abs(value) < _MAX_COORDINATE for value in pose))
+
+
+def _ranges(frame: Frame, audit: Audit) -> Ranges:
+    """Ranges in metres; negative ones are made invalid."""
+    ranges: Ranges = frame.content["ranges_m"].astype(np.float32)
+    negative = ranges < 0.0
+    if negative.any():
+        audit.add(Fault.NEGATIVE_RANGE, frame.number, int(np.count_nonzero(negative)))
+        ranges[negative] = nan
+    ranges.setflags(write=False)
+    return ranges
+
+
+def _audit() -> Audit:
+    return Audit("record")

@@ -1,0 +1,244 @@
+"""Sensor records written as a recording, one by one: after a crash everything but the last record is there."""
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from io import BytesIO, FileIO
+from math import nan
+from pathlib import Path
+from typing import Self
+from zlib import crc32
+
+import numpy as np
+from pydantic import ValidationError
+
+from fcslam.errors import OutputError, SourceError
+from fcslam.records import CameraImage, CameraModel, GroundTruth, LaserModel, LaserScan, Odometry, RecordedItem
+from fcslam.runs import write_tum
+from fcslam.sources.images import check_image, image_suffix
+from fcslam.sources.recording.layout import (
+    GROUND_TRUTH,
+    HEADER_BYTES,
+    IMAGES,
+    IMAGES_FILE,
+    META,
+    ODOMETRY_FILE,
+    FrameFile,
+    Meta,
+    image_path,
+    is_whole,
+    read_meta,
+    scans_file,
+    write_meta,
+)
+
+_NO_POSE = (nan, nan, nan)
+
+
+class RecordingWriter:
+    """A recording that grows. Nothing is held back: what ``write`` has returned from outlives this process."""
+
+    def __init__(self, folder: Path, meta: Meta) -> None:
+        """For ``create`` and ``resume`` only."""
+        self._folder = folder
+        self._meta = meta
+        self._next_sequence = 0
+        self._scans = scans_file(meta.laser)
+        self._appenders: dict[str, _Appender] = {}
+
+    @classmethod
+    def create(cls, folder: Path, laser: LaserModel, camera: CameraModel | None = None) -> Self:
+        """A new recording at ``folder``, which must not be there or be empty.
+
+        Raises:
+            OutputError: there is something, it cannot be written, or the models are not sane.
+        """
+        try:
+            meta = Meta(laser=laser, camera=camera)
+        except ValidationError as error:
+            raise OutputError(f"{folder}: cannot hold these sensors ({error.errors()[0]['msg']})") from error
+        with _reported(folder):
+            folder.mkdir(exist_ok=True)
+            if any(folder.iterdir()):
+                raise OutputError(f"{folder}: is not empty; choose another place")
+            write_meta(folder, meta)
+        return cls._opened(folder, meta)
+
+    @classmethod
+    def resume(cls, folder: Path) -> Self:
+        """Go on with the recording at ``folder`` where it was cut off; a last record that is not whole is removed.
+
+        Raises:
+            SourceError: there is no recording.
+            OutputError: it cannot be written.
+        """
+        return cls._opened(folder, read_meta(folder))
+
+    @classmethod
+    def _opened(cls, folder: Path, meta: Meta) -> Self:
+        writer = cls(folder, meta)
+        try:
+            with _reported(folder):
+                writer._open_files()
+        except BaseException:
+            writer.close()
+            raise
+        return writer
+
+    @property
+    def laser(self) -> LaserModel:
+        """The laser of all scans."""
+        return self._meta.laser
+
+    @property
+    def camera(self) -> CameraModel | None:
+        """The camera of all images."""
+        return self._meta.camera
+
+    def write(self, item: RecordedItem) -> None:
+        """Append one record.
+
+        Raises:
+            OutputError: it cannot be written, has a stamp or pose that is not finite, or comes from another sensor.
+        """
+        self._check(item)
+        with _reported(self._folder):
+            match item:
+                case LaserScan(stamp, ranges_m, _, pose):
+                    self._append(self._scans, stamp, pose, ranges_m)
+                case Odometry(stamp, pose):
+                    self._append(ODOMETRY_FILE, stamp, pose)
+                case CameraImage():
+                    self._append_image(item)
+                case GroundTruth(stamp, pose):
+                    line = BytesIO()
+                    write_tum(line, np.array([stamp]), pose[np.newaxis])
+                    self._appenders[GROUND_TRUTH].append(line.getvalue())
+
+    def close(self) -> None:
+        """Close the files."""
+        for appender in self._appenders.values():
+            appender.file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open_files(self) -> None:
+        files = [self._scans, ODOMETRY_FILE]
+        if self._meta.camera is not None:
+            files.append(IMAGES_FILE)
+            (self._folder / IMAGES).mkdir(exist_ok=True)
+        for frames in files:
+            appender = self._appenders[frames.name] = _Appender(self._folder / frames.name)
+            self._next_sequence = max(self._next_sequence, _cut_to_whole_frames(appender, frames))
+        truth = self._appenders[GROUND_TRUTH] = _Appender(self._folder / GROUND_TRUTH)
+        truth.cut(truth.content(0, truth.size).rfind(b"\n") + 1)
+
+    def _check(self, item: RecordedItem) -> None:
+        pose = item.T_building_base if isinstance(item, GroundTruth) else item.T_odom_base
+        if not np.isfinite(item.stamp) or (pose is not None and not np.all(np.isfinite(pose))):
+            raise OutputError(f"{self._folder}: a record at {item.stamp} s has no finite stamp or pose; leave it out")
+        if isinstance(item, LaserScan) and item.laser != self._meta.laser:
+            raise OutputError(f"{self._folder}: a scan at {item.stamp} s is not of the recording's laser; use one each")
+        if isinstance(item, CameraImage):
+            if item.camera != self._meta.camera:
+                raise OutputError(f"{self._folder}: an image at {item.stamp} s is not of the recording's camera")
+            try:
+                check_image(item.encoded, item.camera)
+            except ValueError as error:
+                raise OutputError(f"{self._folder}: an image at {item.stamp} s cannot be kept ({error})") from error
+
+    def _append(self, frames: FrameFile, *values: object) -> None:
+        self._appenders[frames.name].append(frames.packed(self._next_sequence, *values))
+        self._next_sequence += 1
+
+    def _append_image(self, image: CameraImage) -> None:
+        """The file first: a frame without its file would be a fault, a file without its frame is overwritten."""
+        suffix, encoded = image_suffix(image.encoded), image.encoded
+        index = (self._appenders[IMAGES_FILE.name].size - HEADER_BYTES) // IMAGES_FILE.frame_bytes
+        image_path(self._folder, index, suffix).write_bytes(encoded)
+        pose = _NO_POSE if image.T_odom_base is None else image.T_odom_base
+        self._append(IMAGES_FILE, image.stamp, pose, suffix.encode(), len(encoded), crc32(encoded))
+
+
+def write_recording(
+    folder: Path, laser: LaserModel, camera: CameraModel | None, records: Iterable[RecordedItem]
+) -> None:
+    """Write ``records`` as a new recording at ``folder``; equal records give equal bytes.
+
+    Everything that a source yields comes back to the last bit; ground truth to nine digits after the point.
+
+    Raises:
+        OutputError: as ``RecordingWriter.create`` and ``write``.
+    """
+    with RecordingWriter.create(folder, laser, camera) as writer:
+        for record in records:
+            writer.write(record)
+
+
+class _Appender:
+    """A file that grows by whole pieces."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+")
+        self.size = os.fstat(self.file.fileno()).st_size
+
+    def content(self, start: int, end: int) -> bytes:
+        """The bytes from ``start`` (included) to ``end`` (excluded)."""
+        return os.pread(self.file.fileno(), end - start, start)
+
+    def append(self, piece: bytes) -> None:
+        """Write the whole piece, or nothing and raise OSError: a full disk may take a part of it."""
+        written = 0
+        try:
+            while written < len(piece):
+                written += os.pwrite(self.file.fileno(), piece[written:], self.size + written)
+        except OSError:
+            self.cut(self.size)
+            raise
+        self.size += len(piece)
+
+    def cut(self, size: int) -> None:
+        """Forget what lies beyond ``size``."""
+        self.file.truncate(size)
+        self.size = size
+
+
+def _cut_to_whole_frames(appender: _Appender, frames: FrameFile) -> int:
+    """Remove what is no whole frame from the end, write the header if there is none; the sequence to go on with.
+
+    Raises:
+        SourceError: the file is of another laser or version.
+    """
+    header = appender.content(0, HEADER_BYTES)
+    if header != frames.header[: len(header)]:
+        raise SourceError(f"{appender.path}: does not fit {META}, so it cannot be resumed; copy both again")
+    if len(header) < HEADER_BYTES:
+        appender.cut(0)
+        appender.append(frames.header)
+    count = (appender.size - HEADER_BYTES) // frames.frame_bytes
+    while count:
+        start = HEADER_BYTES + (count - 1) * frames.frame_bytes
+        frame = appender.content(start, start + frames.frame_bytes)
+        if is_whole(frame):
+            break
+        count -= 1
+    appender.cut(HEADER_BYTES + count * frames.frame_bytes)
+    return int(np.frombuffer(frame, frames.frame)["sequence"][0]) + 1 if count else 0
+
+
+@contextmanager
+def _reported(folder: Path) -> Iterator[None]:
+    """Turn what the system raises into one clear line."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OutputError(
+            f"{folder}: cannot be written ({reason}); what was written before can be read, make room or choose "
+            "another place"
+        ) from error
