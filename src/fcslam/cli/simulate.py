@@ -1,0 +1,113 @@
+"""`fcslam simulate`: recordings of a fleet that drives in a building of our own making."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.simulation.layouts import Building
+from fcslam.simulation.lighting import Lighting
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.records import RecordedItem
+    from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot
+
+
+def simulate(
+    *,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the recordings; new or empty.")],
+    robots: Annotated[int, typer.Option(min=1, max=100, help="How many robots drive.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws another building.")] = 1,
+    building: Annotated[Building, typer.Option(help="What kind of building.")] = Building.DEFAULT,
+    path_length: Annotated[float, typer.Option(min=1.0, max=10_000.0, help="Metres that each robot drives.")] = 60.0,
+    lighting: Annotated[
+        list[Lighting] | None,
+        typer.Option(help="What the first robot sees by, the second ...; in turn if given fewer times. [default: day]"),
+    ] = None,
+    moved_furniture: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of the rooms' furniture that moves between robots.")
+    ] = 0.0,
+    no_camera: Annotated[bool, typer.Option("--no-camera", help="LiDAR only; needs no GL library.")] = False,
+    bag: Annotated[bool, typer.Option("--bag", help="Write a ROS 2 bag (.mcap) of each robot as well.")] = False,
+) -> None:
+    """Draw a building, drive robots through it, record what their LiDARs and cameras see and where they really were."""
+    from rich.console import Console
+
+    from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
+
+    settings = SimulationSettings(
+        building=building,
+        robots=robots,
+        path_length_m=path_length,
+        lighting=tuple(lighting or (Lighting.DAY,)),
+        moved_furniture=moved_furniture,
+        camera=None if no_camera else CameraSettings(),
+    )
+    _prepare(output)
+    record_fleet(simulate_fleet(settings, seed), output, seed, bag, Console(stderr=True))
+
+
+def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, console: "Console") -> list[Path]:
+    """Write one recording a robot into the folder ``output``, the truth beside them; returns the recordings.
+
+    Raises:
+        SimulationError: MuJoCo or a GL library is missing.
+        OutputError: something cannot be written.
+    """
+    import numpy as np
+
+    from fcslam.errors import OutputError
+    from fcslam.simulation.truth import write_truth
+    from fcslam.sources import open_source, write_bag, write_recording
+
+    began = time.perf_counter()
+    recordings = []
+    for robot in fleet.robots:
+        place = output / robot.name
+        write_recording(place, robot.laser, robot.camera, _watched(robot, console))
+        recordings.append(place)
+    try:
+        write_truth(fleet, output, np.random.default_rng(seed))
+        if bag:
+            for place in recordings:
+                write_bag(place.with_suffix(".mcap"), open_source(place).records())
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
+    _report(fleet, recordings, time.perf_counter() - began, console)
+    return recordings
+
+
+def _prepare(output: Path) -> None:
+    from fcslam.errors import OutputError
+
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        if any(output.iterdir()):
+            raise OutputError(f"{output}: is not empty; choose another place")
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
+
+
+def _watched(robot: "SimulatedRobot", console: "Console") -> "Iterator[RecordedItem]":
+    """What the robot records, with a progress display."""
+    from rich.progress import Progress
+
+    from fcslam.records import LaserScan
+
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(f"simulating {robot.name}", total=len(robot.stamps))
+        for item in robot.items():
+            yield item
+            if isinstance(item, LaserScan):
+                bar.advance(task)
+
+
+def _report(fleet: "SimulatedFleet", recordings: list[Path], elapsed_s: float, console: "Console") -> None:
+    for robot, place in zip(fleet.robots, recordings, strict=True):
+        typer.echo(f"{place}: {len(robot.stamps)} scans, {len(robot.image_stamps)} images, {robot.duration_s:.0f} s")
+    speed = max(robot.duration_s for robot in fleet.robots) / elapsed_s
+    console.print(f"{elapsed_s:.1f} s, {speed:.1f} x real time", highlight=False)
