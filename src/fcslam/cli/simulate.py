@@ -1,7 +1,10 @@
 """`fcslam simulate`: recordings of a fleet that drives in a building of our own making."""
 
+import os
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +15,7 @@ from fcslam.simulation.lighting import Lighting
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress, TaskID
 
     from fcslam.records import RecordedItem
     from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot
@@ -65,11 +69,17 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, co
     from fcslam.sources import open_source, write_bag, write_recording
 
     began = time.perf_counter()
-    recordings = []
-    for robot in fleet.robots:
-        place = output / robot.name
-        write_recording(place, robot.laser, robot.camera, _watched(robot, console))
-        recordings.append(place)
+    recordings = [output / robot.name for robot in fleet.robots]
+    with _progress(fleet, console) as watch, ThreadPoolExecutor(os.cpu_count()) as pool:
+        jobs = [
+            pool.submit(write_recording, place, robot.laser, robot.camera, watch(robot))
+            for robot, place in zip(fleet.robots, recordings, strict=True)
+        ]
+        try:
+            for job in jobs:
+                job.result()
+        finally:
+            watch.stop()
     try:
         write_truth(fleet, output, np.random.default_rng(seed))
         if bag:
@@ -92,18 +102,36 @@ def _prepare(output: Path) -> None:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
 
 
-def _watched(robot: "SimulatedRobot", console: "Console") -> "Iterator[RecordedItem]":
-    """What the robot records, with a progress display."""
+class _Watch:
+    """Lets robots' records through while somebody looks on, until it is stopped."""
+
+    def __init__(self, bar: "Progress", task: "TaskID") -> None:
+        self._bar, self._task = bar, task
+        self._stopped = False
+
+    def stop(self) -> None:
+        """End every robot's recording at its next record."""
+        self._stopped = True
+
+    def __call__(self, robot: "SimulatedRobot") -> "Iterator[RecordedItem]":
+        from fcslam.records import LaserScan
+
+        with closing(robot.items()) as items:
+            for item in items:
+                if self._stopped:
+                    return
+                yield item
+                if isinstance(item, LaserScan):
+                    self._bar.advance(self._task)
+
+
+@contextmanager
+def _progress(fleet: "SimulatedFleet", console: "Console") -> "Iterator[_Watch]":
+    """A live line over all robots' scans."""
     from rich.progress import Progress
 
-    from fcslam.records import LaserScan
-
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"simulating {robot.name}", total=len(robot.stamps))
-        for item in robot.items():
-            yield item
-            if isinstance(item, LaserScan):
-                bar.advance(task)
+        yield _Watch(bar, bar.add_task("simulating", total=sum(len(robot.stamps) for robot in fleet.robots)))
 
 
 def _report(fleet: "SimulatedFleet", recordings: list[Path], elapsed_s: float, console: "Console") -> None:

@@ -4,12 +4,16 @@ import importlib
 import os
 import sys
 from contextlib import suppress
+from threading import RLock
 from typing import Any
 
 from fcslam.errors import SimulationError
 
 _GL = "MUJOCO_GL"
 _BACKENDS = ("egl", "osmesa")
+SETTING_UP = RLock()
+"""Robots are simulated side by side in threads; what they share is looked up by one of them."""
+
 _PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
 
 
@@ -19,19 +23,19 @@ def mujoco() -> Any:
     Raises:
         SimulationError: it is not installed.
     """
-    if "mujoco" in sys.modules:
-        return sys.modules["mujoco"]
-    wanted = os.environ.get(_GL)
-    os.environ[_GL] = "disable"
-    try:
-        return importlib.import_module("mujoco")
-    except ImportError as error:
-        raise SimulationError(f"the simulator needs MuJoCo ({error}); pip install 'fcslam[sim]'") from error
-    finally:
-        if wanted is None:
-            del os.environ[_GL]
-        else:
-            os.environ[_GL] = wanted
+    with SETTING_UP:
+        if "mujoco" in sys.modules:
+            return sys.modules["mujoco"]
+        wanted = os.environ.get(_GL)
+        os.environ[_GL] = "disable"
+        try:
+            return importlib.import_module("mujoco")
+        except ImportError as error:
+            raise SimulationError(f"the simulator needs MuJoCo ({error}); pip install 'fcslam[sim]'") from error
+        finally:
+            os.environ.pop(_GL)
+            if wanted is not None:
+                os.environ[_GL] = wanted
 
 
 def gl_context(width: int, height: int) -> Any:

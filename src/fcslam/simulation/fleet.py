@@ -6,7 +6,8 @@ nothing for the others, and cameras change nothing for the LiDARs.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,19 +113,19 @@ class SimulatedRobot:
         """From the first scan to the last."""
         return float(self.stamps[-1] - self.stamps[0])
 
-    def items(self) -> Iterator[RecordedItem]:
+    def items(self) -> Generator[RecordedItem, None, None]:
         """Scans, images and the truth at the stamp of each, as they come.
 
         Raises:
             SimulationError: MuJoCo or, with a camera, a GL library is missing.
         """
-        scans, images = self._scans(), self._images()
-        image = next(images, None)
-        for scan in scans:
-            while image is not None and image.stamp < scan.stamp:
-                yield from (image, self._truth(image.stamp))
-                image = next(images, None)
-            yield from (scan, self._truth(scan.stamp))
+        with closing(self._images()) as images:
+            image = next(images, None)
+            for scan in self._scans():
+                while image is not None and image.stamp < scan.stamp:
+                    yield from (image, self._truth(image.stamp))
+                    image = next(images, None)
+                yield from (scan, self._truth(scan.stamp))
 
     def _truth(self, stamp: float) -> GroundTruth:
         return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
@@ -136,7 +137,7 @@ class SimulatedRobot:
             ranges = disturb(caster.cast(pose), self.laser, self.settings.lidar, rng)
             yield LaserScan(float(stamp), frozen(ranges, np.float32), self.laser, frozen(odometry))
 
-    def _images(self) -> Iterator[CameraImage]:
+    def _images(self) -> Generator[CameraImage, None, None]:
         settings = self.settings.camera
         if self.camera is None or self.decoration is None or settings is None:
             return

@@ -8,7 +8,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, FloatArray, LaserModel
-from fcslam.simulation.engine import gl_context, mujoco
+from fcslam.simulation.engine import SETTING_UP, gl_context, mujoco
 from fcslam.simulation.lighting import Light
 from fcslam.simulation.scene import SOLID
 from fcslam.simulation.textures import Image
@@ -52,8 +52,9 @@ class Camera:
     def __init__(self, model: Any, camera: CameraModel, light: Light) -> None:
         self._mujoco = mujoco()
         self._model, self._camera, self._lamps = model, camera, light.lamps
-        self._gl = gl_context(camera.width, camera.height)
-        self._context = self._mujoco.MjrContext(model, self._mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        with SETTING_UP:
+            self._gl = gl_context(camera.width, camera.height)
+            self._context = self._mujoco.MjrContext(model, self._mujoco.mjtFontScale.mjFONTSCALE_100.value)
         self._mujoco.mjr_setBuffer(self._mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._data = self._mujoco.MjData(model)
         self._mujoco.mj_forward(model, self._data)
