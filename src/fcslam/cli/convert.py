@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.recordings import LaserPose, OdomTopic, ScanTopic, bag_options, open_recording, show_faults, show_notes
+from fcslam.cli.recordings import (
+    CameraTopic,
+    LaserPose,
+    OdomTopic,
+    ScanTopic,
+    bag_options,
+    open_recording,
+    show_faults,
+    show_notes,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,6 +45,7 @@ def convert(
     *,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
+    camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
     force: Annotated[bool, typer.Option("--force", "-f", help="Replace what is there already.")] = False,
 ) -> None:
@@ -43,10 +53,12 @@ def convert(
     from rich.console import Console
 
     console = Console(stderr=True)
-    source = open_recording(recording, bag_options(scan_topic, odom_topic, laser_pose))
+    source = open_recording(recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
     _prepare(output, force)
     survey = source.survey()
     show_notes(console, survey.notes)
+    if survey.camera is not None and _CARMEN.search(output.name):
+        show_notes(console, [f"{output}: a CARMEN log has no place for images, they are left out"])
     _write(output, survey, _watched(source, survey.scan_count, console))
     show_faults(console, [source])
     Console().print(f"{survey.scan_count} scans: {output}", highlight=False, markup=False, soft_wrap=True)

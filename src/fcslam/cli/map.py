@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.recordings import LaserPose, OdomTopic, ScanTopic, bag_options, open_recording, show_faults, show_notes
+from fcslam.cli.recordings import (
+    CameraTopic,
+    LaserPose,
+    OdomTopic,
+    ScanTopic,
+    bag_options,
+    open_recording,
+    show_faults,
+    show_notes,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -40,6 +49,7 @@ def map_recordings(
     ] = None,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
+    camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the run; the configuration's if not given.")] = None,
     force: Annotated[bool, typer.Option("--force", "-f", help="Replace a run that is there already.")] = False,
@@ -50,7 +60,7 @@ def map_recordings(
     prepare_output(output, force)
     settings = _settings(config, seed, no_fuse)
     vetoes = read_vetoes(veto) if veto else ()
-    options = bag_options(scan_topic, odom_topic, laser_pose)
+    options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
     sources = _sources([open_recording(log, options) for log in logs], split)
     map_sources(sources, settings, output, force, vetoes)
 

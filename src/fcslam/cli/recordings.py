@@ -24,6 +24,10 @@ OdomTopic = Annotated[
     str | None,
     typer.Option("--odom-topic", metavar="TOPIC", help="The odometry to read, or tf with it.", rich_help_panel=_BAGS),
 ]
+CameraTopic = Annotated[
+    str | None,
+    typer.Option("--camera-topic", metavar="TOPIC", help="The images to read.", rich_help_panel=_BAGS),
+]
 LaserPose = Annotated[
     str | None,
     typer.Option(
@@ -35,7 +39,9 @@ LaserPose = Annotated[
 ]
 
 
-def bag_options(scan_topic: str | None, odom_topic: str | None, laser_pose: str | None) -> "BagOptions | None":
+def bag_options(
+    scan_topic: str | None, odom_topic: str | None, camera_topic: str | None, laser_pose: str | None
+) -> "BagOptions | None":
     """The options of bags; None if none is given.
 
     Raises:
@@ -43,9 +49,9 @@ def bag_options(scan_topic: str | None, odom_topic: str | None, laser_pose: str 
     """
     from fcslam.sources import BagOptions
 
-    if scan_topic is None and odom_topic is None and laser_pose is None:
+    if scan_topic is None and odom_topic is None and camera_topic is None and laser_pose is None:
         return None
-    return BagOptions(scan_topic, odom_topic, None if laser_pose is None else _pose(laser_pose))
+    return BagOptions(scan_topic, odom_topic, camera_topic, None if laser_pose is None else _pose(laser_pose))
 
 
 def open_recording(argument: str, options: "BagOptions | None") -> "Source":

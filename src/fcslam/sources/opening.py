@@ -61,7 +61,7 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
             if options is not None and not kind.takes_options:
                 raise SourceError(
                     f"{path}: a {kind.name} has neither topics nor tf; options of bags (--scan-topic, --odom-topic, "
-                    "--laser-pose) go with ROS bags only, leave them out"
+                    "--camera-topic, --laser-pose) go with ROS bags only, leave them out"
                 )
             return kind.open(path, name or robot_name(path), options)
     known = " or ".join(kind.name for kind in FORMATS)

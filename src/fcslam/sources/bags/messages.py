@@ -77,7 +77,7 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
         raise ValueError("no sane range")
     if increment_rad < 0.0:
         first_rad, increment_rad, ranges = first_rad + span_rad, -increment_rad, ranges[::-1]
-    stamp, frame = _header(content.header, bag_time_ns)
+    stamp, frame = header_of(content.header, bag_time_ns)
     beams = Beams(count, first_rad, increment_rad)
     return ScanMessage(stamp, frame, beams, range_min_m, min(range_max_m, _LONGEST_RANGE_M), ranges)
 
@@ -94,7 +94,7 @@ def measured_ranges(scan: ScanMessage) -> Ranges:
 
 def odometry_of(content: Any, bag_time_ns: int) -> OdometryReading:
     """An odometry message; the base is its child frame."""
-    stamp, _ = _header(content.header, bag_time_ns)
+    stamp, _ = header_of(content.header, bag_time_ns)
     pose = content.pose.pose
     transform = _transform(pose.position, pose.orientation)
     return OdometryReading(stamp, planar(transform), _frame(content.child_frame_id))
@@ -103,7 +103,7 @@ def odometry_of(content: Any, bag_time_ns: int) -> OdometryReading:
 def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
     """The transforms of a tf message."""
     for entry in content.transforms:
-        stamp, parent = _header(entry.header, bag_time_ns)
+        stamp, parent = header_of(entry.header, bag_time_ns)
         transform = _transform(entry.transform.translation, entry.transform.rotation)
         yield StampedTransform(stamp, parent, _frame(entry.child_frame_id), transform)
 
@@ -114,7 +114,7 @@ def _angle_rad(single: float) -> float:
     return rounded if np.float32(rounded) == np.float32(single) else float(single)
 
 
-def _header(header: Any, bag_time_ns: int) -> tuple[float, str]:
+def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
     """Stamp and frame; a stamp that was never set is replaced by the time of recording."""
     stamp_ns = header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
     return (stamp_ns or bag_time_ns) / _NANOSECONDS, _frame(header.frame_id)

@@ -12,5 +12,6 @@ class BagOptions:
     scan_topic: str | None = None
     odom_topic: str | None = None
     """A topic of odometry, or one of tf that carries odom -> base."""
+    camera_topic: str | None = None
     laser_pose: Pose | None = None
     """``T_base_laser`` in metres and radians, in place of what tf says."""

@@ -1,4 +1,4 @@
-"""Scans and the odometry around them: each scan gets the pose at its own stamp.
+"""Scans, images and the odometry around them: each scan and each image gets the pose at its own stamp.
 
 Between two readings of the odometry the pose is interpolated, the shortest way round; a scan with the very stamp of a
 reading gets that reading's pose, to the last bit. Odometry may come later than the scan: scans wait for it, in the
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
+from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.faults import Fault
 from fcslam.sources.pose import Pose, interpolated_pose
@@ -36,22 +37,34 @@ class PosedScan(NamedTuple):
     """What is wrong with the pose; with NO_ODOMETRY there is none, and it is the identity."""
 
 
+class PosedImage(NamedTuple):
+    """An image with the odometry at its stamp."""
+
+    image: ImageMessage
+    T_odom_base: Pose | None
+    """None: there is none within 1 s."""
+
+
 class _Match(NamedTuple):
     T_odom_base: Pose
     fault: Fault | None
 
 
+Message = ScanMessage | ImageMessage | OdometryReading
+Entry = PosedScan | PosedImage | OdometryReading
+
+
 @dataclass(slots=True)
 class _Waiting:
     number: int
-    item: ScanMessage | OdometryReading
+    item: Message
     match: _Match | None
 
 
 def paired(
-    items: Iterable[tuple[int, ScanMessage | OdometryReading]],
-) -> Iterator[tuple[int, PosedScan | OdometryReading]]:
-    """The items in their order, each with its number, scans with their poses."""
+    items: Iterable[tuple[int, Message]],
+) -> Iterator[tuple[int, Entry]]:
+    """The items in their order, each with its number, scans and images with their poses."""
     readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
     queue: deque[_Waiting] = deque()
     for number, item in items:
@@ -67,10 +80,13 @@ def paired(
         yield _leave(waiting, readings)
 
 
-def _leave(waiting: _Waiting, readings: deque[OdometryReading]) -> tuple[int, PosedScan | OdometryReading]:
+def _leave(waiting: _Waiting, readings: deque[OdometryReading]) -> tuple[int, Entry]:
     if isinstance(waiting.item, OdometryReading):
         return waiting.number, waiting.item
     match = waiting.match or _hold(readings, waiting.item.stamp)
+    if isinstance(waiting.item, ImageMessage):
+        unknown = match.fault is Fault.NO_ODOMETRY
+        return waiting.number, PosedImage(waiting.item, None if unknown else match.T_odom_base)
     return waiting.number, PosedScan(waiting.item, *match)
 
 

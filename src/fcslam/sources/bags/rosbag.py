@@ -14,14 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.errors import SourceError
-from fcslam.records import LaserModel, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry, Ranges, SensorRecord
 from fcslam.sources.bags.messages import OdometryReading, measured_ranges
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.pairing import PosedScan
+from fcslam.sources.bags.pairing import Entry, PosedImage, PosedScan
 from fcslam.sources.bags.stream import BagStream
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import refuse_misfits, window
+from fcslam.sources.images import check_image
 from fcslam.sources.overview import Track
 from fcslam.sources.pose import pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -61,22 +62,32 @@ class RosBag:
         for _, entry in self._entries(scans, audit):
             if isinstance(entry, PosedScan):
                 track.add(entry.scan.stamp, entry.T_odom_base)
-        return Survey(track.count, track.duration_s, track.length_m, whole.laser, audit.faults(), whole.notes)
+        return Survey(
+            track.count, track.duration_s, track.length_m, whole.laser, audit.faults(), whole.notes, whole.camera
+        )
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = _audit()
         reading = self._reading
-        for _, entry in self._entries(scans, audit):
-            T_odom_base = pose_array(entry.T_odom_base)
+        laser, camera = reading.survey.laser, reading.survey.camera
+        for number, entry in self._entries(scans, audit, with_images=camera is not None):
             if isinstance(entry, PosedScan):
                 ranges_m = _turned(measured_ranges(entry.scan), reading.upside_down)
-                yield LaserScan(entry.scan.stamp, ranges_m, reading.survey.laser, T_odom_base)
-            else:
-                yield Odometry(entry.stamp, T_odom_base)
+                yield LaserScan(entry.scan.stamp, ranges_m, laser, pose_array(entry.T_odom_base))
+            elif isinstance(entry, OdometryReading):
+                yield Odometry(entry.stamp, pose_array(entry.T_odom_base))
+            elif camera is not None:
+                try:
+                    check_image(entry.image.encoded, camera)
+                except ValueError:
+                    audit.add(Fault.BROKEN_IMAGE, number)
+                else:
+                    yield _image(entry, camera)
 
-    def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, PosedScan | OdometryReading]]:
-        return window(self._stream.entries(audit), scans, lambda entry: isinstance(entry, PosedScan), audit)
+    def _entries(self, scans: ScanRange, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
+        entries = self._stream.entries(audit, with_images=with_images)
+        return window(entries, scans, lambda entry: isinstance(entry, PosedScan), audit)
 
     @cached_property
     def _reading(self) -> _Reading:
@@ -87,14 +98,16 @@ class RosBag:
         for _, entry in self._stream.entries(audit, tree):
             if isinstance(entry, PosedScan):
                 scans.add(entry.scan.stamp, entry.T_odom_base)
-            else:
+            elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry)
+        base_frame = base_frame or next((frame for frame in _USUAL_BASES if frame in tree), _USUAL_BASES[-1])
         mounted = self._mounting(tree, base_frame)
-        notes = (*self._stream.topics.notes, *self._tilt_note(mounted))
+        camera, camera_notes = self._camera(tree, base_frame)
+        notes = (*self._stream.topics.notes, *self._tilt_note(mounted), *camera_notes)
         laser = self._laser(mounted)
-        survey = Survey(scans.count, scans.duration_s, scans.length_m, laser, audit.faults(), notes)
+        survey = Survey(scans.count, scans.duration_s, scans.length_m, laser, audit.faults(), notes, camera)
         return _Reading(survey, mounted.upside_down)
 
     def _refuse(self, faults: Faults, scans: Track, odometry: Track) -> None:
@@ -118,7 +131,6 @@ class RosBag:
         if self._options.laser_pose is not None:
             return Mounting(self._options.laser_pose, upside_down=False, tilt_rad=0.0)
         topic, laser_frame = self._stream.topics.scan.name, self._stream.first_scans[0].frame
-        base_frame = base_frame or next((frame for frame in _USUAL_BASES if frame in tree), _USUAL_BASES[-1])
         try:
             mounted = mounting(tree.fixed(base_frame, laser_frame))
         except NoTransformError as error:
@@ -133,6 +145,21 @@ class RosBag:
             )
         return mounted
 
+    def _camera(self, tree: TransformTree, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
+        """The camera as far as the bag says all about it; if not, it is left out and the laser goes on."""
+        path, topic, calibration = self._stream.path, self._stream.topics.camera, self._stream.calibration
+        if topic is None:
+            return None, ()
+        if calibration is None:
+            return None, (f"{path}: the camera of {topic.name} was never calibrated, it is left out",)
+        try:
+            camera = calibration.camera(tree.fixed(base_frame, calibration.frame))
+        except NoTransformError as error:
+            return None, (f"{path}: tf has {error}, so the camera of {topic.name} is left out",)
+        if calibration.is_distorted:
+            return camera, (f"{path}: the images of {topic.name} are distorted, read as if they were not",)
+        return camera, ()
+
     def _tilt_note(self, mounted: Mounting) -> tuple[str, ...]:
         if mounted.tilt_rad <= _LEVEL_RAD:
             return ()
@@ -141,6 +168,11 @@ class RosBag:
 
 def _audit() -> Audit:
     return Audit("message")
+
+
+def _image(posed: PosedImage, camera: CameraModel) -> CameraImage:
+    T_odom_base = None if posed.T_odom_base is None else pose_array(posed.T_odom_base)
+    return CameraImage(posed.image.stamp, posed.image.encoded, camera, T_odom_base)
 
 
 def _turned(ranges_m: Ranges, upside_down: bool) -> Ranges:

@@ -7,7 +7,14 @@ from pathlib import Path
 
 from fcslam.errors import SourceError
 from fcslam.sources.bags.beams import UsualBeams
-from fcslam.sources.bags.container import ODOMETRY, BagFile, RawMessage, Topic
+from fcslam.sources.bags.camera import (
+    Calibration,
+    ImageMessage,
+    calibration_of,
+    compressed_image_of,
+    raw_image_of,
+)
+from fcslam.sources.bags.container import COMPRESSED_IMAGE, ODOMETRY, BagFile, RawMessage, Topic
 from fcslam.sources.bags.messages import (
     OdometryReading,
     ScanMessage,
@@ -17,13 +24,14 @@ from fcslam.sources.bags.messages import (
     transforms_of,
 )
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.pairing import PosedScan, paired
+from fcslam.sources.bags.pairing import Entry, Message, PosedScan, paired
 from fcslam.sources.bags.topics import Topics, choose_topics
 from fcslam.sources.bags.transforms import TransformTree, planar
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate
 
 _EDGES_NAMED = 10
+_IMAGES_TRIED = 5
 
 
 class BagStream:
@@ -41,7 +49,7 @@ class BagStream:
         Raises:
             SourceError: the bag cannot be read, or has no such topics.
         """
-        return choose_topics(self._bag, self._options, self._field_of_view_rad)
+        return choose_topics(self._bag, self._options, self._field_of_view_rad, self._has_images)
 
     @cached_property
     def first_scans(self) -> list[ScanMessage]:
@@ -63,16 +71,27 @@ class BagStream:
         """The beams to which all scans are brought."""
         return UsualBeams(self.first_scans)
 
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Of the camera; None: there is no camera, or none of its calibrations can be read."""
+        topic = self.topics.camera_info
+        for message in () if topic is None else self._bag.messages([topic]):
+            try:
+                return calibration_of(self._bag.decode(message))
+            except ValueError:
+                continue
+        return None
+
     def entries(
-        self, audit: Audit, tree: TransformTree | None = None
-    ) -> Iterator[tuple[int, PosedScan | OdometryReading]]:
-        """Odometry, and the scans that fit the rest and have odometry, each with its message's number.
+        self, audit: Audit, tree: TransformTree | None = None, with_images: bool = False
+    ) -> Iterator[tuple[int, Entry]]:
+        """Odometry, the scans that fit the rest and have odometry, and perhaps images, each with its message's number.
 
         ``tree`` hears all tf on the way, if it is given.
         """
         gate = ScanGate(self.usual.beams.beam_count, audit)
-        for number, entry in paired(self._items(audit, tree)):
-            if isinstance(entry, OdometryReading):
+        for number, entry in paired(self._items(audit, tree, with_images)):
+            if not isinstance(entry, PosedScan):
                 yield number, entry
             elif gate.admits(number, entry.scan):
                 if entry.fault is not None:
@@ -80,35 +99,37 @@ class BagStream:
                 if entry.fault is not Fault.NO_ODOMETRY:
                     yield number, entry
 
-    def _items(self, audit: Audit, tree: TransformTree | None) -> Iterator[tuple[int, ScanMessage | OdometryReading]]:
+    def _items(self, audit: Audit, tree: TransformTree | None, with_images: bool) -> Iterator[tuple[int, Message]]:
         topics = self.topics
         heard = () if tree is None else topics.transforms
-        for message in self._bag.messages(list(dict.fromkeys((*topics.odometry, *heard, topics.scan)))):
+        seen = (topics.camera,) if with_images and topics.camera is not None else ()
+        for message in self._bag.messages(list(dict.fromkeys((*topics.odometry, *heard, topics.scan, *seen)))):
             try:
                 items = self._items_in(message, tree)
             except ValueError:
-                audit.add(Fault.BROKEN_MESSAGE, message.number)
+                is_image = message.topic == topics.camera
+                audit.add(Fault.BROKEN_IMAGE if is_image else Fault.BROKEN_MESSAGE, message.number)
                 continue
             for item in items:
                 fitting = self._fitting(item, message.number, audit)
                 if fitting is not None:
                     yield message.number, fitting
 
-    def _fitting(
-        self, item: ScanMessage | OdometryReading, number: int, audit: Audit
-    ) -> ScanMessage | OdometryReading | None:
-        """Odometry as it is, a scan with the usual beams, or None."""
-        if isinstance(item, OdometryReading):
+    def _fitting(self, item: Message, number: int, audit: Audit) -> Message | None:
+        """A scan with the usual beams, or None; what is no scan as it is."""
+        if not isinstance(item, ScanMessage):
             return item
         scan = self.usual.brought(item)
         if scan is not item:
             audit.add(Fault.BEAM_COUNT if scan is None else Fault.RESAMPLED, number)
         return scan
 
-    def _items_in(self, message: RawMessage, tree: TransformTree | None) -> list[ScanMessage | OdometryReading]:
+    def _items_in(self, message: RawMessage, tree: TransformTree | None) -> list[Message]:
         """What one message says; raises ValueError when it is broken."""
         if message.topic == self.topics.scan:
             return [scan_of(self._bag.decode(message), message.bag_time_ns)]
+        if message.topic == self.topics.camera:
+            return [self._image_in(message)]
         if message.topic.type == ODOMETRY:
             return [odometry_of(self._bag.decode(message), message.bag_time_ns)]
         transforms = self._transforms_in(message)
@@ -152,6 +173,20 @@ class BagStream:
             except ValueError:
                 continue
             yield scan
+
+    def _image_in(self, message: RawMessage) -> ImageMessage:
+        image_of = compressed_image_of if message.topic.type == COMPRESSED_IMAGE else raw_image_of
+        return image_of(self._bag.decode(message), message.bag_time_ns)
+
+    def _has_images(self, topic: Topic) -> bool:
+        """Whether one of the first messages is an image that is read: depth, for one, is not."""
+        for message in islice(self._bag.messages([topic]), _IMAGES_TRIED):
+            try:
+                self._image_in(message)
+            except ValueError:
+                continue
+            return True
+        return False
 
     def _field_of_view_rad(self, topic: Topic) -> float:
         scan = next(self._scans_of(topic), None)

@@ -4,11 +4,26 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
-from fcslam.sources.bags.container import ODOMETRY, SCAN, BagFile, Topic, is_transforms
+from fcslam.sources.bags.container import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    ODOMETRY,
+    SCAN,
+    BagFile,
+    Topic,
+    is_transforms,
+)
 from fcslam.sources.bags.options import BagOptions
 
 _NAMED_AT_MOST = 15
-_NEEDED = {"--scan-topic": SCAN, "--odom-topic": f"{ODOMETRY}, or tf"}
+_NEEDED = {
+    "--scan-topic": SCAN,
+    "--odom-topic": f"{ODOMETRY}, or tf",
+    "--camera-topic": f"{COMPRESSED_IMAGE} or {IMAGE}",
+}
+_TRUTHS = ("ground_truth", "groundtruth")
+"""In the name of a topic of odometry that no robot measured."""
 
 
 class Topics(NamedTuple):
@@ -19,14 +34,25 @@ class Topics(NamedTuple):
     """One of odometry, or those that carry tf."""
     transforms: tuple[Topic, ...]
     """All that carry tf."""
+    camera: Topic | None
+    """Images; None: there are none that can be read, or they are not calibrated."""
+    camera_info: Topic | None
+    """The calibration of these images."""
     notes: tuple[str, ...]
 
 
-def choose_topics(bag: BagFile, options: BagOptions, field_of_view_rad: Callable[[Topic], float]) -> Topics:
+def choose_topics(
+    bag: BagFile,
+    options: BagOptions,
+    field_of_view_rad: Callable[[Topic], float],
+    has_images: Callable[[Topic], bool],
+) -> Topics:
     """The topics to read.
 
     Of several lasers the one with the widest field of view, to 0.01 rad, then with most messages, then the first by
-    name. Of several odometries one that is called ``odom``, then with most messages, then the first by name.
+    name. Of several odometries one that is called ``odom``, then with most messages, then the first by name; one that
+    is called ground truth only if it is wanted. Of several cameras one that is calibrated, then with most messages,
+    then one whose images are compressed, then the first by name.
 
     Raises:
         SourceError: there is no such topic, or one named is not there or of another type.
@@ -36,7 +62,7 @@ def choose_topics(bag: BagFile, options: BagOptions, field_of_view_rad: Callable
     if not scans:
         raise SourceError(f"{bag.path}: no laser scans ({SCAN}); record them; {_known(bag.topics)}")
     transforms = tuple(topic for topic in heard if is_transforms(topic))
-    measured = [topic for topic in heard if topic.type == ODOMETRY]
+    measured = [topic for topic in heard if topic.type == ODOMETRY and (options.odom_topic or not _is_truth(topic))]
     odometries = _candidates(bag, [*measured, *transforms], options.odom_topic, "--odom-topic")
     if not odometries:
         raise SourceError(
@@ -44,13 +70,47 @@ def choose_topics(bag: BagFile, options: BagOptions, field_of_view_rad: Callable
         )
     views_rad = {topic: round(field_of_view_rad(topic), 2) if len(scans) > 1 else 0.0 for topic in scans}
     scan = min(scans, key=lambda topic: (-views_rad[topic], -topic.message_count, topic.name))
-    notes = _note(bag, "laser scans", "--scan-topic", scan, scans)
+    camera, camera_info, camera_notes = _choose_camera(bag, options.camera_topic, has_images)
+    notes = [*_note(bag, "laser scans", "--scan-topic", scan, scans), *camera_notes]
     measured = [topic for topic in odometries if topic.type == ODOMETRY]
     if not measured:
-        return Topics(scan, tuple(odometries), transforms, tuple(notes))
+        return Topics(scan, tuple(odometries), transforms, camera, camera_info, tuple(notes))
     odometry = min(measured, key=lambda topic: (_basename(topic) != "odom", -topic.message_count, topic.name))
     notes += _note(bag, "odometry", "--odom-topic", odometry, measured)
-    return Topics(scan, (odometry,), transforms, tuple(notes))
+    return Topics(scan, (odometry,), transforms, camera, camera_info, tuple(notes))
+
+
+def _choose_camera(
+    bag: BagFile, wanted: str | None, has_images: Callable[[Topic], bool]
+) -> tuple[Topic | None, Topic | None, list[str]]:
+    """Images, their calibration, and what to say about the choice."""
+    heard = [topic for topic in bag.topics if topic.message_count]
+    images = [topic for topic in heard if topic.type in (COMPRESSED_IMAGE, IMAGE)]
+    cameras = [topic for topic in _candidates(bag, images, wanted, "--camera-topic") if has_images(topic)]
+    if not cameras:
+        names = ", ".join(topic.name for topic in images)
+        return None, None, [f"{bag.path}: no images of {names} can be read, the camera is left out"] if images else []
+    infos = [topic for topic in heard if topic.type == CAMERA_INFO]
+    info_of = {camera: _calibration(camera, infos, len(images)) for camera in cameras}
+    chosen = min(
+        cameras,
+        key=lambda topic: (
+            info_of[topic] is None,
+            -topic.message_count,
+            topic.type != COMPRESSED_IMAGE,
+            topic.name,
+        ),
+    )
+    if info_of[chosen] is None:
+        return None, None, [f"{bag.path}: no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"]
+    return chosen, info_of[chosen], _note(bag, "images", "--camera-topic", chosen, cameras)
+
+
+def _calibration(camera: Topic, infos: Sequence[Topic], camera_count: int) -> Topic | None:
+    """The calibration that is published beside the images, or the only one if there is only one camera."""
+    name = camera.name.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+    beside = [info for info in infos if _slashed(info.name) == _slashed(name)]
+    return next(iter(beside or (infos if len(infos) == camera_count == 1 else [])), None)
 
 
 def _candidates(bag: BagFile, candidates: Sequence[Topic], wanted: str | None, option: str) -> list[Topic]:
@@ -80,6 +140,10 @@ def _known(topics: Sequence[Topic]) -> str:
 
 def _slashed(name: str) -> str:
     return "/" + name.strip("/")
+
+
+def _is_truth(topic: Topic) -> bool:
+    return any(truth in topic.name.lower() for truth in _TRUTHS)
 
 
 def _basename(topic: Topic) -> str:

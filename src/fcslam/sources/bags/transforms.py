@@ -12,6 +12,8 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 """(x, y, z, w), of length 1."""
 
+_ROUNDING = 1e-15
+"""A quaternion whose length is 1 but for rounding stays as it is."""
 _STILL = 0.01
 """Metres or quaternion units by which a fixed transform may differ from message to message."""
 
@@ -38,6 +40,8 @@ def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
     length = sqrt(x * x + y * y + z * z + w * w)
     if not (abs(length - 1.0) < 0.1 and all(map(isfinite, translation_m))):
         raise ValueError("no sane transform")
+    if abs(length - 1.0) < _ROUNDING:
+        return Transform(translation_m, rotation)
     return Transform(translation_m, (x / length, y / length, z / length, w / length))
 
 

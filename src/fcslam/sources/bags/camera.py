@@ -1,0 +1,77 @@
+"""What a bag's camera says: images, kept or brought into an encoded form, and the calibration."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fcslam.records import CameraModel, Transform
+from fcslam.sources.bags.messages import header_of
+from fcslam.sources.images import MAX_SIDE_PX, check_camera, image_suffix
+
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
+_FASTEST = 1
+"""PNG's least effort: the images are compressed while the bag is read."""
+
+
+class ImageMessage(NamedTuple):
+    """sensor_msgs/Image or CompressedImage."""
+
+    stamp: float
+    encoded: bytes
+    """JPEG or PNG."""
+
+
+class Calibration(NamedTuple):
+    """sensor_msgs/CameraInfo."""
+
+    frame: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    is_distorted: bool
+
+    def camera(self, T_base_camera: Transform) -> CameraModel:
+        """The camera that sits there."""
+        return CameraModel(self.width, self.height, self.fx, self.fy, self.cx, self.cy, T_base_camera)
+
+
+def compressed_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
+    """A JPEG or PNG image as it was sent; raises ValueError when it is another kind."""
+    encoded = np.asarray(content.data, dtype=np.uint8).tobytes()
+    image_suffix(encoded)
+    stamp, _ = header_of(content.header, bag_time_ns)
+    return ImageMessage(stamp, encoded)
+
+
+def raw_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
+    """An image of rgb8, bgr8 or mono8 as PNG, which loses nothing; raises ValueError when it is another kind."""
+    import cv2
+
+    channels, width, height, step = _CHANNELS.get(content.encoding), content.width, content.height, content.step
+    if channels is None:
+        raise ValueError("an encoding that is not read")
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and step >= width * channels):
+        raise ValueError("no sane size")
+    data = np.asarray(content.data, dtype=np.uint8)
+    if len(data) != step * height:
+        raise ValueError("the pixels do not fill the image")
+    pixels = data.reshape(height, step)[:, : width * channels].reshape(height, width, channels)
+    if content.encoding == "rgb8":
+        pixels = pixels[..., ::-1]
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, _FASTEST])
+    stamp, _ = header_of(content.header, bag_time_ns)
+    return ImageMessage(stamp, encoded.tobytes())
+
+
+def calibration_of(content: Any) -> Calibration:
+    """A camera's calibration; raises ValueError when the camera was never calibrated."""
+    K = np.asarray(content.k if hasattr(content, "k") else content.K, dtype=np.float64)
+    D = np.asarray(content.d if hasattr(content, "d") else content.D, dtype=np.float64)
+    _, frame = header_of(content.header, 0)
+    fx, cx, fy, cy = (float(K[at]) for at in (0, 2, 4, 5))
+    calibration = Calibration(frame, content.width, content.height, fx, fy, cx, cy, bool(np.any(D)))
+    check_camera(calibration.camera(Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))))
+    return calibration
