@@ -24,8 +24,8 @@ def mujoco() -> Any:
         SimulationError: it is not installed.
     """
     with SETTING_UP:
-        if "mujoco" in sys.modules:
-            return sys.modules["mujoco"]
+        if loaded := sys.modules.get("mujoco"):
+            return loaded
         wanted = os.environ.get(_GL)
         os.environ[_GL] = "disable"
         try:

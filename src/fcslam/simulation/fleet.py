@@ -36,7 +36,7 @@ from fcslam.simulation.route import Schedule, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster
 
-LANE_PER_ROBOT_M = 3.0
+LANE_PER_ROBOT_M = 2.0
 """Robots do not see each other, but a corridor full of them would be no fleet."""
 IMAGE_DELAY_S = 0.03
 """Of the first image after the first scan; cameras and LiDARs are not triggered together."""
