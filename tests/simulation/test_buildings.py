@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fcslam.simulation.floorplan import DOOR_M, Kind, draw_floor_plan, move_furniture
-from fcslam.simulation.layouts import Building
-from fcslam.simulation.lighting import Lighting, light_of
+from fcslam.simulation.kinds import Building, Lighting
+from fcslam.simulation.lighting import light_of
 from fcslam.simulation.route import drive, plan_route, schedule
 
 SEEDS = range(3)

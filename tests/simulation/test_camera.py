@@ -13,8 +13,8 @@ from fcslam.simulation.decoration import Picture, decorate
 from fcslam.simulation.drawn_fleet import LidarSettings
 from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import draw_floor_plan
-from fcslam.simulation.layouts import Building
-from fcslam.simulation.lighting import Lighting, light_of
+from fcslam.simulation.kinds import Building, Lighting
+from fcslam.simulation.lighting import light_of
 from fcslam.simulation.route import drive, plan_route
 from fcslam.simulation.scene import furnished_model
 from fcslam.simulation.sensors import Camera

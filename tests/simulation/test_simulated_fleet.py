@@ -14,7 +14,7 @@ from fcslam.simulation import engine, textures
 from fcslam.simulation.drawn_fleet import DriftSettings, LidarSettings, cast_rays, drift
 from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import Kind, draw_floor_plan
-from fcslam.simulation.layouts import Building
+from fcslam.simulation.kinds import Building
 from fcslam.simulation.route import drive, plan_route
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.simulation.layouts import Building
-from fcslam.simulation.lighting import Lighting
+from fcslam.simulation.kinds import Building, Lighting
 
 if TYPE_CHECKING:
     from rich.console import Console

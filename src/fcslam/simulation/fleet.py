@@ -30,8 +30,8 @@ from fcslam.records import (
 from fcslam.simulation.decoration import Decoration, decorate
 from fcslam.simulation.drawn_fleet import FIRST_STAMP, STAMP_SHIFT_S, DriftSettings, LidarSettings, disturb, drift
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
-from fcslam.simulation.layouts import Building
-from fcslam.simulation.lighting import Lighting, light_of
+from fcslam.simulation.kinds import Building, Lighting
+from fcslam.simulation.lighting import light_of
 from fcslam.simulation.route import Schedule, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster

@@ -12,7 +12,8 @@ from itertools import pairwise
 import numpy as np
 
 from fcslam.records import FloatArray, frozen
-from fcslam.simulation.layouts import Building, Lane, Layout, Row, draw_layout
+from fcslam.simulation.kinds import Building
+from fcslam.simulation.layouts import Lane, Layout, Row, draw_layout
 
 WALL_M = 0.12
 DOOR_M = 1.0

@@ -18,23 +18,14 @@ Coordinates are metres in the coordinate frame ``building``, whose origin is the
 """
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from fcslam.records import FloatArray, frozen
+from fcslam.simulation.kinds import Building
 
 Lane = tuple[FloatArray, FloatArray]
 """Ends (2,) of a corridor's centre line."""
-
-
-class Building(StrEnum):
-    """The kinds of building."""
-
-    FLAT = "flat"
-    DEFAULT = "default"
-    OFFICE = "office"
-    CORRIDOR = "corridor"
 
 
 @dataclass(frozen=True, slots=True)

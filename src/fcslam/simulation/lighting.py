@@ -1,25 +1,16 @@
 """Light in the building: where lamps hang, which of them burn, and how bright it is without them."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from fcslam.records import FloatArray, frozen
 from fcslam.simulation.floorplan import FloorPlan
+from fcslam.simulation.kinds import Lighting
 
 LAMP_HEIGHT_M = 2.4
 _LAMP_SPACING_M = 6.0
 """Along a corridor."""
-
-
-class Lighting(StrEnum):
-    """What a robot sees by."""
-
-    DAY = "day"
-    EVENING = "evening"
-    LAMP_OFF = "lamp-off"
-    """By day, and one lamp in three has failed."""
 
 
 @dataclass(frozen=True, slots=True)
