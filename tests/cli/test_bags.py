@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from sources import carmen_text
 from sources.bag_messages import drive, mounted, odom, save, scan, text
+from sources.camera_records import CAMERA, LASER
+from sources.camera_records import drive as camera_drive
 
 from fcslam.cli import main
 from fcslam.runs import read_tum
-from fcslam.sources import open_source
+from fcslam.sources import open_source, write_recording
 
 
 def run(*arguments):
@@ -55,6 +57,14 @@ def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path,
     stamps, poses = read_tum(tmp_path / "out" / "trajectories" / "robot.tum")
     np.testing.assert_allclose(stamps, from_log[0], atol=1e-9)
     assert np.hypot(*(poses - from_log[1])[:, :2].T).max() < 1e-3
+
+
+def test_a_recording_made_of_a_log_gives_the_same_trajectory_to_the_bit(logs, from_log, tmp_path):
+    assert run("convert", logs[0], tmp_path / "robot.fcslam") == 0
+    assert run("map", tmp_path / "robot.fcslam", "-o", tmp_path / "out") == 0
+    stamps, poses = read_tum(tmp_path / "out" / "trajectories" / "robot.tum")
+    np.testing.assert_array_equal(stamps, from_log[0])
+    np.testing.assert_array_equal(poses, from_log[1])
 
 
 def test_a_robot_that_stands_still_makes_one_small_map(tmp_path):
@@ -142,7 +152,9 @@ def test_bad_bags_leave_nothing(tmp_path, capsys):
 # fcslam convert
 
 
-@pytest.mark.parametrize("name", ["a.clf", "a.log.gz", "a.clf.xz", "a.clf.bz2", "a.bag", "a.mcap", "a.db3", "folder"])
+@pytest.mark.parametrize(
+    "name", ["a.clf", "a.log.gz", "a.clf.xz", "a.clf.bz2", "a.bag", "a.mcap", "a.db3", "folder", "a.fcslam"]
+)
 def test_every_format_can_be_written_and_read(tmp_path, bag, name, capsys):
     output = tmp_path / "deep" / name
     assert run("convert", bag, output) == 0
@@ -159,7 +171,7 @@ def test_options_choose_what_is_converted(tmp_path):
     assert open_source(tmp_path / "other.clf").survey().scan_count == 7
 
 
-@pytest.mark.parametrize("name", ["a.clf", "a.bag", "folder"])
+@pytest.mark.parametrize("name", ["a.clf", "a.bag", "folder", "a.fcslam"])
 def test_only_force_replaces(tmp_path, bag, capsys, name):
     output = tmp_path / name
     assert run("convert", bag, output) == 0
@@ -169,6 +181,16 @@ def test_only_force_replaces(tmp_path, bag, capsys, name):
     assert open_source(output).survey().scan_count == 12
     assert run("convert", output, output, "--force") == 0
     assert open_source(output).survey().scan_count == 12
+
+
+def test_images_go_where_there_is_a_place_for_them(tmp_path, capsys):
+    write_recording(tmp_path / "run.fcslam", LASER, CAMERA, camera_drive())
+    assert run("convert", tmp_path / "run.fcslam", tmp_path / "run.mcap") == 0
+    assert "images" not in capsys.readouterr().err
+    assert open_source(tmp_path / "run.mcap").survey().camera == CAMERA
+    assert run("convert", tmp_path / "run.mcap", tmp_path / "run.clf") == 0
+    assert "run.clf: a CARMEN log has no place for images, they are left out" in capsys.readouterr().err
+    assert open_source(tmp_path / "run.clf").survey().scan_count == 20
 
 
 def test_what_convert_refuses(tmp_path, bag, capsys):

@@ -7,7 +7,18 @@ import pytest
 import small_fleet
 
 from fcslam.features.birdseye import DETECTOR_VERSION
-from fcslam.records import Channel, Constraint, ConstraintKind, Keyscan, Odometry, Place, frozen
+from fcslam.records import (
+    CameraImage,
+    CameraModel,
+    Channel,
+    Constraint,
+    ConstraintKind,
+    Keyscan,
+    Odometry,
+    Place,
+    Transform,
+    frozen,
+)
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
@@ -36,6 +47,14 @@ def test_packets_are_numbered_timed_and_survive_the_wire(scans):
     assert packets == small_fleet.in_order(packets)
     for packet in packets:
         assert encode(decode(encode(packet))) == encode(packet)
+
+
+def test_images_cause_no_packet_and_change_none(scans):
+    camera = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+    seen = [CameraImage(scan.stamp, bytes(5000), camera, scan.T_odom_base) for scan in scans]
+    assert RobotFrontend("r", RobotConfig()).process(seen[0]) == []
+    both = [record for pair in zip(scans, seen, strict=True) for record in pair]
+    assert [encode(packet) for packet in drive(both)[1]] == [encode(packet) for packet in drive(scans)[1]]
 
 
 def test_hello_comes_first_and_once(scans):

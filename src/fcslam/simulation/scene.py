@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -59,9 +60,9 @@ def furnished_model(
     for number, piece in _standing(plan):
         look = "wall" if piece.kind in (Kind.WALL, Kind.LINTEL) else "front"
         builder.piece(piece, decoration.heights_m[number], f"{look} {decoration.looks[number]}")
-    size = np.array(plan.size_m)
-    builder.slab(np.zeros(2), size, -0.008, "corridor")
-    builder.slab(np.zeros(2), size, WALL_HEIGHT_M + 0.02, "ceiling")
+    for low, high in _squares(plan.size_m):
+        builder.slab(low, high, -0.008, "corridor")
+        builder.slab(low, high, WALL_HEIGHT_M + 0.02, "ceiling")
     for room, number in zip(plan.rooms, decoration.room_floors, strict=True):
         builder.slab(room.low, room.high, 0.0, f"floor {number}")
     for number, picture in enumerate(decoration.pictures):
@@ -70,6 +71,13 @@ def furnished_model(
         builder.upright(half, picture.centre, picture.heading_rad, f"picture {number}", SEEN)
     builder.lamps(light)
     return builder.compile()
+
+
+def _squares(size_m: tuple[float, float]) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Corners of what covers a floor: light is computed at the corners of faces, so large ones would stay dark."""
+    edges = [np.append(np.arange(0.0, size, 2.0 * _TEXTURE_M), size) for size in size_m]
+    for (west, east), (south, north) in product(*map(pairwise, edges)):
+        yield np.array([west, south]), np.array([east, north])
 
 
 def _standing(plan: FloorPlan) -> Iterator[tuple[int, Piece]]:

@@ -10,10 +10,12 @@ from fcslam.geometry import se2
 from fcslam.records import CameraModel, FloatArray, LaserModel
 from fcslam.simulation.engine import SETTING_UP, gl_context, mujoco
 from fcslam.simulation.lighting import Light
-from fcslam.simulation.scene import SOLID
+from fcslam.simulation.scene import SEEN, SOLID
 from fcslam.simulation.textures import Image
 
 LASER_HEIGHT_M = 0.25
+_UNSEEN = 5
+"""A group that no geom of the building is in."""
 
 
 class RayCaster:
@@ -65,7 +67,9 @@ class Camera:
         self._option = self._mujoco.MjvOption()
         self._view = self._mujoco.MjvCamera()
         self._view.type, self._view.fixedcamid = self._mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        self._option.geomgroup[_UNSEEN] = 0
         self._T_base_optical = _matrix(camera)
+        self._sides = _sides(camera)
 
     def take(self, T_building_base: FloatArray) -> Image:
         """The picture (height, width, 3) from where the robot stands."""
@@ -76,6 +80,7 @@ class Camera:
         # MuJoCo's cameras look along -z with y up.
         rotation = turn @ self._T_base_optical[:3, :3] @ np.diag([1.0, -1.0, -1.0])
         self._data.cam_xpos[0], self._data.cam_xmat[0] = position, rotation.ravel()
+        self._leave_out_unseen(position, turn @ self._T_base_optical[:3, :3])
         nearest = np.argsort(np.linalg.norm(self._lamps - position, axis=1))
         for number in range(self._model.nlight):
             self._data.light_xpos[number] = self._lamps[nearest[number]]
@@ -87,6 +92,12 @@ class Camera:
         pixels = np.empty((self._camera.height, self._camera.width, 3), dtype=np.uint8)
         self._mujoco.mjr_readPixels(pixels, None, frame, self._context)
         return np.ascontiguousarray(pixels[::-1])
+
+    def _leave_out_unseen(self, position: FloatArray, rotation: FloatArray) -> None:
+        """Take what lies outside the field of view out of the groups that are drawn: MuJoCo would draw it all."""
+        offsets = (self._data.geom_xpos - position) @ rotation
+        seen = np.all(offsets @ self._sides.T > -self._model.geom_rbound[:, None], axis=1)
+        self._model.geom_group[:] = np.where(seen, SEEN, _UNSEEN)
 
     def close(self) -> None:
         """Free what GL holds."""
@@ -113,3 +124,11 @@ def _matrix(camera: CameraModel) -> FloatArray:
     ]
     matrix[:3, 3] = camera.T_base_camera.translation_m
     return matrix
+
+
+def _sides(camera: CameraModel) -> FloatArray:
+    """Unit vectors (4, 3) in the optical frame that point from the sides of the field of view to its inside."""
+    right, down = math.atan(0.5 * camera.width / camera.fx), math.atan(0.5 * camera.height / camera.fy)
+    sideways = [(sign * math.cos(right), 0.0, math.sin(right)) for sign in (-1.0, 1.0)]
+    upwards = [(0.0, sign * math.cos(down), math.sin(down)) for sign in (-1.0, 1.0)]
+    return np.array(sideways + upwards)

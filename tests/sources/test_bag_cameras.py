@@ -1,0 +1,242 @@
+"""Cameras in bags: what is written reads back, what others write is read, and what is missing turns the camera off."""
+
+import cv2
+import numpy as np
+import pytest
+from camera_records import CAMERA, drive, image, png, same, scan
+from rosbags import rosbag2
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from fcslam.errors import SourceError
+from fcslam.records import CameraImage, GroundTruth, LaserScan, frozen
+from fcslam.sources import BagOptions, Fault, open_source, write_bag, write_recording
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
+PIXELS = np.arange(CAMERA.height * CAMERA.width * 3, dtype=np.uint8).reshape(CAMERA.height, CAMERA.width, 3)
+
+
+def images(source):
+    return [record for record in source.records() if isinstance(record, CameraImage)]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_images_and_their_camera_read_back_to_the_last_bit(tmp_path, name):
+    encoded = cv2.imencode(".jpg", PIXELS)[1].tobytes()
+    records = drive(10)
+    records[2] = image(records[2].stamp, records[2].T_odom_base, encoded)
+    write_bag(tmp_path / name, records)
+    source = open_source(tmp_path / name)
+    assert source.survey().camera == CAMERA
+    assert source.survey().notes == ()
+    assert all(map(same, [r for r in records if isinstance(r, CameraImage)], images(source)))
+    assert len(images(source)) == 10
+    assert not source.faults
+
+
+def test_an_image_between_two_readings_gets_the_pose_in_between(tmp_path):
+    write_bag(tmp_path / "run.mcap", [scan(1.0), image(1.25), scan(1.5, (1.0, 0.0, 0.0)), image(9.0)])
+    poses = [record.T_odom_base for record in images(open_source(tmp_path / "run.mcap"))]
+    assert poses[0].tolist() == [0.5, 0.0, 0.0]
+    assert poses[1] is None
+
+
+def test_a_bag_and_a_recording_of_one_drive_hold_the_same_scans_and_images(tmp_path):
+    records = drive(10)
+    write_bag(tmp_path / "run.mcap", records)
+    bag = open_source(tmp_path / "run.mcap")
+    survey = bag.survey()
+    write_recording(tmp_path / "run.fcslam", survey.laser, survey.camera, bag.records())
+    read = list(open_source(tmp_path / "run.fcslam").records())
+    assert len(read) == 30
+    assert all(map(same, bag.records(), read))
+    wanted = [record for record in records if isinstance(record, LaserScan | CameraImage)]
+    assert all(map(same, wanted, [record for record in read if isinstance(record, LaserScan | CameraImage)]))
+
+
+def test_others_read_the_camera_and_the_truth(tmp_path):
+    write_bag(tmp_path / "run.mcap", drive(5))
+    with AnyReader([tmp_path / "run.mcap"], default_typestore=STORE) as reader:
+        kinds = {topic: (info.msgtype, info.msgcount) for topic, info in reader.topics.items()}
+        messages = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+    assert kinds["/camera/image_raw/compressed"] == ("sensor_msgs/msg/CompressedImage", 5)
+    assert kinds["/camera/camera_info"] == ("sensor_msgs/msg/CameraInfo", 5)
+    assert kinds["/ground_truth"] == ("nav_msgs/msg/Odometry", 5)
+    said = dict(reversed(messages))
+    info = said["/camera/camera_info"]
+    assert info.k.tolist() == [7.25, 0, 3.5, 0, 7.5, 2.5, 0, 0, 1]
+    assert info.p.tolist() == [7.25, 0, 3.5, 0, 0, 7.5, 2.5, 0, 0, 0, 1, 0]
+    assert bytes(said["/camera/image_raw/compressed"].data) == png(shade=0)
+    assert said["/ground_truth"].pose.pose.position.x == 1.0
+    statics = {m.transforms[0].child_frame_id: m.transforms[0] for topic, m in messages if topic == "/tf_static"}
+    rotation = statics[info.header.frame_id].transform.rotation
+    assert (rotation.x, rotation.y, rotation.z, rotation.w) == CAMERA.T_base_camera.rotation
+
+
+def make(kind, **fields):
+    return STORE.types[kind.replace("/", "/msg/")](**fields)
+
+
+def rewritten(tmp_path, change):
+    """The bag of a drive with each message as ``change(topic, type, message)`` has it: the same three, or None."""
+    write_bag(tmp_path / "before.mcap", drive(5))
+    with (
+        AnyReader([tmp_path / "before.mcap"], default_typestore=STORE) as reader,
+        rosbag2.Writer(tmp_path / "after", version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer,
+    ):
+        connections = {}
+        for connection, bag_time, raw in reader.messages():
+            changed = change(connection.topic, connection.msgtype, reader.deserialize(raw, connection.msgtype))
+            if changed is None:
+                continue
+            topic, kind, message = changed
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], bag_time, STORE.serialize_cdr(message, kind))
+    return tmp_path / "after"
+
+
+def as_raw(encoding, pixels, padding=0):
+    """A change that turns compressed images into raw ones."""
+
+    def change(topic, kind, message):
+        if topic != "/camera/image_raw/compressed":
+            return topic, kind, message
+        rows = pixels.reshape(CAMERA.height, -1)
+        padded = np.hstack([rows, np.full((CAMERA.height, padding), 255, np.uint8)])
+        raw = make(
+            "sensor_msgs/Image", header=message.header, height=CAMERA.height, width=CAMERA.width, encoding=encoding,
+            is_bigendian=0, step=padded.shape[1], data=padded.ravel(),
+        )  # fmt: skip
+        return "/camera/image_raw", "sensor_msgs/msg/Image", raw
+
+    return change
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+@pytest.mark.parametrize(
+    ("encoding", "pixels", "expected_bgr"),
+    [
+        ("bgr8", PIXELS, PIXELS),
+        ("rgb8", PIXELS, PIXELS[..., ::-1]),
+        ("mono8", PIXELS[..., 0], np.repeat(PIXELS[..., :1], 3, axis=2)),
+    ],
+)
+def test_raw_images_lose_nothing(tmp_path, encoding, pixels, expected_bgr, padding):
+    source = open_source(rewritten(tmp_path, as_raw(encoding, pixels, padding)))
+    read = images(source)
+    assert len(read) == 5
+    decoded = cv2.imdecode(np.frombuffer(read[0].encoded, np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(decoded, expected_bgr)
+
+
+def without(*lost):
+    return lambda topic, kind, message: None if topic in lost else (topic, kind, message)
+
+
+def distorted(topic, kind, message):
+    if topic == "/camera/camera_info":
+        message.d = np.full(5, 0.1)
+    return topic, kind, message
+
+
+def uncalibrated(topic, kind, message):
+    if topic == "/camera/camera_info":
+        message.k = np.zeros(9)
+    return topic, kind, message
+
+
+def unmounted(topic, kind, message):
+    if topic == "/tf_static" and message.transforms[0].child_frame_id != "laser":
+        return None
+    return topic, kind, message
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (without("/camera/camera_info"), "no calibration"),
+        (uncalibrated, "never calibrated"),
+        (unmounted, "no transform from 'base_link' to 'camera_optical_frame'"),
+        (as_raw("16UC1", PIXELS), "no images of /camera/image_raw can be read"),
+    ],
+)
+def test_without_all_of_it_the_camera_is_left_out_and_the_laser_goes_on(tmp_path, change, words):
+    source = open_source(rewritten(tmp_path, change))
+    (note,) = source.survey().notes
+    assert words in note
+    assert "left out" in note
+    assert source.survey().camera is None
+    assert images(source) == []
+    assert sum(isinstance(record, LaserScan) for record in source.records()) == 5
+    assert not source.faults
+
+
+def test_distortion_is_said(tmp_path):
+    source = open_source(rewritten(tmp_path, distorted))
+    assert "distorted" in source.survey().notes[0]
+    assert len(images(source)) == 5
+
+
+def test_an_image_that_is_none_is_left_out_and_counted(tmp_path):
+    count = iter(range(10))
+
+    def change(topic, kind, message):
+        if topic == "/camera/image_raw/compressed":
+            at = next(count)
+            message.data = np.frombuffer({2: b"no image", 3: png(9, 6)}.get(at, png()), np.uint8)
+        return topic, kind, message
+
+    source = open_source(rewritten(tmp_path, change))
+    assert len(images(source)) == 3
+    assert (source.faults[Fault.BROKEN_IMAGE].count, source.faults[Fault.BROKEN_IMAGE].first_line) == (2, 3)
+    assert source.survey().scan_count == 5
+
+
+def doubled(topic, kind, message):
+    """The other camera, which is heard less often, is the only one that stays under its old name."""
+    if topic == "/camera/image_raw/compressed" and doubled.count % 2:
+        topic = "/rear/image_raw/compressed"
+    if topic == "/camera/camera_info" and doubled.count % 2:
+        topic = "/rear/camera_info"
+    doubled.count += topic.endswith("compressed")
+    return topic, kind, message
+
+
+def test_the_camera_heard_most_is_chosen_and_said_and_the_user_may_choose(tmp_path):
+    doubled.count = 0
+    bag = rewritten(tmp_path, doubled)
+    source = open_source(bag)
+    (note,) = source.survey().notes
+    assert "reads images from /camera/image_raw/compressed, not from /rear/image_raw/compressed" in note
+    assert "--camera-topic" in note
+    assert len(images(source)) == 3
+    rear = open_source(bag, BagOptions(camera_topic="/rear/image_raw/compressed"))
+    assert len(images(rear)) == 2
+    with pytest.raises(SourceError, match="--camera-topic needs sensor_msgs/CompressedImage"):
+        open_source(bag, BagOptions(camera_topic="/scan")).survey()
+
+
+def test_the_truth_is_never_taken_for_odometry(tmp_path):
+    """Not even where it is the only topic of its type: then odometry is read from tf."""
+
+    def change(topic, kind, message):
+        return None if topic == "/odom" else (topic, kind, message)
+
+    scans = [r for r in open_source(rewritten(tmp_path, change)).records() if isinstance(r, LaserScan)]
+    assert [record.T_odom_base[0] for record in scans] == [0.125 * k for k in range(5)]
+    alone = rewritten_again(tmp_path, without("/odom", "/tf"))
+    with pytest.raises(SourceError, match="no odometry"):
+        open_source(alone).survey()
+    assert open_source(alone, BagOptions(odom_topic="/ground_truth")).survey().scan_count == 5
+
+
+def rewritten_again(tmp_path, change):
+    (tmp_path / "again").mkdir()
+    return rewritten(tmp_path / "again", change)
+
+
+def test_the_truth_alone_moves_no_robot(tmp_path):
+    write_bag(tmp_path / "run.mcap", [scan(1.0), GroundTruth(1.1, frozen((5.0, 0.0, 0.0))), scan(1.2)])
+    assert all(not record.T_odom_base.any() for record in open_source(tmp_path / "run.mcap").records())
