@@ -5,6 +5,7 @@ FcslamError
 │   ├── SourceError       a recording cannot be read
 │   ├── ConfigError       a configuration file, a key of it or a veto is wrong
 │   ├── OutputError       the output folder cannot be used
+│   ├── SimulationError   a fleet cannot be simulated
 │   └── EvaluationError   a reference file or a run folder cannot be evaluated
 └── PacketError           bytes received are not a packet that may be trusted
 """
@@ -28,6 +29,10 @@ class ConfigError(InputError):
 
 class OutputError(InputError):
     """The output folder cannot be used."""
+
+
+class SimulationError(InputError):
+    """A fleet cannot be simulated: the building is too small for it, or a library is missing."""
 
 
 class EvaluationError(InputError):

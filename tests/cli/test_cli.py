@@ -35,7 +35,9 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"fcslam {__version__}\n"
 
 
-@pytest.mark.parametrize("command", [["config", "dump"], ["evaluate", "relations"], ["evaluate", "closures"]])
+@pytest.mark.parametrize(
+    "command", [["config", "dump"], ["simulate"], ["evaluate", "relations"], ["evaluate", "closures"]]
+)
 def test_every_command_has_an_example(command, capsys):
     assert main([*command, "--help"]) == 0
     assert f"Example: fcslam {' '.join(command)}" in capsys.readouterr().out

@@ -20,11 +20,11 @@ from fcslam.simulation.drawn_fleet import (
     draw_fleet,
     drift,
     sense,
-    true_relations,
     write_fleet,
 )
 from fcslam.simulation.floorplan import draw_floor_plan
 from fcslam.simulation.route import SPEED_M_S, TURN_RATE_RAD_S, drive, plan_route
+from fcslam.simulation.truth import true_relations
 
 SEEDS = range(8)
 NO_DRIFT = DriftSettings(travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0)

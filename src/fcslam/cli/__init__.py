@@ -7,7 +7,7 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import config, demo, evaluate
+from fcslam.cli import config, demo, evaluate, simulate
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.errors import FcslamError
@@ -30,6 +30,9 @@ app.command(
     epilog="Example: fcslam convert robot1.clf.gz robot1.bag, fcslam convert robot2.mcap robot2.clf.gz "
     "--scan-topic /front/scan",
 )(conversion.convert)
+app.command("simulate", epilog="Example: fcslam simulate --output office --building office --no-camera")(
+    simulate.simulate
+)
 app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo.demo)
 app.add_typer(config.app, name="config")
 app.add_typer(evaluate.app, name="evaluate")

@@ -14,11 +14,10 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
 from fcslam.records import FloatArray, LaserModel, LaserScan, frozen
-from fcslam.runs import write_tum
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan
 from fcslam.simulation.route import drive, plan_route
+from fcslam.simulation.truth import write_truth
 
 FIRST_STAMP = 1000.0
 STAMP_SHIFT_S = 0.001
@@ -51,6 +50,8 @@ class DriftSettings(Settings):
         default=0.01, ge=0.0, description="standard deviation of the wrong scale of travel and of turns"
     )
     veer_bias_rad_m: float = Field(default=0.003, ge=0.0, description="standard deviation of the constant veer a metre")
+    slips_per_m: float = Field(default=0.0, ge=0.0, description="how often wheels turn without moving the robot")
+    slip_m: float = Field(default=0.05, ge=0.0, description="mean travel that a slip makes up")
 
 
 class FleetSettings(Settings):
@@ -98,35 +99,16 @@ def draw_fleet(settings: FleetSettings, rng: np.random.Generator) -> DrawnFleet:
 
 
 def write_fleet(fleet: DrawnFleet, folder: Path, rng: np.random.Generator) -> list[Path]:
-    """Write one CARMEN log for each robot, and the truth: ``ground_truth/<robot>.tum`` and ``ground_truth/relations``.
-
-    Returns the logs. The relations let a map be measured without a common coordinate frame.
-    """
+    """Write one CARMEN log for each robot, and the truth as ``write_truth`` does; returns the logs."""
     from fcslam.sources import write_carmen
 
-    truth = folder / "ground_truth"
-    truth.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     logs = []
     for robot in fleet.robots:
         logs.append(folder / f"{robot.name}.clf")
         write_carmen(logs[-1], robot.scans())
-        write_tum(truth / f"{robot.name}.tum", robot.stamps, robot.T_building_base)
-    write_relations(truth / "relations", true_relations(fleet, rng))
+    write_truth(fleet, folder, rng)
     return logs
-
-
-def true_relations(fleet: DrawnFleet, rng: np.random.Generator, count: int = 2000, reach_m: float = 5.0) -> Relations:
-    """Up to ``count`` true relations between scans of any robots less than ``reach_m`` and more than 20 s apart."""
-    stamps = np.concatenate([robot.stamps for robot in fleet.robots])
-    poses = np.concatenate([robot.T_building_base for robot in fleet.robots])
-    first, second = rng.integers(0, len(stamps), (2, 50 * count))
-    near = np.hypot(*(poses[first, :2] - poses[second, :2]).T) < reach_m
-    apart = np.abs(stamps[first] - stamps[second]) > ACROSS_ROBOTS_GAP_S
-    chosen = np.flatnonzero(near & apart)[:count]
-    first, second = first[chosen], second[chosen]
-    return Relations(
-        frozen(np.column_stack((stamps[first], stamps[second]))), frozen(se2.between(poses[first], poses[second]))
-    )
 
 
 def _draw_robot(plan: FloorPlan, number: int, settings: FleetSettings, rng: np.random.Generator) -> DrawnRobot:
@@ -160,6 +142,9 @@ def drift(T_building_base: FloatArray, settings: DriftSettings, rng: np.random.G
             + settings.turn_noise_rad * np.sqrt(turn) * noise[2],
         )
     )
+    if settings.slips_per_m:
+        slips = rng.poisson(settings.slips_per_m * travel)
+        wrong[:, 0] += rng.exponential(settings.slip_m, len(travel)) * slips * np.sign(twists[:, 0])
     return _chain(se2.exp(wrong))
 
 
@@ -169,6 +154,11 @@ def sense(
     """Noisy ranges (N, beams) seen from the true poses (N, 3); ``max_range_m`` where nothing returns."""
     T_building_laser = se2.compose(T_building_base, laser.T_base_laser)
     ranges = cast_rays(T_building_laser, laser.angles_rad(), plan.segments, laser.max_range_m)
+    return disturb(ranges, laser, settings, rng)
+
+
+def disturb(ranges: FloatArray, laser: LaserModel, settings: LidarSettings, rng: np.random.Generator) -> FloatArray:
+    """True ranges (..., beams) with noise and dropouts."""
     hit = ranges < laser.max_range_m
     noisy = np.clip(ranges + rng.normal(0.0, settings.range_noise_m, ranges.shape), 0.0, laser.max_range_m)
     return np.where(hit & (rng.random(ranges.shape) >= settings.dropout), noisy, laser.max_range_m)

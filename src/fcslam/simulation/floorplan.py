@@ -1,37 +1,68 @@
-"""A drawn floor plan: rooms with doors around corridors that form two loops, with furniture, as line segments.
-
-    +--------+------+----------+------+      north rooms
-    |        |      |          |      |
-    +--  ----+-  ---+---  -----+-  ---+
-    |                                 |      north corridor
-    |  +----+-  --+   +--+---  ----+  |
-    |  |    |     |   |  |         |  |      core; west, cross and east corridor
-    |  +-  -+-----+   +  +---------+  |
-    |                                 |      south corridor
-    +-----  ----+--  ----+----  --+-  +
-    |           |        |        |   |
-    +-----------+--------+--------+---+      south rooms
+"""A floor plan: walls with doors, and furniture, as outlines of what stands there.
 
 Its sizes are drawn by a random generator, so that no two corridors are alike, but the doors repeat as in any building.
 Coordinates are metres in the coordinate frame ``building``, whose origin is the south-west corner.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from itertools import pairwise
 
 import numpy as np
 
 from fcslam.records import FloatArray, frozen
+from fcslam.simulation.kinds import Building
+from fcslam.simulation.layouts import Lane, Layout, Row, draw_layout
 
 WALL_M = 0.12
 DOOR_M = 1.0
 CLEARANCE_M = 0.5
 """Furniture keeps this far from where robots drive."""
 
-CORRIDOR_CABINETS = 14
 _ATTEMPTS = 20
 """Tries to place a piece of furniture before it is left out."""
+_SHIFT_M, _TURN_RAD = 0.4, 0.3
+"""Standard deviations of what moving does to a piece of furniture."""
+
+
+class Kind(StrEnum):
+    """What a piece is."""
+
+    WALL = "wall"
+    CABINET = "cabinet"
+    COLUMN = "column"
+    LINTEL = "lintel"
+    """The wall above a door: robots drive and look under it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Something that stands in the building, seen from above."""
+
+    kind: Kind
+    outline: FloatArray
+    """Corners counter-clockwise: (4, 2) of a rectangle, (8, 2) of a column."""
+
+    @property
+    def centre(self) -> FloatArray:
+        """Its middle, shape (2,)."""
+        return np.asarray(self.outline.mean(axis=0))
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Length along its first side and across; a column's diameter twice."""
+        if self.kind is Kind.COLUMN:
+            diameter = float(np.linalg.norm(self.outline[4] - self.outline[0]))
+            return diameter, diameter
+        sides = np.linalg.norm(np.diff(self.outline[:3], axis=0), axis=1)
+        return float(sides[0]), float(sides[1])
+
+    @property
+    def heading_rad(self) -> float:
+        """Of its first side."""
+        along = self.outline[1] - self.outline[0]
+        return float(np.arctan2(along[1], along[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,160 +73,147 @@ class Room:
     """The point on the corridor's centre line in front of the door, shape (2,)."""
     inside: FloatArray
     """Where a visitor turns, shape (2,)."""
+    low: FloatArray
+    """The south-west corner, shape (2,)."""
+    high: FloatArray
+    """The north-east corner, shape (2,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
     """What reflects a laser beam, and where robots can drive."""
 
+    size_m: tuple[float, float]
+    """From west to east and from south to north."""
+    pieces: tuple[Piece, ...]
     segments: FloatArray
     """Ends x1 y1 x2 y2 of every side of a wall or a piece of furniture, shape (S, 4)."""
+    lanes: tuple[Lane, ...]
+    """Centre lines of the corridors."""
     loops: tuple[FloatArray, ...]
-    """Corners (4, 2) of the closed walks along the corridors: the west loop, the east loop, around both."""
+    """Corners (K, 2) of closed walks along the corridors; of the default building the west loop, the east loop, around
+    both."""
     rooms: tuple[Room, ...]
 
-
-@dataclass(frozen=True, slots=True)
-class _Sizes:
-    """The numbers that make this building different from the next, metres from its south-west corner."""
-
-    width: float
-    corridor: float
-    south: float
-    """Front wall of the south rooms."""
-    core: tuple[float, float]
-    """South and north wall of the core."""
-    north: float
-    """Front wall of the north rooms."""
-    height: float
-    cross: float
-    """West wall of the cross corridor."""
-
-    @classmethod
-    def draw(cls, rng: np.random.Generator) -> "_Sizes":
-        corridor = rng.uniform(2.0, 2.4)
-        south = rng.uniform(3.6, 4.6)
-        core = (south + corridor, south + corridor + rng.uniform(3.6, 4.4))
-        north = core[1] + corridor
-        width = rng.uniform(21.0, 24.0)
-        return cls(width, corridor, south, core, north, north + rng.uniform(4.2, 5.4), rng.uniform(8.5, 10.5))
-
     @property
-    def lanes_x(self) -> tuple[float, float, float]:
-        """Centre lines of the west, cross and east corridor."""
-        half = self.corridor / 2.0
-        return half, self.cross + half, self.width - half
-
-    @property
-    def lanes_y(self) -> tuple[float, float]:
-        """Centre lines of the south and north corridor."""
-        half = self.corridor / 2.0
-        return self.south + half, self.core[1] + half
+    def floor_m2(self) -> float:
+        """Floor area, that under the walls included."""
+        return self.size_m[0] * self.size_m[1]
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """Rooms side by side whose doors open to one corridor."""
-
-    x: tuple[float, float]
-    back: float
-    front: float
-    lane: float
-    rooms: int
+def draw_floor_plan(rng: np.random.Generator, building: Building = Building.DEFAULT) -> FloorPlan:
+    """A building, by default of about 22 m by 17 m; the same generator state gives the same one."""
+    return build(draw_layout(building, rng), rng)
 
 
-def draw_floor_plan(rng: np.random.Generator) -> FloorPlan:
-    """A building of about 22 m by 17 m; the same generator state gives the same building."""
-    sizes = _Sizes.draw(rng)
-    pieces = [_wall(0, 0, sizes.width, 0), _wall(0, sizes.height, sizes.width, sizes.height)]
-    pieces += [_wall(x, 0, x, sizes.height) for x in (0.0, sizes.width)]
+def build(layout: Layout, rng: np.random.Generator) -> FloorPlan:
+    """Walls, doors and furniture for a layout, one's own for instance."""
+    walls = [_wall(0, 0, layout.width, 0), _wall(0, layout.height, layout.width, layout.height)]
+    walls += [_wall(x, 0, x, layout.height) for x in (0.0, layout.width)]
+    pieces = [Piece(Kind.WALL, outline) for outline in walls]
     rooms: list[Room] = []
-    for row in _rows(sizes, rng):
-        walls, row_rooms = _build_row(row, (sizes.corridor, sizes.width - sizes.corridor), rng)
-        pieces += walls
+    for row in layout.rows:
+        row_pieces, row_rooms = _build_row(row, layout, rng)
+        pieces += row_pieces
         rooms += row_rooms
-    paths = [(room.doorway, room.inside) for room in rooms]
-    pieces += _corridor_cabinets(sizes, paths, rng)
-    return FloorPlan(frozen(np.concatenate([_sides(piece) for piece in pieces])), _loops(sizes), tuple(rooms))
+    pieces += _corridor_cabinets(layout, [(room.doorway, room.inside) for room in rooms], rng)
+    size_m = (layout.width, layout.height)
+    return FloorPlan(size_m, tuple(pieces), _segments(pieces), layout.lanes, layout.loops, tuple(rooms))
 
 
-def _rows(sizes: _Sizes, rng: np.random.Generator) -> list[_Row]:
-    south_lane, north_lane = sizes.lanes_y
-    low, high = sizes.core
-    rows = [
-        _Row((0.0, sizes.width), 0.0, sizes.south, south_lane, rooms=4),
-        _Row((0.0, sizes.width), sizes.height, sizes.north, north_lane, rooms=4),
+def move_furniture(plan: FloorPlan, share: float, rng: np.random.Generator) -> FloorPlan:
+    """The same building after ``share`` of its rooms' furniture was shifted and turned a little.
+
+    Every piece stays in its room and clear of where robots drive; what finds no such place stays where it was.
+    """
+    moved = [
+        _moved(piece, room, rng) if (room := _room_of(piece, plan)) and rng.random() < share else piece
+        for piece in plan.pieces
     ]
-    blocks = ((sizes.corridor, sizes.cross), (sizes.cross + sizes.corridor, sizes.width - sizes.corridor))
-    for west, east in blocks:
-        split = west + rng.uniform(0.4, 0.6) * (east - west)
-        rows.append(_Row((west, split), high, low, south_lane, rooms=1))
-        rows.append(_Row((split, east), low, high, north_lane, rooms=1))
-    return rows
+    return replace(plan, pieces=tuple(moved), segments=_segments(moved))
 
 
-def _build_row(
-    row: _Row, door_limits: tuple[float, float], rng: np.random.Generator
-) -> tuple[list[FloatArray], list[Room]]:
-    """Outlines of the walls and furniture of a row, and its rooms."""
-    shares = np.cumsum(rng.uniform(0.75, 1.25, row.rooms))
+def _moved(piece: Piece, room: Room, rng: np.random.Generator) -> Piece:
+    centre, margin = piece.centre, 0.5 * float(np.hypot(*piece.size))
+    for _ in range(_ATTEMPTS):
+        place = centre + rng.normal(0.0, _SHIFT_M, 2)
+        turned = (piece.outline - centre) @ _rotation(rng.normal(0.0, _TURN_RAD))
+        fits = np.all(place > room.low + margin) and np.all(place < room.high - margin)
+        if fits and _distance(place, (room.doorway, room.inside)) > CLEARANCE_M + margin:
+            return Piece(piece.kind, frozen(turned + place))
+    return piece
+
+
+def _room_of(piece: Piece, plan: FloorPlan) -> Room | None:
+    """The room in which a piece of furniture stands; None for walls and for what stands in a corridor."""
+    if piece.kind not in (Kind.CABINET, Kind.COLUMN):
+        return None
+    centre = piece.centre
+    inside = (room for room in plan.rooms if np.all(centre > room.low) and np.all(centre < room.high))
+    return next(inside, None)
+
+
+def _build_row(row: Row, layout: Layout, rng: np.random.Generator) -> tuple[list[Piece], list[Room]]:
+    """Walls and furniture of a row, and its rooms."""
+    shares = np.cumsum(np.ones(row.rooms) if layout.alike else rng.uniform(0.75, 1.25, row.rooms))
     edges = row.x[0] + (row.x[1] - row.x[0]) * np.insert(shares / shares[-1], 0, 0.0)
-    pieces = [_wall(row.x[0], row.back, row.x[1], row.back)]
-    pieces += [_wall(edge, row.back, edge, row.front) for edge in edges]
+    walls = [_wall(row.x[0], row.back, row.x[1], row.back)]
+    walls += [_wall(edge, row.back, edge, row.front) for edge in edges]
+    pieces = [Piece(Kind.WALL, outline) for outline in walls]
     rooms = []
+    low, high = sorted((row.front, row.back))
     for west, east in pairwise(edges):
-        door = float(np.clip(west + rng.uniform(0.25, 0.75) * (east - west), *door_limits))
-        pieces.append(_wall(west, row.front, door - DOOR_M / 2.0, row.front))
-        pieces.append(_wall(door + DOOR_M / 2.0, row.front, east, row.front))
+        across = 0.5 if layout.alike else rng.uniform(0.25, 0.75)
+        door = float(np.clip(west + across * (east - west), *layout.door_limits))
+        left, right = door - DOOR_M / 2.0, door + DOOR_M / 2.0
+        pieces.append(Piece(Kind.WALL, _wall(west, row.front, left, row.front)))
+        pieces.append(Piece(Kind.WALL, _wall(right, row.front, east, row.front)))
+        pieces.append(Piece(Kind.LINTEL, _wall(left, row.front, right, row.front)))
         depth = row.front + rng.uniform(0.45, 0.65) * (row.back - row.front)
-        room = Room(frozen([door, row.lane]), frozen([door, depth]))
-        pieces += _furniture((west, east), sorted((row.front, row.back)), room, rng)
+        corner_low, corner_high = np.array([west, low]), np.array([east, high])
+        room = Room(frozen([door, row.lane]), frozen([door, depth]), frozen(corner_low), frozen(corner_high))
+        pieces += _furniture(room, rng)
         rooms.append(room)
     return pieces, rooms
 
 
-def _furniture(x: tuple[float, float], y: Sequence[float], room: Room, rng: np.random.Generator) -> list[FloatArray]:
+def _furniture(room: Room, rng: np.random.Generator) -> list[Piece]:
     """A few tables, cabinets and columns that leave the way through the door free."""
     path = (room.doorway, room.inside)
     pieces = []
     for _ in range(rng.integers(2, 5)):
         size = rng.uniform((0.4, 0.3), (1.6, 0.8))
         margin = 0.5 * float(np.hypot(*size))
-        outline = _column(size[1] / 2.0) if rng.random() < 0.25 else _rectangle(size, rng.normal(0.0, 0.15))
+        column = rng.random() < 0.25
+        outline = _column(size[1] / 2.0) if column else _rectangle(size, rng.normal(0.0, 0.15))
         for _ in range(_ATTEMPTS):
-            centre = rng.uniform((x[0] + margin, y[0] + margin), (x[1] - margin, y[1] - margin))
+            centre = rng.uniform(room.low + margin, room.high - margin)
             if _distance(centre, path) > CLEARANCE_M + margin:
-                pieces.append(outline + centre)
+                pieces.append(Piece(Kind.COLUMN if column else Kind.CABINET, frozen(outline + centre)))
                 break
     return pieces
 
 
-def _corridor_cabinets(
-    sizes: _Sizes, paths: list[tuple[FloatArray, FloatArray]], rng: np.random.Generator
-) -> list[FloatArray]:
+def _corridor_cabinets(layout: Layout, paths: list[Lane], rng: np.random.Generator) -> list[Piece]:
     """Cabinets along the corridors' walls: without them a corridor would not tell how far along it a robot is."""
-    lanes = [(np.array([sizes.lanes_x[0], y]), np.array([sizes.lanes_x[2], y])) for y in sizes.lanes_y]
-    lanes += [(np.array([x, sizes.lanes_y[0]]), np.array([x, sizes.lanes_y[1]])) for x in sizes.lanes_x]
     pieces = []
-    for _ in range(CORRIDOR_CABINETS):
-        lane = rng.integers(len(lanes))
-        start, end = lanes[lane]
+    for _ in range(layout.cabinets):
+        lane = rng.integers(len(layout.lanes))
+        start, end = layout.lanes[lane]
         along = (end - start) / np.linalg.norm(end - start)
         length, depth = rng.uniform((0.4, 0.2), (1.2, 0.35))
-        aside = rng.choice((-1.0, 1.0)) * (sizes.corridor - WALL_M - depth) / 2.0
+        aside = rng.choice((-1.0, 1.0)) * (layout.corridor - WALL_M - depth) / 2.0
         centre = start + rng.uniform(0.15, 0.85) * (end - start) + aside * np.array([-along[1], along[0]])
-        ways = [*paths, *(other for k, other in enumerate(lanes) if k != lane)]
+        ways = [*paths, *(other for k, other in enumerate(layout.lanes) if k != lane)]
         if all(_distance(centre, way) > CLEARANCE_M + length / 2.0 for way in ways):
-            pieces.append(_rectangle((length, depth), float(np.arctan2(along[1], along[0]))) + centre)
+            outline = _rectangle((length, depth), float(np.arctan2(along[1], along[0]))) + centre
+            pieces.append(Piece(Kind.CABINET, frozen(outline)))
     return pieces
 
 
-def _loops(sizes: _Sizes) -> tuple[FloatArray, ...]:
-    (south, north), (west, cross, east) = sizes.lanes_y, sizes.lanes_x
-    return tuple(
-        frozen([[left, south], [right, south], [right, north], [left, north]])
-        for left, right in ((west, cross), (cross, east), (west, east))
-    )
+def _segments(pieces: Sequence[Piece]) -> FloatArray:
+    """The sides of everything that a beam at the laser's height meets, shape (S, 4)."""
+    return frozen(np.concatenate([_sides(piece.outline) for piece in pieces if piece.kind is not Kind.LINTEL]))
 
 
 def _wall(x1: float, y1: float, x2: float, y2: float) -> FloatArray:
@@ -214,8 +232,13 @@ def _wall(x1: float, y1: float, x2: float, y2: float) -> FloatArray:
 def _rectangle(size: Sequence[float] | FloatArray, heading_rad: float) -> FloatArray:
     """Outline of a rectangle around the origin, shape (4, 2)."""
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * np.asarray(size)
+    return np.asarray(corners @ _rotation(heading_rad))
+
+
+def _rotation(heading_rad: float) -> FloatArray:
+    """What points (N, 2) are multiplied by from the right to turn them."""
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
-    return np.asarray(corners @ np.array([[cos, sin], [-sin, cos]]))
+    return np.array([[cos, sin], [-sin, cos]])
 
 
 def _column(radius: float) -> FloatArray:
@@ -229,7 +252,7 @@ def _sides(outline: FloatArray) -> FloatArray:
     return np.hstack((outline, np.roll(outline, -1, axis=0)))
 
 
-def _distance(point: FloatArray, path: tuple[FloatArray, FloatArray]) -> float:
+def _distance(point: FloatArray, path: Lane) -> float:
     """Distance of a point from the segment between two others."""
     start, end = path
     along = end - start

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.records import FloatArray
+from fcslam.records import FloatArray, frozen
 from fcslam.simulation.floorplan import FloorPlan, Room
 
 SPEED_M_S = 0.5
@@ -45,8 +45,29 @@ def plan_route(plan: FloorPlan, loop: int, length_m: float, rng: np.random.Gener
     return _cut(np.array(waypoints), length_m)
 
 
-def drive(waypoints: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:
-    """Times (N,) from zero and poses (N, 3) of a robot that turns at each waypoint and drives straight to the next."""
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """Where a robot is when: it turns at each waypoint and drives straight to the next."""
+
+    times_s: FloatArray
+    """Shape (K,), from zero; twice the same while nothing happens."""
+    poses: FloatArray
+    """Shape (K, 3) at these times; headings are unwrapped, in between everything changes evenly."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long the whole drive takes."""
+        return float(self.times_s[-1])
+
+    def at(self, times_s: FloatArray) -> FloatArray:
+        """Poses (N, 3) at times (N,)."""
+        poses = np.column_stack([np.interp(times_s, self.times_s, column) for column in self.poses.T])
+        poses[:, 2] = se2.wrap_angle(poses[:, 2])
+        return poses
+
+
+def schedule(waypoints: FloatArray) -> Schedule:
+    """The drive along waypoints (K, 2)."""
     legs = np.diff(waypoints, axis=0)
     legs = legs[np.linalg.norm(legs, axis=1) > 1e-9]
     headings = np.unwrap(np.arctan2(legs[:, 1], legs[:, 0]))
@@ -56,11 +77,14 @@ def drive(waypoints: FloatArray, period_s: float) -> tuple[FloatArray, FloatArra
     corners = np.vstack((waypoints[:1], waypoints[0] + np.cumsum(legs, axis=0)))
     positions = np.vstack((np.repeat(corners[:-1], 2, axis=0), corners[-1:]))
     angles = np.append(headings[:1], np.repeat(headings, 2))
-    stamps = np.arange(0.0, times[-1], period_s)
-    columns = (positions[:, 0], positions[:, 1], angles)
-    poses = np.column_stack([np.interp(stamps, times, column) for column in columns])
-    poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    return stamps, poses
+    return Schedule(frozen(times), frozen(np.column_stack((positions, angles))))
+
+
+def drive(waypoints: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:
+    """Times (N,) from zero and poses (N, 3) of a drive along waypoints, every ``period_s``."""
+    plan = schedule(waypoints)
+    stamps = np.arange(0.0, plan.duration_s, period_s)
+    return stamps, plan.at(stamps)
 
 
 def _stops(plan: FloorPlan, corners: FloatArray) -> list[_Stop]:

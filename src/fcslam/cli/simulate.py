@@ -1,0 +1,140 @@
+"""`fcslam simulate`: recordings of a fleet that drives in a building of our own making."""
+
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.simulation.kinds import Building, Lighting
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
+
+    from fcslam.records import RecordedItem
+    from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot
+
+
+def simulate(
+    *,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the recordings; new or empty.")],
+    robots: Annotated[int, typer.Option(min=1, max=100, help="How many robots drive.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws another building.")] = 1,
+    building: Annotated[Building, typer.Option(help="What kind of building.")] = Building.DEFAULT,
+    path_length: Annotated[float, typer.Option(min=1.0, max=10_000.0, help="Metres that each robot drives.")] = 60.0,
+    lighting: Annotated[
+        list[Lighting] | None,
+        typer.Option(help="What the first robot sees by, the second ...; in turn if given fewer times. [default: day]"),
+    ] = None,
+    moved_furniture: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of the rooms' furniture that moves between robots.")
+    ] = 0.0,
+    no_camera: Annotated[bool, typer.Option("--no-camera", help="LiDAR only; needs no GL library.")] = False,
+    bag: Annotated[bool, typer.Option("--bag", help="Write a ROS 2 bag (.mcap) of each robot as well.")] = False,
+) -> None:
+    """Draw a building, drive robots through it, record what their LiDARs and cameras see and where they really were."""
+    from rich.console import Console
+
+    from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
+
+    settings = SimulationSettings(
+        building=building,
+        robots=robots,
+        path_length_m=path_length,
+        lighting=tuple(lighting or (Lighting.DAY,)),
+        moved_furniture=moved_furniture,
+        camera=None if no_camera else CameraSettings(),
+    )
+    _prepare(output)
+    record_fleet(simulate_fleet(settings, seed), output, seed, bag, Console(stderr=True))
+
+
+def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, console: "Console") -> list[Path]:
+    """Write one recording a robot into the folder ``output``, the truth beside them; returns the recordings.
+
+    Raises:
+        SimulationError: MuJoCo or a GL library is missing.
+        OutputError: something cannot be written.
+    """
+    import numpy as np
+
+    from fcslam.errors import OutputError
+    from fcslam.simulation.truth import write_truth
+    from fcslam.sources import open_source, write_bag, write_recording
+
+    began = time.perf_counter()
+    recordings = [output / robot.name for robot in fleet.robots]
+    with _progress(fleet, console) as watch, ThreadPoolExecutor(os.cpu_count()) as pool:
+        jobs = [
+            pool.submit(write_recording, place, robot.laser, robot.camera, watch(robot))
+            for robot, place in zip(fleet.robots, recordings, strict=True)
+        ]
+        try:
+            for job in jobs:
+                job.result()
+        finally:
+            watch.stop()
+    try:
+        write_truth(fleet, output, np.random.default_rng(seed))
+        if bag:
+            for place in recordings:
+                write_bag(place.with_suffix(".mcap"), open_source(place).records())
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
+    _report(fleet, recordings, time.perf_counter() - began, console)
+    return recordings
+
+
+def _prepare(output: Path) -> None:
+    from fcslam.errors import OutputError
+
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        if any(output.iterdir()):
+            raise OutputError(f"{output}: is not empty; choose another place")
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
+
+
+class _Watch:
+    """Lets robots' records through while somebody looks on, until it is stopped."""
+
+    def __init__(self, bar: "Progress", task: "TaskID") -> None:
+        self._bar, self._task = bar, task
+        self._stopped = False
+
+    def stop(self) -> None:
+        """End every robot's recording at its next record."""
+        self._stopped = True
+
+    def __call__(self, robot: "SimulatedRobot") -> "Iterator[RecordedItem]":
+        from fcslam.records import LaserScan
+
+        with closing(robot.items()) as items:
+            for item in items:
+                if self._stopped:
+                    return
+                yield item
+                if isinstance(item, LaserScan):
+                    self._bar.advance(self._task)
+
+
+@contextmanager
+def _progress(fleet: "SimulatedFleet", console: "Console") -> "Iterator[_Watch]":
+    """A live line over all robots' scans."""
+    from rich.progress import Progress
+
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield _Watch(bar, bar.add_task("simulating", total=sum(len(robot.stamps) for robot in fleet.robots)))
+
+
+def _report(fleet: "SimulatedFleet", recordings: list[Path], elapsed_s: float, console: "Console") -> None:
+    for robot, place in zip(fleet.robots, recordings, strict=True):
+        typer.echo(f"{place}: {len(robot.stamps)} scans, {len(robot.image_stamps)} images, {robot.duration_s:.0f} s")
+    speed = max(robot.duration_s for robot in fleet.robots) / elapsed_s
+    console.print(f"{elapsed_s:.1f} s, {speed:.1f} x real time", highlight=False)

@@ -1,0 +1,233 @@
+"""A fleet with LiDARs and cameras in one furnished building: who drives where, sees what, and where it really was.
+
+One seed decides everything. The building, its looks and the furniture come from the seed alone, each robot's route,
+odometry, noise and the furniture that moved before it came from the seed and its number: a further robot changes
+nothing for the others, and cameras change nothing for the LiDARs.
+"""
+
+import math
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.errors import SimulationError
+from fcslam.geometry import se2
+from fcslam.records import (
+    CameraImage,
+    CameraModel,
+    FloatArray,
+    GroundTruth,
+    LaserModel,
+    LaserScan,
+    RecordedItem,
+    Transform,
+    frozen,
+)
+from fcslam.simulation.decoration import Decoration, decorate
+from fcslam.simulation.drawn_fleet import FIRST_STAMP, STAMP_SHIFT_S, DriftSettings, LidarSettings, disturb, drift
+from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
+from fcslam.simulation.kinds import Building, Lighting
+from fcslam.simulation.lighting import light_of
+from fcslam.simulation.route import Schedule, plan_route, schedule
+from fcslam.simulation.scene import bare_model, furnished_model
+from fcslam.simulation.sensors import Camera, RayCaster
+
+LANE_PER_ROBOT_M = 2.0
+"""Robots do not see each other, but a corridor full of them would be no fleet."""
+IMAGE_DELAY_S = 0.03
+"""Of the first image after the first scan; cameras and LiDARs are not triggered together."""
+
+_T_BASE_LASER = (0.05, 0.0, 0.0)
+_AHEAD = (-0.5, 0.5, -0.5, 0.5)
+"""The rotation of an optical frame that looks along x of the base."""
+
+
+class CameraSettings(Settings):
+    """The simulated camera: it looks straight ahead."""
+
+    width: int = Field(default=320, ge=16, le=2048, description="pixels")
+    height: int = Field(default=240, ge=16, le=2048, description="pixels")
+    field_of_view_rad: float = Field(default=1.35, gt=0.1, lt=2.8, description="from left to right")
+    rate_hz: float = Field(default=5.0, gt=0.0, description="images a second")
+    ahead_m: float = Field(default=0.1, description="how far ahead of the base it sits")
+    above_m: float = Field(default=0.6, gt=0.0, lt=2.0, description="how far above the floor")
+    noise: float = Field(default=2.0, ge=0.0, description="standard deviation of a pixel's brightness, of 255")
+    jpeg_quality: int = Field(default=90, ge=1, le=100, description="of the encoded images")
+
+    def model(self) -> CameraModel:
+        """Intrinsics and mounting."""
+        focal = 0.5 * self.width / math.tan(0.5 * self.field_of_view_rad)
+        middle = (0.5 * (self.width - 1), 0.5 * (self.height - 1))
+        mounting = Transform((self.ahead_m, 0.0, self.above_m), _AHEAD)
+        return CameraModel(self.width, self.height, focal, focal, *middle, mounting)
+
+
+class SimulationSettings(Settings):
+    """A simulated fleet."""
+
+    building: Building = Field(default=Building.DEFAULT, description="flat, default, office or corridor")
+    robots: int = Field(default=3, ge=1, description="number of robots")
+    path_length_m: float = Field(default=60.0, gt=0.0, description="how far each drives")
+    lighting: tuple[Lighting, ...] = Field(
+        default=(Lighting.DAY,), min_length=1, description="day, evening or lamp-off of each robot in turn"
+    )
+    moved_furniture: float = Field(
+        default=0.0, ge=0.0, le=1.0, description="share of the rooms' furniture that moved before each further robot"
+    )
+    lidar: LidarSettings = LidarSettings(rate_hz=10.0)
+    drift: DriftSettings = DriftSettings(slips_per_m=0.05)
+    camera: CameraSettings | None = CameraSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRobot:
+    """One robot with its route; what it senses is computed when it is asked for."""
+
+    name: str
+    laser: LaserModel
+    camera: CameraModel | None
+    stamps: FloatArray
+    """Of its scans, shape (N,)."""
+    T_building_base: FloatArray
+    """The truth at these stamps, shape (N, 3)."""
+    T_odom_base: FloatArray
+    """What the wheels say, shape (N, 3), from zero."""
+    image_stamps: FloatArray
+    """Shape (M,); none without a camera."""
+    plan: FloorPlan
+    """The building as this robot met it."""
+    lighting: Lighting
+    settings: SimulationSettings
+    decoration: Decoration | None
+    route: Schedule
+    first_stamp: float
+    noise_seed: tuple[int, int]
+    """Of all chance that is left: noise, dropouts, which lamps fail."""
+
+    @property
+    def duration_s(self) -> float:
+        """From the first scan to the last."""
+        return float(self.stamps[-1] - self.stamps[0])
+
+    def items(self) -> Generator[RecordedItem, None, None]:
+        """Scans, images and the truth at the stamp of each, as they come.
+
+        Raises:
+            SimulationError: MuJoCo or, with a camera, a GL library is missing.
+        """
+        with closing(self._images()) as images:
+            image = next(images, None)
+            for scan in self._scans():
+                while image is not None and image.stamp < scan.stamp:
+                    yield from (image, self._truth(image.stamp))
+                    image = next(images, None)
+                yield from (scan, self._truth(scan.stamp))
+
+    def _truth(self, stamp: float) -> GroundTruth:
+        return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
+
+    def _scans(self) -> Iterator[LaserScan]:
+        caster = RayCaster(bare_model(self.plan), self.laser)
+        rng = np.random.default_rng((*self.noise_seed, 0))
+        for stamp, pose, odometry in zip(self.stamps, self.T_building_base, self.T_odom_base, strict=True):
+            ranges = disturb(caster.cast(pose), self.laser, self.settings.lidar, rng)
+            yield LaserScan(float(stamp), frozen(ranges, np.float32), self.laser, frozen(odometry))
+
+    def _images(self) -> Generator[CameraImage, None, None]:
+        settings = self.settings.camera
+        if self.camera is None or self.decoration is None or settings is None:
+            return
+        rng = np.random.default_rng((*self.noise_seed, 1))
+        light = light_of(self.plan, self.lighting, rng)
+        fov_y_rad = 2.0 * math.atan(0.5 * self.camera.height / self.camera.fy)
+        model = furnished_model(self.plan, self.decoration, light, (settings.width, settings.height), fov_y_rad)
+        poses = self.route.at(self.image_stamps - self.first_stamp)
+        odometry = _between(self.image_stamps, self.stamps, self.T_odom_base)
+        shape = (settings.height, settings.width, 1)
+        with Camera(model, self.camera, light) as camera:
+            for stamp, pose, T_odom_base in zip(self.image_stamps, poses, odometry, strict=True):
+                pixels = camera.take(pose) + settings.noise * rng.standard_normal(shape, dtype=np.float32)
+                encoded = _jpeg(pixels, settings.jpeg_quality)
+                yield CameraImage(float(stamp), encoded, self.camera, frozen(T_odom_base))
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedFleet:
+    """A building and the robots that drive in it."""
+
+    plan: FloorPlan
+    robots: tuple[SimulatedRobot, ...]
+
+
+def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
+    """Draw a building and plan what each robot does; the same seed gives the same fleet.
+
+    Raises:
+        SimulationError: the building is too small for so many robots.
+    """
+    rng = np.random.default_rng(seed)
+    plan = draw_floor_plan(rng, settings.building)
+    _check_room(plan, settings)
+    decoration = decorate(plan, rng) if settings.camera else None
+    return SimulatedFleet(
+        plan, tuple(_robot(plan, decoration, number, settings, seed) for number in range(settings.robots))
+    )
+
+
+def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
+    lanes_m = sum(float(np.linalg.norm(end - start)) for start, end in plan.lanes)
+    most = int(lanes_m / LANE_PER_ROBOT_M)
+    if settings.robots > most:
+        raise SimulationError(
+            f"building '{settings.building}': {lanes_m:.0f} m of corridors are too small for {settings.robots} robots; "
+            f"simulate at most {most}, or take a larger building"
+        )
+
+
+def _robot(
+    plan: FloorPlan, decoration: Decoration | None, number: int, settings: SimulationSettings, seed: int
+) -> SimulatedRobot:
+    rng = np.random.default_rng((seed, number))
+    if number:
+        plan = move_furniture(plan, settings.moved_furniture, rng)
+    route = schedule(plan_route(plan, number % len(plan.loops), settings.path_length_m, rng))
+    times = np.arange(0.0, route.duration_s, 1.0 / settings.lidar.rate_hz)
+    poses, lidar, camera = route.at(times), settings.lidar, settings.camera
+    first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
+    image_times = np.arange(IMAGE_DELAY_S, times[-1], 1.0 / camera.rate_hz) if camera else np.empty(0)
+    return SimulatedRobot(
+        name=f"robot_{number + 1}",
+        laser=LaserModel(lidar.beams, -np.pi, 2.0 * np.pi / lidar.beams, lidar.max_range_m, _T_BASE_LASER),
+        camera=camera.model() if camera else None,
+        stamps=frozen(np.round(first_stamp + times, 6)),
+        T_building_base=frozen(poses),
+        T_odom_base=frozen(drift(poses, settings.drift, rng)),
+        image_stamps=frozen(np.round(first_stamp + image_times, 6)),
+        plan=plan,
+        lighting=settings.lighting[number % len(settings.lighting)],
+        settings=settings,
+        decoration=decoration,
+        route=route,
+        first_stamp=first_stamp,
+        noise_seed=(seed, number),
+    )
+
+
+def _between(stamps: FloatArray, known: FloatArray, poses: FloatArray) -> FloatArray:
+    """Poses (N, 3) at ``stamps``, each on the way between two known ones."""
+    before = np.clip(np.searchsorted(known, stamps) - 1, 0, len(known) - 2)
+    share = (stamps - known[before]) / (known[before + 1] - known[before])
+    step = se2.log(se2.between(poses[before], poses[before + 1]))
+    return se2.compose(poses[before], se2.exp(share[:, None] * step))
+
+
+def _jpeg(pixels: FloatArray, quality: int) -> bytes:
+    import cv2
+
+    image = np.clip(pixels, 0.0, 255.0).astype(np.uint8)
+    _, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return bytes(encoded)

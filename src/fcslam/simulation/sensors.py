@@ -1,0 +1,134 @@
+"""A LiDAR and a camera in a MuJoCo model. Only the camera needs a GL library."""
+
+import math
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from fcslam.geometry import se2
+from fcslam.records import CameraModel, FloatArray, LaserModel
+from fcslam.simulation.engine import SETTING_UP, gl_context, mujoco
+from fcslam.simulation.lighting import Light
+from fcslam.simulation.scene import SEEN, SOLID
+from fcslam.simulation.textures import Image
+
+LASER_HEIGHT_M = 0.25
+_UNSEEN = 5
+"""A group that no geom of the building is in."""
+
+
+class RayCaster:
+    """Casts the beams of one laser."""
+
+    def __init__(self, model: Any, laser: LaserModel) -> None:
+        self._mujoco = mujoco()
+        self._model, self._laser = model, laser
+        self._data = self._mujoco.MjData(model)
+        self._mujoco.mj_forward(model, self._data)
+        self._groups = np.zeros(6, dtype=np.uint8)
+        self._groups[SOLID] = 1
+        self._hits = np.empty(laser.beam_count, dtype=np.int32)
+        self._distances = np.empty(laser.beam_count)
+
+    def cast(self, T_building_base: FloatArray) -> FloatArray:
+        """Ranges (beam_count,) without noise; ``max_range_m`` where nothing is hit."""
+        x, y, heading = se2.compose(T_building_base, np.array(self._laser.T_base_laser))
+        angles = heading + self._laser.angles_rad()
+        directions = np.column_stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)))
+        count, far = self._laser.beam_count, self._laser.max_range_m
+        self._mujoco.mj_multiRay(
+            self._model, self._data, np.array([x, y, LASER_HEIGHT_M]), directions.ravel(), self._groups, True, -1,
+            self._hits, self._distances, None, count, far,
+        )  # fmt: skip
+        return np.where(self._distances < 0.0, far, np.minimum(self._distances, far))
+
+
+class Camera:
+    """Takes pictures with the model's one camera; to be closed, or used in a ``with``.
+
+    Raises:
+        SimulationError: there is no GL library.
+    """
+
+    def __init__(self, model: Any, camera: CameraModel, light: Light) -> None:
+        self._mujoco = mujoco()
+        self._model, self._camera, self._lamps = model, camera, light.lamps
+        with SETTING_UP:
+            self._gl = gl_context(camera.width, camera.height)
+            self._context = self._mujoco.MjrContext(model, self._mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._mujoco.mjr_setBuffer(self._mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._data = self._mujoco.MjData(model)
+        self._mujoco.mj_forward(model, self._data)
+        self._scene = self._mujoco.MjvScene(model, maxgeom=model.ngeom + 10)
+        self._scene.flags[self._mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._scene.flags[self._mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._scene.flags[self._mujoco.mjtRndFlag.mjRND_SKYBOX] = False
+        self._option = self._mujoco.MjvOption()
+        self._view = self._mujoco.MjvCamera()
+        self._view.type, self._view.fixedcamid = self._mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        self._option.geomgroup[_UNSEEN] = 0
+        self._T_base_optical = _matrix(camera)
+        self._sides = _sides(camera)
+
+    def take(self, T_building_base: FloatArray) -> Image:
+        """The picture (height, width, 3) from where the robot stands."""
+        x, y, heading = T_building_base
+        cos, sin = math.cos(heading), math.sin(heading)
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        position = turn @ self._T_base_optical[:3, 3] + [x, y, 0.0]
+        # MuJoCo's cameras look along -z with y up.
+        rotation = turn @ self._T_base_optical[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+        self._data.cam_xpos[0], self._data.cam_xmat[0] = position, rotation.ravel()
+        self._leave_out_unseen(position, turn @ self._T_base_optical[:3, :3])
+        nearest = np.argsort(np.linalg.norm(self._lamps - position, axis=1))
+        for number in range(self._model.nlight):
+            self._data.light_xpos[number] = self._lamps[nearest[number]]
+        self._gl.make_current()
+        everything = self._mujoco.mjtCatBit.mjCAT_ALL.value
+        self._mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._view, everything, self._scene)
+        frame = self._mujoco.MjrRect(0, 0, self._camera.width, self._camera.height)
+        self._mujoco.mjr_render(frame, self._scene, self._context)
+        pixels = np.empty((self._camera.height, self._camera.width, 3), dtype=np.uint8)
+        self._mujoco.mjr_readPixels(pixels, None, frame, self._context)
+        return np.ascontiguousarray(pixels[::-1])
+
+    def _leave_out_unseen(self, position: FloatArray, rotation: FloatArray) -> None:
+        """Take what lies outside the field of view out of the groups that are drawn: MuJoCo would draw it all."""
+        offsets = (self._data.geom_xpos - position) @ rotation
+        seen = np.all(offsets @ self._sides.T > -self._model.geom_rbound[:, None], axis=1)
+        self._model.geom_group[:] = np.where(seen, SEEN, _UNSEEN)
+
+    def close(self) -> None:
+        """Free what GL holds."""
+        self._context.free()
+        self._gl.free()
+
+    def __enter__(self) -> "Camera":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _matrix(camera: CameraModel) -> FloatArray:
+    """``T_base_camera`` as a matrix (4, 4)."""
+    x, y, z, w = camera.T_base_camera.rotation
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = camera.T_base_camera.translation_m
+    return matrix
+
+
+def _sides(camera: CameraModel) -> FloatArray:
+    """Unit vectors (4, 3) in the optical frame that point from the sides of the field of view to its inside."""
+    right, down = math.atan(0.5 * camera.width / camera.fx), math.atan(0.5 * camera.height / camera.fy)
+    sideways = [(sign * math.cos(right), 0.0, math.sin(right)) for sign in (-1.0, 1.0)]
+    upwards = [(0.0, sign * math.cos(down), math.sin(down)) for sign in (-1.0, 1.0)]
+    return np.array(sideways + upwards)

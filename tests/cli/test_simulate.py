@@ -1,0 +1,96 @@
+"""`fcslam simulate`: recordings that the other commands read, and one clear line for what cannot be."""
+
+import numpy as np
+import pytest
+
+from fcslam.cli import main
+from fcslam.records import CameraImage, GroundTruth, LaserScan
+from fcslam.runs import open_run, read_tum
+from fcslam.simulation import engine
+from fcslam.sources import open_source
+
+TINY = ["simulate", "--building", "flat", "--path-length", "6", "--seed", "3"]
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """Two robots without cameras, as recordings and as bags."""
+    output = tmp_path_factory.mktemp("simulated") / "fleet"
+    assert main([*TINY, "--robots", "2", "--no-camera", "--bag", "--output", str(output)]) == 0
+    return output
+
+
+def test_recordings_can_be_read_and_the_truth_lies_beside_them(simulated):
+    for name in ("robot_1", "robot_2"):
+        scans = [record for record in open_source(simulated / name).records() if isinstance(record, LaserScan)]
+        stamps, poses = read_tum(simulated / "ground_truth" / f"{name}.tum")
+        np.testing.assert_allclose([scan.stamp for scan in scans], stamps, atol=1e-9)
+        path_m = np.sum(np.hypot(*np.diff(poses[:, :2], axis=0).T))
+        assert path_m == pytest.approx(6.0, abs=0.1)
+    assert (simulated / "ground_truth" / "relations").is_file()
+
+
+def test_bags_hold_the_same_scans(simulated):
+    recorded, bagged = (
+        [record for record in open_source(simulated / name).records() if isinstance(record, LaserScan)]
+        for name in ("robot_1", "robot_1.mcap")
+    )
+    assert len(recorded) == len(bagged) > 50
+    np.testing.assert_allclose([scan.stamp for scan in recorded], [scan.stamp for scan in bagged], atol=1e-6)
+    np.testing.assert_allclose(
+        [np.minimum(scan.ranges_m, 12.0) for scan in recorded], [np.minimum(scan.ranges_m, 12.0) for scan in bagged]
+    )
+
+
+def test_a_simulated_fleet_is_mapped(simulated, tmp_path):
+    recordings = [str(simulated / name) for name in ("robot_1", "robot_2")]
+    assert main(["map", *recordings, "--output", str(tmp_path / "run")]) == 0
+    run = open_run(tmp_path / "run")
+    assert [trajectory.robot for trajectory in run.trajectories] == ["robot_1", "robot_2"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--robots", "0"], "0 is not in the range"),
+        (["--robots", "60"], "too small for 60 robots"),
+        (["--building", "castle"], "castle"),
+        (["--lighting", "dusk"], "dusk"),
+        (["--path-length", "0"], "0"),
+    ],
+)
+def test_what_cannot_be_is_refused(arguments, message, tmp_path, capsys):
+    assert main([*TINY, "--no-camera", *arguments, "--output", str(tmp_path / "fleet")]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert "Traceback" not in said
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path, capsys):
+    (tmp_path / "notes").write_text("mine")
+    assert main([*TINY, "--no-camera", "--output", str(tmp_path)]) == 2
+    assert "is not empty; choose another place" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["notes"]
+
+
+def test_without_a_gl_library_one_line_says_so(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(engine, "_BACKENDS", ("none",))
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    assert main([*TINY, "--output", str(tmp_path / "fleet")]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert len(lines) == 1
+    assert "apt-get install" in lines[0]
+
+
+@pytest.mark.system
+def test_cameras_are_recorded(tmp_path):
+    output = tmp_path / "fleet"
+    arguments = [*TINY, "--robots", "1", "--lighting", "evening", "--bag", "--output", str(output)]
+    assert main(arguments) == 0
+    records = list(open_source(output / "robot_1").records())
+    images = [record for record in records if isinstance(record, CameraImage)]
+    assert len(images) > 20
+    assert images[0].camera.width == 320
+    assert not any(isinstance(record, GroundTruth) for record in records)
+    bagged = [item for item in open_source(output / "robot_1.mcap").records() if isinstance(item, CameraImage)]
+    assert [image.encoded for image in bagged] == [image.encoded for image in images]

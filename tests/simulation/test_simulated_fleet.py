@@ -1,0 +1,156 @@
+"""The simulated fleet without a GL library: rays against the drawn fleet's, chance that stays where it belongs."""
+
+import importlib
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.errors import SimulationError
+from fcslam.geometry import se2
+from fcslam.records import GroundTruth, LaserModel, LaserScan
+from fcslam.simulation import engine, textures
+from fcslam.simulation.drawn_fleet import DriftSettings, LidarSettings, cast_rays, drift
+from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
+from fcslam.simulation.floorplan import Kind, draw_floor_plan
+from fcslam.simulation.kinds import Building
+from fcslam.simulation.route import drive, plan_route
+from fcslam.simulation.scene import bare_model
+from fcslam.simulation.sensors import RayCaster
+
+TINY = SimulationSettings(
+    building=Building.FLAT, robots=2, path_length_m=4.0, camera=None, lidar=LidarSettings(beams=60, rate_hz=4.0)
+)
+
+
+@pytest.mark.parametrize("building", [Building.FLAT, Building.DEFAULT])
+def test_rays_agree_with_the_drawn_fleets(building):
+    rng = np.random.default_rng(2)
+    plan = draw_floor_plan(rng, building)
+    _, poses = drive(plan_route(plan, 0, 40.0, rng), 8.0)
+    # Columns are round here and have eight corners there.
+    pieces = tuple(piece for piece in plan.pieces if piece.kind is not Kind.COLUMN)
+    sides = [np.hstack((p.outline, np.roll(p.outline, -1, axis=0))) for p in pieces if p.kind is not Kind.LINTEL]
+    laser = LaserModel(120, -np.pi, 2.0 * np.pi / 120, 9.0, T_base_laser=(0.1, 0.02, 0.3))
+    caster = RayCaster(bare_model(replace(plan, pieces=pieces)), laser)
+    ranges = np.array([caster.cast(pose) for pose in poses])
+    T_building_laser = se2.compose(poses, np.array(laser.T_base_laser))
+    expected = cast_rays(T_building_laser, laser.angles_rad(), np.concatenate(sides), 9.0)
+    # Walls end a millimetre earlier: a beam that grazes a corner may go on.
+    assert np.mean(np.abs(ranges - expected) < 1e-6) > 0.9
+    assert np.mean(np.abs(ranges - expected) < 0.02) > 0.995
+    assert np.any(expected == 9.0) or building is Building.FLAT
+
+
+def test_a_round_column_lies_within_its_corners():
+    rng = np.random.default_rng(3)
+    plan = draw_floor_plan(rng)
+    column = next(piece for piece in plan.pieces if piece.kind is Kind.COLUMN)
+    laser = LaserModel(8, -np.pi, np.pi / 4.0, 9.0)
+    caster = RayCaster(bare_model(replace(plan, pieces=(column,))), laser)
+    ahead = caster.cast(np.array([column.centre[0] - 2.0, column.centre[1], 0.0]))[4]
+    assert ahead == pytest.approx(2.0 - column.size[0] / 2.0, abs=1e-6)
+
+
+def test_scans_and_truth_come_in_order():
+    fleet = simulate_fleet(TINY, 1)
+    for robot in fleet.robots:
+        items = list(robot.items())
+        scans = [item for item in items if isinstance(item, LaserScan)]
+        truth = [item for item in items if isinstance(item, GroundTruth)]
+        np.testing.assert_array_equal([scan.stamp for scan in scans], robot.stamps)
+        np.testing.assert_array_equal([item.stamp for item in truth], robot.stamps)
+        np.testing.assert_allclose([item.T_building_base for item in truth], robot.T_building_base, atol=1e-5)
+        np.testing.assert_array_equal([scan.T_odom_base for scan in scans], robot.T_odom_base)
+        assert all(scan.ranges_m.shape == (60,) for scan in scans)
+    assert len(set(np.concatenate([robot.stamps for robot in fleet.robots]))) == sum(
+        len(robot.stamps) for robot in fleet.robots
+    )
+
+
+def ranges(robot):
+    return np.array([item.ranges_m for item in robot.items() if isinstance(item, LaserScan)])
+
+
+def test_the_same_seed_gives_the_same_fleet_and_another_another():
+    first, again, other = (simulate_fleet(TINY, seed).robots[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(ranges(first), ranges(again))
+    assert ranges(first).shape != ranges(other).shape or np.any(ranges(first) != ranges(other))
+
+
+def test_a_further_robot_changes_nothing_for_the_others():
+    few, more = simulate_fleet(TINY, 1), simulate_fleet(TINY.model_copy(update={"robots": 3}), 1)
+    for a, b in zip(few.robots, more.robots[:2], strict=True):
+        np.testing.assert_array_equal(a.T_odom_base, b.T_odom_base)
+        np.testing.assert_array_equal(ranges(a), ranges(b))
+
+
+def test_a_camera_changes_nothing_for_the_lidar():
+    blind = simulate_fleet(TINY, 1)
+    seeing = simulate_fleet(TINY.model_copy(update={"camera": CameraSettings()}), 1)
+    for a, b in zip(blind.robots, seeing.robots, strict=True):
+        np.testing.assert_array_equal(a.T_building_base, b.T_building_base)
+        np.testing.assert_array_equal(a.T_odom_base, b.T_odom_base)
+        np.testing.assert_array_equal(a.plan.segments, b.plan.segments)
+        assert len(a.image_stamps) == 0 < len(b.image_stamps)
+
+
+def test_furniture_moves_before_every_robot_but_the_first():
+    still = simulate_fleet(TINY, 1)
+    moved = simulate_fleet(TINY.model_copy(update={"moved_furniture": 1.0}), 1)
+    np.testing.assert_array_equal(moved.robots[0].plan.segments, still.plan.segments)
+    assert np.any(moved.robots[1].plan.segments != still.plan.segments)
+
+
+def test_slips_make_odometry_longer_and_nothing_else():
+    straight = np.column_stack((np.linspace(0.0, 20.0, 401), np.zeros((401, 2))))
+    flawless = {"travel_noise_m": 0, "heading_noise_rad": 0, "turn_noise_rad": 0, "scale_bias": 0, "veer_bias_rad_m": 0}
+    settings = DriftSettings(slips_per_m=0.5, slip_m=0.04, **flawless)
+    rng = np.random.default_rng(0)
+    ends = np.array([drift(straight, settings, rng)[-1] for _ in range(300)])
+    assert np.mean(ends[:, 0]) == pytest.approx(20.0 + 20.0 * 0.5 * 0.04, abs=0.04)
+    np.testing.assert_allclose(ends[:, 1:], 0.0, atol=1e-12)
+
+
+def test_too_many_robots_for_the_building():
+    with pytest.raises(SimulationError, match=r"'flat'.* too small for 50 robots; simulate at most \d"):
+        simulate_fleet(TINY.model_copy(update={"robots": 50}), 1)
+
+
+def test_without_mujoco_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(SimulationError, match=r"needs MuJoCo.*pip install 'fcslam\[sim\]'"):
+        engine.mujoco()
+
+
+def test_without_a_gl_library_one_line_says_what_to_install(monkeypatch):
+    engine.mujoco()
+    real = importlib.import_module
+
+    def without_gl(name):
+        if name in ("mujoco.egl", "mujoco.osmesa"):
+            raise AttributeError("eglQueryDevicesEXT")
+        return real(name)
+
+    monkeypatch.setattr(importlib, "import_module", without_gl)
+    with pytest.raises(SimulationError, match=r"^no GL library.*apt-get install libegl1 .*--no-camera"):
+        engine.gl_context(32, 24)
+
+
+def test_noise_repeats_at_its_edges():
+    image = textures.noise((64, 64), 4, np.random.default_rng(0))
+    assert np.abs(image[0] - image[-1]).max() < 0.1
+    assert np.abs(image[:, 0] - image[:, -1]).max() < 0.1
+    assert 0.1 < image.std() < 1.0
+
+
+@pytest.mark.parametrize(
+    "draw", [textures.plaster, textures.planks, textures.tiles, textures.carpet, textures.cupboard, textures.picture]
+)
+def test_images_repeat_by_seed_and_differ_between_seeds(draw):
+    first, again, other = (draw(np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert first.dtype == np.uint8
+    assert first.shape[2] == 3
+    np.testing.assert_array_equal(first, again)
+    assert np.mean(first != other) > 0.3
