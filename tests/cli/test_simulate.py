@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from simulation.gl import require_gl
 
 from fcslam.cli import main
 from fcslam.records import CameraImage, GroundTruth, LaserScan
@@ -84,6 +85,7 @@ def test_without_a_gl_library_one_line_says_so(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.system
 def test_cameras_are_recorded(tmp_path):
+    require_gl()
     output = tmp_path / "fleet"
     arguments = [*TINY, "--robots", "1", "--lighting", "evening", "--bag", "--output", str(output)]
     assert main(arguments) == 0

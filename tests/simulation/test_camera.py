@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from simulation.gl import require_gl
 
 from fcslam.records import CameraImage, LaserScan
 from fcslam.simulation.decoration import Picture, decorate
@@ -28,6 +29,11 @@ SMALL = SimulationSettings(
 CAMERA = CameraSettings().model()
 FOV_Y_RAD = 2.0 * math.atan(0.5 * CAMERA.height / CAMERA.fy)
 RED = np.full((16, 16, 3), (255, 0, 0), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def gl():
+    require_gl()
 
 
 @pytest.fixture(scope="module")
