@@ -176,8 +176,8 @@ class Fleet:
             matcher = self._matcher(place.detector_version)
             matches = matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
             entries = [self._ledger.add(match) for match in matches]
-            surprises = [entry for entry in entries if not self._is_vetoed(entry) and self._is_surprise(entry)]
-            for other in dict.fromkeys(entry.closure.i.robot for entry in surprises):
+            waiting = [entry for entry in entries if not self._is_vetoed(entry) and self._accept_or_wait(entry)]
+            for other in dict.fromkeys(entry.closure.i.robot for entry in waiting):
                 self._judge_pair(other, place.id.robot)
             self._places.setdefault((place.detector_version, place.id.robot), []).append(place.id)
         # A robot alone needs no estimate before the end.
@@ -223,8 +223,8 @@ class Fleet:
         entry.vetoed |= any(veto.forbids(i.robot, stamps[0], j.robot, stamps[1]) for veto in self._vetoes)
         return entry.vetoed
 
-    def _is_surprise(self, entry: Entry) -> bool:
-        """Accept what fits the joint map; tells whether only a cluster may accept it."""
+    def _accept_or_wait(self, entry: Entry) -> bool:
+        """Accept what fits the joint map; tells whether it waits, since only a cluster may accept it."""
         closure = entry.closure
         if closure.status is not ClosureStatus.VERIFIED:
             return False
