@@ -79,8 +79,8 @@ def solve_jointly(
 ) -> JointSolution:
     """Poses, maps and closures that hold, from the evidence alone: no earlier estimate plays a part.
 
-    A link whose cluster loses a third of its members in the joint solution, or so many places that it would join nobody,
-    is taken back, and the rest solved again.
+    A link whose cluster loses a third of its members in the joint solution, or so many places that it would join
+    nobody, is taken back, and the rest solved again.
     """
     own = [_own_solution(evidence, robot, consistency, gnc) for robot in evidence.robots]
     paths = [path for path, _ in own]
