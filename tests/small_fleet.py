@@ -37,7 +37,10 @@ def feed(fleet: Fleet, packets: Iterable[Packet]) -> Fleet:
 
 def fingerprint(result: FleetResult) -> tuple[object, ...]:
     """All that a result says, to the last bit."""
-    robots = tuple((r.robot, r.map_index, len(r.keyscans), r.T_map_base.tobytes(), r.laser) for r in result.robots)
+    robots = tuple(
+        (r.robot, r.map_index, len(r.keyscans), r.T_map_base.tobytes(), r.T_local_base.tobytes(), r.laser)
+        for r in result.robots
+    )
     closures = tuple(
         (c.i, c.j, c.similarity, c.T_i_j.tobytes(), c.information.tobytes(), c.status, c.reason, c.informative)
         for c in result.closures

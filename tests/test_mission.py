@@ -52,6 +52,19 @@ def test_trajectories_have_every_scan_of_the_recording(run, drawn):
         assert trajectory.T_map_base.shape == (len(robot.stamps), 3)
 
 
+def test_a_robots_own_map_is_what_it_would_have_mapped_alone(run, logs):
+    """To the last bit: no other robot has a say in it, and its trajectory starts at the origin."""
+    for log, local in zip(logs, run.local_maps, strict=True):
+        (alone,) = run_mission([open_source(log)], MissionConfig(seed=3)).local_maps
+        assert (local.robot, local.pgm, local.yaml) == (alone.robot, alone.pgm, alone.yaml)
+        assert local.T_local_base.tobytes() == alone.T_local_base.tobytes()
+        assert np.array_equal(local.T_local_base[0], np.zeros(3))
+    for local, joint in zip(run.local_maps, run.trajectories, strict=True):
+        assert np.array_equal(local.stamps, joint.stamps)
+    second = run.local_maps[1]
+    assert np.abs(second.T_local_base - run.trajectories[1].T_map_base).max() > 0.5, "another frame"
+
+
 def test_numbers_add_up(run, drawn):
     values = {metric.name: metric.value for metric in run.metrics}
     assert values["robots"] == 3

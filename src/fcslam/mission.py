@@ -21,7 +21,7 @@ from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.records import ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, check_names
+from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run, check_names
 from fcslam.sources import Source
 from fcslam.wire.checks import check_name
 from fcslam.wire.ledger import Ledger
@@ -148,15 +148,26 @@ def _run_of(
         config_yaml=dump(config),
         pose_graph_g2o=g2o_text(result.graph),
         map_files=_map_files(result, trajectories, config.map),
+        local_maps=tuple(_local_map(robot, mapped[robot.robot], config.map) for robot in robots),
     )
 
 
 def _trajectory(robot: RobotFrontend, mapped: MappedRobot) -> RobotTrajectory:
-    """Every raw scan hangs on its keyscan."""
-    keyscans = mapped.T_map_base[[pose.keyscan for pose in robot.scan_poses]]
-    offsets = np.array([pose.T_keyscan_base for pose in robot.scan_poses])
+    return RobotTrajectory(robot.robot, mapped.map_index, *_at_every_scan(robot, mapped.T_map_base))
+
+
+def _local_map(robot: RobotFrontend, mapped: MappedRobot, config: OccupancyConfig) -> LocalMap:
+    """What the robot would have mapped had it been alone."""
+    fused = fuse(mapped.keyscans, mapped.T_local_base, {robot.robot: mapped.laser}, config)
+    stamps, T_local_base = _at_every_scan(robot, mapped.T_local_base)
+    return LocalMap(robot.robot, stamps, T_local_base, pgm_bytes(fused), map_yaml(fused, f"{robot.robot}.pgm"))
+
+
+def _at_every_scan(robot: RobotFrontend, keyscans: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Stamps (N,) and poses (N, 3) of all scans: each hangs on its keyscan, whose poses (K, 3) are given."""
     stamps = np.array([pose.stamp for pose in robot.scan_poses])
-    return RobotTrajectory(robot.robot, mapped.map_index, stamps, se2.compose(keyscans, offsets))
+    offsets = np.array([pose.T_keyscan_base for pose in robot.scan_poses])
+    return stamps, se2.compose(keyscans[[pose.keyscan for pose in robot.scan_poses]], offsets)
 
 
 def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> ClosureRow:

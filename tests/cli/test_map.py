@@ -22,8 +22,8 @@ from fcslam.mission import MissionConfig
 from fcslam.runs import read_tum
 
 RUN_FILES = {
-    "closures.csv", "config.yaml", "map.pgm", "map.png", "map.yaml", "metrics.json", "pose_graph.g2o", "robots.csv",
-    "trajectories",
+    "closures.csv", "config.yaml", "local", "map.pgm", "map.png", "map.yaml", "metrics.json", "pose_graph.g2o",
+    "robots.csv", "trajectories",
 }  # fmt: skip
 
 
@@ -65,6 +65,8 @@ def test_the_run_folder_is_complete(run, drawn):
     assert names_in(run) == RUN_FILES
     assert names_in(run.parent) == {run.name}
     assert names_in(run / "trajectories") == {f"{robot.name}.tum" for robot in drawn.robots}
+    local = {f"{robot.name}.{kind}" for robot in drawn.robots for kind in ("tum", "pgm", "yaml")}
+    assert names_in(run / "local") == local
     for robot in rows_of(run / "robots.csv"):
         truth = next(r for r in drawn.robots if r.name == robot["robot"])
         assert int(robot["scans"]) == len(truth.stamps)

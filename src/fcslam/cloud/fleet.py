@@ -108,8 +108,8 @@ class Fleet:
 
     def _conclude(self) -> FleetResult:
         self._disturbed = True
-        self._reconsider()
-        return conclude(self._store, self._graph, self._ledger, self._maps, self._version)
+        T_local_base = self._reconsider()
+        return conclude(self._store, self._graph, self._ledger, self._maps, T_local_base, self._version)
 
     def veto(self, veto: Veto) -> None:
         """From now on these closures count for nothing; maps that only they held together part."""
@@ -289,11 +289,16 @@ class Fleet:
         self._graph.optimize()
         self._version += 1
 
-    def _reconsider(self) -> None:
-        """Decide every closure anew: revoke what is outvoted, part the maps that only that held together."""
-        self._maps = reconsider(self._graph, self._ledger, self._config.consistency)
+    def _reconsider(self) -> dict[str, FloatArray]:
+        """Decide every closure anew: revoke what is outvoted, part the maps that only that held together.
+
+        Returns every robot's poses by its own measurements alone.
+        """
+        reconsidered = reconsider(self._graph, self._ledger, self._config.consistency)
+        self._maps = reconsidered.maps
         self._doubted, self._patience = False, int(MORE_DOUBTS * len(self._ledger))
         self._version += 1
+        return reconsidered.T_local_base
 
     def _replies(self, packet: Packet) -> list[bytes]:
         """Acknowledgement and, after a place, where the robot's odometry lies in the map."""

@@ -1,6 +1,6 @@
 """What a fleet's packets say in the end: every closure decided, every robot placed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fcslam.cloud.joint_graph import JointGraph
@@ -20,6 +20,9 @@ class MappedRobot:
     keyscans: tuple[Keyscan, ...]
     T_map_base: FloatArray
     """Of each keyscan, in the frame of its map, shape (N, 3)."""
+    T_local_base: FloatArray
+    """Of each keyscan, in the robot's own map, which its own measurements alone made, shape (N, 3); the origin is its
+    first keyscan."""
     laser: LaserModel
 
 
@@ -36,13 +39,25 @@ class FleetResult:
 
 
 def conclude(
-    store: RobotStore, graph: JointGraph, ledger: ClosureLedger, maps: Sequence[Sequence[str]], version: int
+    store: RobotStore,
+    graph: JointGraph,
+    ledger: ClosureLedger,
+    maps: Sequence[Sequence[str]],
+    T_local_base: Mapping[str, FloatArray],
+    version: int,
 ) -> FleetResult:
-    """Collect the result; the map of most robots is the first."""
+    """Collect the result; the map of most robots is the first. ``T_local_base`` (N, 3) as in ``MappedRobot``."""
     by_size = sorted(maps, key=lambda robots: -len(robots))
     index = {robot: k for k, robots in enumerate(by_size) for robot in robots}
     robots = tuple(
-        MappedRobot(robot, index[robot], store.keyscans(robot), frozen(graph.trajectory(robot)), store.laser(robot))
+        MappedRobot(
+            robot,
+            index[robot],
+            store.keyscans(robot),
+            frozen(graph.trajectory(robot)),
+            T_local_base[robot],
+            store.laser(robot),
+        )
         for robot in store.robots
     )
     corrections = tuple(

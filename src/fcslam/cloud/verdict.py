@@ -1,6 +1,7 @@
 """Every closure decided anew from all evidence: what a joint map rests on, and what has to go."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,17 +9,26 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger, Entry
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.joint import HOLDS, JointEvidence, JointSolution, solve_jointly
-from fcslam.records import ClosureStatus
+from fcslam.records import ClosureStatus, FloatArray
 
 CONTRADICTS = "contradicts the joint graph"
 VETOED = "vetoed by hand"
 
 
-def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> list[list[str]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconsidered:
+    """What the evidence says of the robots, beside the poses in the graph and the statuses in the ledger."""
+
+    maps: list[list[str]]
+    """Robots of each map, maps and robots in the order in which they started."""
+    T_local_base: dict[str, FloatArray]
+    """Every robot's keyscans by its own measurements alone, (N, 3); the origin is its first keyscan."""
+
+
+def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> Reconsidered:
     """Solve from the evidence alone; the graph takes the poses over, every entry learns its status.
 
-    Returns the robots of each map, maps and robots in the order in which they started. No earlier estimate, join or
-    verdict plays a part: what joined two maps once and is outvoted now is revoked.
+    No earlier estimate, join or verdict plays a part: what joined two maps once and is outvoted now is revoked.
     """
     entries = [entry for entry in ledger if entry.closure.status is not ClosureStatus.CANDIDATE]
     _enter(graph, (entry for entry in entries if entry.edge is None))
@@ -33,7 +43,8 @@ def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySe
         apart = len({maps[robot] for robot in pair}) > 1
         _decide(entry, bool(solution.weights[entry.edge] > HOLDS), reasons.get(pair, CONTRADICTS) if apart else "")
         graph.count(entry.edge, holds=entry.closure.status is ClosureStatus.ACCEPTED)
-    return [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
+    members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
+    return Reconsidered(members, dict(zip(robots, solution.own, strict=True)))
 
 
 def _enter(graph: JointGraph, entries: Iterable[Entry]) -> None:
