@@ -177,7 +177,7 @@ class Place:
     last: int
     """Number of the last one (inclusive)."""
     keypoints: NDArray[np.float32]
-    """Shape (N, 2): metres in the keyscan's base (lidar)."""
+    """Metres in the keyscan's base: shape (N, 2), x and y (lidar), or (N, 3) with the height z above the floor (camera)."""
     descriptors: Codes
     """Shape (N, 32)."""
 
