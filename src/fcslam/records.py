@@ -177,7 +177,7 @@ class Place:
     last: int
     """Number of the last one (inclusive)."""
     keypoints: NDArray[np.float32]
-    """Metres in the keyscan's base: shape (N, 2), x and y (lidar), or (N, 3) with the height z above the floor (camera)."""
+    """Metres in the keyscan's base: x and y, shape (N, 2), if lidar; with the height z, shape (N, 3), if camera."""
     descriptors: Codes
     """Shape (N, 32)."""
 

@@ -24,7 +24,7 @@ class Orb:
     """Oriented FAST corners with rotated BRIEF codes, from OpenCV."""
 
     def __init__(self, config: OrbConfig) -> None:
-        self._orb = cv2.ORB_create(
+        self._orb = cv2.ORB.create(
             nfeatures=config.most_features, nlevels=config.pyramid_levels, fastThreshold=config.fast_threshold
         )
 
@@ -42,5 +42,7 @@ class Orb:
         order = np.argsort(-scores, kind="stable")
         positions = np.array([keypoint.pt for keypoint in keypoints])
         return ImageFeatures(
-            frozen(positions[order], np.float32), frozen(scores[order], np.float32), frozen(descriptors[order], np.uint8)
+            frozen(positions[order], np.float32),
+            frozen(scores[order], np.float32),
+            frozen(descriptors[order], np.uint8),
         )

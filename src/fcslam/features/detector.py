@@ -43,5 +43,8 @@ class Detector(Protocol):
 
 def decode_grey(encoded: bytes) -> GreyImage | None:
     """The picture in a JPEG or PNG file in grey levels; None if it is broken."""
-    decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # of no bytes at all, for one
+        return None
     return None if decoded is None else np.asarray(decoded, np.uint8)

@@ -36,7 +36,7 @@ class Motion:
 
     T_a_b: FloatArray
     information: FloatArray
-    """Of (x, y, theta) in a's coordinates, shape (3, 3): what images say where walls say nothing. Zeros for LiDAR, whose
+    """Of (x, y, theta) in a's coordinates, shape (3, 3): what images say where walls say nothing. Zeros for LiDAR: its
     keypoints are those walls."""
     share: float
     """Matching descriptors in the smaller of the two places."""

@@ -66,7 +66,8 @@ class RobotFrontend:
     def finish(self) -> list[Packet]:
         """The packets of what was still open when the recording ended."""
         rest = self._mapper.finish()
-        return self._packets([body for submap in rest for body in self._submap_bodies(submap, at_end=submap is rest[-1])])
+        last = rest[-1:]
+        return self._packets([body for submap in rest for body in self._submap_bodies(submap, submap in last)])
 
     def _bodies(self, step: Step) -> list[Body]:
         bodies: list[Body] = []
