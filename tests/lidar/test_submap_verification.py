@@ -199,7 +199,7 @@ def test_a_weak_prior_fixes_nothing():
 def test_where_walls_hold_a_false_prior_hardly_moves(same_room):
     (a, at_a), (b, at_b) = same_room
     truth = se2.between(at_a, at_b)
-    shifted = truth + [0.15, -0.1, 0.0]
+    shifted = truth + np.array([0.15, -0.1, 0.0])
     found = verify(a, b, shifted, CONFIG, np.diag((400.0, 400.0, 2000.0)))
     off = se2.between(truth, found.T_a_b)
     assert np.hypot(off[0], off[1]) < 0.05

@@ -49,7 +49,7 @@ def test_planted_motions_are_found(channel):
 
 def test_keypoints_at_other_heights_do_not_match():
     a, b = planted()
-    lifted = replace(b, keypoints=frozen(b.keypoints + [0.0, 0.0, 0.3], np.float32))
+    lifted = replace(b, keypoints=frozen(b.keypoints + np.array([0.0, 0.0, 0.3]), np.float32))
     assert motions(a, lifted, CONFIG) == []
     assert len(motions(a, lifted, MotionConfig(level_m=0.4))) == 1
 
