@@ -47,7 +47,8 @@ def test_arrays_of_a_received_packet_are_read_only(name):
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_label_is_that_of_the_packet(name):
     sent = EXAMPLES[name]
-    assert read_label(encode(sent)) == (sent.robot, type(sent.body).__name__.lower())
+    label = Label(sent.robot, Kind(type(sent.body).__name__.lower()), getattr(sent.body, "channel", None))
+    assert read_label(encode(sent)) == label
 
 
 @given(informations())
@@ -99,7 +100,7 @@ def test_a_place_of_300_descriptors_fits_12_kilobytes():
     place = replace(
         LIDAR_PLACE,
         channel=Channel.CAMERA,
-        keypoints=rng.uniform(-15.0, 15.0, (300, 2)).astype(np.float32),
+        keypoints=rng.uniform(-15.0, 15.0, (300, 3)).astype(np.float32),
         descriptors=rng.integers(0, 256, (300, 32), np.uint8),
     )
     assert len(encode(packet(place))) <= 12_000
