@@ -15,7 +15,7 @@ from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.strategy import FusionStrategy
 from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import ClosureStatus, Veto
+from fcslam.records import Channel, ClosureStatus, Veto
 
 POSES = rectangle()
 A, B = ("a", POSES), ("b", POSES)
@@ -46,7 +46,7 @@ def ledger_of(*scripts, turned=()):
     ledger = ClosureLedger()
     for number, line in enumerate(line for script in scripts for line in script):
         told = replace(line, i=line.j, j=line.i, T_i_j=se2.inverse(line.T_i_j)) if number in turned else line
-        ledger.add(PlaceMatch(told.i, told.j, 0.5, verified(told), predicted=False))
+        ledger.add(PlaceMatch(told.i, told.j, Channel.LIDAR, 0.5, verified(told), predicted=False))
     return ledger
 
 
