@@ -77,7 +77,7 @@ def row(case: str, seed: int, places: str, found: dict[str, float], cost: common
     ate = max(found[f"ate_rmse_{name}"] for name in names)
     rates = [found[f"uplink_bytes_{name}"] / found[f"duration_{name}"] / 1e3 for name in names]
     sent = [(found[f"{channel}_places"], found[f"{channel}_place_bytes"]) for channel in ("lidar", "camera")]
-    count, size = (sum(value for value in column if value == value) for column in zip(*sent, strict=True))
+    count, size = (sum(value for value in column if math.isfinite(value)) for column in zip(*sent, strict=True))
     verified, accepted = (f"inter_robot_{stage}_both" for stage in ("verified", "accepted"))
     joined = found["maps"] == 1 or case == "corridor"
     passed = (
