@@ -7,7 +7,7 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import config, demo, evaluate, simulate
+from fcslam.cli import config, demo, evaluate, extract, simulate
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.errors import FcslamError
@@ -33,6 +33,7 @@ app.command(
 app.command("simulate", epilog="Example: fcslam simulate --output office --building office --no-camera")(
     simulate.simulate
 )
+app.command("extract", epilog="Example: fcslam extract photos --output features --keypoints 1000")(extract.extract)
 app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo.demo)
 app.add_typer(config.app, name="config")
 app.add_typer(evaluate.app, name="evaluate")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.evaluate_fleet import fleet, percent
+from fcslam.cli.evaluate_homography import homography
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -14,8 +15,11 @@ if TYPE_CHECKING:
     from fcslam.metrics.closures import ClosureCriteria, Precision
     from fcslam.metrics.relations import RelationErrors
 
-app = typer.Typer(no_args_is_help=True, help="Measure run folders against references.")
+app = typer.Typer(no_args_is_help=True, help="Measure run folders against references, and detectors.")
 app.command(epilog="Example: fcslam evaluate fleet fleet/run --truth fleet")(fleet)
+app.command(epilog="Example: fcslam evaluate homography hpatches --detector onnx --detector orb --figures figures")(
+    homography
+)
 
 
 @app.command(epilog="Example: fcslam evaluate relations out/intel intel.relations.gz --across-robots")

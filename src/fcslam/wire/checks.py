@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
+from fcslam.records import CODE_BYTES, NAME, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
 from fcslam.wire.limits import (
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
@@ -20,7 +20,6 @@ from fcslam.wire.limits import (
     MAXIMUM_SEQUENCE,
     MINIMUM_CORRELATION_EIGENVALUE,
     MINIMUM_INFORMATION,
-    NAME,
 )
 from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise, unpack_information
