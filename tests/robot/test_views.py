@@ -5,11 +5,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from features.networks import tiny_network
 from features.pictures import image_at
 from lidar.worlds import drifting, drive, recording, ring
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.config import dump, load
+from fcslam.errors import FeatureError
 from fcslam.features.classical import ORB_VERSION
+from fcslam.features.detector import OnnxConfig
+from fcslam.features.kinds import DetectorKind
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -97,6 +102,27 @@ def test_channels_are_a_choice(seen):
         hello = next(body for body in bodies if isinstance(body, Hello))
         assert set(hello.detector_versions) == set(channels)
         assert {body.channel for body in bodies if isinstance(body, Place)} == set(channels)
+
+
+def test_a_network_describes_places_in_its_own_version(seen, tmp_path):
+    pytest.importorskip("onnxruntime")
+    tiny_network(tmp_path / "n.onnx", version="tiny-7")
+    (tmp_path / "robot.yaml").write_text(f"views: {{detector: onnx, onnx: {{weights: {tmp_path}/n.onnx}}}}")
+    config = load(RobotConfig, tmp_path / "robot.yaml")
+    (tmp_path / "dumped.yaml").write_text(dump(config))
+    assert load(RobotConfig, tmp_path / "dumped.yaml") == config
+    bodies, _ = bodies_of(seen[0], config)
+    hello = next(body for body in bodies if isinstance(body, Hello))
+    assert hello.detector_versions[Channel.CAMERA] == "tiny-7"
+    assert len(places(bodies)) > 5
+    assert {place.detector_version for place in places(bodies)} == {"tiny-7"}
+
+
+def test_a_network_that_is_missing_is_told_at_once(tmp_path):
+    pytest.importorskip("onnxruntime")
+    views = ViewsConfig(detector=DetectorKind.ONNX, onnx=OnnxConfig(weights=tmp_path / "missing.onnx"))
+    with pytest.raises(FeatureError, match="cannot read the network weights"):
+        RobotFrontend("r", RobotConfig(views=views))
 
 
 def test_images_change_nothing_but_camera_places(seen):

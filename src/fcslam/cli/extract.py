@@ -23,8 +23,13 @@ def extract(
         int, typer.Option(min=1, max=2000, help="Keypoints kept of an image, strongest first.")
     ] = 1000,
     nms: Annotated[
-        float, typer.Option(min=0.0, max=64.0, help="Side in pixels of boxes around keypoints that may hardly overlap.")
-    ] = 4.0,
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=64.0,
+            help="Side in pixels of boxes around keypoints that may hardly overlap; 0: all. [default: 4, of orb 0]",
+        ),
+    ] = None,
     longest_side: Annotated[
         int, typer.Option(min=16, max=16384, help="Larger images are shrunk to so many pixels for the detector.")
     ] = 2048,
@@ -42,12 +47,15 @@ def extract(
 
     is_network = weights is not None or SHIPPED_NETWORK.is_file() if detector is None else detector is DetectorKind.ONNX
     kind = DetectorKind.ONNX if is_network else DetectorKind.ORB
-    onnx = OnnxConfig(weights=weights, most_features=keypoints, nms_px=nms, threads=threads)
+    if weights is not None and not is_network:
+        raise FeatureError(f"{weights}: detector orb has no weights; leave --weights out, or --detector")
+    onnx = OnnxConfig(weights=weights, most_features=keypoints, nms_px=4.0 if nms is None else nms, threads=threads)
     finder = make_detector(kind, OrbConfig(most_features=keypoints), onnx)
-    files = [path for path in find_files(images) if output.resolve() not in path.resolve().parents]
+    files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may lie among them
     root = images.parent if images.is_file() else images
     console, done, empty = Console(stderr=True), 0, 0
-    outcomes = extract_all(files, root, output, finder, longest_side, nms)
+    # a network thins out its keypoints itself, before it keeps the strongest
+    outcomes = extract_all(files, root, output, finder, longest_side, 0.0 if is_network else nms or 0.0)
     for outcome in track(outcomes, "extracting", len(files), console=console, transient=True):
         if outcome.skipped:
             console.print(f"skipped: {outcome.skipped}", highlight=False, markup=False, soft_wrap=True)
