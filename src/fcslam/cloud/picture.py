@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.cloud.fusion import FusedMap
-from fcslam.lidar.occupancy import Cells, Occupancy
+from fcslam.map_files import Cells, Occupancy
 from fcslam.records import FloatArray
 
 Image = NDArray[np.uint8]
