@@ -6,8 +6,10 @@ Per building and seed one recorded fleet of three robots that start anywhere and
 used while settings were chosen. Buildings: the default one; the corridor, whose twenty doors are alike; and the default
 one where every robot drives in another light (day, evening, some lamps off) and half of the furniture has moved. Fleets
 are mapped with both channels of places, those of the latter two also with LiDAR places alone and with camera places
-alone. It needs a GL library. Passed: all robots in one map (corridor: no false join), no accepted closure between robots that is off by
-0.5 m or 10 deg, worst ATE of a robot in the joint map at most 0.10 m, F1 of occupied cells at least 0.90.
+alone. It needs a GL library.
+
+Passed: all robots in one map (corridor: no false join), no accepted closure between robots that is off by 0.5 m or
+10 deg, worst ATE of a robot in the joint map at most 0.10 m, F1 of occupied cells at least 0.90.
 
 Recall is that of revisits between robots, by correct verified closures; at 100 % precision: by the closures that are
 more similar than every wrong one of their channel.
