@@ -76,6 +76,10 @@ def test_numbers_add_up(run, drawn):
     assert values["correction_packets"] == values["place_packets"]
     packets = sum(values[f"{kind}_packets"] for kind in ("hello", "keyscan", "constraint", "place"))
     assert values["acknowledgement_packets"] == packets
+    for figure in ("packets", "bytes"):
+        assert values[f"place_{figure}"] == values[f"lidar_place_{figure}"] + values[f"camera_place_{figure}"]
+    sent = sum(values[f"{kind}_bytes"] for kind in ("hello", "keyscan", "constraint", "place"))
+    assert sent == sum(values[f"uplink_bytes_{robot.name}"] for robot in drawn.robots)
     for status in ClosureStatus:
         between = [c for c in run.closures if c.robot_i != c.robot_j and c.status is status]
         assert values[f"inter_robot_closures_{status}"] == len(between)

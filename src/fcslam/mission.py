@@ -19,7 +19,7 @@ from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.records import ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure, Veto
+from fcslam.records import Channel, ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run, check_names
 from fcslam.sources import Source
@@ -226,10 +226,12 @@ def _metrics(result: FleetResult, meter: _Meter) -> list[Metric]:
 
 
 def _traffic(ledger: Ledger) -> list[Metric]:
-    """Bytes and packets per kind of message, of the whole fleet."""
-    kinds = sorted({label.kind for label in ledger.accepted})
-    traffic = [(Kind(kind), ledger.total(kind=Kind(kind))) for kind in kinds]
+    """Packets and bytes per kind of message and channel of places, of the whole fleet; bytes that each robot sent."""
+    traffic = {str(kind): ledger.total(kind=kind) for kind in sorted({label.kind for label in ledger.accepted})}
+    traffic |= {f"{channel}_{Kind.PLACE}": ledger.total(channel=channel) for channel in Channel}
+    robots = sorted({label.robot for label in ledger.accepted})
     return [
-        *(Metric(f"{kind}_packets", total.count, "1") for kind, total in traffic),
-        *(Metric(f"{kind}_bytes", total.bytes, "B") for kind, total in traffic),
+        *(Metric(f"{name}_packets", total.count, "1") for name, total in traffic.items()),
+        *(Metric(f"{name}_bytes", total.bytes, "B") for name, total in traffic.items()),
+        *(Metric(f"uplink_bytes_{robot}", ledger.uplink(robot).bytes, "B") for robot in robots),
     ]

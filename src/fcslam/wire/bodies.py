@@ -68,7 +68,7 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
     codes = [detector.channel for detector in message.detectors]
     if codes != sorted(set(codes)):
         raise PacketError("hello: detectors are not in ascending order of their channels")
-    versions = {_read_channel(detector.channel): detector.version for detector in message.detectors}
+    versions = {read_channel(detector.channel): detector.version for detector in message.detectors}
     return Hello(envelope.robot, envelope.epoch, laser, MappingProxyType(versions))
 
 
@@ -123,7 +123,7 @@ def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
         raise PacketError(f"place: {len(message.keypoints)} bytes of keypoints for {count} descriptors")
     return Place(
         KeyscanId(envelope.robot, message.number),
-        _read_channel(message.channel),
+        read_channel(message.channel),
         message.detector_version,
         message.first,
         message.last,
@@ -163,7 +163,12 @@ def _read_pose(message: Message, field: str) -> FloatArray:
     return frozen((pose.x_m, pose.y_m, pose.theta_rad))
 
 
-def _read_channel(code: int) -> Channel:
+def read_channel(code: int) -> Channel:
+    """The channel that a packet's number stands for.
+
+    Raises:
+        PacketError: none does.
+    """
     channel = _CHANNEL_OF_CODE.get(code)
     if channel is None:
         raise PacketError(f"channel {code} is unknown")
