@@ -177,7 +177,7 @@ class Place:
     last: int
     """Number of the last one (inclusive)."""
     keypoints: NDArray[np.float32]
-    """Shape (N, 2): metres in the keyscan's base (lidar)."""
+    """Metres in the keyscan's base: x and y, shape (N, 2), if lidar; with the height z, shape (N, 3), if camera."""
     descriptors: Codes
     """Shape (N, 32)."""
 

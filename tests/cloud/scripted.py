@@ -54,7 +54,7 @@ class ScriptedMatcher:
     def match(self, place, predicted, strangers) -> list[PlaceMatch]:
         self.predictions[place.id] = dict(predicted)
         found = [line for line in self.script if line.j == place.id]
-        return [PlaceMatch(s.i, s.j, 0.5, verified(s), predicted=not strangers(s.i)) for s in found]
+        return [PlaceMatch(s.i, s.j, Channel.LIDAR, 0.5, verified(s), predicted=not strangers(s.i)) for s in found]
 
 
 def verified(line: Script) -> Verification:

@@ -40,7 +40,10 @@ HOSTILE = {
     "place that reaches ahead": (place("a", 1, last=NUMBER + 5), f"names keyscan {NUMBER + 5}"),
     "place again": (place("a", 4), "described before"),
     "place of another detector": (place("a", 1, detector_version="test-2"), "detector test-2"),
-    "camera place": (place("a", 1, channel=Channel.CAMERA), "camera place"),
+    "place of a channel not announced": (
+        place("a", 1, channel=Channel.CAMERA, keypoints=np.zeros((0, 3), np.float32)),
+        "none was announced",
+    ),
     "correction": (Correction("a", 0, 0, frozen(np.zeros(3))), "goes to a robot"),
     "acknowledgement": (Acknowledgement("a", 0, 3), "goes to a robot"),
 }

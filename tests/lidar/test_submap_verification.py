@@ -6,7 +6,7 @@ from worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_
 
 from fcslam.geometry import se2
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, agreement, build_submap
-from fcslam.lidar.verification import VerificationConfig, verify
+from fcslam.lidar.verification import VerificationConfig, _of_inverse, verify
 
 CONFIG = VerificationConfig()
 
@@ -174,3 +174,43 @@ def test_somebody_who_stands_is_part_of_the_place():
     stood, anchor = walking_along(WEST, 3, stride_m=0.0)
     where = se2.transform(anchor, stood.surface.points)
     assert (np.hypot(where[:, 0] + 1.45, where[:, 1] - 1.6) < 0.4).sum() >= 5
+
+
+def test_along_a_bare_corridor_only_a_prior_holds():
+    """Matched keypoints say where along the corridor two places lie; the walls neither confirm nor move it."""
+    along = [(0.3 * k, 0.1, 0.0) for k in range(8)]
+    back = [(1.5 - 0.3 * k, -0.1, 3.1) for k in range(8)]
+    (a, at_a), (b, at_b) = submap_along(along, corridor(), 4), submap_along(back, corridor(), 5)
+    truth = se2.between(at_a, at_b)
+    prior = np.diag((400.0, 400.0, 2000.0))
+    blind, seeing = verify(a, b, truth, CONFIG), verify(a, b, truth, CONFIG, prior)
+    assert not blind.informative
+    assert seeing.informative
+    off = se2.between(truth, seeing.T_a_b)
+    assert np.hypot(off[0], off[1]) < 0.05
+
+
+def test_a_weak_prior_fixes_nothing():
+    (a, at_a), (b, at_b) = (submap_along([(0.3 * k, 0.1, 0.0) for k in range(8)], corridor(), seed) for seed in (4, 5))
+    weak = np.diag((10.0, 10.0, 2000.0))
+    assert not verify(a, b, se2.between(at_a, at_b), CONFIG, weak).informative
+
+
+def test_where_walls_hold_a_false_prior_hardly_moves(same_room):
+    (a, at_a), (b, at_b) = same_room
+    truth = se2.between(at_a, at_b)
+    shifted = truth + np.array([0.15, -0.1, 0.0])
+    found = verify(a, b, shifted, CONFIG, np.diag((400.0, 400.0, 2000.0)))
+    off = se2.between(truth, found.T_a_b)
+    assert np.hypot(off[0], off[1]) < 0.05
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (2.0, -1.0, 0.7), (-3.0, 4.0, -2.5)])
+def test_information_of_the_inverse_pose(pose):
+    """Against samples: poses drawn with an information, inverted, spread as the information of the inverse says."""
+    information = np.array([[900.0, 100.0, 50.0], [100.0, 400.0, -30.0], [50.0, -30.0, 2500.0]])
+    rng = np.random.default_rng(0)
+    drawn = np.array(pose) + rng.multivariate_normal(np.zeros(3), np.linalg.inv(information), 200_000)
+    spread = np.cov((se2.inverse(drawn) - se2.inverse(pose)).T)
+    expected = np.linalg.inv(_of_inverse(information, np.array(pose)))
+    assert np.allclose(spread, expected, rtol=0.1, atol=0.05 * np.abs(expected).max())

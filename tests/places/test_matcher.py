@@ -8,6 +8,7 @@ from fcslam.features.birdseye import BirdseyeConfig, describe
 from fcslam.geometry import se2
 from fcslam.lidar.submap import build_submap
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
+from fcslam.places.motions import MotionConfig
 from fcslam.places.vocabulary import DynamicVocabularyConfig
 from fcslam.records import Channel, KeyscanId, Place, frozen
 
@@ -63,7 +64,7 @@ def test_the_same_room_from_another_pose_is_the_same_place(visits):
 
 
 def test_another_room_is_another_place(visits):
-    matcher = visits.matcher(inliers=4)
+    matcher = visits.matcher(motions=MotionConfig(inliers=4))
     matcher.match(visits.visit("a", 0, room(), POSE_A), {}, STRANGERS)
     matches = matcher.match(visits.visit("b", 0, other_room(), (0.5, 0.5, 1.0)), {}, STRANGERS)
     assert not any(match.M for match in matches)

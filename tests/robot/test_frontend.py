@@ -7,6 +7,7 @@ import pytest
 import small_fleet
 
 from fcslam.features.birdseye import DETECTOR_VERSION
+from fcslam.features.classical import ORB_VERSION
 from fcslam.records import (
     CameraImage,
     CameraModel,
@@ -49,7 +50,7 @@ def test_packets_are_numbered_timed_and_survive_the_wire(scans):
         assert encode(decode(encode(packet))) == encode(packet)
 
 
-def test_images_cause_no_packet_and_change_none(scans):
+def test_broken_images_cause_no_packet_and_change_none(scans):
     camera = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
     seen = [CameraImage(scan.stamp, bytes(5000), camera, scan.T_odom_base) for scan in scans]
     assert RobotFrontend("r", RobotConfig()).process(seen[0]) == []
@@ -60,7 +61,9 @@ def test_images_cause_no_packet_and_change_none(scans):
 def test_hello_comes_first_and_once(scans):
     _, packets = drive(scans)
     assert bodies(packets, Hello) == [packets[0].body]
-    assert packets[0].body == Hello("r", 0, scans[0].laser, {Channel.LIDAR: DETECTOR_VERSION})
+    assert packets[0].body == Hello(
+        "r", 0, scans[0].laser, {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: ORB_VERSION}
+    )
 
 
 def test_every_keyscan_is_followed_by_the_motion_that_leads_to_it(scans):

@@ -60,8 +60,8 @@ CAMERA_PLACE = Place(
     "cnn-0.3+r12",
     12,
     12,
-    frozen(np.zeros((0, 2)), np.float32),
-    frozen(np.zeros((0, 32)), np.uint8),
+    frozen([[2.5, -1.25, 0.75], [3.0, 0.0, 1.5]], np.float32),
+    frozen(np.arange(64).reshape(2, 32), np.uint8),
 )
 CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]))
 ACKNOWLEDGEMENT = Acknowledgement("alice", 7, 41)

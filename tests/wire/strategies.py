@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fcslam.records import Channel, Constraint, ConstraintKind, Correction, Keyscan, KeyscanId, LaserModel, Place
+from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.quantisation import dequantise
 
@@ -55,13 +56,15 @@ def descriptors(count):
 def places(draw, robot):
     count = draw(st.integers(0, 20))
     first = draw(NUMBERS)
+    channel = draw(st.sampled_from(Channel))
+    shape = (count, KEYPOINT_AXES[channel])
     return Place(
         KeyscanId(robot, draw(NUMBERS)),
-        draw(st.sampled_from(Channel)),
+        channel,
         draw(NAMES),
         first,
         draw(st.integers(first, 2**31 - 1)),
-        draw(hnp.arrays(np.float32, (count, 2), elements=st.floats(-327.0, 327.0, width=32))),
+        draw(hnp.arrays(np.float32, shape, elements=st.floats(-327.0, 327.0, width=32))),
         draw(descriptors(count)),
     )
 

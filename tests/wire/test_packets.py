@@ -100,7 +100,7 @@ def test_a_place_of_300_descriptors_fits_12_kilobytes():
     place = replace(
         LIDAR_PLACE,
         channel=Channel.CAMERA,
-        keypoints=rng.uniform(-15.0, 15.0, (300, 2)).astype(np.float32),
+        keypoints=rng.uniform(-15.0, 15.0, (300, 3)).astype(np.float32),
         descriptors=rng.integers(0, 256, (300, 32), np.uint8),
     )
     assert len(encode(packet(place))) <= 12_000

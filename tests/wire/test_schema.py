@@ -33,7 +33,7 @@ LONGEST = {
     "Detector.version": 64,
     "Place.detector_version": 64,
     "Keyscan.ranges": 3 * 4096,
-    "Place.keypoints": 4 * 2048,
+    "Place.keypoints": 6 * 2048,
     "Place.descriptors": 32 * 2048,
     "Hello.detectors": 2,
     "Constraint.information": 6,

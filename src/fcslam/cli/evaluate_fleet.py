@@ -149,8 +149,8 @@ def _explanations(report: "FleetReport") -> "Iterator[str]":
     counts = ", ".join(_revisits(report, within) for within in Within)
     yield (
         f"Recall: share of revisits found: {counts}. At every {asked.every_m:g} m of each path there is one for each "
-        f"robot whose path passes within {asked.radius_m:g} m (its own: more than {asked.within_gap_s:g} s away). It is "
-        f"found if a correct closure ends within {criteria.reach_m:g} m of path at both sides. Like heading: within "
+        f"robot whose path passes within {asked.radius_m:g} m (its own: over {asked.within_gap_s:g} s away), found "
+        f"if a correct closure ends within {criteria.reach_m:g} m of path at both sides. Like heading: within "
         f"{LIKE_HEADING_DEG:g} deg. At 100 %: by the closures more similar than every wrong one of their channel."
     )
     yield "A robot reports only closures that it accepts, so candidates within robots are not all known."

@@ -43,7 +43,7 @@ class ClosureLedger:
         """Book a match as verified or, if geometry does not confirm it, as a candidate."""
         status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
         closure = LoopClosure(
-            match.i, match.j, Channel.LIDAR, match.similarity, frozen(match.check.T_a_b),
+            match.i, match.j, match.channel, match.similarity, frozen(match.check.T_a_b),
             frozen(match.check.information), status, match.check.reason, match.check.informative,
         )  # fmt: skip
         entry = Entry(closure, independent=not match.predicted)

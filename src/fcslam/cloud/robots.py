@@ -20,7 +20,7 @@ class RobotStore:
         self._keyscans: dict[str, list[Keyscan]] = {}
         self._connected: dict[str, int] = {}
         """Keyscans that motions tie to the first; only they are known to others."""
-        self._places: set[KeyscanId] = set()
+        self._places: set[tuple[KeyscanId, Channel]] = set()
         self._replies: dict[str, int] = {}
 
     @property
@@ -108,14 +108,14 @@ class RobotStore:
         """
         self.require(place.id, KeyscanId(place.id.robot, place.last))
         announced = self._hellos[place.id.robot].detector_versions.get(place.channel)
-        if place.channel is not Channel.LIDAR or place.detector_version != announced:
+        if place.detector_version != announced:
             raise PacketError(
                 f"{place.id.robot}: a {place.channel} place of detector {place.detector_version}; "
-                f"LiDAR places are compared, of the detector announced ({announced})"
+                f"{announced or 'none'} was announced"
             )
-        if place.id in self._places:
-            raise PacketError(f"{place.id.robot}: place {place.id.number} was described before")
-        self._places.add(place.id)
+        if (place.id, place.channel) in self._places:
+            raise PacketError(f"{place.id.robot}: {place.channel} place {place.id.number} was described before")
+        self._places.add((place.id, place.channel))
 
     def require(self, *ids: KeyscanId) -> None:
         """Check that the keyscans are there.

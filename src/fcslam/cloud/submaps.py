@@ -5,7 +5,7 @@ from fcslam.cloud.robots import RobotStore
 from fcslam.geometry import se2
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.records import KeyscanId, Place
+from fcslam.records import Channel, KeyscanId, Place
 
 
 class SubmapShelf:
@@ -15,16 +15,17 @@ class SubmapShelf:
         self._store = store
         self._graph = graph
         self._capacity = capacity
-        self._submaps: dict[KeyscanId, Submap] = {}
+        self._submaps: dict[tuple[KeyscanId, Channel], Submap] = {}
 
     def of(self, place: Place) -> Submap:
         """The submap around a place, in its keyscan's frame, by the robot's own motions."""
-        submap = self._submaps.pop(place.id, None)
+        key = (place.id, place.channel)
+        submap = self._submaps.pop(key, None)
         if submap is None:
             submap = self._build(place)
             if len(self._submaps) >= self._capacity:
                 del self._submaps[next(iter(self._submaps))]
-        self._submaps[place.id] = submap  # newest last
+        self._submaps[key] = submap  # newest last
         return submap
 
     def _build(self, place: Place) -> Submap:

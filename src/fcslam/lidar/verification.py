@@ -85,10 +85,22 @@ class Verification:
         return 1.0 if self.strict else 0.5 * self.rich
 
 
-def verify(a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig) -> Verification:
-    """Align both ways by Gauss-Newton from the guess, then judge by the worse side."""
-    forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, NO_PRIOR, _ALIGNMENT)
-    backward = match_scan(_sample(a.surface), b.field, se2.inverse(forward.T_field_base), NO_PRIOR, _ALIGNMENT)
+def verify(
+    a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig, prior: FloatArray = NO_PRIOR
+) -> Verification:
+    """Align both ways by Gauss-Newton from the guess, then judge by the worse side.
+
+    Args:
+        a: one submap.
+        b: the other.
+        T_a_b_guess: where the alignment starts, shape (3,).
+        config: what the pair has to show.
+        prior: information of the guess from elsewhere, of (x, y, theta) in a's coordinates, shape (3, 3): along a
+            corridor, where no wall holds the alignment, matched keypoints do.
+    """
+    forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, prior, _ALIGNMENT)
+    T_b_a = se2.inverse(forward.T_field_base)
+    backward = match_scan(_sample(a.surface), b.field, T_b_a, _of_inverse(prior, forward.T_field_base), _ALIGNMENT)
     T_a_b, T_a_b_back = forward.T_field_base, se2.inverse(backward.T_field_base)
     gap = se2.between(T_a_b, T_a_b_back)
     T_a_b = se2.compose(T_a_b, 0.5 * gap)
@@ -102,12 +114,12 @@ def verify(a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationCo
         worse.normal_tensor,
     )
     symmetric = np.hypot(gap[0], gap[1]) < config.symmetry_m and abs(gap[2]) < config.symmetry_rad
-    informative = worse.weakest >= config.informative
+    informative = worse.weakest >= config.informative or _fixes(prior, config)
     strict_reason = _shortfall(worse, config.strict)
     reason = strict_reason or ("" if informative else "fixed in one direction only, as in a corridor")
     return Verification(
         T_a_b=T_a_b,
-        information=_information(forward.information, T_a_b, config),
+        information=_information(forward.information + prior, T_a_b, config),
         worse=worse,
         strict=symmetric and not strict_reason,
         loose=symmetric and not _shortfall(worse, config.loose),
@@ -133,6 +145,25 @@ def _shortfall(found: Agreement, gate: Gate) -> str:
     if found.overlap < gate.overlap:
         return f"overlap of {found.overlap:.2f}"
     return ""
+
+
+def _of_inverse(information: FloatArray, T_a_b: FloatArray) -> FloatArray:
+    """Information of T_a_b, of (x, y, theta) in a, as that of T_b_a, of (x, y, theta) in b."""
+    x, y, theta = T_a_b
+    cos, sin = np.cos(theta), np.sin(theta)
+    # T_b_a = (-R' t, -theta); this is its derivative, which is its own inverse's shape
+    jacobian = np.array([[-cos, -sin, sin * x - cos * y], [sin, -cos, cos * x + sin * y], [0.0, 0.0, -1.0]])
+    inverse = np.linalg.inv(jacobian)
+    return np.asarray(inverse.T @ information @ inverse)
+
+
+def _fixes(prior: FloatArray, config: VerificationConfig) -> bool:
+    """Whether a prior alone fixes the pose in every direction."""
+    if not prior.any():
+        return False
+    covariance = np.linalg.inv(prior)
+    sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    return bool(sigma_m <= config.symmetry_m and np.sqrt(covariance[2, 2]) <= 2.0 * config.symmetry_rad)
 
 
 def _information(points: FloatArray, T_a_b: FloatArray, config: VerificationConfig) -> FloatArray:

@@ -12,13 +12,13 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.codes import mutual_matches
+from fcslam.geometry import se2
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import Verification, VerificationConfig, verify
-from fcslam.places.hypotheses import HypothesisConfig, propose
 from fcslam.places.index import InvertedIndex
+from fcslam.places.motions import Motion, MotionConfig, motions
 from fcslam.places.vocabulary import DynamicVocabulary, DynamicVocabularyConfig
-from fcslam.records import FloatArray, KeyscanId, Place
+from fcslam.records import Channel, FloatArray, KeyscanId, Place
 
 
 class MatcherConfig(Settings):
@@ -28,13 +28,13 @@ class MatcherConfig(Settings):
         default=150, ge=0, description="up to this many places are all compared; then words choose"
     )
     candidates: int = Field(default=20, gt=0, description="places that words propose for one place")
-    hamming_limit: int = Field(default=60, gt=0, le=256, description="most different bits of matching descriptors")
     doubts: int = Field(
         default=2, ge=0, description="places of robots in the same map that are compared wherever the map puts them"
     )
-    inliers: int = Field(default=8, ge=4, description="keypoints that must agree before geometry is asked")
     vocabulary: DynamicVocabularyConfig = Field(default=DynamicVocabularyConfig(), description="dynamic vocabulary")
-    hypotheses: HypothesisConfig = Field(default=HypothesisConfig(), description="rigid motions from keypoints")
+    motions: MotionConfig = Field(default=MotionConfig(), description="rigid motions from keypoints")
+    borne_out_m: float = Field(default=1.0, gt=0.0, description="images bear out a prediction that is off by no more")
+    borne_out_rad: float = Field(default=0.3, gt=0.0, description="and turned by no more")
     verification: VerificationConfig = Field(default=VerificationConfig(), description="verification of closures")
 
 
@@ -44,6 +44,7 @@ class PlaceMatch:
 
     i: KeyscanId
     j: KeyscanId
+    channel: Channel
     similarity: float
     """Eq. (4) on the scale of [0, 1]; the share of matching descriptors before the first vocabulary."""
     check: Verification
@@ -81,16 +82,13 @@ class PlaceMatcher:
         """
         comparable = bool(predicted) or any(strangers(i) for i in self._places)
         similarity = self._similarities(place) if comparable else {}  # Algorithm 1, lines 11-13
-        matches = [self._near_match(i, place, T_i_j, similarity) for i, T_i_j in predicted.items()]
+        near = [self._near_match(i, place, T_i_j, similarity) for i, T_i_j in predicted.items()]
         doubtful = self._doubtful(place.id.robot, similarity, predicted, strangers)
-        matches += [
-            match
-            for i in (*self._candidates(similarity, strangers), *doubtful)
-            if (match := self._far_match(i, place, similarity)) is not None
-        ]
+        others = (*self._candidates(similarity, strangers), *doubtful)
+        far = [self._far_match(i, place, similarity) for i in others]
         self._places[place.id] = place
         self._backlog.append(place)
-        return matches
+        return [match for match in (*near, *far) if match is not None]
 
     def _similarities(self, place: Place) -> dict[KeyscanId, float]:
         for stored in self._backlog:  # a robot alone never needs its words
@@ -122,23 +120,36 @@ class PlaceMatcher:
 
     def _near_match(
         self, i: KeyscanId, place: Place, T_i_j: FloatArray, similarity: Mapping[KeyscanId, float]
-    ) -> PlaceMatch:
-        check = verify(self._submap_of(self._places[i]), self._submap_of(place), T_i_j, self._config.verification)
-        return PlaceMatch(i, place.id, similarity.get(i, 0.0), check, predicted=True)
+    ) -> PlaceMatch | None:
+        """Verify a prediction. Submaps that are near show the same; images need not, so they have to bear it out."""
+        stored = self._places[i]
+        if place.channel is Channel.LIDAR:
+            check = verify(self._submap_of(stored), self._submap_of(place), T_i_j, self._config.verification)
+        else:
+            seen = (motion for motion in motions(stored, place, self._config.motions) if self._bears_out(motion, T_i_j))
+            motion = next(seen, None)
+            if motion is None:
+                return None
+            check = self._verify(stored, place, motion)
+        return PlaceMatch(i, place.id, place.channel, similarity.get(i, 0.0), check, predicted=True)
+
+    def _bears_out(self, motion: Motion, T_i_j: FloatArray) -> bool:
+        off = se2.between(T_i_j, motion.T_a_b)
+        return bool(np.hypot(off[0], off[1]) <= self._config.borne_out_m and abs(off[2]) <= self._config.borne_out_rad)
 
     def _far_match(self, i: KeyscanId, place: Place, similarity: Mapping[KeyscanId, float]) -> PlaceMatch | None:
         """Verify the motions that the keypoints propose; the most convincing one, None if there is none."""
         stored = self._places[i]
-        matches = mutual_matches(stored.descriptors, place.descriptors, self._config.hamming_limit)
-        proposed = propose(stored.keypoints, place.keypoints, matches, self._config.hypotheses)
-        proposed = [h for h in proposed if h.inlier_count >= self._config.inliers]
+        proposed = motions(stored, place, self._config.motions)
         if not proposed:
             return None
-        a, b = self._submap_of(stored), self._submap_of(place)
-        checks = [verify(a, b, h.T_a_b, self._config.verification) for h in proposed]
+        checks = [self._verify(stored, place, motion) for motion in proposed]
         best = max(checks, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
-        share = len(matches.pairs) / max(1, min(len(stored.descriptors), len(place.descriptors)))
-        return PlaceMatch(i, place.id, similarity.get(i, share), best, predicted=False)
+        return PlaceMatch(i, place.id, place.channel, similarity.get(i, proposed[0].share), best, predicted=False)
+
+    def _verify(self, stored: Place, place: Place, motion: Motion) -> Verification:
+        a, b = self._submap_of(stored), self._submap_of(place)
+        return verify(a, b, motion.T_a_b, self._config.verification, motion.information)
 
     def _describe(self, place: Place) -> None:
         """Algorithm 1, lines 3-11: the place joins the vocabulary's window, and the index in its words."""

@@ -8,7 +8,8 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig, describe
 from fcslam.lidar.mapper import FinishedSubmap, LidarConfig, Mapper, ScanPose, Step
-from fcslam.records import Channel, KeyscanId, LaserScan, Place, SensorRecord
+from fcslam.records import CameraImage, Channel, KeyscanId, LaserScan, Place, SensorRecord
+from fcslam.robot.views import View, ViewFinder, ViewsConfig
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.quantisation import dequantise, quantise
 
@@ -17,7 +18,11 @@ class RobotConfig(Settings):
     """What runs on a robot."""
 
     lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM")
+    channels: tuple[Channel, ...] = Field(
+        default=tuple(Channel), min_length=1, description="what places are described by: lidar, camera"
+    )
     birdseye: BirdseyeConfig = Field(default=BirdseyeConfig(), description="binary features of LiDAR submaps")
+    views: ViewsConfig = Field(default=ViewsConfig(), description="binary features of camera images")
 
 
 class RobotFrontend:
@@ -28,24 +33,41 @@ class RobotFrontend:
         self.scan_poses: list[ScanPose] = []
         self._config = config
         self._mapper = Mapper(robot, config.lidar)
+        self._view_finder = ViewFinder(config.views)
+        self._views: list[View] = []
+        """Those that wait for the submap around them."""
         self._sequence = 0
         self._time = float("-inf")
 
     def process(self, record: SensorRecord) -> list[Packet]:
         """The packets that the next record of the recording causes."""
-        if not isinstance(record, LaserScan):
-            return []  # a scan brings its own odometry; images never leave the robot
+        match record:
+            case LaserScan():
+                return self._process_scan(record)
+            case CameraImage() if Channel.CAMERA in self._config.channels:
+                self._process_image(record)
+        return []  # a scan brings its own odometry; images never leave the robot
+
+    def _process_scan(self, record: LaserScan) -> list[Packet]:
         self._time = max(self._time, record.stamp)
         # The robot works with the ranges that the cloud will see, to the last bit.
         scan = replace(record, ranges_m=dequantise(quantise(record.ranges_m)))
         hello = [] if self.scan_poses else [self._hello(scan)]
         step = self._mapper.process(scan)
         self.scan_poses.append(step.pose)
+        self._view_finder.at(scan, step.pose)
         return self._packets([*hello, *self._bodies(step)])
+
+    def _process_image(self, image: CameraImage) -> None:
+        view = self._view_finder.look(image)
+        if view is not None:
+            self._views.append(view)
 
     def finish(self) -> list[Packet]:
         """The packets of what was still open when the recording ended."""
-        return self._packets([body for submap in self._mapper.finish() for body in self._submap_bodies(submap)])
+        rest = self._mapper.finish()
+        last = rest[-1:]
+        return self._packets([body for submap in rest for body in self._submap_bodies(submap, submap in last)])
 
     def _bodies(self, step: Step) -> list[Body]:
         bodies: list[Body] = []
@@ -57,17 +79,31 @@ class RobotFrontend:
             bodies += self._submap_bodies(step.submap)
         return bodies
 
-    def _submap_bodies(self, submap: FinishedSubmap) -> list[Body]:
-        """A LiDAR place and the robot's own closures to it."""
+    def _submap_bodies(self, submap: FinishedSubmap, at_end: bool = False) -> list[Body]:
+        """The robot's own closures to a submap, its LiDAR place, and the camera places on the way to its anchor."""
+        bodies: list[Body] = list(submap.closures)
+        if Channel.LIDAR in self._config.channels:
+            bodies.append(self._lidar_place(submap))
+        ripe = [view for view in self._views if at_end or view.keyscan <= submap.anchor]
+        self._views = self._views[len(ripe) :]
+        return [*bodies, *(self._camera_place(view, submap) for view in ripe)]
+
+    def _lidar_place(self, submap: FinishedSubmap) -> Place:
         features = describe(submap.surface, self._config.birdseye)
-        place = Place(
+        return Place(
             KeyscanId(self.robot, submap.anchor), Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last,
             features.keypoints_m, features.descriptors,
         )  # fmt: skip
-        return [*submap.closures, place]
+
+    def _camera_place(self, view: View, submap: FinishedSubmap) -> Place:
+        return Place(
+            KeyscanId(self.robot, view.keyscan), Channel.CAMERA, self._view_finder.detector_version, submap.first,
+            submap.last, view.keypoints, view.descriptors,
+        )  # fmt: skip
 
     def _hello(self, scan: LaserScan) -> Hello:
-        return Hello(self.robot, 0, scan.laser, {Channel.LIDAR: DETECTOR_VERSION})
+        versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_finder.detector_version}
+        return Hello(self.robot, 0, scan.laser, {channel: versions[channel] for channel in self._config.channels})
 
     def _packets(self, bodies: Iterable[Body]) -> list[Packet]:
         packets = []

@@ -22,7 +22,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.limits import BYTES_PER_KEYPOINT, MAXIMUM_KEYPOINTS
+from fcslam.wire.limits import BYTES_PER_AXIS, KEYPOINT_AXES, MAXIMUM_KEYPOINTS
 from fcslam.wire.messages import Acknowledgement, Hello, Kind
 from fcslam.wire.quantisation import (
     dequantise,
@@ -119,15 +119,17 @@ def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
         raise PacketError(f"place: {len(message.descriptors)} bytes of descriptors, not {CODE_BYTES} for each")
     if count > MAXIMUM_KEYPOINTS:
         raise PacketError(f"place: {count} descriptors, at most {MAXIMUM_KEYPOINTS}")
-    if len(message.keypoints) != BYTES_PER_KEYPOINT * count:
+    channel = read_channel(message.channel)
+    axes = KEYPOINT_AXES[channel]
+    if len(message.keypoints) != BYTES_PER_AXIS * axes * count:
         raise PacketError(f"place: {len(message.keypoints)} bytes of keypoints for {count} descriptors")
     return Place(
         KeyscanId(envelope.robot, message.number),
-        read_channel(message.channel),
+        channel,
         message.detector_version,
         message.first,
         message.last,
-        unpack_keypoints(message.keypoints),
+        unpack_keypoints(message.keypoints, axes),
         np.frombuffer(message.descriptors, dtype=np.uint8).reshape(count, CODE_BYTES),
     )
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fcslam.errors import PacketError
 from fcslam.records import CODE_BYTES, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
 from fcslam.wire.limits import (
+    KEYPOINT_AXES,
     MAXIMUM_BEAMS,
     MAXIMUM_COORDINATE_M,
     MAXIMUM_INFORMATION,
@@ -116,7 +117,7 @@ def _check_place(place: Place, _: Packet) -> None:
     check_name(place.detector_version, "place: detector version")
     count = len(place.keypoints)
     _require(count <= MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {MAXIMUM_KEYPOINTS}")
-    _check_shape(place.keypoints, (count, 2), "place: keypoints")
+    _check_shape(place.keypoints, (count, KEYPOINT_AXES[place.channel]), "place: keypoints")
     _check_shape(place.descriptors, (count, CODE_BYTES), "place: descriptors")
     _require(place.descriptors.dtype == np.uint8, f"place: descriptors are {place.descriptors.dtype}, not bytes")
     within = bool((np.abs(place.keypoints) <= MAXIMUM_KEYPOINT_M).all())

@@ -2,10 +2,12 @@
 
 import re
 
+from fcslam.records import Channel
+
 PROTOCOL_VERSION = 1
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
-"""The largest packet, a place with the most keypoints, has 74 kB."""
+"""The largest packet, a place with the most keypoints, has 78 kB."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,63}", re.ASCII)
 """Names of robots and detector versions: also safe as file names."""
@@ -22,7 +24,9 @@ MAXIMUM_RANGES_BYTES = BYTES_PER_RANGE * MAXIMUM_BEAMS
 """Length of a keyscan's ranges, both before and after inflating."""
 
 MAXIMUM_KEYPOINTS = 2048
-BYTES_PER_KEYPOINT = 4
+KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
+"""Coordinates of a keypoint; a camera sees how high it is, too."""
+BYTES_PER_AXIS = 2
 
 MAXIMUM_COORDINATE_M = 1e6
 MAXIMUM_LASER_RANGE_M = 1e3

@@ -72,13 +72,13 @@ def unpack_ranges(data: bytes) -> RangeCodes:
 
 
 def pack_keypoints(keypoints: NDArray[np.float32]) -> bytes:
-    """Keypoints (N, 2) in metres, within the limit, rounded to 1 cm."""
+    """Keypoints (N, 2) or (N, 3) in metres, within the limit, rounded to 1 cm."""
     return np.rint(np.asarray(keypoints, dtype=np.float64) / KEYPOINT_STEP_M).astype("<i2").tobytes()
 
 
-def unpack_keypoints(data: bytes) -> NDArray[np.float32]:
-    """Keypoints (N, 2) in metres from ``4 N`` bytes."""
-    return frozen(np.frombuffer(data, dtype="<i2").reshape(-1, 2) * KEYPOINT_STEP_M, np.float32)
+def unpack_keypoints(data: bytes, axes: int) -> NDArray[np.float32]:
+    """Keypoints (N, axes) in metres from ``2 N axes`` bytes."""
+    return frozen(np.frombuffer(data, dtype="<i2").reshape(-1, axes) * KEYPOINT_STEP_M, np.float32)
 
 
 def pack_information(information: FloatArray) -> list[float]:

@@ -1,0 +1,109 @@
+"""Where the keypoints of a camera image are: their bearings from the camera, how far from the LiDAR.
+
+Walls, cupboards and door frames stand upright, so what the camera sees above or below the scan plane is taken to lie
+where the LiDAR's returns in that direction do, seen from above. A ray that would be under the floor or above
+``ceiling_m`` there met the floor or the ceiling on its way, and is left out; so is one in whose direction nothing
+returned. Wrong remains what sticks out over or under the scan plane (a table top): RANSAC and the comparison of the
+submaps have to bear it.
+"""
+
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fcslam.records import CameraModel, FloatArray
+
+FLOOR_MARGIN_M: Final = 0.03
+"""Keypoints so near the floor may lie on it."""
+SAME_SURFACE_M: Final = 0.20
+"""Returns next to each other and closer than this lie on one surface ..."""
+SLANT: Final = 4.0
+"""... or than so many times what their beams are apart there: surfaces seen at a grazing angle."""
+WIDEST_GAP_RAD: Final = 0.07
+"""Between returns that are farther apart in direction, nothing is known."""
+EDGE_M: Final = 0.08
+"""A ray that passes an edge this closely ends there: what stands out in an image is often an edge."""
+
+
+def place_keypoints(
+    keypoints_px: NDArray[np.float32], camera: CameraModel, returns: FloatArray, origin: FloatArray, ceiling_m: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Positions of keypoints in ``base``, shape (K, 2) in metres, and for which of them there is one, shape (K,).
+
+    Args:
+        keypoints_px: shape (K, 2), pixels.
+        camera: its geometry; ``base`` lies on the floor.
+        returns: shape (N, 2), the LiDAR's returns in ``base``, in the order of their beams.
+        origin: shape (2,), where the LiDAR is in ``base``.
+        ceiling_m: height that no wall exceeds.
+    """
+    rays = _rays(keypoints_px.astype(np.float64), camera)
+    level = np.hypot(rays[:, 0], rays[:, 1])
+    eye, height = np.array(camera.T_base_camera.translation_m[:2]), camera.T_base_camera.translation_m[2]
+    directions = rays[:, :2] / np.maximum(level, 1e-9)[:, None]
+    distances = _distances(eye, directions, returns, origin)
+    heights = height + distances * rays[:, 2] / np.maximum(level, 1e-9)
+    placed = np.isfinite(distances) & (heights > FLOOR_MARGIN_M) & (heights < ceiling_m)
+    positions = np.column_stack((eye + distances[:, None] * directions, heights))
+    return np.where(placed[:, None], positions, 0.0), placed
+
+
+def _rays(keypoints_px: FloatArray, camera: CameraModel) -> FloatArray:
+    """Viewing rays in ``base``, shape (K, 3)."""
+    x = (keypoints_px[:, 0] - camera.cx) / camera.fx
+    y = (keypoints_px[:, 1] - camera.cy) / camera.fy
+    return np.column_stack((x, y, np.ones(len(x)))) @ _rotation(camera.T_base_camera.rotation).T
+
+
+def _rotation(quaternion: tuple[float, float, float, float]) -> FloatArray:
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@njit(cache=True)
+def _distances(eye: FloatArray, directions: FloatArray, returns: FloatArray, origin: FloatArray) -> FloatArray:
+    """How far each ray from ``eye`` goes until it meets a surface between neighbouring returns; NaN if none."""
+    nearest = np.full(len(directions), np.inf)
+    count = len(returns)
+    for k in range(count if count > 1 else 0):
+        ax, ay = returns[k, 0], returns[k, 1]
+        bx, by = returns[(k + 1) % count, 0], returns[(k + 1) % count, 1]
+        range_a, range_b = np.hypot(ax - origin[0], ay - origin[1]), np.hypot(bx - origin[0], by - origin[1])
+        dot = (ax - origin[0]) * (bx - origin[0]) + (ay - origin[1]) * (by - origin[1])
+        cross = (ax - origin[0]) * (by - origin[1]) - (ay - origin[1]) * (bx - origin[0])
+        gap = abs(np.arctan2(cross, dot))
+        if gap > WIDEST_GAP_RAD:
+            continue
+        length = np.hypot(bx - ax, by - ay)
+        surface = length < max(SAME_SURFACE_M, SLANT * gap * max(range_a, range_b))
+        for i in range(len(directions)):
+            distance = _crossing(eye, directions[i], (ax, ay, bx - ax, by - ay))
+            if not np.isfinite(distance) or distance >= nearest[i]:
+                continue
+            if not surface:
+                x, y = eye[0] + distance * directions[i, 0], eye[1] + distance * directions[i, 1]
+                to_a, to_b = np.hypot(x - ax, y - ay), np.hypot(x - bx, y - by)
+                if min(to_a, to_b) > EDGE_M:
+                    continue
+            nearest[i] = distance
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
+@njit(cache=True)
+def _crossing(eye: FloatArray, direction: FloatArray, side: tuple[float, float, float, float]) -> float:
+    """Distance along the ray to a side (start x, y and vector x, y); infinite where they do not cross."""
+    x, y, dx, dy = side
+    determinant = direction[1] * dx - direction[0] * dy
+    if abs(determinant) < 1e-12:
+        return np.inf
+    distance = (dx * (y - eye[1]) - dy * (x - eye[0])) / determinant
+    share = (direction[0] * (y - eye[1]) - direction[1] * (x - eye[0])) / determinant
+    return distance if distance > 0.0 and 0.0 <= share <= 1.0 else np.inf

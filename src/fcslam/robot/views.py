@@ -1,0 +1,96 @@
+"""Keyframe images: what the camera shows of a place, as descriptors with metric positions. The images stay here."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.features.classical import Orb, OrbConfig
+from fcslam.features.detector import Detector, decode_grey
+from fcslam.features.placing import place_keypoints
+from fcslam.geometry import se2
+from fcslam.lidar.mapper import ScanPose
+from fcslam.lidar.scan import point_scan
+from fcslam.records import CameraImage, Codes, FloatArray, LaserScan, frozen
+
+
+class ViewsConfig(Settings):
+    """Which images become places, and what is kept of them."""
+
+    every_m: float = Field(default=1.0, gt=0.0, description="travel between two camera places [m]")
+    every_rad: float = Field(default=0.5, gt=0.0, description="or turn: half of what a camera sees is new [rad]")
+    fewest_keypoints: int = Field(default=20, ge=1, description="an image of a bare wall is no place")
+    ceiling_m: float = Field(default=3.0, gt=0.0, description="keypoints above this lie on no wall [m]")
+    orb: OrbConfig = Field(default=OrbConfig(), description="the detector")
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One keyframe image, as far as it leaves the robot."""
+
+    keyscan: int
+    keypoints: NDArray[np.float32]
+    """Shape (K, 3): x, y, z in metres in the keyscan's base."""
+    descriptors: Codes
+    """Shape (K, 32)."""
+
+
+class ViewFinder:
+    """Picks images that show something new and turns them into views."""
+
+    def __init__(self, config: ViewsConfig) -> None:
+        self._config = config
+        self._detector: Detector = Orb(config.orb)
+        self._scan: LaserScan | None = None
+        self._pose: ScanPose | None = None
+        self._last: tuple[int, FloatArray] | None = None
+        """Keyscan and odometry of the last view."""
+
+    @property
+    def detector_version(self) -> str:
+        """Of the descriptors."""
+        return self._detector.version
+
+    def at(self, scan: LaserScan, pose: ScanPose) -> None:
+        """The robot has seen this scan from this pose."""
+        self._scan, self._pose = scan, pose
+
+    def look(self, image: CameraImage) -> View | None:
+        """The view in the next image; None if it shows little, or little that is new.
+
+        Between the last scan and the image the robot moved as its odometry says, or not at all if that is not known.
+        """
+        if self._scan is None or self._pose is None:
+            return None
+        odometry = self._scan.T_odom_base if image.T_odom_base is None else image.T_odom_base
+        if not self._is_new(self._pose.keyscan, odometry):
+            return None
+        picture = decode_grey(image.encoded)
+        if picture is None:
+            return None
+        self._last = self._pose.keyscan, odometry
+        features = self._detector.detect(picture)
+        T_scan_image = se2.between(self._scan.T_odom_base, odometry)
+        returns = point_scan(self._scan.ranges_m, self._scan.laser)
+        ends = se2.transform(se2.inverse(T_scan_image), np.vstack((returns.origin, returns.points)))
+        positions, placed = place_keypoints(
+            features.keypoints_px, image.camera, ends[1:], ends[0], self._config.ceiling_m
+        )
+        if placed.sum() < self._config.fewest_keypoints:
+            return None
+        T_keyscan_image = se2.compose(self._pose.T_keyscan_base, T_scan_image)
+        positions[:, :2] = se2.transform(T_keyscan_image, positions[:, :2])
+        return View(
+            self._pose.keyscan, frozen(positions[placed], np.float32), frozen(features.descriptors[placed], np.uint8)
+        )
+
+    def _is_new(self, keyscan: int, T_odom_base: FloatArray) -> bool:
+        """A keyscan has one view at most, which names its place."""
+        if self._last is None:
+            return True
+        seen_from, T_odom_last = self._last
+        motion = se2.between(T_odom_last, T_odom_base)
+        moved = np.hypot(motion[0], motion[1]) >= self._config.every_m or abs(motion[2]) >= self._config.every_rad
+        return bool(moved) and keyscan > seen_from

@@ -1,0 +1,111 @@
+"""Keypoints of images in metres: bearings from the camera, distances from the LiDAR."""
+
+import numpy as np
+import pytest
+from features.pictures import CAMERA
+from lidar.worlds import LASER, box, path, room, scan_at
+
+from fcslam.features.placing import place_keypoints
+from fcslam.geometry import se2
+from fcslam.records import CameraModel, Transform
+
+POSE = np.array([-1.5, -1.0, 0.2])
+
+
+def project(points, camera=CAMERA):
+    """Pixels (K, 2) of points (K, 3) in ``base``, by the matrix of the camera: x right, y down, z ahead."""
+    eye = np.array(camera.T_base_camera.translation_m)
+    ahead, left, up = (points - eye).T
+    return np.column_stack((camera.cx - camera.fx * left / ahead, camera.cy - camera.fy * up / ahead)).astype(
+        np.float32
+    )
+
+
+def located(points, walls, pose=POSE, camera=CAMERA):
+    scan = scan_at(pose, walls, LASER)
+    return place_keypoints(project(points, camera), camera, scan.points, scan.origin, 3.0)
+
+
+def on_walls(pose, walls, angles_rad, heights):
+    """Points (K, 3) in ``base`` where level rays from the camera meet a wall, the nearest by brute force."""
+    eye = se2.transform(pose, np.array([CAMERA.T_base_camera.translation_m[:2]]))[0]
+    points = []
+    for angle, height in zip(angles_rad, heights, strict=True):
+        direction = np.array([np.cos(pose[2] + angle), np.sin(pose[2] + angle)])
+        ends = [cross(eye, direction, wall) for wall in walls]
+        distance = min(end for end in ends if end is not None)
+        points.append([*se2.transform(se2.inverse(pose), (eye + distance * direction)[None])[0], height])
+    return np.array(points)
+
+
+def cross(eye, direction, wall):
+    start, along = wall[:2], wall[2:] - wall[:2]
+    matrix = np.column_stack((direction, -along))
+    if abs(np.linalg.det(matrix)) < 1e-9:
+        return None
+    distance, share = np.linalg.solve(matrix, start - eye)
+    return distance if distance > 0 and 0 <= share <= 1 else None
+
+
+@pytest.mark.parametrize("pose", [POSE, np.array([2.0, 1.0, -2.4]), np.array([0.0, 3.0, 1.7])])
+def test_points_of_walls_are_found_where_they_are(pose):
+    """Between two beams the wall is straight, except where it turns a corner or ends."""
+    rng = np.random.default_rng(3)
+    points = on_walls(pose, room(), rng.uniform(-0.6, 0.6, 200), rng.uniform(0.1, 2.0, 200))
+    found, placed = located(points, room(), pose)
+    errors = np.linalg.norm(found[placed] - points[placed], axis=1)
+    assert placed.mean() > 0.9
+    assert np.median(errors) < 0.002
+    assert np.mean(errors < 0.05) > 0.95
+
+
+def test_floor_and_ceiling_lie_on_no_wall():
+    walls = box(-4, -4, 4, 4)
+    points = np.array([[2.0, 0.3, 0.0], [1.0, -0.2, 0.0], [2.0, 0.0, 3.0], [2.5, 0.5, 3.0], [3.5, 0.0, 1.0]])
+    _, placed = located(points, walls, np.zeros(3))
+    assert placed.tolist() == [False, False, False, False, True]
+
+
+def test_where_nothing_returned_nothing_is_placed():
+    walls = path((3, 0.2), (3, 4))
+    points = np.array([[3.0, 1.0, 1.0], [3.0, -1.0, 1.0]])
+    _, placed = located(points, walls, np.zeros(3))
+    assert placed.tolist() == [True, False]
+    _, placed = place_keypoints(project(points), CAMERA, np.empty((0, 2)), np.zeros(2), 3.0)
+    assert not placed.any()
+
+
+def test_an_edge_belongs_to_what_stands_in_front():
+    """A door post 1 m in front of a wall: its edge is not smeared between the two."""
+    walls = np.vstack((path((2.0, -1.0), (2.0, 0.013)), path((3.0, -3.0), (3.0, 3.0))))
+    edge = np.array([[2.0, 0.012 + 0.004 * k, 1.0] for k in range(3)])
+    found, placed = located(edge, walls, np.zeros(3))
+    assert np.all(np.abs(found[placed][:, 0] - 2.0) < 0.1)
+    between = np.array([[2.5, 0.03, 1.0]])
+    found, placed = located(between, walls, np.zeros(3))
+    assert not placed[0] or abs(found[0, 0] - 3.0) < 0.1 or abs(found[0, 0] - 2.0) < 0.1
+
+
+def test_the_mounting_of_the_camera_is_heeded():
+    """Turned to the left on its mast, and pitched down by 10 degrees."""
+    walls = box(-4, -4, 4, 4)
+    yaw = np.array([0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)])
+    left = product(yaw, np.array(CAMERA.T_base_camera.rotation))
+    turned = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5, Transform((0.0, 0.1, 0.6), tuple(left)))
+    centre = np.array([[159.5, 119.5]], np.float32)
+    scan = scan_at(np.zeros(3), walls, LASER)
+    found, placed = place_keypoints(centre, turned, scan.points, scan.origin, 3.0)
+    assert placed[0]
+    assert np.allclose(found[0], (0.0, 4.0, 0.6), atol=0.01)
+    pitch = np.array([0.0, np.sin(np.deg2rad(5)), 0.0, np.cos(np.deg2rad(5))])
+    down = product(pitch, np.array(CAMERA.T_base_camera.rotation))
+    lowered = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5, Transform((0.0, 0.0, 0.9), tuple(down)))
+    found, placed = place_keypoints(centre, lowered, scan.points, scan.origin, 3.0)
+    assert placed[0]
+    assert np.allclose(found[0], (4.0, 0.0, 0.9 - 4.0 * np.tan(np.deg2rad(10))), atol=0.01)
+
+
+def product(p, q):
+    """Of two quaternions (x, y, z, w)."""
+    (a, b), (s, t) = (p[:3], q[:3]), (p[3], q[3])
+    return np.append(s * b + t * a + np.cross(a, b), s * t - a @ b)

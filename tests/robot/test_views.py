@@ -1,0 +1,160 @@
+"""Camera places of a robot that drives through a drawn room, and that its images stay with it."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from features.pictures import image_at
+from lidar.worlds import drifting, drive, recording, ring
+
+from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.features.classical import ORB_VERSION
+from fcslam.geometry import se2
+from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.views import ViewsConfig
+from fcslam.wire.messages import Hello, Packet
+from fcslam.wire.packets import encode
+
+EVERY = 3
+"""Scans between two images."""
+
+
+def records_of(waypoints, seed):
+    """A drive along the drawn ring: scans, an image shortly after every third, and the true poses at the scans."""
+    rng = np.random.default_rng(seed)
+    poses = drive(waypoints)
+    odometry = drifting(poses, rng)
+    scans = list(recording(poses, odometry, ring(), seed=seed))
+    records = []
+    for k, scan in enumerate(scans):
+        records.append(scan)
+        if k % EVERY == 0 and k + 1 < len(scans):
+            step = 0.4 * se2.between(odometry[k], odometry[k + 1])
+            true_step = 0.4 * se2.between(poses[k], poses[k + 1])
+            moved = se2.compose(odometry[k], step)
+            stamp = scan.stamp + 0.4 * (scans[k + 1].stamp - scan.stamp)
+            records.append(image_at(stamp, se2.compose(poses[k], true_step), ring(), moved))
+    return records, poses
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return records_of([(1.5, 1.5), (11.0, 1.5)], 1)
+
+
+def bodies_of(records, config=RobotConfig()):  # noqa: B008 - frozen
+    frontend = RobotFrontend("r", config)
+    packets = [packet for record in records for packet in frontend.process(record)] + frontend.finish()
+    return [packet.body for packet in packets], packets
+
+
+def places(bodies, channel=Channel.CAMERA):
+    return [body for body in bodies if isinstance(body, Place) and body.channel is channel]
+
+
+def test_camera_places_come_every_metre_with_heights(seen):
+    bodies, packets = bodies_of(seen[0])
+    found = places(bodies)
+    assert 8 <= len(found) <= 11
+    numbers = [place.id.number for place in found]
+    assert numbers == sorted(set(numbers))
+    for place in found:
+        assert place.detector_version == ORB_VERSION
+        assert place.first <= place.id.number <= place.last
+        assert place.keypoints.shape == (len(place.descriptors), 3)
+        assert np.all((place.keypoints[:, 2] > 0.0) & (place.keypoints[:, 2] < 3.0))
+    assert [encode(packet) for packet in packets] == [encode(packet) for packet in bodies_of(seen[0])[1]]
+
+
+def test_keypoints_lie_on_the_walls(seen):
+    """In the frame of their keyscan, whose true pose the drive tells."""
+    records, poses = seen
+    bodies, _ = bodies_of(records)
+    stamps = [record.stamp for record in records if isinstance(record, LaserScan)]
+    at = {body.id.number: poses[stamps.index(body.stamp)] for body in bodies if isinstance(body, Keyscan)}
+    walls = ring()
+    for place in places(bodies):
+        points = se2.transform(at[place.id.number], place.keypoints[:, :2].astype(float))
+        along = walls[:, 2:] - walls[:, :2]
+        share = np.einsum("kwi,wi->kw", points[:, None] - walls[:, :2], along) / np.sum(along**2, axis=1)
+        foot = walls[:, :2] + np.clip(share, 0, 1)[..., None] * along
+        distance = np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1)
+        assert np.mean(distance < 0.08) > 0.9
+
+
+def test_a_robot_that_stands_still_sees_nothing_new(seen):
+    records = seen[0][: EVERY + 2]
+    last = records[-1]
+    standing = [replace(r, stamp=last.stamp + 0.1 * k) for k in range(20) for r in records[:2]]
+    assert len(places(bodies_of(standing)[0])) <= 1
+
+
+def test_channels_are_a_choice(seen):
+    for channels in ((Channel.LIDAR,), (Channel.CAMERA,)):
+        bodies, _ = bodies_of(seen[0], RobotConfig(channels=channels))
+        hello = next(body for body in bodies if isinstance(body, Hello))
+        assert set(hello.detector_versions) == set(channels)
+        assert {body.channel for body in bodies if isinstance(body, Place)} == set(channels)
+
+
+def test_images_change_nothing_but_camera_places(seen):
+    records, _ = seen
+    sighted = [body for body in bodies_of(records)[0] if getattr(body, "channel", None) is not Channel.CAMERA]
+    blind, _ = bodies_of([record for record in records if isinstance(record, LaserScan)])
+    assert len(sighted) == len(blind)
+    assert all(
+        encode(Packet("r", 0, 0, 1e9, a)) == encode(Packet("r", 0, 0, 1e9, b))
+        for a, b in zip(sighted, blind, strict=True)
+    )
+
+
+def test_images_of_bare_walls_are_no_places(seen):
+    assert places(bodies_of(seen[0], RobotConfig(views=ViewsConfig(fewest_keypoints=2000)))[0]) == []
+
+
+def test_without_odometry_at_the_image_the_robot_stands(seen):
+    blind = [r if isinstance(r, LaserScan) else replace(r, T_odom_base=None) for r in seen[0]]
+    assert len(places(bodies_of(blind)[0])) >= 7
+
+
+def test_no_packet_holds_a_piece_of_an_image(seen):
+    """Every packet that a robot with a camera sends, whatever its kind: not 12 bytes of a file, nor 12 grey levels."""
+    records, _ = seen
+    pieces = set()
+    for image in (record for record in records if not isinstance(record, LaserScan)):
+        pieces |= {image.encoded[k : k + 12] for k in range(640, len(image.encoded) - 12)}  # behind the JPEG's tables
+        grey = cv2.imdecode(np.frombuffer(image.encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+        rows = [row.tobytes() for row in grey[60:180:8]]
+        pieces |= {row[k : k + 12] for row in rows for k in range(0, 308) if len(set(row[k : k + 12])) > 6}
+    _, packets = bodies_of(records)
+    assert {type(packet.body).__name__ for packet in packets} >= {"Hello", "Keyscan", "Constraint", "Place"}
+    for packet in packets:
+        data = encode(packet)
+        assert not any(data[k : k + 12] in pieces for k in range(len(data) - 11))
+
+
+def test_what_cameras_saw_joins_two_maps():
+    """Two robots that drive the same way, from unknown starts: camera places alone tell how they lie."""
+    ways = ([(1.5, 1.5), (14.5, 1.5), (14.5, 6.0)], [(4.0, 1.6), (14.4, 1.6), (14.4, 8.0)])
+    config, cloud, truth = RobotConfig(channels=(Channel.CAMERA,)), Fleet(FleetConfig(), 0), {}
+    for number, way in enumerate(ways):
+        records, poses = records_of(way, 10 + number)
+        robot = RobotFrontend(f"r{number}", config)
+        for record in records:
+            for packet in robot.process(record):
+                cloud.receive(encode(packet))
+        for packet in robot.finish():
+            cloud.receive(encode(packet))
+        stamps = [record.stamp for record in records if isinstance(record, LaserScan)]
+        truth[robot.robot] = (stamps, poses)
+    result = cloud.finalize()
+    assert {robot.map_index for robot in result.robots} == {0}
+    accepted = [c for c in result.closures if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot]
+    assert len(accepted) >= 3
+    assert {closure.channel for closure in accepted} == {Channel.CAMERA}
+    starts = [robot.T_map_base[0] for robot in result.robots]
+    true_starts = [truth[robot.robot][1][0] for robot in result.robots]
+    off = se2.between(se2.between(*true_starts), se2.between(*starts))
+    assert np.hypot(off[0], off[1]) < 0.1
