@@ -87,6 +87,7 @@ def _prepare(output: Path, settings: "SimulationSettings", seed: int) -> None:
         for name in (RECORDINGS, RUN):
             if (output / name).exists():
                 shutil.rmtree(output / name)
+        (output / RECORDINGS).mkdir()
         for name in (FIGURE, TABLE):
             (output / name).unlink(missing_ok=True)
         about = "# What `fcslam demo` simulated. It replaces this folder's demo when it runs again."
