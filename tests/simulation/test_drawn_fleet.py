@@ -1,10 +1,11 @@
-"""The drawn fleet: rays against an independent oracle, routes that touch nothing, odometry that drifts as said."""
+"""The drawn fleet: rays against an independent oracle, odometry that drifts as said."""
 
 import sys
 import types
 
 import numpy as np
 import pytest
+from simulation.driving import distances
 
 from fcslam import config
 from fcslam.errors import ConfigError
@@ -23,7 +24,6 @@ from fcslam.simulation.drawn_fleet import (
     write_fleet,
 )
 from fcslam.simulation.floorplan import draw_floor_plan
-from fcslam.simulation.route import SPEED_M_S, TURN_RATE_RAD_S, drive, plan_route
 from fcslam.simulation.truth import true_relations
 
 SEEDS = range(8)
@@ -33,15 +33,6 @@ NO_DRIFT = DriftSettings(travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0
 @pytest.fixture(scope="module")
 def fleet():
     return draw_fleet(FleetSettings(), np.random.default_rng(0))
-
-
-def distances(points, segments):
-    """Distance of every point from its nearest segment, shape (N,)."""
-    a, b = segments[:, :2], segments[:, 2:]
-    along = b - a
-    share = np.einsum("nsk,sk->ns", points[:, None] - a, along) / np.sum(along**2, axis=1)
-    nearest = a + np.clip(share, 0.0, 1.0)[..., None] * along
-    return np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1)
 
 
 def solve_ray(pose, angle, segments, max_range):
@@ -70,36 +61,6 @@ def test_nothing_to_hit_is_the_maximum_range():
     assert np.all(cast_rays(np.zeros((2, 3)), np.zeros(4), np.empty((0, 4)), 7.0) == 7.0)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_robots_touch_neither_walls_nor_furniture(seed):
-    rng = np.random.default_rng(seed)
-    plan = draw_floor_plan(rng)
-    for loop in range(3):
-        _, poses = drive(plan_route(plan, loop, 90.0, rng), 0.1)
-        assert distances(poses[:, :2], plan.segments).min() > 0.25
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_drive_has_the_length_and_the_speeds_asked(seed):
-    rng = np.random.default_rng(seed)
-    waypoints = plan_route(draw_floor_plan(rng), seed % 3, 60.0, rng)
-    assert np.sum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)) == pytest.approx(60.0)
-    stamps, poses = drive(waypoints, 0.2)
-    np.testing.assert_allclose(np.diff(stamps), 0.2)
-    motions = se2.relative(poses)
-    assert np.hypot(motions[:, 0], motions[:, 1]).max() < SPEED_M_S * 0.2 + 1e-9
-    assert np.abs(motions[:, 2]).max() < TURN_RATE_RAD_S * 0.2 + 1e-9
-    np.testing.assert_allclose(poses[0, :2], waypoints[0])
-
-
-@pytest.mark.parametrize("length_m", [0.5, 5.0, 300.0])
-def test_short_and_long_routes(length_m):
-    rng = np.random.default_rng(3)
-    plan = draw_floor_plan(rng)
-    waypoints = plan_route(plan, 2, length_m, rng)
-    assert np.sum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)) == pytest.approx(length_m)
-
-
 def test_every_room_has_a_door_that_a_robot_can_see_through():
     for seed in SEEDS:
         plan = draw_floor_plan(np.random.default_rng(seed))
@@ -108,17 +69,6 @@ def test_every_room_has_a_door_that_a_robot_can_see_through():
             way = room.inside - room.doorway
             pose = np.array([[*room.doorway, np.arctan2(way[1], way[0])]])
             assert cast_rays(pose, np.zeros(1), plan.segments, 50.0)[0, 0] > np.linalg.norm(way)
-
-
-def test_neighbours_share_ground_and_return_to_their_own(fleet):
-    positions = [robot.T_building_base[:, :2] for robot in fleet.robots]
-    for a, b in ((0, 2), (1, 2), (0, 1)):
-        apart = np.linalg.norm(positions[a][:, None] - positions[b], axis=2).min(axis=1)
-        assert np.mean(apart < 1.5) > 0.05
-    for robot in fleet.robots:
-        start = np.linalg.norm(robot.T_building_base[:, :2] - robot.T_building_base[0, :2], axis=1)
-        away = np.argmax(start > 5.0)
-        assert start[away:].min() < 2.0
 
 
 def test_noiseless_returns_lie_on_walls(fleet):

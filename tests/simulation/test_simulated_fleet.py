@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulation.driving import route
 
 from fcslam.errors import SimulationError
 from fcslam.geometry import se2
@@ -15,7 +16,7 @@ from fcslam.simulation.drawn_fleet import DriftSettings, LidarSettings, cast_ray
 from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import Kind, draw_floor_plan
 from fcslam.simulation.kinds import Building
-from fcslam.simulation.route import drive, plan_route
+from fcslam.simulation.route import drive
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster
 
@@ -28,7 +29,7 @@ TINY = SimulationSettings(
 def test_rays_agree_with_the_drawn_fleets(building):
     rng = np.random.default_rng(2)
     plan = draw_floor_plan(rng, building)
-    _, poses = drive(plan_route(plan, 0, 40.0, rng), 8.0)
+    _, poses = drive(route(plan, 40.0, rng), 8.0)
     # Columns are round here and have eight corners there.
     pieces = tuple(piece for piece in plan.pieces if piece.kind is not Kind.COLUMN)
     sides = [np.hstack((p.outline, np.roll(p.outline, -1, axis=0))) for p in pieces if p.kind is not Kind.LINTEL]

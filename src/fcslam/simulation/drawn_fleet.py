@@ -1,6 +1,6 @@
 """A fleet of robots with 2D LiDARs and drifting wheels in a drawn floor plan: no simulator needed, truth known.
 
-Each robot walks round one of the building's loops and visits rooms; neighbours share corridors. Its odometry starts
+Each robot drives a round through rooms and corridors; neighbours share a part. Its odometry starts
 at zero wherever the robot stands, so nothing but the scans tells where the robots were relative to each other.
 """
 
@@ -16,7 +16,7 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, LaserModel, LaserScan, frozen
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan
-from fcslam.simulation.route import drive, plan_route
+from fcslam.simulation.route import draw_goals, drive, plan_route
 from fcslam.simulation.truth import write_truth
 
 FIRST_STAMP = 1000.0
@@ -95,7 +95,9 @@ class DrawnFleet:
 def draw_fleet(settings: FleetSettings, rng: np.random.Generator) -> DrawnFleet:
     """Draw a building and let the robots drive in it; the same generator state gives the same fleet."""
     plan = draw_floor_plan(rng)
-    return DrawnFleet(plan, tuple(_draw_robot(plan, number, settings, rng) for number in range(settings.robots)))
+    goals = draw_goals(plan, settings.robots, settings.path_length_m, rng.spawn(1)[0])
+    robots = tuple(_draw_robot(plan, number, goals[number], settings, rng) for number in range(settings.robots))
+    return DrawnFleet(plan, robots)
 
 
 def write_fleet(fleet: DrawnFleet, folder: Path, rng: np.random.Generator) -> list[Path]:
@@ -111,8 +113,10 @@ def write_fleet(fleet: DrawnFleet, folder: Path, rng: np.random.Generator) -> li
     return logs
 
 
-def _draw_robot(plan: FloorPlan, number: int, settings: FleetSettings, rng: np.random.Generator) -> DrawnRobot:
-    waypoints = plan_route(plan, number % len(plan.loops), settings.path_length_m, rng)
+def _draw_robot(
+    plan: FloorPlan, number: int, goals: FloatArray, settings: FleetSettings, rng: np.random.Generator
+) -> DrawnRobot:
+    waypoints = plan_route(plan, goals, settings.path_length_m, rng)
     times, poses = drive(waypoints, 1.0 / settings.lidar.rate_hz)
     laser = LaserModel(settings.lidar.beams, -np.pi, 2.0 * np.pi / settings.lidar.beams, settings.lidar.max_range_m)
     return DrawnRobot(

@@ -1,8 +1,8 @@
 """A fleet with LiDARs and cameras in one furnished building: who drives where, sees what, and where it really was.
 
-One seed decides everything. The building, its looks and the furniture come from the seed alone, each robot's route,
-odometry, noise and the furniture that moved before it came from the seed and its number: a further robot changes
-nothing for the others, and cameras change nothing for the LiDARs.
+One seed decides everything. The building, its looks, the furniture and the fleet's goals come from the seed alone,
+each robot's route, odometry, noise and the furniture that moved before it came from the seed and its number: a further
+robot changes nothing for the others, and cameras change nothing for the LiDARs.
 """
 
 import math
@@ -32,7 +32,7 @@ from fcslam.simulation.drawn_fleet import FIRST_STAMP, STAMP_SHIFT_S, DriftSetti
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
 from fcslam.simulation.kinds import Building, Lighting
 from fcslam.simulation.lighting import light_of
-from fcslam.simulation.route import Schedule, plan_route, schedule
+from fcslam.simulation.route import Schedule, draw_goals, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster
 
@@ -167,15 +167,15 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
     """Draw a building and plan what each robot does; the same seed gives the same fleet.
 
     Raises:
-        SimulationError: the building is too small for so many robots.
+        SimulationError: the building is too small for so many robots, or to drive in.
     """
     rng = np.random.default_rng(seed)
     plan = draw_floor_plan(rng, settings.building)
     _check_room(plan, settings)
+    goals = draw_goals(plan, settings.robots, settings.path_length_m, rng.spawn(1)[0])
     decoration = decorate(plan, rng) if settings.camera else None
-    return SimulatedFleet(
-        plan, tuple(_robot(plan, decoration, number, settings, seed) for number in range(settings.robots))
-    )
+    robots = (_robot(plan, decoration, number, goals[number], settings, seed) for number in range(settings.robots))
+    return SimulatedFleet(plan, tuple(robots))
 
 
 def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
@@ -189,12 +189,17 @@ def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
 
 
 def _robot(
-    plan: FloorPlan, decoration: Decoration | None, number: int, settings: SimulationSettings, seed: int
+    plan: FloorPlan,
+    decoration: Decoration | None,
+    number: int,
+    goals: FloatArray,
+    settings: SimulationSettings,
+    seed: int,
 ) -> SimulatedRobot:
     rng = np.random.default_rng((seed, number))
     if number:
         plan = move_furniture(plan, settings.moved_furniture, rng)
-    route = schedule(plan_route(plan, number % len(plan.loops), settings.path_length_m, rng))
+    route = schedule(plan_route(plan, goals, settings.path_length_m, rng))
     times = np.arange(0.0, route.duration_s, 1.0 / settings.lidar.rate_hz)
     poses, lidar, camera = route.at(times), settings.lidar, settings.camera
     first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
