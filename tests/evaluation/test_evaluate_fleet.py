@@ -138,7 +138,7 @@ def test_robots_in_another_map_have_an_alignment_of_their_own(folder):
 
 
 CLOSURES = (
-    closure((0, 22), (1, 22), ACCEPTED, LIDAR, similarity=0.2),
+    closure((0, 22), (1, 22), ACCEPTED, LIDAR, similarity=0.5),
     closure((0, 62), (1, 62), REJECTED, LIDAR, similarity=0.9),
     closure((1, 140), (0, 140), REVOKED, LIDAR, (0.6, 0.0, 0.0), similarity=0.5),
     closure((0, 30), (2, 120), CANDIDATE, LIDAR, (0.0, 0.0, 0.3), similarity=0.1),
@@ -169,7 +169,7 @@ def test_recall_counts_what_correct_closures_find(folder):
     # Robot 1 is half a metre ahead. A closure at s metres of both finds those of robot 0 in [s - 1.5, s + 2] and of
     # robot 1 in [s - 2, s + 1.5]: four and three.
     assert (lidar.recall.found, camera.recall.found, both.recall.found) == (14, 7, 21)
-    # Of the lidar's verified ones the second is more similar than the wrong one, the first is not.
+    # Of the lidar's verified ones the second is more similar than the wrong one, the first is as similar.
     found = [score.recall_full_precision.found for score in (lidar, camera, both)]
     assert found == [7, 7, 14]
     # robot 2 drives the other way round

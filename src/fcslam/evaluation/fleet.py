@@ -9,7 +9,7 @@ import numpy as np
 
 from fcslam.evaluation.fleet_closures import FleetClosures, score_closures
 from fcslam.evaluation.truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
-from fcslam.metrics.closures import ClosureCriteria
+from fcslam.metrics.closures import ClosureCriteria, Mask
 from fcslam.metrics.grid import GridAgreement, grid_agreement
 from fcslam.metrics.relations import RelationErrors
 from fcslam.metrics.trajectory import (
@@ -120,7 +120,7 @@ def evaluate_fleet(run: Path, truth: Path | None = None, criteria: ClosureCriter
     )
 
 
-def _poses(known: KnownPoses, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[FloatArray, FloatArray]:
+def _poses(known: KnownPoses, rows: Mask) -> tuple[FloatArray, FloatArray]:
     """``T_truth_base`` and ``T_map_base`` (N, 3) of the rows for which ``rows`` holds."""
     return known.truth.T_map_base[rows], known.estimate.T_map_base[rows]
 
