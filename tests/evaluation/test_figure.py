@@ -8,7 +8,7 @@ import pytest
 
 from fcslam.cloud import palette
 from fcslam.errors import EvaluationError, OutputError
-from fcslam.evaluation.charts import Chart, FleetCharts, Match, Outline, fleet_charts, spread
+from fcslam.evaluation.charts import RAY_M, Chart, FleetCharts, Match, Outline, fleet_charts, spread
 from fcslam.evaluation.figure import MATCHES_DRAWN, WIDTH_PX, draw_figure, write_figure
 from fcslam.geometry import se2
 from fcslam.metrics.grid import LabelledGrid
@@ -152,7 +152,7 @@ def test_single_beams_do_not_widen_a_chart():
     beams = LabelledGrid(np.pad(grid.occupied, ((0, 0), (0, 200))), free, SIDE_M, np.zeros(3))
     np.testing.assert_allclose(Chart(beams, {}).bounds(), Chart(grid, {}).bounds())
     lost = Chart(beams, {"a": np.array([(12.0, 2.0, 0.0)])})
-    assert lost.bounds()[1][0] == pytest.approx(12.0 + SIDE_M)
+    assert lost.bounds()[1][0] == pytest.approx(12.0 + RAY_M)
 
 
 def test_maps_of_nothing_are_still_a_figure(tmp_path):

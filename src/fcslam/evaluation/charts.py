@@ -17,7 +17,7 @@ from fcslam.records import Channel, ClosureStatus, FloatArray
 from fcslam.runs import LOCAL, ClosureRow, LocalMap, Run, open_run
 
 RAY_M: Final = 0.5
-"""Known area thinner than this (single beams through doors) does not widen a chart."""
+"""Known area thinner than this (single beams through doors) does not widen a chart, which has so wide a margin."""
 AS_IT_IS: Final = (0.0, 0.0, 0.0)
 
 
@@ -62,7 +62,7 @@ class Chart:
         placed = np.concatenate([self.place(part) for part in points])
         if not len(placed):
             return np.zeros(2), np.ones(2)
-        return placed.min(axis=0) - self.grid.resolution_m, placed.max(axis=0) + self.grid.resolution_m
+        return placed.min(axis=0) - RAY_M, placed.max(axis=0) + RAY_M
 
 
 @dataclass(frozen=True, slots=True)

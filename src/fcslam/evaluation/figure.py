@@ -159,7 +159,8 @@ def _draw_chart(axes: "Axes", panel: _Panel, colors: Mapping[str, str]) -> None:
 
 
 def _draw_grid(axes: "Axes", panel: _Panel) -> None:
-    """The grid turned as it lies; unknown cells leave the paper as it is."""
+    """The grid turned as it lies, cut where the chart ends; unknown cells leave the paper as it is."""
+    from matplotlib.patches import Rectangle
     from matplotlib.transforms import Affine2D
 
     grid = panel.chart.grid
@@ -167,10 +168,12 @@ def _draw_grid(axes: "Axes", panel: _Panel) -> None:
     in_grid = grid.resolution_m * np.array(((0, 0), (width, 0), (0, height)))
     corner, right, upper = panel.pixels(se2.transform(grid.T_frame_grid, in_grid))
     turned = Affine2D.from_values(*(right - corner), *(upper - corner), *corner)
-    axes.imshow(
+    image = axes.imshow(
         _colored(grid, panel.scale), origin="lower", extent=(0, 1, 0, 1), transform=turned + axes.transData,
         aspect="auto", interpolation="bilinear",
     )  # fmt: skip
+    box = panel.scale * panel.size_m
+    image.set_clip_path(Rectangle((panel.corner_px[0], panel.corner_px[1]), box[0], box[1], transform=axes.transData))
 
 
 def _colored(grid: LabelledGrid, scale: float) -> "NDArray[np.uint8]":
