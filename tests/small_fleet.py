@@ -7,7 +7,8 @@ import numpy as np
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.result import FleetResult
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.simulation.drawn_fleet import DrawnFleet, DrawnRobot, FleetSettings, LidarSettings, draw_fleet
+from fcslam.simulation.drawn_fleet import DrawnFleet, DrawnRobot, FleetSettings, draw_fleet
+from fcslam.simulation.noise import LidarSettings
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 

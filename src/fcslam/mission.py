@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
-from fcslam.cloud.fusion import FusedMap, fuse, map_yaml, pgm_bytes
+from fcslam.cloud.fusion import FusedMap, fuse
 from fcslam.cloud.picture import Meeting, map_png
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.config import Settings, dump
@@ -19,6 +19,7 @@ from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.map_files import map_yaml, pgm_bytes
 from fcslam.records import Channel, ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run, check_names

@@ -12,11 +12,11 @@ from simulation.gl import require_gl
 
 from fcslam.records import CameraImage, LaserScan
 from fcslam.simulation.decoration import Picture, decorate
-from fcslam.simulation.drawn_fleet import LidarSettings
 from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import draw_floor_plan
 from fcslam.simulation.kinds import Building, Lighting
 from fcslam.simulation.lighting import light_of
+from fcslam.simulation.noise import LidarSettings
 from fcslam.simulation.route import drive
 from fcslam.simulation.scene import furnished_model
 from fcslam.simulation.sensors import Camera

@@ -13,18 +13,10 @@ from fcslam.geometry import se2
 from fcslam.metrics.relations import PoseTable, read_relations, relation_errors
 from fcslam.records import LaserModel
 from fcslam.runs import read_tum
-from fcslam.simulation.drawn_fleet import (
-    DriftSettings,
-    FleetSettings,
-    LidarSettings,
-    cast_rays,
-    draw_fleet,
-    drift,
-    sense,
-    write_fleet,
-)
+from fcslam.simulation.drawn_fleet import FleetSettings, cast_rays, draw_fleet, sense, write_fleet
 from fcslam.simulation.floorplan import draw_floor_plan
-from fcslam.simulation.truth import true_relations
+from fcslam.simulation.noise import LidarSettings
+from fcslam.simulation.odometry import DriftSettings, drift
 
 SEEDS = range(8)
 NO_DRIFT = DriftSettings(travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0)
@@ -163,13 +155,6 @@ def test_a_recording_is_written_with_its_truth(fleet, tmp_path, monkeypatch):
     errors = relation_errors(read_relations(truth / "relations"), table)
     assert errors.used == errors.total == 2000
     assert errors.translation.maximum < 1e-6
-
-
-def test_true_relations_span_robots(fleet):
-    relations = true_relations(fleet, np.random.default_rng(0), count=500)
-    milliseconds = np.round(relations.stamps * 1000).astype(int) % 10
-    assert np.sum(milliseconds[:, 0] != milliseconds[:, 1]) > 100
-    assert np.hypot(relations.T_1_2[:, 0], relations.T_1_2[:, 1]).max() < 5.0
 
 
 @pytest.mark.parametrize(

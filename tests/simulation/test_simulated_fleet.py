@@ -12,10 +12,12 @@ from fcslam.errors import SimulationError
 from fcslam.geometry import se2
 from fcslam.records import GroundTruth, LaserModel, LaserScan
 from fcslam.simulation import engine, textures
-from fcslam.simulation.drawn_fleet import DriftSettings, LidarSettings, cast_rays, drift
+from fcslam.simulation.drawn_fleet import cast_rays
 from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import Kind, draw_floor_plan
 from fcslam.simulation.kinds import Building
+from fcslam.simulation.noise import LidarSettings
+from fcslam.simulation.odometry import DriftSettings, drift
 from fcslam.simulation.route import drive
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fcslam.cloud import palette
 from fcslam.cloud.fusion import FusedMap
-from fcslam.lidar.occupancy import Cells, Occupancy
+from fcslam.map_files import Cells, Occupancy
 from fcslam.records import Channel, FloatArray
 
 Image = NDArray[np.uint8]

@@ -14,44 +14,15 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.metrics.relations import write_relations
 from fcslam.records import FloatArray, LaserModel, LaserScan, frozen
+from fcslam.runs import write_tum
+from fcslam.simulation.fleet import FIRST_STAMP, STAMP_SHIFT_S
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan
+from fcslam.simulation.noise import LidarSettings, disturb
+from fcslam.simulation.odometry import DriftSettings, drift
 from fcslam.simulation.route import draw_goals, drive, plan_route
-from fcslam.simulation.truth import write_truth
-
-FIRST_STAMP = 1000.0
-STAMP_SHIFT_S = 0.001
-"""Between robots, so that a stamp tells which robot it belongs to."""
-
-
-class LidarSettings(Settings):
-    """The simulated LiDAR."""
-
-    beams: int = Field(default=360, ge=8, description="beams of one full turn")
-    max_range_m: float = Field(default=12.0, gt=0.0, description="beams that go further return nothing")
-    range_noise_m: float = Field(default=0.015, ge=0.0, description="standard deviation of a range")
-    dropout: float = Field(
-        default=0.01, ge=0.0, le=1.0, description="share of beams that return nothing without a reason"
-    )
-    rate_hz: float = Field(default=5.0, gt=0.0, description="scans a second")
-
-
-class DriftSettings(Settings):
-    """How wheel odometry goes wrong: chance along the way, and a bias drawn once for each robot."""
-
-    travel_noise_m: float = Field(
-        default=0.01, ge=0.0, description="standard deviation after 1 m; grows with the square root"
-    )
-    heading_noise_rad: float = Field(default=0.01, ge=0.0, description="standard deviation of the heading after 1 m")
-    turn_noise_rad: float = Field(
-        default=0.02, ge=0.0, description="standard deviation of the heading after turning 1 rad"
-    )
-    scale_bias: float = Field(
-        default=0.01, ge=0.0, description="standard deviation of the wrong scale of travel and of turns"
-    )
-    veer_bias_rad_m: float = Field(default=0.003, ge=0.0, description="standard deviation of the constant veer a metre")
-    slips_per_m: float = Field(default=0.0, ge=0.0, description="how often wheels turn without moving the robot")
-    slip_m: float = Field(default=0.05, ge=0.0, description="mean travel that a slip makes up")
+from fcslam.simulation.truth import true_relations
 
 
 class FleetSettings(Settings):
@@ -101,15 +72,17 @@ def draw_fleet(settings: FleetSettings, rng: np.random.Generator) -> DrawnFleet:
 
 
 def write_fleet(fleet: DrawnFleet, folder: Path, rng: np.random.Generator) -> list[Path]:
-    """Write one CARMEN log for each robot, and the truth as ``write_truth`` does; returns the logs."""
+    """Write one CARMEN log for each robot, the truth at its scans, and ``ground_truth/relations``; returns the logs."""
     from fcslam.sources import write_carmen
 
-    folder.mkdir(parents=True, exist_ok=True)
+    truth = folder / "ground_truth"
+    truth.mkdir(parents=True, exist_ok=True)
     logs = []
     for robot in fleet.robots:
         logs.append(folder / f"{robot.name}.clf")
         write_carmen(logs[-1], robot.scans())
-    write_truth(fleet, folder, rng)
+        write_tum(truth / f"{robot.name}.tum", robot.stamps, robot.T_building_base)
+    write_relations(truth / "relations", true_relations(fleet.robots, rng))
     return logs
 
 
@@ -129,29 +102,6 @@ def _draw_robot(
     )
 
 
-def drift(T_building_base: FloatArray, settings: DriftSettings, rng: np.random.Generator) -> FloatArray:
-    """Odometry (N, 3) of a robot that drove the true poses (N, 3): zero at first, then ever more wrong."""
-    twists = se2.log(se2.relative(T_building_base))
-    travel, turn = np.abs(twists[:, 0]), np.abs(twists[:, 2])
-    scale_travel, scale_turn = 1.0 + rng.normal(0.0, settings.scale_bias, 2)
-    veer = rng.normal(0.0, settings.veer_bias_rad_m)
-    noise = rng.normal(0.0, 1.0, (3, len(twists)))
-    wrong = np.column_stack(
-        (
-            scale_travel * twists[:, 0] + settings.travel_noise_m * np.sqrt(travel) * noise[0],
-            twists[:, 1],
-            scale_turn * twists[:, 2]
-            + veer * travel
-            + settings.heading_noise_rad * np.sqrt(travel) * noise[1]
-            + settings.turn_noise_rad * np.sqrt(turn) * noise[2],
-        )
-    )
-    if settings.slips_per_m:
-        slips = rng.poisson(settings.slips_per_m * travel)
-        wrong[:, 0] += rng.exponential(settings.slip_m, len(travel)) * slips * np.sign(twists[:, 0])
-    return _chain(se2.exp(wrong))
-
-
 def sense(
     plan: FloorPlan, T_building_base: FloatArray, laser: LaserModel, settings: LidarSettings, rng: np.random.Generator
 ) -> FloatArray:
@@ -159,13 +109,6 @@ def sense(
     T_building_laser = se2.compose(T_building_base, laser.T_base_laser)
     ranges = cast_rays(T_building_laser, laser.angles_rad(), plan.segments, laser.max_range_m)
     return disturb(ranges, laser, settings, rng)
-
-
-def disturb(ranges: FloatArray, laser: LaserModel, settings: LidarSettings, rng: np.random.Generator) -> FloatArray:
-    """True ranges (..., beams) with noise and dropouts."""
-    hit = ranges < laser.max_range_m
-    noisy = np.clip(ranges + rng.normal(0.0, settings.range_noise_m, ranges.shape), 0.0, laser.max_range_m)
-    return np.where(hit & (rng.random(ranges.shape) >= settings.dropout), noisy, laser.max_range_m)
 
 
 @njit(cache=True)
@@ -189,12 +132,3 @@ def cast_rays(poses: FloatArray, angles: FloatArray, segments: FloatArray, max_r
                         nearest = along
             ranges[i, b] = nearest
     return ranges
-
-
-def _chain(motions: FloatArray) -> FloatArray:
-    """Poses (N + 1, 3) that start at zero and follow ``motions`` (N, 3)."""
-    headings = np.insert(np.cumsum(motions[:, 2]), 0, 0.0)
-    steps = np.column_stack((motions[:, :2], np.zeros(len(motions))))
-    turned = se2.compose(np.column_stack((np.zeros((len(motions), 2)), headings[:-1])), steps)
-    positions = np.vstack((np.zeros(2), np.cumsum(turned[:, :2], axis=0)))
-    return np.column_stack((positions, se2.wrap_angle(headings)))

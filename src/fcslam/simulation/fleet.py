@@ -28,14 +28,18 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.simulation.decoration import Decoration, decorate
-from fcslam.simulation.drawn_fleet import FIRST_STAMP, STAMP_SHIFT_S, DriftSettings, LidarSettings, disturb, drift
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
 from fcslam.simulation.kinds import Building, Lighting
 from fcslam.simulation.lighting import light_of
+from fcslam.simulation.noise import LidarSettings, disturb
+from fcslam.simulation.odometry import DriftSettings, drift
 from fcslam.simulation.route import Schedule, draw_goals, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster
 
+FIRST_STAMP = 1000.0
+STAMP_SHIFT_S = 0.001
+"""Between robots, so that a stamp tells which robot it belongs to."""
 LANE_PER_ROBOT_M = 2.0
 """Robots do not see each other, but a corridor full of them would be no fleet."""
 IMAGE_DELAY_S = 0.03
