@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.simulation.kinds import Building, Lighting
+from fcslam.simulation.kinds import Building
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,15 +42,13 @@ def demo(
     from fcslam.sources import open_source
 
     began = time.perf_counter()
-    settings = SimulationSettings(
-        building=building, robots=robots, path_length_m=path_length, lighting=(Lighting.DAY,),
-        camera=None if no_camera else CameraSettings(),
-    )  # fmt: skip
+    camera = None if no_camera else CameraSettings()
+    settings = SimulationSettings(building=building, robots=robots, path_length_m=path_length, camera=camera)
     _check_libraries(settings)
     fleet = simulate_fleet(settings, seed)
     _prepare(output, settings, seed)
     console = Console(stderr=True)
-    _announce(console, 1, f"simulate: {robots} robots drive {path_length:g} m each, from places that no robot is told")
+    _announce(console, 1, f"simulate: {robots} robots drive {path_length:g} m each; none is told where it starts")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, False, console)
     _announce(console, 2, "map each robot, recognise places, fuse")
     map_sources([open_source(place) for place in recordings], MissionConfig(seed=seed), output / RUN, force=True)
