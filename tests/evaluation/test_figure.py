@@ -1,6 +1,7 @@
 """The figure of a fleet: what is drawn where. Whether it is beautiful is for people to judge."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -141,8 +142,22 @@ def test_the_scale_bars_are_as_long_as_they_say(charts):
 def test_few_of_many_matches_lie_far_apart():
     crowd = [match(0, 1, x=1.0 + 0.001 * k) for k in range(50)] + [match(0, 1, x=4.0), match(0, 2, x=4.0)]
     assert [(m.robot_j, float(m.xy_i[0])) for m in spread(crowd, 2)] == [("b", 1.0), ("b", 4.0), ("c", 4.0)]
-    assert len(spread(crowd, MATCHES_DRAWN)) == MATCHES_DRAWN + 1
     assert len(spread(crowd, 1000)) == len(crowd)
+
+
+@pytest.mark.parametrize("robots", [2, 3, 8])
+def test_lines_do_not_crowd_and_stay_under_the_titles(robots):
+    names = [f"robot_{k}" for k in range(robots)]
+    pairs = list(combinations(names, 2))
+    xy = [np.array((x, 3.9)) for x in np.linspace(0.5, 5.5, 30)]
+    matches = [Match(i, at, j, at, Channel.LIDAR) for i, j in pairs for at in xy]
+    ways = {name: way() for name in names}
+    local = {name: Chart(hall(), {name: way()}) for name in names}
+    charts = FleetCharts(local, Chart(hall(), ways), Chart(hall(), ways), matches)
+    lines = match_lines(charts)
+    assert len(pairs) <= len(lines) <= max(MATCHES_DRAWN, len(pairs))
+    title = next(text for text in sheet(charts).texts if text.get_text().startswith("no robot knows"))
+    assert max(line.get_ydata().max() for line in lines) < title.get_position()[1]
 
 
 def test_single_beams_do_not_widen_a_chart():

@@ -4,6 +4,7 @@ All charts stand on one sheet that is measured in pixels, y upwards, so that lin
 """
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
@@ -32,8 +33,6 @@ MARGIN_PX: Final = 60
 GAP_PX: Final = 80
 TITLE_PX: Final = 130
 NAME_PX: Final = 70
-RISE_PX: Final = 60
-"""Room for lines that rise over charts."""
 LEGEND_PX: Final = 120
 SCALE_PX: Final = 60
 HIGHEST_PX: Final = 850
@@ -42,8 +41,8 @@ SHADES: Final = 128
 """Colours of the PNG: with so few it is a quarter of the size, and nobody sees the difference."""
 FINE_PX: Final = 2.5
 """Walls of cells smaller than this are drawn one cell thicker."""
-MATCHES_DRAWN: Final = 5
-"""Of one channel between two robots."""
+MATCHES_DRAWN: Final = 15
+"""Of one channel, if each two robots have their share of them; at least one between two robots."""
 BOW: Final = 0.15
 """A line over a chart rises by this share of its length."""
 TITLE_PT, TEXT_PT = 12.0, 9.5
@@ -94,16 +93,17 @@ def draw_figure(charts: FleetCharts) -> "Figure":
     lower = _row((charts.fused, charts.building), MARGIN_PX + SCALE_PX)
     legend_px = _top(lower) + TITLE_PX
     upper = _row(tuple(charts.local.values()), legend_px + LEGEND_PX + NAME_PX)
-    titles_px = _top(upper) + RISE_PX
+    local = dict(zip(charts.local, upper, strict=True))
+    lines = [(match.channel, _line(match, local)) for match in _chosen(charts)]
+    titles_px = max(_top(upper), *(line[:, 1].max() for _, line in lines), 0.0)
     figure, axes = _sheet(titles_px + TITLE_PX)
     colors = {robot: _hex(color) for robot, color in zip(charts.local, cycle(ROBOTS), strict=False)}
     for panel in (*upper, *lower):
         _draw_chart(axes, panel, colors)
-    local = dict(zip(charts.local, upper, strict=True))
-    order = list(local)
-    for match in spread(charts.matches, MATCHES_DRAWN):
-        passed = abs(order.index(match.robot_i) - order.index(match.robot_j)) - 1
-        _draw_match(axes, local[match.robot_i], local[match.robot_j], match, BOW * passed)
+    for channel, line in lines:
+        color = _hex(CLOSURES[channel])
+        axes.plot(*line.T, color=color, linewidth=0.9, alpha=0.85, gid="match")
+        axes.plot(*line[[0, -1]].T, "o", color=color, markersize=2.5)
     for robot, panel in local.items():
         below = panel.corner_px[1] - 0.6 * NAME_PX
         _write(axes, panel.head_px[0], below, robot, color=colors[robot], weight="bold", ha="center")
@@ -112,6 +112,22 @@ def draw_figure(charts: FleetCharts) -> "Figure":
     _draw_scale(axes, legend_px + 0.5 * LEGEND_PX, upper[0].scale)
     _draw_scale(axes, MARGIN_PX, lower[0].scale)
     return figure
+
+
+def _chosen(charts: FleetCharts) -> list[Match]:
+    pairs = math.comb(len(charts.local), 2)
+    return spread(charts.matches, max(1, MATCHES_DRAWN // max(1, pairs)))
+
+
+def _line(match: Match, local: Mapping[str, _Panel]) -> FloatArray:
+    """From where one robot was to where the other was, shape (N, 2); it rises where other charts lie between."""
+    order = list(local)
+    start, end = (local[robot].pixels(xy[None])[0] for robot, xy in (match[:2], match[2:4]))
+    share = np.linspace(0.0, 1.0, 40)[:, None]
+    line = start + share * (end - start)
+    if abs(order.index(match.robot_i) - order.index(match.robot_j)) > 1:
+        line[:, 1:] += 4.0 * share * (1.0 - share) * BOW * np.linalg.norm(end - start)
+    return np.asarray(line)
 
 
 def _row(charts: Sequence[Chart], bottom_px: float) -> list[_Panel]:
@@ -185,17 +201,6 @@ def _colored(grid: LabelledGrid, scale: float) -> "NDArray[np.uint8]":
     image[grid.free] = (*_rgb(FLOOR), 255)
     image[binary_dilation(grid.occupied, np.ones((2, 2), np.bool_)) if fine else grid.occupied] = (*_rgb(WALL), 255)
     return image
-
-
-def _draw_match(axes: "Axes", panel_i: _Panel, panel_j: _Panel, match: Match, bow: float) -> None:
-    """From where one robot was to where the other was; the line rises by ``bow`` of its length."""
-    start, end = (panel.pixels(xy[None])[0] for panel, xy in ((panel_i, match.xy_i), (panel_j, match.xy_j)))
-    share = np.linspace(0.0, 1.0, 40)[:, None]
-    line = start + share * (end - start)
-    line[:, 1:] += 4.0 * share * (1.0 - share) * bow * np.linalg.norm(end - start)
-    color = _hex(CLOSURES[match.channel])
-    axes.plot(*line.T, color=color, linewidth=0.9, alpha=0.85, gid="match")
-    axes.plot(*line[[0, -1]].T, "o", color=color, markersize=2.5)
 
 
 def _draw_titles(axes: "Axes", upper_px: float, lower: Sequence[_Panel], robots: int) -> None:
