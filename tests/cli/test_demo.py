@@ -54,7 +54,7 @@ def test_it_ends_with_a_run_a_figure_and_a_table(shown):
 def test_it_replaces_itself_and_nothing_else(shown):
     assert (shown / "notes").read_text() == "mine"
     assert not (shown / "recordings" / "stale").exists()
-    assert "path_length_m: 30.0" in (shown / "demo.yaml").read_text()
+    assert "path_length_m: 30.0" in (shown / "recordings" / "simulation.yaml").read_text()
 
 
 def test_it_says_where_everything_is(tmp_path, capsys):

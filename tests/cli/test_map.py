@@ -341,6 +341,16 @@ def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
     assert log.read_text().startswith("ODOM")
 
 
+def test_fusion_is_one_of_three_and_leaves_nothing_to_do_for_no_fuse(tmp_path, log, capsys):
+    run = tmp_path / "run"
+    assert "--no-fuse" in refused(capsys, tmp_path, log, "--no-fuse", "--fusion", "two_point", "--output", run)
+    assert run_map(log, "--fusion", "three_point", "--output", run) == 2
+    assert "two_point" in capsys.readouterr().err
+    assert not run.exists()
+    assert run_map(log, "--fusion", "two_point", "--output", run) == 0
+    assert yaml.safe_load((run / "config.yaml").read_text())["fleet"]["fusion"] == "two_point"
+
+
 def test_splits_that_cannot_be_are_refused(tmp_path, log, capsys):
     other = save(tmp_path / "other.log", drive(40))
     run = tmp_path / "run"

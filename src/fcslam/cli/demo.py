@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fcslam.simulation.fleet import SimulatedFleet, SimulationSettings
 
 RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
-SETTINGS = "demo.yaml"
+ABOUT = "about"
 """It tells a folder that a demo wrote from one that holds somebody's work."""
 
 
@@ -39,6 +39,7 @@ def demo(
     from fcslam.cli.simulate import record_fleet
     from fcslam.mission import MissionConfig
     from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
+    from fcslam.simulation.recording import prepare_fleet_folder
     from fcslam.sources import open_source
 
     began = time.perf_counter()
@@ -46,7 +47,8 @@ def demo(
     settings = SimulationSettings(building=building, robots=robots, path_length_m=path_length, camera=camera)
     _check_libraries(settings)
     fleet = simulate_fleet(settings, seed)
-    _prepare(output, settings, seed)
+    _prepare(output)
+    prepare_fleet_folder(output / RECORDINGS, settings, seed, resume=False)
     console = Console(stderr=True)
     _announce(console, 1, f"simulate: {robots} robots drive {path_length:g} m each; none is told where it starts")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, False, console)
@@ -69,27 +71,27 @@ def _check_libraries(settings: "SimulationSettings") -> None:
         mujoco()
 
 
-def _prepare(output: Path, settings: "SimulationSettings", seed: int) -> None:
+def _prepare(output: Path) -> None:
     """A folder in which nothing of an earlier demo is left.
 
     Raises:
         OutputError: something else is there, or it cannot be written.
     """
-    from fcslam.config import dump
     from fcslam.errors import OutputError
 
     try:
         output.mkdir(parents=True, exist_ok=True)
-        if any(output.iterdir()) and not (output / SETTINGS).is_file():
+        if any(output.iterdir()) and not (output / ABOUT).is_file():
             raise OutputError(f"{output}: holds something that is no demo; name another folder with --output")
-        for name in (RECORDINGS, RUN):
-            if (output / name).exists():
-                shutil.rmtree(output / name)
-        (output / RECORDINGS).mkdir()
-        for name in (FIGURE, TABLE):
-            (output / name).unlink(missing_ok=True)
-        about = "# What `fcslam demo` simulated. It replaces this folder's demo when it runs again."
-        (output / SETTINGS).write_text(f"{about}\nseed: {seed}\n{dump(settings)}", encoding="utf-8")
+        names = (RECORDINGS, RUN, FIGURE, TABLE)
+        (output / ABOUT).write_text(
+            f"Written by `fcslam demo`, which replaces {', '.join(names)} here when it runs again.\n", encoding="utf-8"
+        )
+        for place in (output / name for name in names):
+            if place.is_dir():
+                shutil.rmtree(place)
+            else:
+                place.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
 

@@ -19,6 +19,7 @@ from fcslam.cli.recordings import (
     show_faults,
     show_notes,
 )
+from fcslam.cloud.strategy import FusionStrategy
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,6 +39,13 @@ def map_recordings(
     output: Annotated[Path, typer.Option("--output", "-o", help="The run folder to write.")],
     split: Annotated[int, typer.Option(min=1, help="Cut one LOG into this many robots of equal scan count.")] = 1,
     no_fuse: Annotated[bool, typer.Option("--no-fuse", help="Map each robot alone.")] = False,
+    fusion: Annotated[
+        FusionStrategy | None,
+        typer.Option(
+            help="How maps become one: a joint robust graph, or rigid maps laid on one another by matched points; "
+            "the configuration's if not given."
+        ),
+    ] = None,
     veto: Annotated[
         Path | None,
         typer.Option(
@@ -58,7 +66,7 @@ def map_recordings(
     from fcslam.runs import prepare_output, read_vetoes
 
     prepare_output(output, force)
-    settings = _settings(config, seed, no_fuse)
+    settings = _settings(config, seed, no_fuse, fusion)
     vetoes = read_vetoes(veto) if veto else ()
     options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
     sources = _sources([open_recording(log, options) for log in logs], split)
@@ -91,16 +99,19 @@ def map_sources(
     return run
 
 
-def _settings(config: Path | None, seed: int | None, no_fuse: bool) -> "MissionConfig":
+def _settings(config: Path | None, seed: int | None, no_fuse: bool, fusion: FusionStrategy | None) -> "MissionConfig":
     from fcslam.config import load
+    from fcslam.errors import ConfigError
     from fcslam.mission import MissionConfig
 
     settings = MissionConfig() if config is None else load(MissionConfig, config)
     if seed is not None:
         settings = settings.model_copy(update={"seed": seed})
-    if no_fuse:
-        settings = settings.model_copy(update={"fleet": settings.fleet.model_copy(update={"join_maps": False})})
-    return settings
+    if no_fuse and fusion is not None:
+        raise ConfigError("--no-fuse leaves nothing to fuse; drop it or --fusion")
+    changes: dict[str, object] = {"join_maps": False} if no_fuse else {}
+    changes |= {"fusion": fusion} if fusion is not None else {}
+    return settings.model_copy(update={"fleet": settings.fleet.model_copy(update=changes)})
 
 
 def _sources(sources: "list[Source]", parts: int) -> "list[Source]":

@@ -12,8 +12,10 @@ from pydantic import Field
 from fcslam.cloud.joining import first_estimate, judge
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger, Entry
-from fcslam.cloud.result import FleetResult, conclude
+from fcslam.cloud.result import FleetResult, Fusion, conclude
+from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.robots import RobotStore
+from fcslam.cloud.strategy import FusionStrategy
 from fcslam.cloud.submaps import SubmapShelf
 from fcslam.cloud.verdict import reconsider
 from fcslam.config import Settings
@@ -41,6 +43,10 @@ class FleetConfig(Settings):
     """The cloud's part."""
 
     join_maps: bool = Field(default=True, description="look for places that several robots saw")
+    fusion: FusionStrategy = Field(
+        default=FusionStrategy.JOINT,
+        description="joint: one robust graph; two_point, n_point: rigid maps laid on one another by matched points",
+    )
     sight_m: float = Field(default=6.0, gt=0, description="in a joint map, places this near are compared")
     near_visits: int = Field(
         default=2, ge=0, description="so many of another robot's visits are compared with one place"
@@ -108,8 +114,10 @@ class Fleet:
 
     def _conclude(self) -> FleetResult:
         self._disturbed = True
-        T_local_base = self._reconsider()
-        return conclude(self._store, self._graph, self._ledger, self._maps, T_local_base, self._version)
+        fusion = self._reconsider()
+        if self._config.fusion is not FusionStrategy.JOINT:
+            fusion = fuse_rigidly(self._ledger, fusion.T_local_base, self._config.fusion)
+        return conclude(self._store, self._graph, self._ledger, fusion, self._version)
 
     def veto(self, veto: Veto) -> None:
         """From now on these closures count for nothing; maps that only they held together part."""
@@ -289,16 +297,13 @@ class Fleet:
         self._graph.optimize()
         self._version += 1
 
-    def _reconsider(self) -> dict[str, FloatArray]:
-        """Decide every closure anew: revoke what is outvoted, part the maps that only that held together.
-
-        Returns every robot's poses by its own measurements alone.
-        """
-        reconsidered = reconsider(self._graph, self._ledger, self._config.consistency)
-        self._maps = reconsidered.maps
+    def _reconsider(self) -> Fusion:
+        """Decide every closure anew: revoke what is outvoted, part the maps that only that held together."""
+        fusion = reconsider(self._graph, self._ledger, self._config.consistency)
+        self._maps = [list(robots) for robots in fusion.maps]
         self._doubted, self._patience = False, int(MORE_DOUBTS * len(self._ledger))
         self._version += 1
-        return reconsidered.T_local_base
+        return fusion
 
     def _replies(self, packet: Packet) -> list[bytes]:
         """Acknowledgement and, after a place, where the robot's odometry lies in the map."""

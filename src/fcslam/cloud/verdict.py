@@ -1,31 +1,21 @@
 """Every closure decided anew from all evidence: what a joint map rests on, and what has to go."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger, Entry
+from fcslam.cloud.result import Fusion
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.joint import HOLDS, JointEvidence, JointSolution, solve_jointly
-from fcslam.records import ClosureStatus, FloatArray
+from fcslam.records import ClosureStatus, FloatArray, frozen
 
 CONTRADICTS = "contradicts the joint graph"
 VETOED = "vetoed by hand"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Reconsidered:
-    """What the evidence says of the robots, beside the poses in the graph and the statuses in the ledger."""
-
-    maps: list[list[str]]
-    """Robots of each map, maps and robots in the order in which they started."""
-    T_local_base: dict[str, FloatArray]
-    """Every robot's keyscans by its own measurements alone, (N, 3); the origin is its first keyscan."""
-
-
-def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> Reconsidered:
+def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> Fusion:
     """Solve from the evidence alone; the graph takes the poses over, every entry learns its status.
 
     No earlier estimate, join or verdict plays a part: what joined two maps once and is outvoted now is revoked.
@@ -44,7 +34,9 @@ def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySe
         _decide(entry, bool(solution.weights[entry.edge] > HOLDS), reasons.get(pair, CONTRADICTS) if apart else "")
         graph.count(entry.edge, holds=entry.closure.status is ClosureStatus.ACCEPTED)
     members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
-    return Reconsidered(members, dict(zip(robots, solution.own, strict=True)))
+    T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
+    T_local_base = dict(zip(robots, solution.own, strict=True))
+    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in ledger))
 
 
 def _enter(graph: JointGraph, entries: Iterable[Entry]) -> None:
