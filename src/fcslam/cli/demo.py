@@ -82,7 +82,9 @@ def _prepare(output: Path) -> None:
     try:
         output.mkdir(parents=True, exist_ok=True)
         if any(output.iterdir()) and not (output / ABOUT).is_file():
-            raise OutputError(f"{output}: holds something that is no demo; name another folder with --output")
+            raise OutputError(
+                f"{output}: holds something that is no demo; remove it, or name another folder with --output"
+            )
         names = (RECORDINGS, RUN, FIGURE, TABLE)
         (output / ABOUT).write_text(
             f"Written by `fcslam demo`, which replaces {', '.join(names)} here when it runs again.\n", encoding="utf-8"
