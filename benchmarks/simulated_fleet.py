@@ -3,11 +3,13 @@
     python benchmarks/simulated_fleet.py
 
 Per building and seed one recorded fleet of three robots that start anywhere and drive 60 m each; the seeds were not
-used while settings were chosen. Every fleet is mapped with both channels of places, with LiDAR places alone and with
-camera places alone. Buildings: the default one; the corridor, whose twenty doors are alike; and the default one where
-every robot drives in another light (day, evening, some lamps off) and half of the furniture has moved. It needs a GL
-library. Passed: all robots in one map (corridor: no false join), no accepted closure between robots that is off by
-0.5 m or 10 deg, worst ATE of a robot in the joint map at most 0.10 m, F1 of occupied cells at least 0.90.
+used while settings were chosen. Buildings: the default one; the corridor, whose twenty doors are alike; and the default
+one where every robot drives in another light (day, evening, some lamps off) and half of the furniture has moved. Fleets
+are mapped with both channels of places, those of the latter two also with LiDAR places alone and with camera places
+alone. It needs a GL library.
+
+Passed: all robots in one map (corridor: no false join), no accepted closure between robots that is off by 0.5 m or
+10 deg, worst ATE of a robot in the joint map at most 0.10 m, F1 of occupied cells at least 0.90.
 
 Recall is that of revisits between robots, by correct verified closures; at 100 % precision: by the closures that are
 more similar than every wrong one of their channel.
@@ -25,8 +27,13 @@ import common
 ROBOTS = 3
 SEEDS = tuple(range(101, 111))
 DIM = ("--lighting", "day", "--lighting", "evening", "--lighting", "lamp-off", "--moved-furniture", "0.5")
-CASES = {"default": (), "corridor": ("--building", "corridor"), "default, other light": DIM}
 CHANNELS = {"both": ("lidar", "camera"), "lidar": ("lidar",), "camera": ("camera",)}
+CASES = {
+    "default": ((), ("both",)),
+    "corridor": (("--building", "corridor"), tuple(CHANNELS)),
+    "default, other light": (DIM, tuple(CHANNELS)),
+}
+"""What is simulated, and by which places it is mapped."""
 WORST_ATE_M, LEAST_F1 = 0.10, 0.90
 
 COLUMNS = {"building": "", "seed": "", "places": "", "maps": ".0f", "false joins": ".0f", "worst ATE, m": ".4f",
@@ -54,12 +61,13 @@ def main() -> None:
 
 def fleet_rows(case: str, seed: int) -> Iterable[tuple]:
     """One recorded fleet, mapped with each choice of channels."""
+    simulated, places = CASES[case]
     with tempfile.TemporaryDirectory() as place:
         fleet = Path(place) / "fleet"
-        common.run_fcslam("simulate", "--robots", ROBOTS, "--seed", seed, *CASES[case], "--output", fleet)
-        for name, channels in CHANNELS.items():
+        common.run_fcslam("simulate", "--robots", ROBOTS, "--seed", seed, *simulated, "--output", fleet)
+        for name in places:
             settings, run, result = Path(place) / f"{name}.yaml", Path(place) / name, Path(place) / f"{name}.json"
-            settings.write_text(f"robot: {{channels: [{', '.join(channels)}]}}\n", encoding="utf-8")
+            settings.write_text(f"robot: {{channels: [{', '.join(CHANNELS[name])}]}}\n", encoding="utf-8")
             robots = [fleet / f"robot_{k + 1}" for k in range(ROBOTS)]
             cost = common.run_fcslam("map", *robots, "--config", settings, "--output", run)
             common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result)
@@ -96,7 +104,7 @@ def row(case: str, seed: int, places: str, found: dict[str, float], cost: common
 def summary(rows: Sequence[tuple], cases: Sequence[str]) -> Iterable[tuple]:
     """Each case and choice of channels over all seeds: sums of closures, means of recalls, the worst of the rest."""
     for case in cases:
-        for places in CHANNELS:
+        for places in CASES[case][1]:
             some = [dict(zip(COLUMNS, row, strict=True)) for row in rows if (row[0], row[2]) == (case, places)]
             total = {name: sum(row[name] for row in some) for name in ("verified", "wrong", "accepted", "wrong ")}
             mean = {name: total_of(some, name) / len(some) for name in ("recall", "at 100 %", "like heading")}

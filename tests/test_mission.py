@@ -35,6 +35,14 @@ def test_the_same_seed_gives_the_same_bytes(run, logs, tmp_path):
     )
 
 
+def test_the_watcher_sees_all_scans_and_then_that_the_cloud_fuses(logs):
+    seen = []
+    run = run_mission([open_source(log) for log in logs], MissionConfig(seed=3), seen.append)
+    assert [now.fusing for now in seen] == [False] * (len(seen) - 1) + [True]
+    assert [now.scans for now in seen] == sorted(now.scans for now in seen)
+    assert seen[-1].scans == sum(len(trajectory.stamps) for trajectory in run.trajectories)
+
+
 def test_the_order_of_the_recordings_does_not_matter(run, logs):
     turned = run_mission([open_source(log) for log in reversed(logs)], MissionConfig(seed=3))
     assert turned.closures

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
-from fcslam.cloud.fusion import FusedMap, fuse, map_yaml, pgm_bytes
+from fcslam.cloud.fusion import FusedMap, fuse
 from fcslam.cloud.picture import Meeting, map_png
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.config import Settings, dump
@@ -19,6 +19,7 @@ from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.map_files import map_yaml, pgm_bytes
 from fcslam.records import Channel, ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run, check_names
@@ -48,6 +49,8 @@ class Progress:
     recorded_s: float
     """Time that the recordings have played, of all robots together."""
     closures: dict[str, int]
+    fusing: bool = False
+    """All is recorded and sent; the cloud decides and fuses."""
 
 
 Watch = Callable[[Progress], None]
@@ -76,6 +79,7 @@ def run_mission(
         reply = transport.send(encode(packet))
         if reply.refusal:
             raise FcslamError(f"{packet.robot}: the cloud refused a packet: {reply.refusal}")
+    meter.tell(fusing=True)
     return _run_of(robots, cloud.finalize(), transport.ledger(), config, meter)
 
 
@@ -112,7 +116,12 @@ class _Meter:
         self.scans += 1
         self.keyscans += any(isinstance(packet.body, Keyscan) for packet in packets)
         if self.scans % self.EVERY == 0:
-            self._watch(Progress(self.scans, self.keyscans, self.recorded_s, self._cloud.closure_counts()))
+            self.tell()
+
+    def tell(self, fusing: bool = False) -> None:
+        """Where the mission is now."""
+        closures = self._cloud.closure_counts()
+        self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing))
 
 
 def _check_robots(sources: Sequence[Source]) -> None:

@@ -30,9 +30,12 @@ app.command(
     epilog="Example: fcslam convert robot1.clf.gz robot1.bag, fcslam convert robot2.mcap robot2.clf.gz "
     "--scan-topic /front/scan",
 )(conversion.convert)
-app.command("simulate", epilog="Example: fcslam simulate --output office --building office --no-camera")(
-    simulate.simulate
-)
+app.command(
+    "simulate",
+    epilog="Example: fcslam simulate --output office --building office --no-camera, "
+    "fcslam simulate --output day-and-evening --robots 2 --lighting day --lighting evening --moved-furniture 0.3, "
+    "and after an interruption the same with --resume",
+)(simulate.simulate)
 app.command("extract", epilog="Example: fcslam extract photos --output features --keypoints 1000")(extract.extract)
 app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo.demo)
 app.add_typer(config.app, name="config")

@@ -48,14 +48,14 @@ def fleet(
         write_metrics(fleet_metrics(report), csv)
 
 
-def show_fleet(report: "FleetReport", console: "Console") -> None:
-    """The report as tables, and what they rest on."""
+def show_fleet(report: "FleetReport", console: "Console", explained: bool = True) -> None:
+    """The report as tables and, if it is to be ``explained``, what they rest on."""
     from fcslam.evaluation.closures import Within
 
     closures = (_closures(report, within) for within in Within)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
         console.print(table)
-    for line in (*_findings(report), *_explanations(report)):
+    for line in (*_findings(report), *(_explanations(report) if explained else ())):
         console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 

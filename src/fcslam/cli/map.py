@@ -131,16 +131,17 @@ def _progress(console: "Console", total: int) -> "Iterator[Watch]":
     from rich import progress
 
     columns = [
-        progress.TextColumn("mapping"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
+        progress.TextColumn("{task.fields[stage]}"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
         progress.TextColumn("scans, {task.fields[what]}"), progress.TimeRemainingColumn(),
     ]  # fmt: skip
     # where nobody watches, even an erased display leaves an empty line
     with progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=total, what="")
+        task = bar.add_task("", total=total, stage="mapping", what="")
         began = time.perf_counter()
 
         def watch(now: "Progress") -> None:
-            bar.update(task, completed=now.scans, what=_what(now, time.perf_counter() - began))
+            what = _what(now, time.perf_counter() - began)
+            bar.update(task, completed=now.scans, stage="fusing" if now.fusing else "mapping", what=what)
 
         yield watch
 
