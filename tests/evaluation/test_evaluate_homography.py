@@ -8,7 +8,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.evaluation.contenders import choose_contenders, frame
-from fcslam.evaluation.homography import LARGE, SMALL, evaluate_homography, matched_points
+from fcslam.evaluation.homography import LARGE, SMALL, evaluate_homography, match_pair, matched_points
 from fcslam.evaluation.homography_measures import column, difference, mean
 from fcslam.evaluation.scenes import SceneKind, find_scenes
 from fcslam.features.detector import ImageFeatures
@@ -133,6 +133,21 @@ def test_features_of_the_file_are_brought_into_the_framed_picture(scenes, tmp_pa
     assert pair.matching[0].corner_error_px < 1e-2
     assert pair.matching[0].accuracy[0] > 0.8  # some of the nearest are not in the cropped picture
     assert pair.matching[0].score == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_homography_is_judged_in_common_view_the_matches_among_the_strongest():
+    """A thousand strong keypoints that only one of the images shows: they crowd out the matches, not the homography."""
+    rng = np.random.default_rng(4)
+    shift = np.array([[1.0, 0, -300], [0, 1, 0], [0, 0, 1]])
+    common = rng.uniform((300, 0), (640, 480), (100, 2))
+    alone = rng.uniform((0, 0), (300, 480), (1000, 2)), rng.uniform((340, 0), (640, 480), (1000, 2))
+    codes = rng.integers(0, 256, (1100, 32), np.uint8)
+    scores = np.arange(1100, 0, -1, dtype=np.float32)
+    views = [np.vstack((alone[0], common)), np.vstack((alone[1], warp(shift, common)))]
+    first, second = (ImageFeatures(points.astype(np.float32), scores, codes) for points in views)
+    result = match_pair(first, second, shift)
+    assert result.corner_error_px < 1e-2
+    assert (result.matches, result.accuracy[9]) == (1000, pytest.approx(0.0, abs=0.01))
 
 
 def test_nothing_found_scores_nothing(scenes, tmp_path):

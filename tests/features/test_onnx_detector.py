@@ -97,6 +97,17 @@ def test_foreign_and_missing_files_are_refused(tmp_path):
         OnnxDetector(OnnxConfig(weights=tmp_path / "missing.onnx"))
 
 
+def test_without_weights_one_is_told_so(tmp_path, monkeypatch):
+    monkeypatch.setattr("fcslam.features.detector.SHIPPED_NETWORK", tmp_path / "none.onnx")
+    with pytest.raises(FeatureError, match="no network weights come with this version"):
+        OnnxDetector(OnnxConfig())
+
+
+def test_weights_that_come_with_the_package_are_the_default(weights, monkeypatch):
+    monkeypatch.setattr("fcslam.features.detector.SHIPPED_NETWORK", weights)
+    assert OnnxDetector(OnnxConfig()).version == "tiny-1"
+
+
 def test_the_kind_chooses(weights):
     onnx = OnnxConfig(weights=weights)
     assert make_detector(DetectorKind.ONNX, OrbConfig(), onnx).version == "tiny-1"

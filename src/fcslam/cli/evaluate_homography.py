@@ -24,11 +24,11 @@ def homography(
     *,
     detector: Annotated[
         list[ContenderKind] | None,
-        typer.Option(help="Only this one; may be given several times. [default: all there are]"),
+        typer.Option(help="Only this one; may be given several times."),
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(help="Network weights (.onnx) of detector onnx. [default: those that come with fcslam]"),
+        typer.Option(help="Network weights (.onnx) of detector onnx, if not those that come with fcslam."),
     ] = None,
     features: Annotated[
         list[Path] | None,

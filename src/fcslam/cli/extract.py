@@ -13,11 +13,12 @@ def extract(
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the features, one .npz an image.")],
     detector: Annotated[
-        DetectorKind | None, typer.Option(help="[default: onnx where weights are given or come with fcslam, else orb]")
+        DetectorKind | None,
+        typer.Option(help="If not said: onnx where weights are given or come with fcslam, else orb."),
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(help="Network weights (.onnx) of detector onnx. [default: those that come with fcslam]"),
+        typer.Option(help="Network weights (.onnx) of detector onnx, if not those that come with fcslam."),
     ] = None,
     keypoints: Annotated[
         int, typer.Option(min=1, max=2000, help="Keypoints kept of an image, strongest first.")
@@ -27,7 +28,7 @@ def extract(
         typer.Option(
             min=0.0,
             max=64.0,
-            help="Side in pixels of boxes around keypoints that may hardly overlap; 0: all. [default: 4, of orb 0]",
+            help="Side in pixels of boxes around keypoints that may hardly overlap; 0: all. If not said: 4, of orb 0.",
         ),
     ] = None,
     longest_side: Annotated[

@@ -99,6 +99,8 @@ class OnnxDetector:
             FeatureError: there is no such file, or it is no network of this contract.
         """
         self._config = config
+        if config.weights is None and not SHIPPED_NETWORK.is_file():
+            raise FeatureError("no network weights come with this version of fcslam; name an .onnx file, or take orb")
         path = SHIPPED_NETWORK if config.weights is None else config.weights
         self._session, metadata = _load(path, config.threads)
         if metadata.get("fcslam_format") != NETWORK_FORMAT:
@@ -167,12 +169,13 @@ def decode_grey(encoded: bytes) -> GreyImage | None:
 
 def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
     """An ONNX Runtime session and the file's own metadata."""
-    import onnxruntime
-
     try:
         content = path.read_bytes()
     except OSError as error:
         raise FeatureError(f"{path}: cannot read the network weights ({error}); name an .onnx file") from error
+
+    import onnxruntime
+
     onnxruntime.disable_telemetry_events()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
