@@ -12,6 +12,9 @@ ORB_VERSION = "orb-1"
 """Changes whenever the same image would give other descriptors."""
 
 
+_PYRAMID_STEP = 1.2
+
+
 class OrbConfig(Settings):
     """ORB. A change makes old and new places incomparable."""
 
@@ -25,7 +28,10 @@ class Orb:
 
     def __init__(self, config: OrbConfig) -> None:
         self._orb = cv2.ORB.create(
-            nfeatures=config.most_features, nlevels=config.pyramid_levels, fastThreshold=config.fast_threshold
+            nfeatures=config.most_features,
+            scaleFactor=_PYRAMID_STEP,
+            nlevels=config.pyramid_levels,
+            fastThreshold=config.fast_threshold,
         )
 
     @property
@@ -41,6 +47,9 @@ class Orb:
         scores = np.array([keypoint.response for keypoint in keypoints])
         order = np.argsort(-scores, kind="stable")
         positions = np.array([keypoint.pt for keypoint in keypoints])
+        # OpenCV multiplies by the scale of the level; the centre of a coarse pixel lies half of the difference further.
+        scales = _PYRAMID_STEP ** np.array([keypoint.octave for keypoint in keypoints])
+        positions += 0.5 * (scales[:, None] - 1.0)
         return ImageFeatures(
             frozen(positions[order], np.float32),
             frozen(scores[order], np.float32),

@@ -42,9 +42,9 @@ class Detector(Protocol):
 
 
 def decode_grey(encoded: bytes) -> GreyImage | None:
-    """The picture in a JPEG or PNG file in grey levels; None if it is broken."""
+    """The picture in a JPEG or PNG file in grey levels, as its pixels are stored; None if it is broken."""
     try:
-        decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+        decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:  # of no bytes at all, for one
         return None
     return None if decoded is None else np.asarray(decoded, np.uint8)
