@@ -35,6 +35,14 @@ def test_the_default_building_is_large_enough_for_a_fleet(seed):
     assert len(plan.rooms) >= 8
 
 
+@every_building
+def test_every_room_has_a_straight_free_way_in(building):
+    plan = draw_floor_plan(np.random.default_rng(2), building)
+    for room in plan.rooms:
+        way = room.doorway + np.linspace(0.0, 1.0, 50)[:, None] * (room.inside - room.doorway)
+        assert distances(way, plan.segments).min() > 0.35
+
+
 def test_the_office_is_sixty_by_forty_metres():
     plan = draw_floor_plan(np.random.default_rng(0), Building.OFFICE)
     assert plan.size_m == (60.0, 40.0)

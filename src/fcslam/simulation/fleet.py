@@ -128,7 +128,7 @@ class SimulatedRobot:
             SimulationError: MuJoCo or, with a camera, a GL library is missing.
         """
         stamps = np.concatenate((self.stamps, self.image_stamps))
-        scans, count = self._scans(first_scan), len(self.stamps)
+        scans, count = self.scans(first_scan), len(self.stamps)
         with closing(self._images(first_image)) as images:
             for k in np.argsort(stamps, kind="stable"):
                 if first_scan <= k < count:
@@ -140,7 +140,12 @@ class SimulatedRobot:
     def _truth(self, stamp: float) -> GroundTruth:
         return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
 
-    def _scans(self, first: int) -> Iterator[LaserScan]:
+    def scans(self, first: int = 0) -> Iterator[LaserScan]:
+        """Scans from number ``first`` on; each time the same.
+
+        Raises:
+            SimulationError: MuJoCo is missing.
+        """
         caster = RayCaster(bare_model(self.plan), self.laser)
         for k in range(first, len(self.stamps)):
             rng = self._generator(_Chance.SCANS, k)

@@ -14,11 +14,11 @@ from fcslam.simulation.free_space import FreeSpace
 
 SPEED_M_S = 0.5
 TURN_RATE_RAD_S = 0.9
-_STRETCH, _SHIFT = 0.8, 0.4
+_STRETCH, _SHIFT = 0.85, 0.55
 """How long a robot's stretch of the walk is, and how much later its neighbour's begins, as shares of its path."""
-_NEXT = 5
+_NEXT = 2
 """A walk goes on to one of so many nearest spots."""
-_LANE_SPOTS_M = 6.0
+_LANE_SPOTS_M = 15.0
 _SWAY_M = 0.2
 """No two passes follow the same line."""
 _LEAST_SPREAD_M = 1.0
@@ -27,7 +27,7 @@ _LEAST_SPREAD_M = 1.0
 def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:
     """Goals (G, 2) of each robot that is to drive ``length_m``: stretches of one walk through rooms and corridors.
 
-    Neighbours' stretches overlap by half. A further robot changes nothing for those before it.
+    Neighbours' stretches overlap. A further robot changes nothing for those before it.
 
     Raises:
         SimulationError: the building has no free space, or too little to drive about in.
@@ -125,7 +125,7 @@ def _draw_spots(plan: FloorPlan, space: FreeSpace, rng: np.random.Generator) -> 
         if len(inside):
             spots.append(int(rng.choice(inside)))
     for start, end in plan.lanes:
-        count = max(2, round(float(np.linalg.norm(end - start)) / _LANE_SPOTS_M))
+        count = max(1, round(float(np.linalg.norm(end - start)) / _LANE_SPOTS_M))
         shares = (np.arange(count) + rng.uniform(0.1, 0.9, count)) / count
         spots += [space.nearest(start + share * (end - start)) for share in shares]
     return np.unique(np.array(spots, dtype=np.intp))
