@@ -5,8 +5,8 @@
 The first images of five scenes at 640 x 480. Shift: rolled right and down by so many pixels; of the 500 strongest
 keypoints away from the edges, the share that is found again within 1 px among the 500 strongest there. A detector that
 works in cells of 8 x 8 pixels gives itself away here. FAST, Harris and Shi keep 600 corners of an image, some of which
-lie on the seam of a rolled one: that alone costs them the last 0.05. Turn: about the middle; the matching accuracy at 3 px, without
-NMS, and the share of the homographies that are right to 3 px.
+lie on the seam of a rolled one: that alone costs them the last 0.05. Turn: about the middle; the matching accuracy at
+3 px, without NMS, and the share of the homographies that are right to 3 px.
 """
 
 from collections.abc import Sequence

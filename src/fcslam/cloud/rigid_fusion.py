@@ -91,8 +91,12 @@ def _links(matches: Sequence[_Match], strategy: FusionStrategy) -> _Links:
 
 def _relation(matches: Sequence[_Match], strategy: FusionStrategy) -> FloatArray:
     """T_a_b of two robots' own maps; NaN where the points contradict each other so much that no rotation is better."""
+    # A robot may claim to be so far away that its two points are one to a computer.
     align = two_point_alignment if strategy is FusionStrategy.TWO_POINT else n_point_alignment
-    return align([match.xy_a for match in matches], [match.xy_b for match in matches])
+    try:
+        return align([match.xy_a for match in matches], [match.xy_b for match in matches])
+    except ValueError:
+        return np.full(3, np.nan)
 
 
 def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], frames: dict[str, FloatArray]) -> bool:

@@ -26,6 +26,9 @@ _CORNERS: Final = 600
 _SIFT_NUMBERS: Final = 128
 
 
+_PYRAMID_STEP = 1.2
+
+
 class OrbConfig(Settings):
     """ORB. A change makes old and new places incomparable."""
 
@@ -47,7 +50,10 @@ class Orb:
 
     def __init__(self, config: OrbConfig) -> None:
         self._orb = cv2.ORB.create(
-            nfeatures=config.most_features, nlevels=config.pyramid_levels, fastThreshold=config.fast_threshold
+            nfeatures=config.most_features,
+            scaleFactor=_PYRAMID_STEP,
+            nlevels=config.pyramid_levels,
+            fastThreshold=config.fast_threshold,
         )
 
     @property
@@ -60,7 +66,10 @@ class Orb:
         keypoints, descriptors = self._orb.detectAndCompute(image, None)
         if descriptors is None:
             return NO_FEATURES
-        found, order = _ranked(*_positions_and_responses(keypoints))
+        positions, responses = _positions_and_responses(keypoints)
+        # OpenCV multiplies by the scale of the level; the centre of a coarse pixel lies half of the difference further.
+        scales = _PYRAMID_STEP ** np.array([keypoint.octave for keypoint in keypoints])
+        found, order = _ranked(positions + 0.5 * (scales[:, None] - 1.0), responses)
         return ImageFeatures(found.keypoints_px, found.scores, frozen(descriptors[order], np.uint8))
 
 

@@ -156,12 +156,12 @@ class OnnxDetector:
 
 
 def decode_grey(encoded: bytes) -> GreyImage | None:
-    """The picture in an image file in grey levels, 8 bits each; None if it is broken or no image.
+    """The picture in an image file in grey levels, 8 bits each, as its pixels are stored; None if it is broken.
 
     Colours are weighed as in ITU-R BT.601, transparency is left out, and of 16 bits the upper 8 count.
     """
     try:
-        decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+        decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:  # of no bytes at all, for one
         return None
     return None if decoded is None else np.asarray(decoded, np.uint8)

@@ -11,7 +11,7 @@ from fcslam.features.choice import make_detector
 from fcslam.features.classical import OrbConfig
 from fcslam.features.detector import OnnxConfig, decode_grey
 from fcslam.features.kinds import DetectorKind
-from fcslam.features.placing import place_keypoints
+from fcslam.features.placing import LidarView, place_keypoints
 from fcslam.geometry import se2
 from fcslam.lidar.mapper import ScanPose
 from fcslam.lidar.scan import point_scan
@@ -77,15 +77,16 @@ class ViewFinder:
         if not self._is_new(self._pose.keyscan, odometry):
             return None
         picture = decode_grey(image.encoded)
-        if picture is None:
+        if picture is None or picture.shape != (image.camera.height, image.camera.width):
             return None
         self._last = self._pose.keyscan, odometry
         features = self._detector.detect(picture)
         T_scan_image = se2.between(self._scan.T_odom_base, odometry)
         returns = point_scan(self._scan.ranges_m, self._scan.laser)
+        spacing_rad = abs(self._scan.laser.angle_increment_rad)
         ends = se2.transform(se2.inverse(T_scan_image), np.vstack((returns.origin, returns.points)))
         positions, placed = place_keypoints(
-            features.keypoints_px, image.camera, ends[1:], ends[0], self._config.ceiling_m
+            features.keypoints_px, image.camera, LidarView(ends[1:], ends[0], spacing_rad), self._config.ceiling_m
         )
         if placed.sum() < self._config.fewest_keypoints:
             return None

@@ -113,6 +113,8 @@ def _check_place(place: Place, _: Packet) -> None:
     _check_count(place.first, "place: first", MAXIMUM_NUMBER)
     _check_count(place.last, "place: last", MAXIMUM_NUMBER)
     _require(place.first <= place.last, f"place: first = {place.first} is after last = {place.last}")
+    within = place.first <= place.id.number <= place.last
+    _require(within, f"place: number = {place.id.number} is not in {place.first}..{place.last}")
     check_name(place.detector_version, "place: detector version")
     count = len(place.keypoints)
     _require(count <= MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {MAXIMUM_KEYPOINTS}")
