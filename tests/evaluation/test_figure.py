@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fcslam.cli import main
 from fcslam.cloud import palette
 from fcslam.errors import EvaluationError, OutputError
 from fcslam.evaluation.charts import RAY_M, Chart, FleetCharts, Match, Outline, fleet_charts, spread
@@ -240,3 +241,11 @@ def test_what_is_missing_is_told(run_folder):
     (run_folder / "local").rmdir()
     with pytest.raises(EvaluationError, match="robots' own maps"):
         fleet_charts(run_folder)
+
+
+def test_the_command_draws_it(run_folder):
+    drawn = run_folder.parent / "figure.png"
+    assert main(["evaluate", "fleet", str(run_folder), "--figure", str(drawn)]) == 0
+    picture = cv2.imread(str(drawn))
+    assert picture is not None
+    assert picture.shape[1] == WIDTH_PX

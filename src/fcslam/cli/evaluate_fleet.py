@@ -33,6 +33,9 @@ def fleet(
     csv: Annotated[
         Path | None, typer.Option(help="Write the numbers to this file as well (as JSON if it ends in .json).")
     ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw the robots' maps, matched places, the fused map and the truth to a PNG.")
+    ] = None,
 ) -> None:
     """A run against the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
     from rich.console import Console
@@ -46,6 +49,11 @@ def fleet(
     show_fleet(report, Console())
     if csv is not None:
         write_metrics(fleet_metrics(report), csv)
+    if figure is not None:
+        from fcslam.evaluation.charts import fleet_charts
+        from fcslam.evaluation.figure import write_figure
+
+        write_figure(fleet_charts(run, truth), figure)
 
 
 def show_fleet(report: "FleetReport", console: "Console", explained: bool = True) -> None:
