@@ -64,7 +64,8 @@ def find_revisits(truth: PoseTable, criteria: RevisitCriteria, between_robots: b
 def _sampled(rows: NDArray[np.int64], metres: NDArray[np.float64], every_m: float) -> NDArray[np.int64]:
     """Rows of one robot about ``every_m`` of path apart, its first among them."""
     lengths = metres[rows]
-    return rows[np.unique(np.searchsorted(lengths, np.arange(0.0, lengths[-1] + 1e-9, every_m)))]
+    at = np.searchsorted(lengths, np.arange(0.0, lengths[-1] + 1e-9, every_m))
+    return rows[np.unique(np.minimum(at, len(rows) - 1))]
 
 
 def _passes(row: int, others: NDArray[np.int64], truth: PoseTable, criteria: RevisitCriteria) -> Iterator[int]:
