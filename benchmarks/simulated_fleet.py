@@ -20,6 +20,7 @@ import math
 import sys
 import tempfile
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import common
@@ -49,9 +50,12 @@ def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="kinds of fleet")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of the fleets")
+    parser.add_argument("--jobs", type=int, default=1, help="fleets at the same time; more spoil the times")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
-    rows = [row for case in chosen.cases for seed in chosen.seeds for row in fleet_rows(case, seed)]
+    fleets = [(case, seed) for case in chosen.cases for seed in chosen.seeds]
+    with ThreadPoolExecutor(chosen.jobs) as pool:
+        rows = [row for some in pool.map(lambda fleet: list(fleet_rows(*fleet)), fleets) for row in some]
     report.table("Summary", SUMMARY, summary(rows, chosen.cases))
     report.table("Fleets", COLUMNS, rows)
     report.write()

@@ -2,6 +2,8 @@
 
 import math
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -12,6 +14,7 @@ from simulation.gl import require_gl
 
 from fcslam.records import CameraImage, LaserScan
 from fcslam.simulation.decoration import Picture, decorate
+from fcslam.simulation.engine import mujoco
 from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import draw_floor_plan
 from fcslam.simulation.kinds import Building, Lighting
@@ -131,3 +134,22 @@ def test_robots_side_by_side_see_what_they_see_alone():
     for thread in threads:
         thread.join()
     assert [into[0] for into in together] == alone
+
+
+def test_robots_draw_one_after_the_other(monkeypatch):
+    """Mesa's software renderer crashes, now and then, where two threads draw at once."""
+    module, render, inside, most = mujoco(), mujoco().mjr_render, [], []
+
+    def watched(*arguments):
+        inside.append(1)
+        most.append(len(inside))
+        time.sleep(0.002)
+        render(*arguments)
+        inside.pop()
+
+    monkeypatch.setattr(module, "mjr_render", watched)
+    fleet = simulate_fleet(SimulationSettings(path_length_m=2.0), 1)
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda robot: [None for _ in robot.items()], fleet.robots))
+    assert len(most) > 20
+    assert max(most) == 1

@@ -11,8 +11,9 @@ from fcslam.errors import SimulationError
 
 _GL = "MUJOCO_GL"
 _BACKENDS = ("egl", "osmesa")
-SETTING_UP = RLock()
-"""Robots are simulated side by side in threads; what they share is looked up by one of them."""
+ALONE = RLock()
+"""Robots are simulated side by side in threads. Whoever loads a library or calls GL does so alone: Mesa's software
+renderer looks through what all contexts of the process are drawing, without asking whether one of them is at it."""
 
 _PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
 
@@ -23,7 +24,7 @@ def mujoco() -> Any:
     Raises:
         SimulationError: it is not installed.
     """
-    with SETTING_UP:
+    with ALONE:
         if loaded := sys.modules.get("mujoco"):
             return loaded
         wanted = os.environ.get(_GL)

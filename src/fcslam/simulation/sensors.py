@@ -8,7 +8,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, FloatArray, LaserModel
-from fcslam.simulation.engine import SETTING_UP, gl_context, mujoco
+from fcslam.simulation.engine import ALONE, gl_context, mujoco
 from fcslam.simulation.lighting import Light
 from fcslam.simulation.scene import SEEN, SOLID
 from fcslam.simulation.textures import Image
@@ -54,10 +54,10 @@ class Camera:
     def __init__(self, model: Any, camera: CameraModel, light: Light) -> None:
         self._mujoco = mujoco()
         self._model, self._camera, self._lamps = model, camera, light.lamps
-        with SETTING_UP:
+        with ALONE:
             self._gl = gl_context(camera.width, camera.height)
             self._context = self._mujoco.MjrContext(model, self._mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        self._mujoco.mjr_setBuffer(self._mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+            self._mujoco.mjr_setBuffer(self._mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._data = self._mujoco.MjData(model)
         self._mujoco.mj_forward(model, self._data)
         self._scene = self._mujoco.MjvScene(model, maxgeom=model.ngeom + 10)
@@ -84,13 +84,14 @@ class Camera:
         nearest = np.argsort(np.linalg.norm(self._lamps - position, axis=1))
         for number in range(self._model.nlight):
             self._data.light_xpos[number] = self._lamps[nearest[number]]
-        self._gl.make_current()
         everything = self._mujoco.mjtCatBit.mjCAT_ALL.value
         self._mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._view, everything, self._scene)
         frame = self._mujoco.MjrRect(0, 0, self._camera.width, self._camera.height)
-        self._mujoco.mjr_render(frame, self._scene, self._context)
         pixels = np.empty((self._camera.height, self._camera.width, 3), dtype=np.uint8)
-        self._mujoco.mjr_readPixels(pixels, None, frame, self._context)
+        with ALONE:
+            self._gl.make_current()
+            self._mujoco.mjr_render(frame, self._scene, self._context)
+            self._mujoco.mjr_readPixels(pixels, None, frame, self._context)
         return np.ascontiguousarray(pixels[::-1])
 
     def _leave_out_unseen(self, position: FloatArray, rotation: FloatArray) -> None:
@@ -101,8 +102,10 @@ class Camera:
 
     def close(self) -> None:
         """Free what GL holds."""
-        self._context.free()
-        self._gl.free()
+        with ALONE:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
 
     def __enter__(self) -> "Camera":
         return self
