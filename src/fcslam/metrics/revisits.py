@@ -65,7 +65,8 @@ def _sampled(rows: NDArray[np.int64], metres: NDArray[np.float64], every_m: floa
     """Rows of one robot about ``every_m`` of path apart, its first among them."""
     lengths = metres[rows]
     at = np.searchsorted(lengths, np.arange(0.0, lengths[-1] + 1e-9, every_m))
-    return rows[np.unique(np.minimum(at, len(rows) - 1))]
+    sampled: NDArray[np.int64] = rows[np.unique(np.minimum(at, len(rows) - 1))]
+    return sampled
 
 
 def _passes(row: int, others: NDArray[np.int64], truth: PoseTable, criteria: RevisitCriteria) -> Iterator[int]:
