@@ -1,0 +1,171 @@
+"""A trained network as ONNX files: in float32, and in int8 for processors without a GPU.
+
+Input `image` float32 (1, 1, H, W), grey in [0, 1], H and W any multiples of 8. Outputs `scores` float32 (1, H, W) and `logits`
+float32 (1, 256, H/8, W/8), cell (r, c) centred at the pixel (8 c + 3.5, 8 r + 3.5). Metadata: `fcslam_format`, and
+`fcslam_version`, which is another one for other weights, and stamps every descriptor.
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from fcslam.errors import OutputError
+from fcslam.features.detector import GreyImage
+from fcslam.learning.network import CELL_PX, KeypointNetwork
+
+FORMAT: Final = "1"
+OPSET: Final = 17
+CALIBRATION_IMAGES: Final = 64
+TRACED_SIZE: Final = (240, 320)
+
+
+class Exported(nn.Module):
+    """A network with the outputs of the file."""
+
+    def __init__(self, network: KeypointNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """``scores`` and ``logits``."""
+        maps = self.network(image)
+        return self.network.scores(maps), maps.code_logits
+
+
+def version_of(network: KeypointNetwork) -> str:
+    """A name of exactly these weights, such as `light-0a1b2c3d4e5f`."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(network.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().numpy().tobytes())
+    return f"{network.encoder}-{digest.hexdigest()[:12]}"
+
+
+def export(network: KeypointNetwork, path: Path) -> None:
+    """Write the float32 file.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    import onnx
+
+    ready = Exported(network).cpu().eval()
+    unfinished = path.with_suffix(".part")
+    sides = {2: "height", 3: "width"}
+    try:
+        with _quietly():
+            torch.onnx.export(
+                ready,
+                (torch.rand(1, 1, *TRACED_SIZE),),
+                str(unfinished),
+                input_names=["image"],
+                output_names=["scores", "logits"],
+                dynamic_axes={"image": sides, "scores": {1: "height", 2: "width"}, "logits": {2: "rows", 3: "columns"}},
+                opset_version=OPSET,
+                dynamo=False,
+            )
+        written = onnx.load(str(unfinished))
+        _finish(written, version_of(network), path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def quantise(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
+    """Write the int8 file of a float32 one, with the ranges that ``images`` give its activations.
+
+    The two last convolutions stay in float: their outputs are compared with each other, and cost little.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    import onnx
+    from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
+
+    unfinished = path.with_suffix(".part")
+    try:
+        with _quietly():
+            quantize_static(
+                str(source),
+                str(unfinished),
+                _Calibration(images[:CALIBRATION_IMAGES]),
+                quant_format=QuantFormat.QDQ,
+                per_channel=True,
+                activation_type=QuantType.QUInt8,
+                weight_type=QuantType.QInt8,
+                op_types_to_quantize=["Conv"],
+                nodes_to_exclude=_last_convolutions(onnx.load(str(source))),
+            )
+        written = onnx.load(str(unfinished))
+        version = next(entry.value for entry in written.metadata_props if entry.key == "fcslam_version")
+        _finish(written, f"{version}-int8", path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+class _Calibration:
+    """Feeds images to the quantiser, one after another."""
+
+    def __init__(self, images: Sequence[GreyImage]) -> None:
+        self._images = iter(images)
+
+    def get_next(self) -> dict[str, Any] | None:
+        """The next input, or None at the end."""
+        image = next(self._images, None)
+        if image is None:
+            return None
+        height, width = (side // CELL_PX * CELL_PX for side in image.shape)
+        return {"image": image[None, None, :height, :width].astype(np.float32) / np.float32(255.0)}
+
+
+def _last_convolutions(graph: Any) -> list[str]:
+    """Names of the convolutions that no other convolution comes after."""
+    consumers: dict[str, list[Any]] = {}
+    for node in graph.graph.node:
+        for name in node.input:
+            consumers.setdefault(name, []).append(node)
+
+    def leads_on(node: Any) -> bool:
+        return any(
+            each.op_type == "Conv" or leads_on(each) for output in node.output for each in consumers.get(output, [])
+        )
+
+    return [node.name for node in graph.graph.node if node.op_type == "Conv" and not leads_on(node)]
+
+
+def _finish(written: Any, version: str, path: Path) -> None:
+    """Stamp a file and put it in its place."""
+    import onnx
+
+    del written.metadata_props[:]
+    for key, value in (("fcslam_format", FORMAT), ("fcslam_version", version)):
+        written.metadata_props.add(key=key, value=value)
+    onnx.checker.check_model(written)
+    finished = path.with_suffix(".new")
+    finished.write_bytes(written.SerializeToString(deterministic=True))
+    os.replace(finished, path)
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Without the exporters' remarks on their own future."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(level)
