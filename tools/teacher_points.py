@@ -3,9 +3,9 @@
     python tools/teacher_points.py WEIGHTS IMAGES... --output TEACHER
 
 Needs torch and kornia (`pip install --no-deps kornia kornia_rs`), which fcslam itself never does. Each image gets one
-`.npz` below TEACHER at its own path, which begins with the name of its folder IMAGES: `keypoints` (N, 2) float32 x, y in
-pixels, `scores` (N,) float32, `descriptors` (N, 128) float16. Images that have one are skipped, so an interrupted run
-goes on where it was.
+`.npz` below TEACHER at its own path, which begins with the name of its folder IMAGES: `keypoints` (N, 2) float32 x, y
+in pixels, `scores` (N,) float32, `descriptors` (N, 128) float16. Images that have one are skipped, so an interrupted
+run goes on where it was.
 """
 
 import argparse

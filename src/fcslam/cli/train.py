@@ -27,7 +27,9 @@ def train(
     seed: Annotated[int | None, typer.Option(min=0, help="Another seed trains another detector.")] = None,
     teacher: Annotated[Path | None, typer.Option(help="Folder of a teacher's points, see docs/training.md.")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, or auto: cuda if there is one.")] = "auto",
-    quick: Annotated[bool, typer.Option("--quick", help="A minute's run that only shows that everything works.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A minute's run that only shows that everything works.")
+    ] = False,
 ) -> None:
     """Train a detector of keypoints with 256-bit descriptors; needs no labels."""
     import time
@@ -97,7 +99,9 @@ def _progress(console: Any) -> "Iterator[Watch]":
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.fields[figures]}"), console=console, disable=not console.is_terminal) as bar:
+    with Progress(
+        *columns, TextColumn("{task.fields[figures]}"), console=console, disable=not console.is_terminal
+    ) as bar:
         tasks: dict[str, Any] = {}
         last: dict[str, str] = {}
 

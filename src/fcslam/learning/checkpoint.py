@@ -40,11 +40,12 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "step": checkpoint.step,
         "settings": checkpoint.settings,
     }
-    arrays = {name: tensor.detach().cpu().numpy() for name, tensor in checkpoint.tensors.items()}
+    arrays: dict[str, Any] = {_HEADER: np.array(json.dumps(header))}
+    arrays |= {name: tensor.detach().cpu().numpy() for name, tensor in checkpoint.tensors.items()}
     unfinished = path.with_suffix(".part")
     try:
         with unfinished.open("wb") as file:
-            np.savez(file, **{_HEADER: np.array(json.dumps(header))}, **arrays)
+            np.savez(file, allow_pickle=False, **arrays)
         unfinished.replace(path)
     except OSError as error:
         unfinished.unlink(missing_ok=True)
@@ -62,7 +63,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
             header = json.loads(str(file[_HEADER]))
             tensors = {name: torch.from_numpy(file[name]) for name in file.files if name != _HEADER}
         if header["format"] != FORMAT:
-            raise TrainingError(f"{path}: has format {header['format']}, expected {FORMAT}; train anew in another folder")
+            raise TrainingError(
+                f"{path}: has format {header['format']}, expected {FORMAT}; train anew in another folder"
+            )
         return Checkpoint(header["stage"], header["step"], header["settings"], tensors)
     except TrainingError:
         raise

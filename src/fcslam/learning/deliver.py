@@ -50,7 +50,8 @@ def _card(
     lines = [
         f"# Detector {version}",
         "",
-        f"Trained on {len(images.train)} images; {len(images.held_out)} others were held out, {images.skipped} left out.",
+        f"Trained on {len(images.train)} images; {len(images.held_out)} others were held out, {images.skipped} left "
+        "out.",
         f"Teacher: {taught}.",
         "",
         "| on pairs of held-out images, 320 x 240, warped and lit at random | |",

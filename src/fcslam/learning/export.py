@@ -1,8 +1,8 @@
 """A trained network as ONNX files: in float32, and in int8 for processors without a GPU.
 
-Input `image` float32 (1, 1, H, W), grey in [0, 1], H and W any multiples of 8. Outputs `scores` float32 (1, H, W) and `logits`
-float32 (1, 256, H/8, W/8), cell (r, c) centred at the pixel (8 c + 3.5, 8 r + 3.5). Metadata: `fcslam_format`, and
-`fcslam_version`, which is another one for other weights, and stamps every descriptor.
+Input `image` float32 (1, 1, H, W), grey in [0, 1], H and W any multiples of 8. Outputs `scores` float32 (1, H, W) and
+`logits` float32 (1, 256, H/8, W/8), cell (r, c) centred at the pixel (8 c + 3.5, 8 r + 3.5). Metadata: `fcslam_format`,
+and `fcslam_version`, which is another one for other weights, and stamps every descriptor.
 """
 
 import contextlib

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
-from fcslam.learning.warps import Crop, random_change, warp
+from fcslam.learning.warps import Crop, inverse, random_change, warp
 from fcslam.records import FloatArray
 
 Response = NDArray[np.float32]
@@ -34,7 +34,7 @@ def adapt(
     count = np.ones(image.shape, np.float32)
     for _ in range(copies):
         homography = random_change(crop, rng)
-        back = np.linalg.inv(homography)
+        back = inverse(homography)
         response = detector(warp(image, homography, crop))
         everywhere = np.zeros(image.shape, np.float32)
         everywhere[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 1.0
@@ -44,9 +44,10 @@ def adapt(
 
 
 def harris(image: GreyImage) -> Response:
-    """Harris's corner measure (Harris and Stephens 1988), compressed so that strong contrast does not drown the rest."""
-    measure = cv2.cornerHarris(image, HARRIS_BLOCK_PX, 3, HARRIS_K)
-    return np.sqrt(np.maximum(measure, 0.0, dtype=np.float32))
+    """Harris's corner measure (Harris and Stephens 1988); its root, so that strong contrast does not drown the rest."""
+    measure = np.asarray(cv2.cornerHarris(image, HARRIS_BLOCK_PX, 3, HARRIS_K), np.float32)
+    response: Response = np.sqrt(np.maximum(measure, np.float32(0.0)))
+    return response
 
 
 def peaks(response: Response, radius_px: int, most: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -75,7 +76,8 @@ def _vertices(response: Response, rows: NDArray[np.int64], columns: NDArray[np.i
     ):
         bend = left - 2.0 * middle + right
         offsets.append(np.where(bend < 0.0, 0.5 * (left - right) / np.where(bend < 0.0, bend, 1.0), 0.0))
-    return np.clip(np.stack(offsets, axis=1), -0.5, 0.5)
+    clipped: FloatArray = np.clip(np.stack(offsets, axis=1), -0.5, 0.5)
+    return clipped
 
 
 def _unwarp(response: Response, homography: FloatArray) -> Response:

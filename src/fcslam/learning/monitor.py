@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from fcslam.features.codes import CODE_BITS, hamming_matrix, mutual_matches
 from fcslam.learning.network import KeypointNetwork, sample_codes
 from fcslam.learning.pairs import Pair
-from fcslam.learning.warps import inside, project
+from fcslam.learning.warps import inside, inverse, project
 from fcslam.records import FloatArray
 
 SUPPRESSION_PX: Final = 4
@@ -73,7 +73,7 @@ def _validate_pair(network: KeypointNetwork, pair: Pair, device: torch.device) -
     (points_a, codes_a, logits_a), (points_b, codes_b, _) = (detect(network, image) for image in images)
     height, width = pair.views[0].image.shape
     there = project(points_a, pair.homography)
-    back = project(points_b, np.linalg.inv(pair.homography))
+    back = project(points_b, inverse(pair.homography))
     common_a, common_b = inside(there, width, height, 0.0), inside(back, width, height, 0.0)
     distances = np.linalg.norm(there[common_a][:, None] - points_b[common_b][None], axis=2)
     found = 0

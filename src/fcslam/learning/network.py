@@ -1,8 +1,8 @@
 """The network: where keypoints are, and 256 logits whose signs are their descriptors.
 
 Two encoders behind one class. `vgg` is the paper's: convolutions in pairs, pooled three times, a detector head of 65
-channels for each cell of 8 x 8 pixels (64 places and "none") that sub-pixel convolution lays out to full size. `light` has a
-thirteenth of its work: strided convolutions, context from 1/16, and a detector head at half resolution, so that a
+channels for each cell of 8 x 8 pixels (64 places and "none") that sub-pixel convolution lays out to full size. `light`
+has a tenth of its work: strided convolutions, context from 1/16, and a detector head at half resolution, so that a
 point is found wherever it lies and not once a cell; its sub-pixel step is 2 x 2.
 
 All resampling is symmetric about the middle of a pixel block, so cell (r, c) of the logits is centred at the pixel

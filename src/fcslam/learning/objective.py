@@ -59,13 +59,14 @@ def objective(
     candidates = negatives(batch.points, batch.valid)
     codes = losses.binary_activation(first), losses.binary_activation(second)
     margin = weights.margin * (0.3 + 0.7 * progress)
+    points = (maps.point_logits.float(), batch.targets, batch.seen)
     parts = {
         "triplet": losses.triplet_loss(losses.code_distances(*codes), candidates, batch.valid, margin),
         "contrastive": losses.contrastive_loss(
             torch.tanh(first), torch.tanh(second), candidates, batch.valid, weights.temperature
         ),
         "balance": losses.balance_loss(torch.tanh(logits), batch.valid.repeat(2, 1)),
-        "detector": losses.detector_loss(*shift_grid((maps.point_logits.float(), batch.targets, batch.seen), grid_shift)),
+        "detector": losses.detector_loss(*shift_grid(points, grid_shift)),
     }
     factors = {name: getattr(weights, name) for name in parts}
     if bits is not None:

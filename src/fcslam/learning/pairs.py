@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
 from fcslam.learning.labels import Labels, Teacher
-from fcslam.learning.warps import Crop, inside, project, random_change, random_view, relight, seen, warp
+from fcslam.learning.warps import Crop, inside, inverse, project, random_change, random_view, relight, seen, warp
 from fcslam.records import FloatArray
 
 BORDER_PX: Final = 4
@@ -70,7 +70,7 @@ def draw_pair(example: Example, crop: Crop, points: int, taught: int, rng: np.ra
         _in_both(views[0].points, views[1].points, crop) & inside(chosen, image.shape[1], image.shape[0], 0.0),
         _in_both(views[0].taught, views[1].taught, crop),
         descriptors,
-        homographies[1] @ np.linalg.inv(homographies[0]),
+        homographies[1] @ inverse(homographies[0]),
     )
 
 
@@ -110,13 +110,13 @@ def _choose(
 ) -> FloatArray:
     """Points (count, 2) of the image: keypoints that both views see, the better the likelier, and others anywhere."""
     keypoints = example.labels.keypoints.astype(np.float64)
-    usable = np.flatnonzero(_in_both(*(project(keypoints, each) for each in homographies), crop))
+    usable = np.flatnonzero(_in_both(project(keypoints, homographies[0]), project(keypoints, homographies[1]), crop))
     wanted = min(len(usable), round((1.0 - GRID_SHARE) * count))
     # Gumbel's trick: the largest of noise plus log weight are a draw without replacement.
     appeal = np.log(example.labels.quality[usable]) + rng.gumbel(size=len(usable))
     best = usable[np.argsort(-appeal)[:wanted]]
     anywhere = rng.uniform(0.0, 1.0, (count - wanted, 2)) * [crop.width - 1.0, crop.height - 1.0]
-    return np.concatenate((keypoints[best], project(anywhere, np.linalg.inv(homographies[0]))))
+    return np.concatenate((keypoints[best], project(anywhere, inverse(homographies[0]))))
 
 
 def _choose_taught(
@@ -125,7 +125,7 @@ def _choose_taught(
     if teacher is None:
         return np.zeros((count, 2)), np.zeros((count, 0), np.float32)
     keypoints = teacher.keypoints.astype(np.float64)
-    usable = np.flatnonzero(_in_both(*(project(keypoints, each) for each in homographies), crop))
+    usable = np.flatnonzero(_in_both(project(keypoints, homographies[0]), project(keypoints, homographies[1]), crop))
     best = rng.permutation(usable)[:count]
     missing = count - len(best)
     places = np.concatenate((keypoints[best], np.full((missing, 2), np.nan)))

@@ -13,7 +13,7 @@ class LossSettings(Settings):
     margin: float = Field(default=1.0, ge=0.0, description="its margin at the end, ramped up; 0 is the paper's")
     contrastive: float = Field(default=1.0, ge=0.0, description="weight of InfoNCE on the smooth codes")
     temperature: float = Field(default=0.05, gt=0.0, description="its temperature, for similarities in [-1, 1]")
-    distillation: float = Field(default=30.0, ge=0.0, description="weight of the teacher's bits; halves twice on the way")
+    distillation: float = Field(default=30.0, ge=0.0, description="weight of the teacher's bits; a quarter at the end")
     balance: float = Field(default=0.1, ge=0.0, description="weight of the bits' balance")
     detector: float = Field(default=1.0, ge=0.0, description="weight of the detector's cross entropy")
 

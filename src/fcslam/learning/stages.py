@@ -1,8 +1,8 @@
 """From a folder of images to a trained network: shapes, labels, joint training. Each stage resumes where it stopped.
 
 Without a teacher, a detector first learns corners on synthetic shapes, and labels the images by homographic
-adaptation, together with Harris's measure. With one, its keypoints take that detector's place, and its descriptors say which
-bits are wanted.
+adaptation, together with Harris's measure. With one, its keypoints take that detector's place, and its descriptors say
+which bits are wanted.
 """
 
 import zlib
@@ -183,7 +183,8 @@ def _as_detector(network: KeypointNetwork, device: torch.device) -> Callable[[Gr
         response[:height, :width] = network.scores(network(batch))[0].cpu().numpy()
         return response
 
-    return detector
+    answer: Callable[[GreyImage], Response] = detector
+    return answer
 
 
 def _made(folder: Path) -> Path:

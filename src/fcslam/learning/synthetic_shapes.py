@@ -10,7 +10,6 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
 from fcslam.learning.labels import Labels
@@ -137,7 +136,8 @@ def cube(picture: GreyImage, rng: np.random.Generator) -> FloatArray:
     place = rng.uniform(room, np.maximum([width, height] - room, room + 1.0)) - middle
     for face, shade in zip(faces, _shades(3, picture, rng), strict=True):
         cv2.fillConvexPoly(picture, np.rint(face + place).astype(np.int32), shade, cv2.LINE_AA)
-    return np.rint(corners + place)
+    placed: FloatArray = np.rint(corners + place)
+    return placed
 
 
 def ellipses(picture: GreyImage, rng: np.random.Generator) -> FloatArray:
@@ -216,9 +216,9 @@ def _shades(count: int, picture: GreyImage, rng: np.random.Generator) -> list[in
     return shades
 
 
-def _whole(line: FloatArray) -> list[list[int]]:
-    rounded: NDArray[np.int64] = np.rint(line).astype(np.int64)
-    return [[int(x), int(y)] for x, y in rounded]
+def _whole(line: FloatArray) -> tuple[list[int], list[int]]:
+    start, end = np.rint(line).astype(int).tolist()
+    return start, end
 
 
 def _cross(a: FloatArray, b: FloatArray) -> bool:
@@ -227,4 +227,5 @@ def _cross(a: FloatArray, b: FloatArray) -> bool:
     def side(p: FloatArray, q: FloatArray, r: FloatArray) -> float:
         return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
 
-    return side(*a, b[0]) * side(*a, b[1]) <= 0 and side(*b, a[0]) * side(*b, a[1]) <= 0
+    apart = side(a[0], a[1], b[0]) * side(a[0], a[1], b[1]) > 0 or side(b[0], b[1], a[0]) * side(b[0], b[1], a[1]) > 0
+    return not apart

@@ -1,6 +1,6 @@
 """The training loop: draw pairs, step, average, look now and then how good the network is, keep a checkpoint.
 
-A step depends on the seed, its number and the state before it, so a run that was interrupted goes on as if it had not been.
+A step depends on the seed, its number and the state before it, so an interrupted run goes on as if it had not been.
 """
 
 import csv
@@ -107,7 +107,8 @@ class Run:
             if last or time.monotonic() - self._saved > self.pace.checkpoint_every_s:
                 self._save()
             watch(self.step, figures)
-        return self.average
+        trained: KeypointNetwork = self.average
+        return trained
 
     def _step(self, step: int, batch: Batch, bits: TeacherBits | None) -> dict[str, Tensor]:
         self.network.train()

@@ -61,11 +61,16 @@ def warp(image: GreyImage, homography: FloatArray, crop: Crop) -> GreyImage:
 
 
 def seen(shape: tuple[int, int], homography: FloatArray, crop: Crop, border: int = 2) -> NDArray[np.bool_]:
-    """Which pixels of the crop show the image of this shape, ``border`` pixels of it left out; shape (height, width)."""
+    """Which pixels (height, width) of the crop show the image of this shape, ``border`` pixels of it left out."""
     own = np.zeros(shape, np.uint8)
     own[border:-border, border:-border] = 1
     warped = cv2.warpPerspective(own, homography, (crop.width, crop.height), flags=cv2.INTER_NEAREST)
     return np.asarray(warped, np.bool_)
+
+
+def inverse(homography: FloatArray) -> FloatArray:
+    """The homography back."""
+    return np.asarray(np.linalg.inv(homography), np.float64)
 
 
 def project(points: FloatArray, homography: FloatArray) -> FloatArray:
@@ -80,8 +85,7 @@ def inside(points: FloatArray, width: int, height: int, border: float) -> NDArra
     """Whether points (N, 2) are in an image, ``border`` pixels from its rim."""
     low, high = border, np.array([width - 1.0, height - 1.0]) - border
     with np.errstate(invalid="ignore"):
-        result: NDArray[np.bool_] = ((points >= low) & (points <= high)).all(axis=1)
-    return result
+        return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
 
 
 def relight(image: GreyImage, rng: np.random.Generator) -> NDArray[np.float32]:
