@@ -37,7 +37,7 @@ class SimulationError(InputError):
 
 
 class TrainingError(InputError):
-    """A detector cannot be trained: images, a teacher's points or a checkpoint cannot be used, or a library is missing."""
+    """A detector cannot be trained: images, a teacher's points or a checkpoint do not serve, or torch is missing."""
 
 
 class EvaluationError(InputError):
