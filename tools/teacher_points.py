@@ -16,6 +16,7 @@ import torch
 from kornia.feature import ALIKED
 
 from fcslam.features.detector import GreyImage
+from fcslam.learning.arrays import write_arrays
 from fcslam.learning.images import find_images, read_grey
 
 MOST_POINTS = 800
@@ -44,16 +45,12 @@ def main() -> None:
 def write_points(teacher: ALIKED, image: GreyImage, target: Path) -> None:
     """Describe one image; the file appears only when it is complete."""
     (points,) = teacher(torch.from_numpy(image).float()[None, None].expand(1, 3, -1, -1) / 255.0)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = target.with_suffix(".part")
-    with unfinished.open("wb") as file:
-        np.savez(
-            file,
-            keypoints=points.keypoints.numpy().astype(np.float32),
-            scores=points.keypoint_scores.numpy().astype(np.float32),
-            descriptors=points.descriptors.numpy().astype(np.float16),
-        )
-    unfinished.replace(target)
+    arrays = {
+        "keypoints": points.keypoints.numpy().astype(np.float32),
+        "scores": points.keypoint_scores.numpy().astype(np.float32),
+        "descriptors": points.descriptors.numpy().astype(np.float16),
+    }
+    write_arrays(target, arrays)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,12 @@ if TYPE_CHECKING:
 
     from fcslam.learning.settings import TrainingSettings
     from fcslam.learning.stages import Watch
+    from fcslam.learning.trainer import Status
 
 QUICK = {"steps": 40, "shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Enough to see that everything works, and no more."""
+LINE_EVERY = 500
+"""Steps between two lines of figures where there is no terminal."""
 FIGURES = ("repeatability", "mma_3px", "shift_repeatability")
 
 
@@ -98,20 +101,31 @@ def _progress(console: Any) -> "Iterator[Watch]":
     """A live line a stage; without a terminal, a line of figures now and then."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(
-        *columns, TextColumn("{task.fields[figures]}"), console=console, disable=not console.is_terminal
-    ) as bar:
+    live = console.is_terminal
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[figures]}"),
+    )
+    with Progress(*columns, console=console, disable=not live) as bar:
         tasks: dict[str, Any] = {}
-        last: dict[str, str] = {}
+        said: set[str] = set()
 
-        def watch(stage: str, done: int, total: int, figures: dict[str, float]) -> None:
+        def say(text: str) -> None:
+            if text not in said:
+                said.add(text)
+                console.print(text, highlight=False)
+
+        def watch(stage: str, status: "Status") -> None:
             if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total, figures="")
-            text = "  ".join(f"{name} {figures[name]:.3f}" for name in FIGURES if name in figures)
-            bar.update(tasks[stage], completed=done, figures=text)
-            if not console.is_terminal and text and last.get(stage) != text:
-                console.print(f"{stage} {done}/{total}  {text}", highlight=False)
-                last[stage] = text
+                tasks[stage] = bar.add_task(stage, total=status.steps, figures="")
+            text = "  ".join(f"{name} {status.figures[name]:.3f}" for name in FIGURES if name in status.figures)
+            bar.update(tasks[stage], completed=status.step, figures=text)
+            if not live and status.step % LINE_EVERY == 0:
+                say(f"{stage} {status.step}/{status.steps}  {text}")
+            for alarm in status.alarms:
+                say(f"warning: {alarm}")
 
         yield watch

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from fcslam.errors import OutputError, TrainingError
+from fcslam.learning.arrays import read_arrays, write_arrays
 
 FORMAT = 1
 _HEADER = "header"
@@ -42,13 +43,9 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     }
     arrays: dict[str, Any] = {_HEADER: np.array(json.dumps(header))}
     arrays |= {name: tensor.detach().cpu().numpy() for name, tensor in checkpoint.tensors.items()}
-    unfinished = path.with_suffix(".part")
     try:
-        with unfinished.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        unfinished.replace(path)
+        write_arrays(path, arrays)
     except OSError as error:
-        unfinished.unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot be written ({error}); make room and run the same command again") from error
 
 
@@ -59,15 +56,12 @@ def read_checkpoint(path: Path) -> Checkpoint:
         TrainingError: the file is no checkpoint, or of another format.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(str(file[_HEADER]))
-            tensors = {name: torch.from_numpy(file[name]) for name in file.files if name != _HEADER}
-        if header["format"] != FORMAT:
-            raise TrainingError(
-                f"{path}: has format {header['format']}, expected {FORMAT}; train anew in another folder"
-            )
-        return Checkpoint(header["stage"], header["step"], header["settings"], tensors)
-    except TrainingError:
-        raise
-    except Exception as error:  # whatever a foreign or broken archive makes numpy, zipfile or json raise
+        arrays = read_arrays(path)
+        header = json.loads(str(arrays.pop(_HEADER)))
+        if header["format"] == FORMAT:
+            tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+            return Checkpoint(header["stage"], header["step"], header["settings"], tensors)
+        found = header["format"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{path}: is no checkpoint of a training run ({error}); take it away") from error
+    raise TrainingError(f"{path}: has format {found}, expected {FORMAT}; train anew in another folder")

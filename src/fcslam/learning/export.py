@@ -7,8 +7,9 @@ and `fcslam_version`, which is another one for other weights, and stamps every d
 
 import contextlib
 import hashlib
+import io
 import logging
-import os
+import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -59,26 +60,20 @@ def export(network: KeypointNetwork, path: Path) -> None:
     import onnx
 
     ready = Exported(network).cpu().eval()
-    unfinished = path.with_suffix(".part")
+    content = io.BytesIO()
     sides = {2: "height", 3: "width"}
-    try:
-        with _quietly():
-            torch.onnx.export(
-                ready,
-                (torch.rand(1, 1, *TRACED_SIZE),),
-                str(unfinished),
-                input_names=["image"],
-                output_names=["scores", "logits"],
-                dynamic_axes={"image": sides, "scores": {1: "height", 2: "width"}, "logits": {2: "rows", 3: "columns"}},
-                opset_version=OPSET,
-                dynamo=False,
-            )
-        written = onnx.load(str(unfinished))
-        _finish(written, version_of(network), path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with _quietly():
+        torch.onnx.export(
+            ready,
+            (torch.rand(1, 1, *TRACED_SIZE),),
+            content,
+            input_names=["image"],
+            output_names=["scores", "logits"],
+            dynamic_axes={"image": sides, "scores": {1: "height", 2: "width"}, "logits": {2: "rows", 3: "columns"}},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+    _write(onnx.load_from_string(content.getvalue()), version_of(network), path)
 
 
 def quantise(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
@@ -92,27 +87,22 @@ def quantise(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
     import onnx
     from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
-    unfinished = path.with_suffix(".part")
-    try:
-        with _quietly():
-            quantize_static(
-                str(source),
-                str(unfinished),
-                _Calibration(images[:CALIBRATION_IMAGES]),
-                quant_format=QuantFormat.QDQ,
-                per_channel=True,
-                activation_type=QuantType.QUInt8,
-                weight_type=QuantType.QInt8,
-                op_types_to_quantize=["Conv"],
-                nodes_to_exclude=_last_convolutions(onnx.load(str(source))),
-            )
-        written = onnx.load(str(unfinished))
-        version = next(entry.value for entry in written.metadata_props if entry.key == "fcslam_version")
-        _finish(written, f"{version}-int8", path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
+    graph = onnx.load(str(source))
+    version = next(entry.value for entry in graph.metadata_props if entry.key == "fcslam_version")
+    with tempfile.TemporaryDirectory() as folder, _quietly():
+        quantize_static(
+            graph,
+            f"{folder}/{path.name}",
+            _Calibration(images[:CALIBRATION_IMAGES]),
+            quant_format=QuantFormat.QDQ,
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            op_types_to_quantize=["Conv"],
+            nodes_to_exclude=_last_convolutions(graph),
+        )
+        quantised = onnx.load(f"{folder}/{path.name}")
+    _write(quantised, f"{version}-int8", path)
 
 
 class _Calibration:
@@ -145,17 +135,20 @@ def _last_convolutions(graph: Any) -> list[str]:
     return [node.name for node in graph.graph.node if node.op_type == "Conv" and not leads_on(node)]
 
 
-def _finish(written: Any, version: str, path: Path) -> None:
-    """Stamp a file and put it in its place."""
+def _write(graph: Any, version: str, path: Path) -> None:
+    """Stamp a graph and write it in one piece."""
     import onnx
 
-    del written.metadata_props[:]
+    del graph.metadata_props[:]
     for key, value in (("fcslam_format", FORMAT), ("fcslam_version", version)):
-        written.metadata_props.add(key=key, value=value)
-    onnx.checker.check_model(written)
-    finished = path.with_suffix(".new")
-    finished.write_bytes(written.SerializeToString(deterministic=True))
-    os.replace(finished, path)
+        graph.metadata_props.add(key=key, value=value)
+    onnx.checker.check_model(graph)
+    unfinished = path.with_suffix(".part")
+    try:
+        unfinished.write_bytes(graph.SerializeToString(deterministic=True))
+        unfinished.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
 
 
 @contextlib.contextmanager

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fcslam.errors import TrainingError
+from fcslam.learning.arrays import read_arrays, write_arrays
 
 SAME_POINT_PX: Final = 3.0
 """Points of two detectors this close are one."""
@@ -68,12 +68,12 @@ def read_teacher(path: Path) -> Teacher:
         TrainingError: there is no such file, or it does not hold what it should.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            keypoints, scores, descriptors = file["keypoints"], file["scores"], file["descriptors"]
-            order = np.argsort(-scores, kind="stable")
-            teacher = Teacher(keypoints[order].astype(np.float32), descriptors[order].astype(np.float16))
-            sound = keypoints.shape == (len(scores), 2) and descriptors.ndim == 2 and len(descriptors) == len(scores)
-    except (OSError, ValueError, KeyError, IndexError, BadZipFile) as error:
+        arrays = read_arrays(path)
+        keypoints, scores, descriptors = arrays["keypoints"], arrays["scores"], arrays["descriptors"]
+        order = np.argsort(-scores, kind="stable")
+        teacher = Teacher(keypoints[order].astype(np.float32), descriptors[order].astype(np.float16))
+        sound = keypoints.shape == (len(scores), 2) and descriptors.ndim == 2 and len(descriptors) == len(scores)
+    except (OSError, ValueError, KeyError, IndexError) as error:
         raise TrainingError(f"{path}: is no file of a teacher's points ({error})") from error
     if not sound or not np.isfinite(teacher.keypoints).all() or not np.isfinite(teacher.descriptors).all():
         raise TrainingError(f"{path}: keypoints (N, 2), scores (N,) and descriptors (N, D) do not fit together")
@@ -86,19 +86,15 @@ def write_labels(path: Path, labels: Labels, key: int) -> None:
     Raises:
         OSError: they cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".part")
-    with unfinished.open("wb") as file:
-        np.savez(file, keypoints=labels.keypoints, quality=labels.quality, key=np.array(key))
-    unfinished.replace(path)
+    write_arrays(path, {"keypoints": labels.keypoints, "quality": labels.quality, "key": np.array(key)})
 
 
 def read_labels(path: Path, key: int) -> Labels | None:
     """Labels kept for this very image, if there are."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return Labels(file["keypoints"], file["quality"]) if int(file["key"]) == key else None
-    except (OSError, ValueError, KeyError, BadZipFile):
+        arrays = read_arrays(path)
+        return Labels(arrays["keypoints"], arrays["quality"]) if int(arrays["key"]) == key else None
+    except (OSError, ValueError, KeyError, TypeError):
         return None
 
 

@@ -9,16 +9,16 @@ All resampling is symmetric about the middle of a pixel block, so cell (r, c) of
 (8 c + 3.5, 8 r + 3.5), where (0, 0) is the centre of the first one.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from fcslam.features.codes import CODE_BITS
+from fcslam.learning.settings import Encoder
 
 CELL_PX = 8
-Encoder = Literal["light", "vgg"]
 
 _CONTRAST_FLOOR = 1e-4
 """Variance of grey levels in [0, 1] below which an image counts as blank and is not stretched."""

@@ -8,8 +8,8 @@ from torch import Tensor
 from fcslam.features.codes import CODE_BITS
 from fcslam.learning import losses
 from fcslam.learning.batches import Batch
-from fcslam.learning.network import CELL_PX, Encoder, Maps, sample_codes
-from fcslam.learning.settings import LossSettings
+from fcslam.learning.network import CELL_PX, Maps, sample_codes
+from fcslam.learning.settings import Encoder, LossSettings
 
 APART_PX = 8.0
 """Points this close to a match are no negatives: their codes should be alike."""

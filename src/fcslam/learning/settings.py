@@ -1,9 +1,12 @@
 """How a detector is trained."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.learning.network import Encoder
+
+Encoder = Literal["light", "vgg"]
 
 
 class LossSettings(Settings):

@@ -8,6 +8,7 @@ which bits are wanted.
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, overload
 
@@ -25,7 +26,7 @@ from fcslam.learning.objective import TeacherBits, teacher_bits
 from fcslam.learning.pairs import Example
 from fcslam.learning.settings import LossSettings, TrainingSettings
 from fcslam.learning.synthetic_shapes import draw_shapes
-from fcslam.learning.trainer import Pace, Run
+from fcslam.learning.trainer import Pace, Run, Status
 
 LABEL_RADIUS_PX: Final = 3
 DESCRIPTORS_OF_AN_IMAGE: Final = 32
@@ -35,8 +36,8 @@ HELD_OUT_SHAPES: Final = 32
 SHAPE_SIDE_PX: Final = 240
 SHAPE_LOSSES: Final = LossSettings(triplet=0.0, contrastive=0.0, distillation=0.0, balance=0.0)
 
-Watch = Callable[[str, int, int, dict[str, float]], None]
-"""Is told the stage, what of it is done, of how many, and the latest figures."""
+Watch = Callable[[str, Status], None]
+"""Is told the stage and where it stands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +88,7 @@ def train_detector(
         start, detector = first.state_dict(), _as_detector(first, torch.device(pace.device))
     images = gather(files, folder / "labels", settings, detector, teacher, watch)
     run = Run(settings, "joint", _made(folder / "joint"), pace, start)
-
-    def tell(step: int, figures: dict[str, float]) -> None:
-        watch("joint", step, settings.steps, figures)
-
-    return run.train(images.train, images.held_out, _bits(images.train, settings.seed), tell), images
+    return run.train(images.train, images.held_out, _bits(images.train, settings.seed), partial(watch, "joint")), images
 
 
 def gather(
@@ -118,7 +115,7 @@ def gather(
             (held_out if is_held_out(file.name) else train).append(
                 Example(image, _labels(image, place, settings, detector, taught), taught)
             )
-        watch("labels", index + 1, len(files), {})
+        watch("labels", Status(index + 1, len(files), {}))
     if len(train) < FEWEST_IMAGES:
         raise TrainingError(
             f"only {len(train)} of {len(files)} image files can be trained on: the others are no images, "
@@ -157,12 +154,8 @@ def _labels(
 
 def _train_on_shapes(folder: Path, settings: TrainingSettings, pace: Pace, watch: Watch) -> KeypointNetwork:
     shapes = settings.model_copy(update={"steps": settings.shape_steps, "loss": SHAPE_LOSSES})
-
-    def tell(step: int, figures: dict[str, float]) -> None:
-        watch("shapes", step, shapes.steps, figures)
-
     run = Run(shapes, "shapes", _made(folder), pace)
-    return run.train(Shapes(0, SHAPE_COUNT), Shapes(1, HELD_OUT_SHAPES), watch=tell)
+    return run.train(Shapes(0, SHAPE_COUNT), Shapes(1, HELD_OUT_SHAPES), watch=partial(watch, "shapes"))
 
 
 def _bits(examples: Sequence[Example], seed: int) -> TeacherBits | None:

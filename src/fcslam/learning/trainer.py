@@ -5,7 +5,7 @@ A step depends on the seed, its number and the state before it, so an interrupte
 
 import csv
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fcslam.errors import TrainingError
+from fcslam.errors import OutputError, TrainingError
 from fcslam.learning.batches import Batch, stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from fcslam.learning.monitor import alarms, validate
@@ -48,6 +48,19 @@ class Pace:
     device: str = "cpu"
 
 
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Where a stage stands."""
+
+    step: int
+    """Steps done."""
+    steps: int
+    figures: Mapping[str, float]
+    """The latest losses and validation figures."""
+    alarms: tuple[str, ...] = ()
+    """What the latest validation found wrong with the codes."""
+
+
 class Run:
     """One stage of training in a folder: resumes where its checkpoint stands."""
 
@@ -65,14 +78,14 @@ class Run:
         self.average.eval()
         self.optimiser = torch.optim.AdamW(self.network.parameters(), weight_decay=WEIGHT_DECAY)
         self.step = 0
-        self._began = self._saved = time.monotonic()
+        self._saved = time.monotonic()
 
     def train(
         self,
         examples: Sequence[Example],
         held_out: Sequence[Example],
         bits: TeacherBits | None = None,
-        watch: Callable[[int, dict[str, float]], None] = lambda _step, _figures: None,
+        watch: Callable[[Status], None] = lambda _status: None,
     ) -> KeypointNetwork:
         """Train to the last step; returns the averaged network.
 
@@ -80,33 +93,33 @@ class Run:
             examples: to train on.
             held_out: to validate on.
             bits: a teacher's, if the examples have one.
-            watch: is told the step and the latest figures after every step.
+            watch: is told after every step.
 
         Raises:
             TrainingError: the folder's checkpoint is another run's, or training diverged.
-            OutputError: a checkpoint cannot be written.
+            OutputError: a checkpoint or the log cannot be written.
         """
         self._resume()
         bits = None if bits is None else bits.to(self.device)
         views = validation_pairs(held_out)
         figures: dict[str, float] = {}
+        warnings: tuple[str, ...] = ()
         for step, batch in stream(examples, self.settings, self.step, 4 * self.pace.threads, self.pace.threads):
             parts = self._step(step, batch.to(self.device), bits)
             self.step = step + 1
             last = self.step == self.settings.steps
             if self.step % self.pace.log_every == 0 or last:
-                figures |= {name: float(part) for name, part in parts.items()}
-                self._log(figures, parts)
+                losses = {name: float(part) for name, part in parts.items()}
+                figures |= losses
+                self._log(losses)
             if self.step % self.pace.validate_every == 0 or last:
                 found = validate(self.average, views, self.device)
                 figures |= found
-                self._log(found | {"seconds": time.monotonic() - self._began}, found)
-                for alarm in alarms(found):
-                    self._log({"alarm": 1.0}, {"alarm": 1.0})
-                    watch(self.step, {**figures, alarm: 1.0})
+                warnings = tuple(alarms(found))
+                self._log(found | {"alarms": float(len(warnings))})
             if last or time.monotonic() - self._saved > self.pace.checkpoint_every_s:
                 self._save()
-            watch(self.step, figures)
+            watch(Status(self.step, self.settings.steps, dict(figures), warnings))
         trained: KeypointNetwork = self.average
         return trained
 
@@ -172,15 +185,17 @@ class Run:
         write_checkpoint(self.folder / CHECKPOINT_FILE, Checkpoint(self.stage, self.step, settings, tensors))
         self._saved = time.monotonic()
 
-    def _log(self, figures: dict[str, float], only: dict[str, object] | dict[str, float] | dict[str, Tensor]) -> None:
+    def _log(self, figures: Mapping[str, float]) -> None:
         path = self.folder / PROGRESS_FILE
-        new = not path.exists()
-        with path.open("a", newline="", encoding="utf-8") as file:
-            rows = csv.writer(file)
-            if new:
-                rows.writerow(("stage", "step", "name", "value"))
-            for name in sorted(set(figures) & (set(only) | {"seconds"})):
-                rows.writerow((self.stage, self.step, name, f"{figures[name]:.6g}"))
+        try:
+            new = not path.exists()
+            with path.open("a", newline="", encoding="utf-8") as file:
+                rows = csv.writer(file)
+                if new:
+                    rows.writerow(("stage", "step", "name", "value"))
+                rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in figures.items())
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written ({error}); make room and run the command again") from error
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
