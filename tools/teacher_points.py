@@ -3,7 +3,7 @@
     python tools/teacher_points.py WEIGHTS IMAGES... --output TEACHER
 
 Needs torch and kornia (`pip install --no-deps kornia kornia_rs`), which fcslam itself never does. Each image gets one
-`.npz` below TEACHER at its own path, which begins with the name of its folder IMAGES: `keypoints` (N, 2) float32 x, y
+`PATH.npz` below TEACHER, its PATH beginning with the name of its folder IMAGES: `keypoints` (N, 2) float32 x, y
 in pixels, `scores` (N,) float32, `descriptors` (N, 128) float16. Images that have one are skipped, so an interrupted
 run goes on where it was.
 """
@@ -36,7 +36,7 @@ def main() -> None:
     teacher.load_state_dict(torch.load(arguments.weights, map_location="cpu", weights_only=True), strict=False)
     for file in find_images(arguments.images):
         image = read_grey(file.path)
-        target = (arguments.output / file.name).with_suffix(".npz")
+        target = arguments.output / f"{file.name}.npz"
         if image is not None and not target.exists():
             write_points(teacher, image, target)
 

@@ -123,7 +123,7 @@ def _progress(console: Any) -> "Iterator[Watch]":
                 tasks[stage] = bar.add_task(stage, total=status.steps, figures="")
             text = "  ".join(f"{name} {status.figures[name]:.3f}" for name in FIGURES if name in status.figures)
             bar.update(tasks[stage], completed=status.step, figures=text)
-            if not live and status.step % LINE_EVERY == 0:
+            if not live and text and status.step % LINE_EVERY == 0:
                 say(f"{stage} {status.step}/{status.steps}  {text}")
             for alarm in status.alarms:
                 say(f"warning: {alarm}")

@@ -2,8 +2,8 @@
 
 Two encoders behind one class. `vgg` is the paper's: convolutions in pairs, pooled three times, a detector head of 65
 channels for each cell of 8 x 8 pixels (64 places and "none") that sub-pixel convolution lays out to full size. `light`
-has a tenth of its work: strided convolutions, context from 1/16, and a detector head at half resolution, so that a
-point is found wherever it lies and not once a cell; its sub-pixel step is 2 x 2.
+has a tenth of its work: strided convolutions, context from 1/16, and a detector head at half resolution whose sub-pixel
+step is 2 x 2, refined at full resolution, so that a point is found wherever it lies and not once a cell.
 
 All resampling is symmetric about the middle of a pixel block, so cell (r, c) of the logits is centred at the pixel
 (8 c + 3.5, 8 r + 3.5), where (0, 0) is the centre of the first one.
@@ -49,8 +49,8 @@ class KeypointNetwork(nn.Module):
         """
         if image.shape[-1] % CELL_PX or image.shape[-2] % CELL_PX:
             raise ValueError(f"sides must be multiples of {CELL_PX}, not {tuple(image.shape[-2:])}")
-        maps = self.body(image)
-        return Maps(maps.point_logits, maps.code_logits)
+        maps: Maps = self.body(image)
+        return maps
 
     def scores(self, maps: Maps) -> Tensor:
         """Probability of a keypoint at every pixel, shape (B, H, W)."""
@@ -75,6 +75,8 @@ class LightBody(nn.Module):
         self.context_eighth = nn.Conv2d(64, 16, 1)
         self.context_quarter = nn.Conv2d(24, 16, 1)
         self.point_head = nn.Sequential(_convolution(20, 16), nn.Conv2d(16, 4, 3, padding=1))
+        self.refine = nn.Sequential(_convolution(2, 8), nn.Conv2d(8, 1, 3, padding=1))
+        nn.init.zeros_(self.refine[-1].weight)  # begins as no change
 
     def forward(self, image: Tensor) -> Maps:
         """As in ``KeypointNetwork``."""
@@ -86,7 +88,9 @@ class LightBody(nn.Module):
         joint = self.joint(eighth + around)
         context = _twice(self.context_quarter(quarter) + _twice(self.context_eighth(joint)))
         detail = torch.cat((half + context, F.pixel_unshuffle(image, 2)), dim=1)
-        return Maps(F.pixel_shuffle(self.point_head(detail), 2).squeeze(1), self.code_head(joint))
+        points = F.pixel_shuffle(self.point_head(detail), 2)
+        points = points + self.refine(torch.cat((image, points), dim=1))
+        return Maps(points.squeeze(1), self.code_head(joint))
 
 
 class VggBody(nn.Module):

@@ -46,7 +46,7 @@ class Images:
 
     train: list[Example]
     held_out: list[Example]
-    """Never trained on."""
+    """Not trained on, unless there are too few images to hold any out."""
     skipped: int
     """Files that are no images, too small or too bare."""
 
@@ -110,8 +110,8 @@ def gather(
     for index, file in enumerate(files):
         image = read_grey(file.path)
         if image is not None and is_usable(image):
-            taught = None if teacher is None else read_teacher((teacher / file.name).with_suffix(".npz"))
-            place = (cache / file.name).with_suffix(".npz")
+            taught = None if teacher is None else read_teacher(teacher / f"{file.name}.npz")
+            place = cache / f"{file.name}.npz"
             (held_out if is_held_out(file.name) else train).append(
                 Example(image, _labels(image, place, settings, detector, taught), taught)
             )

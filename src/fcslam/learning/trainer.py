@@ -69,8 +69,10 @@ class Run:
     ) -> None:
         self.settings, self.stage, self.folder, self.pace = settings, stage, folder, pace
         self.device = torch.device(pace.device)
-        torch.manual_seed(settings.seed)
-        self.network = KeypointNetwork(settings.encoder).to(self.device, memory_format=torch.channels_last)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(settings.seed)
+            network = KeypointNetwork(settings.encoder)
+        self.network = network.to(self.device, memory_format=torch.channels_last)
         if start is not None:
             self.network.load_state_dict(start)
         self.average = KeypointNetwork(settings.encoder).to(self.device)
