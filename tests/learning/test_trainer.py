@@ -141,11 +141,16 @@ def test_the_rate_rises_stays_and_falls():
     assert rates[-1] == pytest.approx(1e-5, rel=0.1)
 
 
-def test_neighbours_are_no_negatives():
-    points = torch.tensor([[[0.0, 0.0], [3.0, 0.0], [50.0, 0.0]]] * 2)
-    allowed = negatives(points, torch.tensor([[True, True, True]]))[0]
-    assert allowed.tolist() == [[False, False, True], [False, False, True], [True, True, False]]
-    assert not negatives(points, torch.tensor([[True, True, False]])).any()
+def test_neighbours_in_either_view_are_no_negatives():
+    first = [[0.0, 0.0], [3.0, 0.0], [50.0, 0.0], [90.0, 0.0]]
+    second = [[0.0, 0.0], [30.0, 0.0], [60.0, 0.0], [63.0, 0.0]]
+    allowed = negatives(torch.tensor([first, second]), torch.ones(1, 4, dtype=torch.bool))[0]
+    close = {(0, 1), (2, 3)}
+    assert [[bool(allowed[i, j]) for j in range(4)] for i in range(4)] == [
+        [i != j and (min(i, j), max(i, j)) not in close for j in range(4)] for i in range(4)
+    ]
+    only_two = torch.tensor([[True, True, False, False]])
+    assert not negatives(torch.tensor([first, second]), only_two).any()
 
 
 def test_a_shifted_grid_keeps_whole_cells():

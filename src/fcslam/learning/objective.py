@@ -79,7 +79,7 @@ def objective(
 
 
 def negatives(points: Tensor, valid: Tensor) -> Tensor:
-    """Which points (B, N) may be compared as different ones: both valid, and far apart in either view; (B, N, N)."""
+    """Which points (B, N) may be compared as different ones: both valid, and far apart in both views; (B, N, N)."""
     first, second = points.chunk(2)
     apart = (torch.cdist(first, first) > APART_PX) & (torch.cdist(second, second) > APART_PX)
     return apart & valid[:, :, None] & valid[:, None, :]
