@@ -5,18 +5,24 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed-$(EXTRAS)
 DEMO ?= demo
+# What draws the pictures of simulated cameras where there is no display and no graphics card.
+GL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
+HAS_GL := $(BIN)/python -c "from fcslam.simulation.engine import gl_context; gl_context(16, 16).free()" 2>/dev/null
+AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
+APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire::http::Timeout=20 -o Acquire::Retries=1
 BENCHMARKS := $(filter-out benchmarks/common.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install demo test test-system check bench proto
+.PHONY: help install gl demo test test-system check bench proto
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo         draw a small fleet, map it, say where the map is"
+	@echo "make demo         simulate a fleet, map it, compare with the truth, draw it all"
 	@echo "make test         the tests that need nothing but this folder"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings only if FCSLAM_DATA names their folder"
 	@echo "make install      .venv alone; EXTRAS=dev,train,federated,sim,foxglove for more"
+	@echo "make gl           the GL library of the simulated cameras, if it may be installed without a question"
 	@echo "make proto        generate the wire format's Python code anew"
 
 install: $(INSTALLED)
@@ -27,8 +33,18 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
 
-demo: $(INSTALLED)
-	@$(BIN)/fcslam demo --output $(DEMO)
+# Never fails: without a GL library there are LiDARs.
+gl: $(INSTALLED)
+	@if ! $(HAS_GL); then \
+	    if command -v apt-get >/dev/null && $(AS_ROOT) true 2>/dev/null; then \
+	        echo "Installing a GL library for the simulated cameras: $(GL_PACKAGES)"; \
+	        { $(APT_GET) update; $(APT_GET) install --no-install-recommends $(GL_PACKAGES); } >/dev/null 2>&1 || true; \
+	    fi; \
+	    $(HAS_GL) || echo "No GL library, so no cameras. To have them: sudo apt-get install $(GL_PACKAGES)"; \
+	fi
+
+demo: gl
+	@$(BIN)/fcslam demo --output $(DEMO) $$($(HAS_GL) || echo --no-camera)
 
 test: $(INSTALLED)
 	@$(BIN)/python -m pytest -m "not system"

@@ -31,12 +31,10 @@ from fcslam.records import ClosureStatus, Place
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import Source, open_source, split
 from fcslam.wire.ledger import Ledger
-from fcslam.wire.messages import Kind, Packet
+from fcslam.wire.messages import UPLINK, Kind, Packet
 from fcslam.wire.packets import encode
 from fcslam.wire.transport import InMemoryTransport
 
-DOWN = (Kind.CORRECTION, Kind.ACKNOWLEDGEMENT)
-UP = tuple(kind for kind in Kind if kind not in DOWN)
 STATED_DESCRIPTORS = 300
 SPACINGS_M = (2.0, 4.0, 8.0, 16.0)
 KINDS = {"log": "", "kind": "", "packets": ",", "bytes": ",", "bytes a packet": ".0f", "share": ".1%",
@@ -110,8 +108,8 @@ def kind_rows(log: str, ledger: Ledger, seconds: float, metres: float) -> list[t
 
 def robot_row(robot: str, ledger: Ledger, seconds: float, metres: float) -> tuple:
     by_kind = {kind: ledger.total(robot, kind).bytes for kind in Kind}
-    down = sum(by_kind[kind] for kind in DOWN)
-    up = sum(by_kind.values()) - down
+    up = ledger.uplink(robot).bytes
+    down = sum(by_kind.values()) - up
     kilobytes = [count / 1e3 for count in by_kind.values()]
     return robot, seconds, metres, *kilobytes, up / seconds, up / metres, down / seconds, down / metres
 
@@ -120,7 +118,7 @@ def place_row(log: str, ledger: Ledger, places: list[Packet]) -> tuple:
     counts = np.array([len(packet.body.descriptors) for packet in places])
     size = sum(len(encode(packet)) for packet in places)
     stated = [size_of(packet) for packet in places if len(packet.body.descriptors) >= STATED_DESCRIPTORS]
-    up = sum(ledger.total(kind=kind).bytes for kind in UP)
+    up = sum(ledger.total(kind=kind).bytes for kind in UPLINK)
     count = (len(places), int(counts.min()), counts.mean(), int(counts.max()))
     kilobytes = (np.mean(stated) / 1e3, max(stated) / 1e3, up / len(places) / 1e3)
     return log, *count, size / len(places), size / counts.sum(), len(stated), *kilobytes
@@ -152,7 +150,7 @@ def thinned_rows(folder: Path) -> list[tuple]:
 
 def thinned_row(run: Path, reference: Path) -> tuple:
     found = common.metrics(run)
-    up = sum(found.get(f"{kind}_bytes", 0.0) for kind in UP)
+    up = sum(found.get(f"{kind}_bytes", 0.0) for kind in UPLINK)
     judged = evaluate_closures(run, reference, ClosureCriteria()).scores[Within.FLEET, ClosureStatus.ACCEPTED].graph
     errors = evaluate_relations(run, reference, RelationsQuestion(across_robots=True))
     accuracy = (errors.translation.mean, errors.translation.maximum, errors.rotation.mean)

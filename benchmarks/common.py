@@ -29,11 +29,11 @@ SPLITS = {"intel": 3, "fr079": 3, "mit-csail": 2}
 """Logs of the SLAM benchmark and into how many robots each is cut."""
 
 _COMMAND = "import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"
-_PACKAGES = ("numpy", "numba", "gtsam", "scipy", "opencv-python-headless")
+_PACKAGES = ("numpy", "numba", "gtsam", "scipy", "opencv-python-headless", "onnxruntime")
 
 
-def recordings(*needed: str) -> Path:
-    """The folder ``$FCSLAM_DATA/lidar``; without FCSLAM_DATA the script ends with one line and succeeds.
+def recordings(*needed: str, kind: str = "lidar") -> Path:
+    """The folder ``$FCSLAM_DATA/lidar``, or of another kind; without FCSLAM_DATA the script ends and succeeds.
 
     ``needed``: paths below it that must be there, or the script fails with one line.
     """
@@ -41,7 +41,7 @@ def recordings(*needed: str) -> Path:
     if not place:
         print("skipped: needs recordings; set FCSLAM_DATA to their folder")
         sys.exit(0)
-    folder = Path(place) / "lidar"
+    folder = Path(place) / kind
     missing = [name for name in needed if not (folder / name).exists()]
     if missing:
         sys.exit(f"{folder}: {', '.join(missing)} missing")

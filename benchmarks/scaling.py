@@ -8,14 +8,14 @@ two poses in the first round's result. So the building stays the same while scan
 the first round" says how far the last round's scans lie from the same scans in the first. Without FCSLAM_DATA this part
 is left out.
 
-**One building, more robots**: 1 to 16 drawn robots of 60 m each in one drawn building. **More buildings, more robots**:
+**One building, more robots**: 1 to 16 simulated robots of 60 m each in one building. **More buildings, more robots**:
 the same, two robots in each building, and none may meet a robot of another one; here the map grows with the fleet.
 
 Each case is a process of its own after a small warm-up drive. CPU is user and system of the process, all threads. A
 scan is a robot's work, a place the cloud's: decode, match, verify, and solve where one is due. "Quick solve" is the
 cloud's solve on the way, "robust solve" the one at the end, "end" all that the cloud does at the end of the run (after
 the first round of a longer run it takes all packets in again before). Memory is the peak resident set; recordings are
-streamed in the first part and drawn in memory in the others, so it holds them there.
+streamed in the first part and simulated as they are needed in the others.
 """
 
 import heapq
@@ -50,7 +50,7 @@ FLEET = {"robots": "", "buildings": "", "maps": "", "scans": ",", "places": ",",
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="how often the recording is driven")
-    parser.add_argument("--robots", nargs="+", type=int, default=ROBOTS, help="sizes of the drawn fleets")
+    parser.add_argument("--robots", nargs="+", type=int, default=ROBOTS, help="sizes of the simulated fleets")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
     rounds = []
@@ -210,7 +210,7 @@ def round_row(watches: Watches, since: tuple[int, int], result: Any, poses: Any,
 
 
 def drive_fleet(robots: int, buildings: int) -> tuple:
-    """A drawn fleet, spread evenly over drawn buildings."""
+    """A simulated fleet, spread evenly over buildings."""
     import numpy as np
 
     from fcslam.cloud.fleet import Fleet
@@ -221,7 +221,7 @@ def drive_fleet(robots: int, buildings: int) -> tuple:
     warm_up()
     config = MissionConfig()
     sizes = [robots // buildings + (building < robots % buildings) for building in range(buildings)]
-    recordings = [recording for building, size in enumerate(sizes) for recording in drawn(building, size)]
+    recordings = [recording for building, size in enumerate(sizes) for recording in simulated(building, size)]
     frontends = [RobotFrontend(recording.name, config.robot) for recording in recordings]
     cloud = Fleet(config.fleet, config.seed)
     with Watches().on() as watches:
@@ -238,14 +238,15 @@ def drive_fleet(robots: int, buildings: int) -> tuple:
             between.count(ClosureStatus.ACCEPTED), peak_mb())  # fmt: skip
 
 
-def drawn(building: int, robots: int, path_length_m: float = 60.0) -> Iterator[Any]:
+def simulated(building: int, robots: int, path_length_m: float = 60.0) -> Iterator[Any]:
     """Recordings of robots in a building of their own."""
-    import numpy as np
+    from fcslam.simulation.fleet import SimulationSettings, simulate_fleet
+    from fcslam.simulation.noise import LidarSettings
 
-    from fcslam.simulation.drawn_fleet import FleetSettings, draw_fleet
-
-    settings = FleetSettings(robots=robots, path_length_m=path_length_m)
-    for robot in draw_fleet(settings, np.random.default_rng((SEED, building))).robots:
+    settings = SimulationSettings(
+        robots=robots, path_length_m=path_length_m, camera=None, lidar=LidarSettings(rate_hz=5.0)
+    )
+    for robot in simulate_fleet(settings, 1000 * SEED + building).robots:
         yield replace(robot, name=f"building_{building + 1}_{robot.name}")
 
 
@@ -256,7 +257,7 @@ def warm_up() -> None:
     from fcslam.robot.frontend import RobotFrontend
 
     config, watches = MissionConfig(), Watches()
-    streams = [packets(RobotFrontend(r.name, config.robot), r.scans(), watches) for r in drawn(99, 2, 20.0)]
+    streams = [packets(RobotFrontend(r.name, config.robot), r.scans(), watches) for r in simulated(99, 2, 20.0)]
     cloud = Fleet(config.fleet, config.seed)
     send(itertools.chain(*streams), cloud, watches)
     cloud.finalize()
@@ -304,7 +305,7 @@ def draw(rounds: list[tuple], one: list[tuple], several: list[tuple]) -> Any:
     again = {"one robot": (ROUND, rounds)}
     plot(top, "rounds of intel", again, ("a scan: mean, ms", "robust solve, s", "peak, MB"))
     fleets = {"one building": (FLEET, one), "two robots a building": (FLEET, several)}
-    plot(bottom, "drawn robots of 60 m", fleets, ("a place: mean, ms", "robust solve, s", "peak, MB"))
+    plot(bottom, "simulated robots of 60 m", fleets, ("a place: mean, ms", "robust solve, s", "peak, MB"))
     bottom[0].legend(fontsize=8)
     return figure
 

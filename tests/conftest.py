@@ -1,11 +1,13 @@
-"""One small fleet for all tests that need one: drawn once, its packets made once."""
+"""One small fleet for all tests that need one: simulated once, its packets made once."""
 
 import numpy as np
 import pytest
 import small_fleet
 from hypothesis import settings
 
-from fcslam.simulation.drawn_fleet import DrawnFleet, write_fleet
+from fcslam.simulation.fleet import SimulatedFleet
+from fcslam.simulation.truth import write_truth
+from fcslam.sources import write_carmen
 from fcslam.wire.messages import Packet
 
 # How long an example takes says something of the machine, and of code that is compiled at its first call.
@@ -14,7 +16,7 @@ settings.load_profile("fcslam")
 
 
 @pytest.fixture(scope="session")
-def drawn() -> DrawnFleet:
+def drawn() -> SimulatedFleet:
     """Three robots, 30 m each, that meet."""
     return small_fleet.draw(3)
 
@@ -27,5 +29,9 @@ def packets(drawn) -> list[Packet]:
 
 @pytest.fixture(scope="session")
 def logs(drawn, tmp_path_factory):
-    """The three recordings as files, with the truth beside them."""
-    return write_fleet(drawn, tmp_path_factory.mktemp("recordings"), np.random.default_rng(0))
+    """The three recordings as CARMEN logs, with the truth beside them."""
+    folder = tmp_path_factory.mktemp("recordings")
+    for robot in drawn.robots:
+        write_carmen(folder / f"{robot.name}.clf", robot.scans())
+    write_truth(drawn, folder, np.random.default_rng(0))
+    return [folder / f"{robot.name}.clf" for robot in drawn.robots]

@@ -1,4 +1,4 @@
-"""A small drawn fleet, what its robots send, and a result as bytes: shared by the tests of robot, cloud and mission."""
+"""A small simulated fleet, what its robots send, and a result as bytes, for the tests of robot, cloud and mission."""
 
 from collections.abc import Iterable, Sequence
 
@@ -7,18 +7,19 @@ import numpy as np
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.result import FleetResult
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.simulation.drawn_fleet import DrawnFleet, DrawnRobot, FleetSettings, LidarSettings, draw_fleet
+from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, simulate_fleet
+from fcslam.simulation.noise import LidarSettings
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
 
-def draw(robots: int, path_length_m: float = 30.0, seed: int = 1) -> DrawnFleet:
+def draw(robots: int, path_length_m: float = 30.0, seed: int = 1) -> SimulatedFleet:
     lidar = LidarSettings(beams=180, rate_hz=3.0)
-    settings = FleetSettings(robots=robots, path_length_m=path_length_m, lidar=lidar)
-    return draw_fleet(settings, np.random.default_rng(seed))
+    settings = SimulationSettings(robots=robots, path_length_m=path_length_m, lidar=lidar, camera=None)
+    return simulate_fleet(settings, seed)
 
 
-def sent_by(robot: DrawnRobot, name: str | None = None) -> list[Packet]:
+def sent_by(robot: SimulatedRobot, name: str | None = None) -> list[Packet]:
     """Everything that a robot sends over its recording."""
     frontend = RobotFrontend(name or robot.name, RobotConfig())
     packets = [packet for scan in robot.scans() for packet in frontend.process(scan)]
@@ -37,7 +38,10 @@ def feed(fleet: Fleet, packets: Iterable[Packet]) -> Fleet:
 
 def fingerprint(result: FleetResult) -> tuple[object, ...]:
     """All that a result says, to the last bit."""
-    robots = tuple((r.robot, r.map_index, len(r.keyscans), r.T_map_base.tobytes(), r.laser) for r in result.robots)
+    robots = tuple(
+        (r.robot, r.map_index, len(r.keyscans), r.T_map_base.tobytes(), r.T_local_base.tobytes(), r.laser)
+        for r in result.robots
+    )
     closures = tuple(
         (c.i, c.j, c.similarity, c.T_i_j.tobytes(), c.information.tobytes(), c.status, c.reason, c.informative)
         for c in result.closures
@@ -51,6 +55,6 @@ def map_of(result: FleetResult) -> dict[str, int]:
     return {robot.robot: robot.map_index for robot in result.robots}
 
 
-def truth_at(robot: DrawnRobot, stamps: Sequence[float]) -> np.ndarray:
+def truth_at(robot: SimulatedRobot, stamps: Sequence[float]) -> np.ndarray:
     """True poses (N, 3) at stamps of the recording."""
     return robot.T_building_base[np.searchsorted(robot.stamps, np.asarray(stamps) - 1e-6)]

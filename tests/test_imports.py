@@ -18,6 +18,7 @@ ROOMS = [
     "config",
     "geometry",
     "metrics",
+    "map_files",
     "runs",
     "sources",
     "graph",

@@ -35,6 +35,14 @@ def test_the_same_seed_gives_the_same_bytes(run, logs, tmp_path):
     )
 
 
+def test_the_watcher_sees_all_scans_and_then_that_the_cloud_fuses(logs):
+    seen = []
+    run = run_mission([open_source(log) for log in logs], MissionConfig(seed=3), seen.append)
+    assert [now.fusing for now in seen] == [False] * (len(seen) - 1) + [True]
+    assert [now.scans for now in seen] == sorted(now.scans for now in seen)
+    assert seen[-1].scans == sum(len(trajectory.stamps) for trajectory in run.trajectories)
+
+
 def test_the_order_of_the_recordings_does_not_matter(run, logs):
     turned = run_mission([open_source(log) for log in reversed(logs)], MissionConfig(seed=3))
     assert turned.closures
@@ -52,6 +60,19 @@ def test_trajectories_have_every_scan_of_the_recording(run, drawn):
         assert trajectory.T_map_base.shape == (len(robot.stamps), 3)
 
 
+def test_a_robots_own_map_is_what_it_would_have_mapped_alone(run, logs):
+    """To the last bit: no other robot has a say in it, and its trajectory starts at the origin."""
+    for log, local in zip(logs, run.local_maps, strict=True):
+        (alone,) = run_mission([open_source(log)], MissionConfig(seed=3)).local_maps
+        assert (local.robot, local.pgm, local.yaml) == (alone.robot, alone.pgm, alone.yaml)
+        assert local.T_local_base.tobytes() == alone.T_local_base.tobytes()
+        assert np.array_equal(local.T_local_base[0], np.zeros(3))
+    for local, joint in zip(run.local_maps, run.trajectories, strict=True):
+        assert np.array_equal(local.stamps, joint.stamps)
+    second = run.local_maps[1]
+    assert np.abs(second.T_local_base - run.trajectories[1].T_map_base).max() > 0.5, "another frame"
+
+
 def test_numbers_add_up(run, drawn):
     values = {metric.name: metric.value for metric in run.metrics}
     assert values["robots"] == 3
@@ -63,6 +84,10 @@ def test_numbers_add_up(run, drawn):
     assert values["correction_packets"] == values["place_packets"]
     packets = sum(values[f"{kind}_packets"] for kind in ("hello", "keyscan", "constraint", "place"))
     assert values["acknowledgement_packets"] == packets
+    for figure in ("packets", "bytes"):
+        assert values[f"place_{figure}"] == values[f"lidar_place_{figure}"] + values[f"camera_place_{figure}"]
+    sent = sum(values[f"{kind}_bytes"] for kind in ("hello", "keyscan", "constraint", "place"))
+    assert sent == sum(values[f"uplink_bytes_{robot.name}"] for robot in drawn.robots)
     for status in ClosureStatus:
         between = [c for c in run.closures if c.robot_i != c.robot_j and c.status is status]
         assert values[f"inter_robot_closures_{status}"] == len(between)

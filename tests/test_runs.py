@@ -1,6 +1,7 @@
 """The run folder: what is written is read back, and nothing half written ever looks whole."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,17 @@ from fcslam import runs
 from fcslam.errors import ConfigError, EvaluationError, OutputError
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus
-from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, open_run, prepare_output, read_vetoes, write_run
+from fcslam.runs import (
+    ClosureRow,
+    LocalMap,
+    Metric,
+    RobotTrajectory,
+    Run,
+    open_run,
+    prepare_output,
+    read_vetoes,
+    write_run,
+)
 
 
 def trajectory(robot="robot_1", map_index=0, count=40, seed=0):
@@ -25,13 +36,18 @@ def run():
         "robot_1", 976052857.33753, "b-2", 976052999.5, Channel.LIDAR, 0.25, np.array([1.0, -2.5, 3.0]),
         ClosureStatus.REJECTED, 'outside the cluster, "3 of 7"',
     )  # fmt: skip
+    trajectories = (trajectory(), trajectory("b-2", 1, count=1, seed=1), trajectory("étage.0", 2, count=0))
     return Run(
-        trajectories=(trajectory(), trajectory("b-2", 1, count=1, seed=1), trajectory("étage.0", 2, count=0)),
+        trajectories=trajectories,
         closures=(closure,),
         metrics=(Metric("uplink", 4.5, "kB/s"), Metric("error", float("nan"), "m")),
         config_yaml="seed: 1\n",
         pose_graph_g2o="VERTEX_SE2 0 0 0 0\n",
         map_files={"map.pgm": b"P5\x00\xff", "map_1.yaml": b"image: map_1.pgm\n"},
+        local_maps=tuple(
+            LocalMap(t.robot, t.stamps, t.T_map_base[::-1], b"P5 \x00" + t.robot.encode(), f"image: {t.robot}.pgm\n")
+            for t in trajectories
+        ),
     )
 
 
@@ -54,6 +70,16 @@ def test_what_is_written_is_read_back(tmp_path, run):
     assert np.isnan(back.metrics[1].value)
     assert (back.config_yaml, back.pose_graph_g2o) == (run.config_yaml, run.pose_graph_g2o)
     assert dict(back.map_files) == dict(run.map_files)
+    for given, read in zip(run.local_maps, back.local_maps, strict=True):
+        assert (given.robot, given.pgm, given.yaml) == (read.robot, read.pgm, read.yaml)
+        np.testing.assert_allclose(read.stamps, given.stamps, atol=1e-6, rtol=0)
+        np.testing.assert_allclose(se2.between(given.T_local_base, read.T_local_base), 0.0, atol=1e-7)
+
+
+def test_local_maps_may_be_left_out_as_a_whole(tmp_path, run):
+    write_run(replace(run, local_maps=()), tmp_path / "run")
+    assert not (tmp_path / "run" / "local").exists()
+    assert open_run(tmp_path / "run").local_maps == ()
 
 
 def test_tables_have_the_columns_promised(tmp_path, run):
@@ -179,6 +205,9 @@ def test_what_is_no_run_folder_is_refused(tmp_path):
         ("robots.csv", "robot,map,path_length_m,scans\nrobot_1,zero,1,1\n", "zero"),
         ("closures.csv", "robot_i\nrobot_1\n", "closures.csv, line 2"),
         ("closures.csv", None, "closures.csv"),
+        ("local/robot_1.tum", None, "robot_1.tum"),
+        ("local/b-2.pgm", None, "b-2.pgm"),
+        ("local/b-2.yaml", "image: \xff\n", "broken"),
         ("metrics.json", "{", "broken"),
         ("metrics.json", '{"a": 1}', "metrics.json"),
         ("metrics.json", "[3]", "metrics.json"),

@@ -17,7 +17,7 @@ from kornia.feature import ALIKED
 
 from fcslam.features.detector import GreyImage
 from fcslam.learning.arrays import write_arrays
-from fcslam.learning.images import find_images, read_grey
+from fcslam.learning.images import find_images, read_image
 
 MOST_POINTS = 800
 SUPPRESSION_RADIUS_PX = 2
@@ -35,7 +35,7 @@ def main() -> None:
     ).eval()
     teacher.load_state_dict(torch.load(arguments.weights, map_location="cpu", weights_only=True), strict=False)
     for file in find_images(arguments.images):
-        image = read_grey(file.path)
+        image = read_image(file.path)
         target = arguments.output / f"{file.name}.npz"
         if image is not None and not target.exists():
             write_points(teacher, image, target)

@@ -6,6 +6,7 @@ FcslamError
 │   ├── ConfigError       a configuration file, a key of it or a veto is wrong
 │   ├── OutputError       the output folder cannot be used
 │   ├── SimulationError   a fleet cannot be simulated
+│   ├── FeatureError      network weights, images or extracted features cannot be used
 │   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
 │   └── EvaluationError   a reference file or a run folder cannot be evaluated
 └── PacketError           bytes received are not a packet that may be trusted
@@ -34,6 +35,10 @@ class OutputError(InputError):
 
 class SimulationError(InputError):
     """A fleet cannot be simulated: the building is too small for it, or a library is missing."""
+
+
+class FeatureError(InputError):
+    """Network weights, images or extracted features cannot be used."""
 
 
 class TrainingError(InputError):

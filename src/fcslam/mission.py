@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
-from fcslam.cloud.fusion import FusedMap, fuse, map_yaml, pgm_bytes
+from fcslam.cloud.fusion import FusedMap, fuse
 from fcslam.cloud.picture import Meeting, map_png
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.config import Settings, dump
@@ -19,9 +19,10 @@ from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.records import ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure, Veto
+from fcslam.map_files import map_yaml, pgm_bytes
+from fcslam.records import Channel, ClosureStatus, FloatArray, Keyscan, LaserScan, LoopClosure, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, check_names
+from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run, check_names
 from fcslam.sources import Source
 from fcslam.wire.checks import check_name
 from fcslam.wire.ledger import Ledger
@@ -48,6 +49,8 @@ class Progress:
     recorded_s: float
     """Time that the recordings have played, of all robots together."""
     closures: dict[str, int]
+    fusing: bool = False
+    """All is recorded and sent; the cloud decides and fuses."""
 
 
 Watch = Callable[[Progress], None]
@@ -76,6 +79,7 @@ def run_mission(
         reply = transport.send(encode(packet))
         if reply.refusal:
             raise FcslamError(f"{packet.robot}: the cloud refused a packet: {reply.refusal}")
+    meter.tell(fusing=True)
     return _run_of(robots, cloud.finalize(), transport.ledger(), config, meter)
 
 
@@ -112,7 +116,12 @@ class _Meter:
         self.scans += 1
         self.keyscans += any(isinstance(packet.body, Keyscan) for packet in packets)
         if self.scans % self.EVERY == 0:
-            self._watch(Progress(self.scans, self.keyscans, self.recorded_s, self._cloud.closure_counts()))
+            self.tell()
+
+    def tell(self, fusing: bool = False) -> None:
+        """Where the mission is now."""
+        closures = self._cloud.closure_counts()
+        self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing))
 
 
 def _check_robots(sources: Sequence[Source]) -> None:
@@ -148,15 +157,26 @@ def _run_of(
         config_yaml=dump(config),
         pose_graph_g2o=g2o_text(result.graph),
         map_files=_map_files(result, trajectories, config.map),
+        local_maps=tuple(_local_map(robot, mapped[robot.robot], config.map) for robot in robots),
     )
 
 
 def _trajectory(robot: RobotFrontend, mapped: MappedRobot) -> RobotTrajectory:
-    """Every raw scan hangs on its keyscan."""
-    keyscans = mapped.T_map_base[[pose.keyscan for pose in robot.scan_poses]]
-    offsets = np.array([pose.T_keyscan_base for pose in robot.scan_poses])
+    return RobotTrajectory(robot.robot, mapped.map_index, *_at_every_scan(robot, mapped.T_map_base))
+
+
+def _local_map(robot: RobotFrontend, mapped: MappedRobot, config: OccupancyConfig) -> LocalMap:
+    """What the robot would have mapped had it been alone."""
+    fused = fuse(mapped.keyscans, mapped.T_local_base, {robot.robot: mapped.laser}, config)
+    stamps, T_local_base = _at_every_scan(robot, mapped.T_local_base)
+    return LocalMap(robot.robot, stamps, T_local_base, pgm_bytes(fused), map_yaml(fused, f"{robot.robot}.pgm"))
+
+
+def _at_every_scan(robot: RobotFrontend, keyscans: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Stamps (N,) and poses (N, 3) of all scans: each hangs on its keyscan, whose poses (K, 3) are given."""
     stamps = np.array([pose.stamp for pose in robot.scan_poses])
-    return RobotTrajectory(robot.robot, mapped.map_index, stamps, se2.compose(keyscans, offsets))
+    offsets = np.array([pose.T_keyscan_base for pose in robot.scan_poses])
+    return stamps, se2.compose(keyscans[[pose.keyscan for pose in robot.scan_poses]], offsets)
 
 
 def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> ClosureRow:
@@ -215,10 +235,12 @@ def _metrics(result: FleetResult, meter: _Meter) -> list[Metric]:
 
 
 def _traffic(ledger: Ledger) -> list[Metric]:
-    """Bytes and packets per kind of message, of the whole fleet."""
-    kinds = sorted({label.kind for label in ledger.accepted})
-    traffic = [(Kind(kind), ledger.total(kind=Kind(kind))) for kind in kinds]
+    """Packets and bytes per kind of message and channel of places, of the whole fleet; bytes that each robot sent."""
+    traffic = {str(kind): ledger.total(kind=kind) for kind in sorted({label.kind for label in ledger.accepted})}
+    traffic |= {f"{channel}_{Kind.PLACE}": ledger.total(channel=channel) for channel in Channel}
+    robots = sorted({label.robot for label in ledger.accepted})
     return [
-        *(Metric(f"{kind}_packets", total.count, "1") for kind, total in traffic),
-        *(Metric(f"{kind}_bytes", total.bytes, "B") for kind, total in traffic),
+        *(Metric(f"{name}_packets", total.count, "1") for name, total in traffic.items()),
+        *(Metric(f"{name}_bytes", total.bytes, "B") for name, total in traffic.items()),
+        *(Metric(f"uplink_bytes_{robot}", ledger.uplink(robot).bytes, "B") for robot in robots),
     ]

@@ -4,6 +4,7 @@ Poses are (x, y, theta) in metres and radians; ``T_a_b`` takes coordinates in b 
 REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recording's own clock.
 """
 
+import re
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple, TypeVar
@@ -19,6 +20,9 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 CODE_BYTES = 32
 """A binary descriptor is 256 bits, packed."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,63}", re.ASCII)
+"""Names of robots and detector versions: also safe as file names."""
 
 SAME_STAMP_S = 1e-6
 """Stamps that differ by less are one: files print them with so many digits."""

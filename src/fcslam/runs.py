@@ -7,6 +7,8 @@
     metrics.json               [{name, value, unit}]
     config.yaml                the complete configuration of the run
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
+    local/<robot>.tum          as trajectories/, in the robot's own map, which nothing but its own measurements made
+    local/<robot>.pgm, .yaml   that map
 
 A run folder is whole or not there: it is written into a hidden folder beside its place and renamed at the end.
 """
@@ -28,7 +30,7 @@ import numpy as np
 from fcslam.errors import ConfigError, EvaluationError, OutputError
 from fcslam.records import Channel, ClosureStatus, FloatArray, Veto, frozen
 
-TRAJECTORIES, ROBOTS, CLOSURES = "trajectories", "robots.csv", "closures.csv"
+TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
@@ -53,6 +55,20 @@ class RobotTrajectory:
         """Length of the polygon through the positions."""
         steps = np.diff(self.T_map_base[:, :2], axis=0)
         return float(np.sum(np.hypot(steps[:, 0], steps[:, 1])))
+
+
+@dataclass(frozen=True, slots=True)
+class LocalMap:
+    """One robot's own map: what it knew before any other robot's measurements; the origin is its first keyscan."""
+
+    robot: str
+    stamps: FloatArray
+    """Shape (N,), as in the robot's trajectory."""
+    T_local_base: FloatArray
+    """Shape (N, 3), at every laser scan."""
+    pgm: bytes
+    yaml: str
+    """For ROS map_server; names the PGM file ``<robot>.pgm``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +107,8 @@ class Run:
     pose_graph_g2o: str = ""
     map_files: Mapping[str, bytes] = field(default_factory=dict)
     """File name to content: map.pgm, map.yaml, map.png, map_1.pgm ..."""
+    local_maps: tuple[LocalMap, ...] = ()
+    """Of every robot, in the order of the trajectories; or none, and the folder has no ``local``."""
 
 
 def prepare_output(path: Path, force: bool = False) -> Path:
@@ -138,11 +156,16 @@ def write_run(run: Run, path: Path, force: bool = False) -> None:
     Raises:
         OutputError: as in ``prepare_output``, a name cannot be a file's, or writing fails.
     """
-    check_names([trajectory.robot for trajectory in run.trajectories] + list(run.map_files))
+    robots = [trajectory.robot for trajectory in run.trajectories] + [local.robot for local in run.local_maps]
+    check_names([*robots, *run.map_files])
     with _staged(prepare_output(path, force)) as folder:
         (folder / TRAJECTORIES).mkdir()
         for trajectory in run.trajectories:
             write_tum(_tum_path(folder, trajectory.robot), trajectory.stamps, trajectory.T_map_base)
+        if run.local_maps:
+            (folder / LOCAL).mkdir()
+        for local in run.local_maps:
+            _write_local_map(folder / LOCAL, local)
         _write_csv(folder / ROBOTS, _ROBOT_COLUMNS, map(_robot_fields, run.trajectories))
         _write_csv(folder / CLOSURES, _CLOSURE_COLUMNS, map(_closure_fields, run.closures))
         (folder / METRICS).write_text(metrics_json(run.metrics), encoding="utf-8")
@@ -163,13 +186,15 @@ def open_run(path: Path) -> Run:
             f"{path}: no run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one"
         )
     try:
+        trajectories = tuple(_read_trajectory(path, row) for row in _read_csv(path / ROBOTS, _ROBOT_COLUMNS))
         return Run(
-            trajectories=tuple(_read_trajectory(path, row) for row in _read_csv(path / ROBOTS, _ROBOT_COLUMNS)),
+            trajectories=trajectories,
             closures=tuple(_read_closure(row) for row in _read_csv(path / CLOSURES, _CLOSURE_COLUMNS)),
             metrics=_read_metrics(path / METRICS),
             config_yaml=(path / CONFIG).read_text(encoding="utf-8"),
             pose_graph_g2o=(path / POSE_GRAPH).read_text(encoding="utf-8"),
             map_files={file.name: file.read_bytes() for file in sorted(path.glob("map*.*"))},
+            local_maps=_read_local_maps(path / LOCAL, [trajectory.robot for trajectory in trajectories]),
         )
     except (OSError, ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: a broken run folder ({error})") from error
@@ -276,6 +301,22 @@ def _read_trajectory(folder: Path, row: dict[str, str]) -> RobotTrajectory:
         raise ValueError(f"{ROBOTS}: {row['robot']!r} is no robot's name")
     stamps, poses = read_tum(_tum_path(folder, row["robot"]))
     return RobotTrajectory(row["robot"], int(row["map"]), stamps, poses)
+
+
+def _write_local_map(folder: Path, local: LocalMap) -> None:
+    write_tum(folder / f"{local.robot}.tum", local.stamps, local.T_local_base)
+    (folder / f"{local.robot}.pgm").write_bytes(local.pgm)
+    (folder / f"{local.robot}.yaml").write_text(local.yaml, encoding="utf-8")
+
+
+def _read_local_maps(folder: Path, robots: Iterable[str]) -> tuple[LocalMap, ...]:
+    return tuple(_read_local_map(folder, robot) for robot in robots) if folder.exists() else ()
+
+
+def _read_local_map(folder: Path, robot: str) -> LocalMap:
+    stamps, poses = read_tum(folder / f"{robot}.tum")
+    pgm, yaml = (folder / f"{robot}.pgm").read_bytes(), (folder / f"{robot}.yaml").read_text(encoding="utf-8")
+    return LocalMap(robot, stamps, poses, pgm, yaml)
 
 
 def _closure_fields(closure: ClosureRow) -> list[Any]:

@@ -22,8 +22,8 @@ from fcslam.mission import MissionConfig
 from fcslam.runs import read_tum
 
 RUN_FILES = {
-    "closures.csv", "config.yaml", "map.pgm", "map.png", "map.yaml", "metrics.json", "pose_graph.g2o", "robots.csv",
-    "trajectories",
+    "closures.csv", "config.yaml", "local", "map.pgm", "map.png", "map.yaml", "metrics.json", "pose_graph.g2o",
+    "robots.csv", "trajectories",
 }  # fmt: skip
 
 
@@ -65,6 +65,8 @@ def test_the_run_folder_is_complete(run, drawn):
     assert names_in(run) == RUN_FILES
     assert names_in(run.parent) == {run.name}
     assert names_in(run / "trajectories") == {f"{robot.name}.tum" for robot in drawn.robots}
+    local = {f"{robot.name}.{kind}" for robot in drawn.robots for kind in ("tum", "pgm", "yaml")}
+    assert names_in(run / "local") == local
     for robot in rows_of(run / "robots.csv"):
         truth = next(r for r in drawn.robots if r.name == robot["robot"])
         assert int(robot["scans"]) == len(truth.stamps)
@@ -337,6 +339,16 @@ def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
     assert "output folder" in refused(capsys, tmp_path, log, "--output", log / "run")
     assert "no run folder" in refused(capsys, tmp_path, log, "--output", log, "--force")
     assert log.read_text().startswith("ODOM")
+
+
+def test_fusion_is_one_of_three_and_leaves_nothing_to_do_for_no_fuse(tmp_path, log, capsys):
+    run = tmp_path / "run"
+    assert "--no-fuse" in refused(capsys, tmp_path, log, "--no-fuse", "--fusion", "two_point", "--output", run)
+    assert run_map(log, "--fusion", "three_point", "--output", run) == 2
+    assert "two_point" in capsys.readouterr().err
+    assert not run.exists()
+    assert run_map(log, "--fusion", "two_point", "--output", run) == 0
+    assert yaml.safe_load((run / "config.yaml").read_text())["fleet"]["fusion"] == "two_point"
 
 
 def test_splits_that_cannot_be_are_refused(tmp_path, log, capsys):

@@ -24,11 +24,11 @@ def simulated(tmp_path_factory):
 def test_recordings_can_be_read_and_the_truth_lies_beside_them(simulated):
     for name in ("robot_1", "robot_2"):
         scans = [record for record in open_source(simulated / name).records() if isinstance(record, LaserScan)]
-        stamps, poses = read_tum(simulated / "ground_truth" / f"{name}.tum")
+        stamps, poses = read_tum(simulated / name / "ground_truth.tum")
         np.testing.assert_allclose([scan.stamp for scan in scans], stamps, atol=1e-9)
         path_m = np.sum(np.hypot(*np.diff(poses[:, :2], axis=0).T))
         assert path_m == pytest.approx(6.0, abs=0.1)
-    assert (simulated / "ground_truth" / "relations").is_file()
+    assert sorted(path.name for path in (simulated / "ground_truth").iterdir()) == ["map.pgm", "map.yaml", "relations"]
 
 
 def test_bags_hold_the_same_scans(simulated):

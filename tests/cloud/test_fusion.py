@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import yaml
 
-from fcslam.cloud.fusion import fuse, map_yaml, pgm_bytes
-from fcslam.lidar.occupancy import Occupancy, OccupancyConfig
+from fcslam.cloud.fusion import fuse
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.map_files import Occupancy, map_yaml, pgm_bytes
 from fcslam.records import Keyscan, KeyscanId, LaserModel
 
 CONFIG = OccupancyConfig()

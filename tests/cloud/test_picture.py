@@ -4,7 +4,8 @@ import pytest
 
 from fcslam.cloud.fusion import FusedMap
 from fcslam.cloud.picture import CLOSURE, FLOOR, INK, LONG_SIDE_PX, PAPER, ROBOTS, WALL, Meeting, map_png, round_length
-from fcslam.lidar.occupancy import Occupancy, OccupancyGrid
+from fcslam.lidar.occupancy import OccupancyGrid
+from fcslam.map_files import Occupancy
 
 SIDE_M = 0.05
 

@@ -7,6 +7,7 @@ import pytest
 from cloud.scripted import LASER, closures, keyscan, motion, place, rectangle, stream
 from small_fleet import feed, fingerprint, in_order
 
+from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.records import Channel, ConstraintKind, Correction, KeyscanId, frozen
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
@@ -164,3 +165,30 @@ def test_places_made_to_confuse_are_matched_without_harm(packets, changed):
     others = {robot.robot: robot.map_index for robot in result.robots}
     assert others["robot_1"] == others["robot_3"] == 0
     assert KeyscanId("robot_2", 0) in {robot.keyscans[0].id for robot in result.robots}
+
+
+def test_detectors_of_two_channels_may_have_one_name():
+    """Places of different channels are never compared, whatever their detectors are called."""
+    cloud = Fleet(FleetConfig(), seed=0)
+    rng = np.random.default_rng(0)
+    for robot in ("x", "y"):
+        bodies = [Hello(robot, 0, LASER, dict.fromkeys(Channel, "one"))]
+        bodies += [keyscan(robot, 0, NOW)]
+        for channel, axes in ((Channel.LIDAR, 2), (Channel.CAMERA, 3)):
+            keypoints = rng.uniform(0.1, 2.0, (30, axes)).astype(np.float32)
+            codes = np.random.default_rng(1).integers(0, 256, (30, 32), np.uint8)
+            names = {"channel": channel, "detector_version": "one", "keypoints": keypoints, "descriptors": codes}
+            bodies.append(place(robot, 0, **names))
+        for sequence, body in enumerate(bodies):
+            cloud.receive(encode(Packet(robot, 0, sequence, NOW, body)))
+    assert len(cloud.finalize().robots) == 2
+
+
+def test_what_fails_does_not_count_as_received(scripted, monkeypatch):
+    """A fault of the cloud's own is no refusal: the packet is not acknowledged when it is sent again."""
+    cloud = feed(scripted(SCRIPT), PACKETS[:HALF])
+    monkeypatch.setattr(Fleet, "_take", lambda *_: 1 / 0)
+    data = encode(next_packet(keyscan("a", NUMBER, NOW)))
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            cloud.receive(data)

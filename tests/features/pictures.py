@@ -23,8 +23,11 @@ def pattern(number, length_m):
     return cv2.GaussianBlur(noise, (0, 0), 1.2) * 3.0 - 255.0
 
 
-def picture(pose, segments, camera=CAMERA):
-    """What the camera sees from the base's pose, shape (height, width): the nearest wall in every column."""
+def picture(pose, segments, camera=CAMERA, wears=lambda number: number):
+    """What the camera sees from the base's pose, shape (height, width): the nearest wall in every column.
+
+    ``wears``: which pattern the wall of a number wears; its own.
+    """
     eye = se2.transform(pose, np.array([camera.T_base_camera.translation_m[:2]]))[0]
     side = (np.arange(camera.width) - camera.cx) / camera.fx
     rise = (camera.cy - np.arange(camera.height)) / camera.fy
@@ -45,13 +48,13 @@ def picture(pose, segments, camera=CAMERA):
         seen = (wall == number) & (heights >= 0) & (heights <= WALL_HEIGHT_M)
         u = np.broadcast_to(where * length_m * TEXELS_PER_M, heights.shape).astype(np.float32)
         worn = cv2.remap(
-            pattern(int(number), length_m), u, (heights * TEXELS_PER_M).astype(np.float32), cv2.INTER_LINEAR
+            pattern(wears(int(number)), length_m), u, (heights * TEXELS_PER_M).astype(np.float32), cv2.INTER_LINEAR
         )
         image = np.where(seen, worn, image)
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def image_at(stamp, pose, segments, T_odom_base, camera=CAMERA):
+def image_at(stamp, pose, segments, T_odom_base, wears=lambda number: number):
     """The same as a record."""
-    encoded = bytes(cv2.imencode(".jpg", picture(pose, segments, camera))[1])
-    return CameraImage(stamp, encoded, camera, frozen(T_odom_base))
+    encoded = bytes(cv2.imencode(".jpg", picture(pose, segments, CAMERA, wears))[1])
+    return CameraImage(stamp, encoded, CAMERA, frozen(T_odom_base))

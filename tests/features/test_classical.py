@@ -56,3 +56,24 @@ def test_broken_images_are_told(image):
     assert np.array_equal(decode_grey(encoded), image)
     assert decode_grey(b"\xff\xd8\xff\xe0" + bytes(50)) is None
     assert decode_grey(b"") is None
+
+
+def test_coarse_keypoints_lie_where_fine_ones_do(image):
+    """Mirrored pictures have mirrored keypoints: a position that is off to one side at coarse levels would show."""
+    blurred = cv2.GaussianBlur(image, (0, 0), 2.5)  # corners of coarse levels
+    there, back = (Orb(OrbConfig(fast_threshold=3)).detect(view).keypoints_px for view in (blurred, blurred[:, ::-1]))
+    back = np.column_stack((image.shape[1] - 1 - back[:, 0], back[:, 1]))
+    away = there[:, None] - back
+    nearest = np.linalg.norm(away, axis=2).argmin(axis=1)
+    offsets = away[np.arange(len(there)), nearest]
+    near = np.linalg.norm(offsets, axis=1) < 4.0
+    assert near.sum() > 40
+    assert np.all(np.abs(offsets[near].mean(axis=0)) < 0.25)
+
+
+def test_pictures_are_read_as_their_pixels_are_stored(image):
+    """A camera's calibration knows nothing of a file's orientation tag."""
+    jpeg = bytes(cv2.imencode(".jpg", image)[1])
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
+    tagged = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    assert np.array_equal(decode_grey(tagged), decode_grey(jpeg))

@@ -5,7 +5,7 @@ import pytest
 from features.pictures import CAMERA
 from lidar.worlds import LASER, box, path, room, scan_at
 
-from fcslam.features.placing import place_keypoints
+from fcslam.features.placing import LidarView, place_keypoints
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, Transform
 
@@ -23,7 +23,11 @@ def project(points, camera=CAMERA):
 
 def located(points, walls, pose=POSE, camera=CAMERA):
     scan = scan_at(pose, walls, LASER)
-    return place_keypoints(project(points, camera), camera, scan.points, scan.origin, 3.0)
+    return place_keypoints(project(points, camera), camera, seen_in(scan), 3.0)
+
+
+def seen_in(scan):
+    return LidarView(scan.points, scan.origin, LASER.angle_increment_rad)
 
 
 def on_walls(pose, walls, angles_rad, heights):
@@ -71,7 +75,7 @@ def test_where_nothing_returned_nothing_is_placed():
     points = np.array([[3.0, 1.0, 1.0], [3.0, -1.0, 1.0]])
     _, placed = located(points, walls, np.zeros(3))
     assert placed.tolist() == [True, False]
-    _, placed = place_keypoints(project(points), CAMERA, np.empty((0, 2)), np.zeros(2), 3.0)
+    _, placed = place_keypoints(project(points), CAMERA, LidarView(np.empty((0, 2)), np.zeros(2), 0.02), 3.0)
     assert not placed.any()
 
 
@@ -86,6 +90,16 @@ def test_an_edge_belongs_to_what_stands_in_front():
     assert not placed[0] or abs(found[0, 0] - 3.0) < 0.1 or abs(found[0, 0] - 2.0) < 0.1
 
 
+def test_nothing_is_placed_across_an_opening():
+    """A crack in a wall, behind it a hall where nothing returns: what is seen through it lies nowhere."""
+    walls = np.vstack((path((4.0, -3.0), (4.0, -0.15)), path((4.0, 0.15), (4.0, 3.0))))
+    through = np.array([[4.0, y, 1.0] for y in (-0.05, 0.0, 0.05)])
+    _, placed = located(through, walls, np.zeros(3))
+    assert not placed.any()
+    beside = np.array([[4.0, y, 1.0] for y in (-0.6, 0.6)])
+    assert located(beside, walls, np.zeros(3))[1].all()
+
+
 def test_the_mounting_of_the_camera_is_heeded():
     """Turned to the left on its mast, and pitched down by 10 degrees."""
     walls = box(-4, -4, 4, 4)
@@ -94,13 +108,13 @@ def test_the_mounting_of_the_camera_is_heeded():
     turned = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5, Transform((0.0, 0.1, 0.6), tuple(left)))
     centre = np.array([[159.5, 119.5]], np.float32)
     scan = scan_at(np.zeros(3), walls, LASER)
-    found, placed = place_keypoints(centre, turned, scan.points, scan.origin, 3.0)
+    found, placed = place_keypoints(centre, turned, seen_in(scan), 3.0)
     assert placed[0]
     assert np.allclose(found[0], (0.0, 4.0, 0.6), atol=0.01)
     pitch = np.array([0.0, np.sin(np.deg2rad(5)), 0.0, np.cos(np.deg2rad(5))])
     down = product(pitch, np.array(CAMERA.T_base_camera.rotation))
     lowered = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5, Transform((0.0, 0.0, 0.9), tuple(down)))
-    found, placed = place_keypoints(centre, lowered, scan.points, scan.origin, 3.0)
+    found, placed = place_keypoints(centre, lowered, seen_in(scan), 3.0)
     assert placed[0]
     assert np.allclose(found[0], (4.0, 0.0, 0.9 - 4.0 * np.tan(np.deg2rad(10))), atol=0.01)
 

@@ -6,7 +6,7 @@ import pytest
 from learning.textures import textured
 
 from fcslam.errors import TrainingError
-from fcslam.learning.images import LARGEST_SIDE_PX, find_images, is_held_out, is_usable, read_grey
+from fcslam.learning.images import LARGEST_SIDE_PX, find_images, is_held_out, is_usable, read_image
 
 
 def write(path, image):
@@ -40,13 +40,13 @@ def test_every_kind_of_image_becomes_grey(tmp_path, kind):
         "deep": grey.astype(np.uint16) * 257,
     }[kind]
     write(tmp_path / "1.png", image)
-    assert read_grey(tmp_path / "1.png").astype(int) == pytest.approx(grey.astype(int), abs=1)
+    assert read_image(tmp_path / "1.png").astype(int) == pytest.approx(grey.astype(int), abs=1)
 
 
 def test_huge_images_are_shrunk_and_others_are_not(tmp_path):
     write(tmp_path / "huge.png", textured(1, 1600, 800))
-    assert read_grey(tmp_path / "huge.png").shape == (LARGEST_SIDE_PX // 2, LARGEST_SIDE_PX)
-    assert read_grey(tmp_path / "nowhere.png") is None
+    assert read_image(tmp_path / "huge.png").shape == (LARGEST_SIDE_PX // 2, LARGEST_SIDE_PX)
+    assert read_image(tmp_path / "nowhere.png") is None
 
 
 def test_what_teaches_nothing_is_not_used():

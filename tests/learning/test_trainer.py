@@ -28,7 +28,7 @@ def examples():
     made = []
     for seed in range(3):
         image = textured(seed)
-        points, _ = peaks(harris(image), 3, 200)
+        points = peaks(harris(image), 4, 200)
         descriptors = np.random.default_rng(seed).normal(size=(len(points), 16)).astype(np.float16)
         made.append(Example(image, fuse(points, points), Teacher(points, descriptors)))
     return made
@@ -125,7 +125,7 @@ def test_collapsed_codes_sound_the_alarm(examples):
 def test_a_perfect_detector_of_unmoved_pictures_scores_one():
     """The same view twice: everything is found again, everything matches."""
     image = textured(4)
-    points, _ = peaks(harris(image), 3, 100)
+    points = peaks(harris(image), 4, 100)
     (pair,) = validation_pairs([Example(image, fuse(points, points))])
     same = type(pair)((pair.views[0], pair.views[0]), pair.valid, pair.taught_valid, pair.taught, np.eye(3))
     figures = validate(KeypointNetwork("light").eval(), [same], torch.device("cpu"))

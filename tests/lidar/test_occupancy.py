@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from fcslam.geometry import se2
-from fcslam.lidar.occupancy import Occupancy, OccupancyConfig, cast, classify
+from fcslam.lidar.occupancy import OccupancyConfig, cast, classify
+from fcslam.map_files import Occupancy
 from fcslam.records import LaserModel
 
 CELL_M = 0.0625  # a power of two: moving by whole cells is exact

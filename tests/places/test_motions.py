@@ -8,7 +8,7 @@ from features.pictures import CAMERA, picture
 from lidar.worlds import LASER, room, scan_at
 
 from fcslam.features.classical import Orb, OrbConfig
-from fcslam.features.placing import place_keypoints
+from fcslam.features.placing import LidarView, place_keypoints
 from fcslam.geometry import se2
 from fcslam.places.motions import MotionConfig, motions
 from fcslam.records import Channel, KeyscanId, Place, frozen
@@ -35,7 +35,9 @@ def viewed(robot, pose):
     """What a robot sees of the room, as a camera place."""
     features = Orb(OrbConfig()).detect(picture(pose, room()))
     scan = scan_at(pose, room(), LASER)
-    positions, placed = place_keypoints(features.keypoints_px, CAMERA, scan.points, scan.origin, 3.0)
+    positions, placed = place_keypoints(
+        features.keypoints_px, CAMERA, LidarView(scan.points, scan.origin, LASER.angle_increment_rad), 3.0
+    )
     keypoints, codes = frozen(positions[placed], np.float32), features.descriptors[placed]
     return Place(KeyscanId(robot, 0), Channel.CAMERA, "v", 0, 0, keypoints, codes)
 

@@ -5,13 +5,18 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from features.networks import tiny_network
 from features.pictures import image_at
-from lidar.worlds import drifting, drive, recording, ring
+from lidar.worlds import drifting, drive, path, recording, ring
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.config import dump, load
+from fcslam.errors import FeatureError
 from fcslam.features.classical import ORB_VERSION
+from fcslam.features.detector import OnnxConfig
+from fcslam.features.kinds import DetectorKind
 from fcslam.geometry import se2
-from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place
+from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.views import ViewsConfig
 from fcslam.wire.messages import Hello, Packet
@@ -21,12 +26,13 @@ EVERY = 3
 """Scans between two images."""
 
 
-def records_of(waypoints, seed):
-    """A drive along the drawn ring: scans, an image shortly after every third, and the true poses at the scans."""
+def records_of(waypoints, seed, walls=None, wears=lambda number: number):
+    """A drive, along the drawn ring: scans, an image shortly after every third, and the true poses at the scans."""
+    walls = ring() if walls is None else walls
     rng = np.random.default_rng(seed)
     poses = drive(waypoints)
     odometry = drifting(poses, rng)
-    scans = list(recording(poses, odometry, ring(), seed=seed))
+    scans = list(recording(poses, odometry, walls, seed=seed))
     records = []
     for k, scan in enumerate(scans):
         records.append(scan)
@@ -35,7 +41,7 @@ def records_of(waypoints, seed):
             true_step = 0.4 * se2.between(poses[k], poses[k + 1])
             moved = se2.compose(odometry[k], step)
             stamp = scan.stamp + 0.4 * (scans[k + 1].stamp - scan.stamp)
-            records.append(image_at(stamp, se2.compose(poses[k], true_step), ring(), moved))
+            records.append(image_at(stamp, se2.compose(poses[k], true_step), walls, moved, wears))
     return records, poses
 
 
@@ -88,7 +94,7 @@ def test_a_robot_that_stands_still_sees_nothing_new(seen):
     records = seen[0][: EVERY + 2]
     last = records[-1]
     standing = [replace(r, stamp=last.stamp + 0.1 * k) for k in range(20) for r in records[:2]]
-    assert len(places(bodies_of(standing)[0])) <= 1
+    assert len(places(bodies_of(standing)[0])) == 1
 
 
 def test_channels_are_a_choice(seen):
@@ -97,6 +103,27 @@ def test_channels_are_a_choice(seen):
         hello = next(body for body in bodies if isinstance(body, Hello))
         assert set(hello.detector_versions) == set(channels)
         assert {body.channel for body in bodies if isinstance(body, Place)} == set(channels)
+
+
+def test_a_network_describes_places_in_its_own_version(seen, tmp_path):
+    pytest.importorskip("onnxruntime")
+    tiny_network(tmp_path / "n.onnx", version="tiny-7")
+    (tmp_path / "robot.yaml").write_text(f"views: {{detector: onnx, onnx: {{weights: {tmp_path}/n.onnx}}}}")
+    config = load(RobotConfig, tmp_path / "robot.yaml")
+    (tmp_path / "dumped.yaml").write_text(dump(config))
+    assert load(RobotConfig, tmp_path / "dumped.yaml") == config
+    bodies, _ = bodies_of(seen[0], config)
+    hello = next(body for body in bodies if isinstance(body, Hello))
+    assert hello.detector_versions[Channel.CAMERA] == "tiny-7"
+    assert len(places(bodies)) > 5
+    assert {place.detector_version for place in places(bodies)} == {"tiny-7"}
+
+
+def test_a_network_that_is_missing_is_told_at_once(tmp_path):
+    pytest.importorskip("onnxruntime")
+    views = ViewsConfig(detector=DetectorKind.ONNX, onnx=OnnxConfig(weights=tmp_path / "missing.onnx"))
+    with pytest.raises(FeatureError, match="cannot read the network weights"):
+        RobotFrontend("r", RobotConfig(views=views))
 
 
 def test_images_change_nothing_but_camera_places(seen):
@@ -110,7 +137,7 @@ def test_images_change_nothing_but_camera_places(seen):
     )
 
 
-def test_images_of_bare_walls_are_no_places(seen):
+def test_images_with_few_keypoints_are_no_places(seen):
     assert places(bodies_of(seen[0], RobotConfig(views=ViewsConfig(fewest_keypoints=2000)))[0]) == []
 
 
@@ -158,3 +185,48 @@ def test_what_cameras_saw_joins_two_maps():
     true_starts = [truth[robot.robot][1][0] for robot in result.robots]
     off = se2.between(se2.between(*true_starts), se2.between(*starts))
     assert np.hypot(off[0], off[1]) < 0.1
+
+
+def test_a_view_whose_surroundings_no_submap_shows_is_left_out(seen):
+    """Scans are missing while the robot drives 20 m: what it saw before it has no submap after it."""
+    records, _ = seen
+    jumped = [
+        replace(r, T_odom_base=frozen(r.T_odom_base + np.array([20.0, 0.0, 0.0]))) if k > len(records) // 3 else r
+        for k, r in enumerate(records)
+    ]
+    bodies, packets = bodies_of(jumped)
+    assert places(bodies)
+    for place in places(bodies):
+        assert place.first <= place.id.number <= place.last
+    for packet in packets:
+        encode(packet)
+
+
+def test_an_image_of_another_size_than_its_camera_is_left_out(seen):
+    records = [r if isinstance(r, LaserScan) else replace(r, camera=replace(r.camera, width=100)) for r in seen[0]]
+    assert places(bodies_of(records)[0]) == []
+
+
+def corridor_of_one_pattern(period_m):
+    """Two bare walls that wear the same pattern again and again: `pictures` gives walls patterns by their number."""
+    ends = np.arange(-60.0, 80.0, period_m)
+    south = [path((x, -1.0), (x + period_m, -1.0)) for x in ends]
+    north = [path((x + period_m, 1.0), (x, 1.0)) for x in ends]
+    return np.vstack((*south, *north)), len(ends)
+
+
+def test_corridors_that_repeat_themselves_join_nothing_by_their_images_alone():
+    """Two robots in stretches 24 m apart that look the same: no wall fixes a match, so nobody guesses."""
+    walls, count = corridor_of_one_pattern(8.0)
+    config, cloud = RobotConfig(channels=(Channel.CAMERA,)), Fleet(FleetConfig(), 0)
+    for number, start in enumerate((0.0, 24.0)):
+        records, _ = records_of([(start, 0.0), (start + 12.0, 0.0)], 10 + number, walls, lambda number: number // count)
+        robot = RobotFrontend(f"r{number}", config)
+        packets = [packet for record in records for packet in robot.process(record)] + robot.finish()
+        assert any(isinstance(packet.body, Place) for packet in packets)
+        for packet in packets:
+            cloud.receive(encode(packet))
+    result = cloud.finalize()
+    assert len({robot.map_index for robot in result.robots}) == 2
+    assert not [c for c in result.closures if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot]
+    assert [c for c in result.closures if c.i.robot != c.j.robot], "the images were not even alike"

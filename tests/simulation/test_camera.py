@@ -7,16 +7,17 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from simulation.driving import route
 from simulation.gl import require_gl
 
 from fcslam.records import CameraImage, LaserScan
 from fcslam.simulation.decoration import Picture, decorate
-from fcslam.simulation.drawn_fleet import LidarSettings
 from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import draw_floor_plan
 from fcslam.simulation.kinds import Building, Lighting
 from fcslam.simulation.lighting import light_of
-from fcslam.simulation.route import drive, plan_route
+from fcslam.simulation.noise import LidarSettings
+from fcslam.simulation.route import drive
 from fcslam.simulation.scene import furnished_model
 from fcslam.simulation.sensors import Camera
 
@@ -40,7 +41,7 @@ def gl():
 def flat():
     rng = np.random.default_rng(1)
     plan = draw_floor_plan(rng, Building.FLAT)
-    _, poses = drive(plan_route(plan, 0, 40.0, rng), 5.0)
+    _, poses = drive(route(plan, 40.0, rng), 5.0)
     return plan, decorate(plan, rng), poses
 
 

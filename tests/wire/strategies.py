@@ -56,14 +56,15 @@ def descriptors(count):
 def places(draw, robot):
     count = draw(st.integers(0, 20))
     first = draw(NUMBERS)
+    last = draw(st.integers(first, 2**31 - 1))
     channel = draw(st.sampled_from(Channel))
     shape = (count, KEYPOINT_AXES[channel])
     return Place(
-        KeyscanId(robot, draw(NUMBERS)),
+        KeyscanId(robot, draw(st.integers(first, last))),
         channel,
         draw(NAMES),
         first,
-        draw(st.integers(first, 2**31 - 1)),
+        last,
         draw(hnp.arrays(np.float32, shape, elements=st.floats(-327.0, 327.0, width=32))),
         draw(descriptors(count)),
     )

@@ -47,7 +47,8 @@ def test_arrays_of_a_received_packet_are_read_only(name):
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_label_is_that_of_the_packet(name):
     sent = EXAMPLES[name]
-    assert read_label(encode(sent)) == (sent.robot, type(sent.body).__name__.lower())
+    label = Label(sent.robot, Kind(type(sent.body).__name__.lower()), getattr(sent.body, "channel", None))
+    assert read_label(encode(sent)) == label
 
 
 @given(informations())

@@ -4,6 +4,8 @@ import pytest
 from wire.examples import ACKNOWLEDGEMENT, CORRECTION, EXAMPLES, packet, same
 
 from fcslam.errors import PacketError
+from fcslam.records import Channel
+from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.ledger import Counter, Ledger, Traffic
 from fcslam.wire.messages import Kind
 from fcslam.wire.packets import Label, decode, encode
@@ -45,6 +47,24 @@ def test_the_ledger_adds_up():
     assert ledger.total("alice", Kind.KEYSCAN) == ledger.total(kind=Kind.KEYSCAN) == Traffic(2, 2 * len(keyscan))
     assert ledger.total("bob") == Traffic()
     assert ledger.refused == Traffic()
+
+
+def test_places_are_counted_by_channel_and_what_goes_up_by_robot():
+    transport = InMemoryTransport(Cloud().receive)
+    lidar, camera, hello = (encode(EXAMPLES[name]) for name in ("lidar_place", "camera_place", "hello"))
+    for data in (lidar, camera, hello, camera):
+        transport.send(data)
+    ledger = transport.ledger()
+    assert ledger.total(channel=Channel.LIDAR) == Traffic(1, len(lidar))
+    assert ledger.total(channel=Channel.CAMERA) == Traffic(2, 2 * len(camera))
+    assert ledger.total(kind=Kind.PLACE) == Traffic(3, len(lidar) + 2 * len(camera))
+    assert ledger.uplink("alice") == Traffic(4, len(lidar) + 2 * len(camera) + len(hello)), "not what comes back"
+    assert ledger.uplink("bob") == Traffic()
+
+
+def test_a_place_of_an_unknown_channel_is_refused():
+    place = pb.Packet(version=1, robot="bob", place=pb.Place(channel=7)).SerializeToString()
+    assert InMemoryTransport(Cloud().receive).send(place) == Reply(refusal="channel 7 is unknown")
 
 
 def test_a_ledger_shown_does_not_change():

@@ -7,7 +7,7 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import config, demo, evaluate, simulate, train
+from fcslam.cli import config, demo, evaluate, extract, simulate, train
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.errors import FcslamError
@@ -30,9 +30,13 @@ app.command(
     epilog="Example: fcslam convert robot1.clf.gz robot1.bag, fcslam convert robot2.mcap robot2.clf.gz "
     "--scan-topic /front/scan",
 )(conversion.convert)
-app.command("simulate", epilog="Example: fcslam simulate --output office --building office --no-camera")(
-    simulate.simulate
-)
+app.command(
+    "simulate",
+    epilog="Example: fcslam simulate --output office --building office --no-camera, "
+    "fcslam simulate --output day-and-evening --robots 2 --lighting day --lighting evening --moved-furniture 0.3, "
+    "and after an interruption the same with --resume",
+)(simulate.simulate)
+app.command("extract", epilog="Example: fcslam extract photos --output features --keypoints 1000")(extract.extract)
 app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo.demo)
 app.command("train", epilog="Example: fcslam train photos --output detector, fcslam train photos -o try --quick")(
     train.train

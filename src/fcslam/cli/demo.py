@@ -1,40 +1,140 @@
-"""`fcslam demo`: a small fleet drawn on the spot and mapped by the real command."""
+"""`fcslam demo`: a fleet simulated, mapped together, measured against the truth, and drawn."""
 
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from fcslam.simulation.kinds import Building
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.simulation.fleet import SimulatedFleet, SimulationSettings
+
+RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
+ABOUT = "about"
+"""It tells a folder that a demo wrote from one that holds somebody's work."""
 
 
 def demo(
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the recordings and the run.")] = Path(
-        "demo"
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for everything; a demo there is replaced.")] = (
+        Path("demo")
     ),
     robots: Annotated[int, typer.Option(min=1, max=8, help="How many robots drive.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws another building.")] = 1,
+    building: Annotated[Building, typer.Option(help="What kind of building.")] = Building.DEFAULT,
+    path_length: Annotated[float, typer.Option(min=1.0, max=10_000.0, help="Metres that each robot drives.")] = 60.0,
+    no_camera: Annotated[bool, typer.Option("--no-camera", help="LiDAR only; needs no GL library.")] = False,
 ) -> None:
-    """Draw a building, drive robots with drifting odometry through it, map their logs, compare with the truth."""
-    import numpy as np
+    """Simulate a fleet whose robots do not know where they are, map it, compare the map with the truth, draw both."""
     from rich.console import Console
 
-    from fcslam.cli.evaluate import relations
     from fcslam.cli.map import map_sources
-    from fcslam.errors import OutputError
+    from fcslam.cli.simulate import record_fleet
     from fcslam.mission import MissionConfig
-    from fcslam.runs import prepare_output
-    from fcslam.simulation.drawn_fleet import FleetSettings, draw_fleet, write_fleet
+    from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
+    from fcslam.simulation.recording import prepare_fleet_folder
     from fcslam.sources import open_source
 
-    console = Console()
-    recordings, run = output / "recordings", output / "run"
-    prepare_output(run, force=True)
+    began = time.perf_counter()
+    camera = None if no_camera else CameraSettings()
+    settings = SimulationSettings(building=building, robots=robots, path_length_m=path_length, camera=camera)
+    _check_libraries(settings)
+    fleet = simulate_fleet(settings, seed)
+    _prepare(output)
+    prepare_fleet_folder(output / RECORDINGS, settings, seed, resume=False)
+    console = Console(stderr=True)
+    _announce(console, 1, f"simulate: {robots} robots drive {path_length:g} m each; none is told where it starts")
+    recordings = record_fleet(fleet, output / RECORDINGS, seed, False, console)
+    _announce(console, 2, "map each robot, recognise places, fuse")
+    map_sources([open_source(place) for place in recordings], MissionConfig(seed=seed), output / RUN, force=True)
+    _evaluate(output, console)
+    _draw(output, fleet, console)
+    typer.echo(f"{time.perf_counter() - began:.0f} s in all")
+    for what, name in (("run folder", RUN), ("figure", FIGURE), ("every figure measured", TABLE)):
+        typer.echo(f"{what}: {output / name}")
+
+
+def _check_libraries(settings: "SimulationSettings") -> None:
+    """Refuse before the work, and before an earlier demo is removed."""
+    from fcslam.simulation.engine import gl_context, mujoco
+
+    if settings.camera:
+        gl_context(16, 16).free()
+    else:
+        mujoco()
+
+
+def _prepare(output: Path) -> None:
+    """A folder in which nothing of an earlier demo is left.
+
+    Raises:
+        OutputError: something else is there, or it cannot be written.
+    """
+    from fcslam.errors import OutputError
+
     try:
-        recordings.mkdir(parents=True, exist_ok=True)
+        output.mkdir(parents=True, exist_ok=True)
+        if any(output.iterdir()) and not (output / ABOUT).is_file():
+            raise OutputError(
+                f"{output}: holds something that is no demo; remove it, or name another folder with --output"
+            )
+        names = (RECORDINGS, RUN, FIGURE, TABLE)
+        (output / ABOUT).write_text(
+            f"Written by `fcslam demo`, which replaces {', '.join(names)} here when it runs again.\n", encoding="utf-8"
+        )
+        for place in (output / name for name in names):
+            if place.is_dir():
+                shutil.rmtree(place)
+            else:
+                place.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
-    rng = np.random.default_rng(seed)
-    logs = write_fleet(draw_fleet(FleetSettings(robots=robots), rng), recordings, rng)
-    console.print(f"recordings: {', '.join(str(log) for log in logs)}", highlight=False, markup=False, soft_wrap=True)
-    map_sources([open_source(log) for log in logs], MissionConfig(seed=seed), run, force=True)
-    relations(run, recordings / "ground_truth" / "relations", across_robots=len(logs) > 1)
+
+
+def _evaluate(output: Path, console: "Console") -> None:
+    from rich.console import Console
+
+    from fcslam.cli.evaluate_fleet import show_fleet
+    from fcslam.evaluation.fleet import evaluate_fleet
+    from fcslam.evaluation.fleet_metrics import fleet_metrics
+    from fcslam.evaluation.relations import write_metrics
+
+    _announce(console, 3, "evaluate: compare with the truth")
+    with _busy(console, "evaluating"):
+        report = evaluate_fleet(output / RUN, output / RECORDINGS)
+        write_metrics(fleet_metrics(report), output / TABLE)
+    show_fleet(report, Console(), explained=False)
+    typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
+
+
+def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
+    from fcslam.evaluation.charts import Outline, fleet_charts
+    from fcslam.evaluation.figure import write_figure
+    from fcslam.simulation.floorplan import Kind
+
+    _announce(console, 4, "draw")
+    with _busy(console, "drawing"):
+        solid = [piece for piece in fleet.plan.pieces if piece.kind is not Kind.LINTEL]
+        outlines = [Outline(piece.outline, piece.kind is not Kind.WALL) for piece in solid]
+        write_figure(fleet_charts(output / RUN, output / RECORDINGS, outlines), output / FIGURE)
+
+
+def _announce(console: "Console", stage: int, what: str) -> None:
+    console.print(f"[bold]{stage} of 4[/bold] {what}", highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _busy(console: "Console", what: str) -> Iterator[None]:
+    """A sign of life where somebody watches."""
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(what):
+        yield

@@ -1,10 +1,12 @@
 """`fcslam evaluate`: run folders against references."""
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from fcslam.cli.evaluate_fleet import fleet, percent
+from fcslam.cli.evaluate_homography import homography
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -13,7 +15,11 @@ if TYPE_CHECKING:
     from fcslam.metrics.closures import ClosureCriteria, Precision
     from fcslam.metrics.relations import RelationErrors
 
-app = typer.Typer(no_args_is_help=True, help="Measure run folders against references.")
+app = typer.Typer(no_args_is_help=True, help="Measure run folders against references, and detectors.")
+app.command(epilog="Example: fcslam evaluate fleet fleet/run --truth fleet")(fleet)
+app.command(epilog="Example: fcslam evaluate homography hpatches --detector onnx --detector orb --figures figures")(
+    homography
+)
 
 
 @app.command(epilog="Example: fcslam evaluate relations out/intel intel.relations.gz --across-robots")
@@ -101,9 +107,9 @@ def _show_closures(report: "ClosureReport", criteria: "ClosureCriteria") -> None
     names = {"intra_robot": "within", "inter_robot": "between"}
     for (within, status), score in report.scores.items():
         name, graph, single, recall = f"{names[within]}, {status}", score.graph, score.single, score.recall
-        covered = f"{graph.covered}, {_percent(graph.coverage)}"
-        found = "" if recall is None else f"{recall.found}/{recall.revisits}, {_percent(recall.recall)}"
-        counts.add_row(name, str(graph.closures), covered, str(graph.wrong), _percent(graph.precision), found)
+        covered = f"{graph.covered}, {percent(graph.coverage)}"
+        found = "" if recall is None else f"{recall.found}/{recall.revisits}, {percent(recall.recall)}"
+        counts.add_row(name, str(graph.closures), covered, str(graph.wrong), percent(graph.precision), found)
         if graph.covered:
             chain = f"{score.chain[0]:.0f} / {score.chain[1]:.0f}"
             errors.add_row(name, *_error_cells(graph), chain, f"{single.covered}, {single.wrong} wrong")
@@ -144,8 +150,3 @@ def _explain_closures(console: "Console", report: "ClosureReport", criteria: "Cl
 def _error_cells(found: "Precision") -> tuple[str, str]:
     (middle_m, most_m), (middle_deg, most_deg) = found.translation_m, found.rotation_deg
     return f"{middle_m:.3f} / {most_m:.3f}", f"{middle_deg:.2f} / {most_deg:.2f}"
-
-
-def _percent(share: float) -> str:
-    """In tenths of a percent, never rounded up to all."""
-    return "-" if math.isnan(share) else f"{math.floor(1000.0 * share) / 10.0:.1f}%"

@@ -19,6 +19,7 @@ from fcslam.cli.recordings import (
     show_faults,
     show_notes,
 )
+from fcslam.cloud.strategy import FusionStrategy
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,6 +39,13 @@ def map_recordings(
     output: Annotated[Path, typer.Option("--output", "-o", help="The run folder to write.")],
     split: Annotated[int, typer.Option(min=1, help="Cut one LOG into this many robots of equal scan count.")] = 1,
     no_fuse: Annotated[bool, typer.Option("--no-fuse", help="Map each robot alone.")] = False,
+    fusion: Annotated[
+        FusionStrategy | None,
+        typer.Option(
+            help="How maps become one: a joint robust graph, or rigid maps laid on one another by matched points; "
+            "the configuration's if not given."
+        ),
+    ] = None,
     veto: Annotated[
         Path | None,
         typer.Option(
@@ -58,7 +66,7 @@ def map_recordings(
     from fcslam.runs import prepare_output, read_vetoes
 
     prepare_output(output, force)
-    settings = _settings(config, seed, no_fuse)
+    settings = _settings(config, seed, no_fuse, fusion)
     vetoes = read_vetoes(veto) if veto else ()
     options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
     sources = _sources([open_recording(log, options) for log in logs], split)
@@ -91,16 +99,19 @@ def map_sources(
     return run
 
 
-def _settings(config: Path | None, seed: int | None, no_fuse: bool) -> "MissionConfig":
+def _settings(config: Path | None, seed: int | None, no_fuse: bool, fusion: FusionStrategy | None) -> "MissionConfig":
     from fcslam.config import load
+    from fcslam.errors import ConfigError
     from fcslam.mission import MissionConfig
 
     settings = MissionConfig() if config is None else load(MissionConfig, config)
     if seed is not None:
         settings = settings.model_copy(update={"seed": seed})
-    if no_fuse:
-        settings = settings.model_copy(update={"fleet": settings.fleet.model_copy(update={"join_maps": False})})
-    return settings
+    if no_fuse and fusion is not None:
+        raise ConfigError("--no-fuse leaves nothing to fuse; drop it or --fusion")
+    changes: dict[str, object] = {"join_maps": False} if no_fuse else {}
+    changes |= {"fusion": fusion} if fusion is not None else {}
+    return settings.model_copy(update={"fleet": settings.fleet.model_copy(update=changes)})
 
 
 def _sources(sources: "list[Source]", parts: int) -> "list[Source]":
@@ -120,16 +131,17 @@ def _progress(console: "Console", total: int) -> "Iterator[Watch]":
     from rich import progress
 
     columns = [
-        progress.TextColumn("mapping"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
+        progress.TextColumn("{task.fields[stage]}"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
         progress.TextColumn("scans, {task.fields[what]}"), progress.TimeRemainingColumn(),
     ]  # fmt: skip
     # where nobody watches, even an erased display leaves an empty line
     with progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=total, what="")
+        task = bar.add_task("", total=total, stage="mapping", what="")
         began = time.perf_counter()
 
         def watch(now: "Progress") -> None:
-            bar.update(task, completed=now.scans, what=_what(now, time.perf_counter() - began))
+            what = _what(now, time.perf_counter() - began)
+            bar.update(task, completed=now.scans, stage="fusing" if now.fusing else "mapping", what=what)
 
         yield watch
 

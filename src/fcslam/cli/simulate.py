@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from fcslam.records import RecordedItem
-    from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot
+    from fcslam.simulation.fleet import SimulatedFleet
 
 
 def simulate(
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the recordings; new or empty.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder for the recordings; new or empty, but for --resume."),
+    ],
     robots: Annotated[int, typer.Option(min=1, max=100, help="How many robots drive.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws another building.")] = 1,
     building: Annotated[Building, typer.Option(help="What kind of building.")] = Building.DEFAULT,
@@ -36,11 +39,16 @@ def simulate(
     ] = 0.0,
     no_camera: Annotated[bool, typer.Option("--no-camera", help="LiDAR only; needs no GL library.")] = False,
     bag: Annotated[bool, typer.Option("--bag", help="Write a ROS 2 bag (.mcap) of each robot as well.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with an interrupted simulation of the same settings.")
+    ] = False,
 ) -> None:
     """Draw a building, drive robots through it, record what their LiDARs and cameras see and where they really were."""
     from rich.console import Console
 
+    from fcslam.errors import OutputError
     from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
+    from fcslam.simulation.recording import prepare_fleet_folder
 
     settings = SimulationSettings(
         building=building,
@@ -50,12 +58,20 @@ def simulate(
         moved_furniture=moved_furniture,
         camera=None if no_camera else CameraSettings(),
     )
-    _prepare(output)
-    record_fleet(simulate_fleet(settings, seed), output, seed, bag, Console(stderr=True))
+    fleet = simulate_fleet(settings, seed)
+    prepare_fleet_folder(output, settings, seed, resume)
+    try:
+        record_fleet(fleet, output, seed, bag, Console(stderr=True), resume)
+    except OutputError as error:
+        raise OutputError(f"{error}; with --resume the same command goes on") from error
 
 
-def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, console: "Console") -> list[Path]:
+def record_fleet(
+    fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, console: "Console", resume: bool = False
+) -> list[Path]:
     """Write one recording a robot into the folder ``output``, the truth beside them; returns the recordings.
+
+    With ``resume`` recordings that are there already go on.
 
     Raises:
         SimulationError: MuJoCo or a GL library is missing.
@@ -64,14 +80,15 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, co
     import numpy as np
 
     from fcslam.errors import OutputError
+    from fcslam.simulation.recording import record_robot
     from fcslam.simulation.truth import write_truth
-    from fcslam.sources import open_source, write_bag, write_recording
+    from fcslam.sources import open_source, write_bag
 
     began = time.perf_counter()
     recordings = [output / robot.name for robot in fleet.robots]
     with _progress(fleet, console) as watch, ThreadPoolExecutor(os.cpu_count()) as pool:
         jobs = [
-            pool.submit(write_recording, place, robot.laser, robot.camera, watch(robot))
+            pool.submit(record_robot, robot, place, watch, resume)
             for robot, place in zip(fleet.robots, recordings, strict=True)
         ]
         try:
@@ -83,26 +100,17 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, co
         write_truth(fleet, output, np.random.default_rng(seed))
         if bag:
             for place in recordings:
-                write_bag(place.with_suffix(".mcap"), open_source(place).records())
+                # A bag is whole or not there.
+                if not place.with_suffix(".mcap").exists():
+                    write_bag(place.with_suffix(".mcap"), open_source(place).records())
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
     _report(fleet, recordings, time.perf_counter() - began, console)
     return recordings
 
 
-def _prepare(output: Path) -> None:
-    from fcslam.errors import OutputError
-
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        if any(output.iterdir()):
-            raise OutputError(f"{output}: is not empty; choose another place")
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
-
-
 class _Watch:
-    """Lets robots' records through while somebody looks on, until it is stopped."""
+    """Lets robots' records through while somebody looks on, until it is stopped. Each record comes with its truth."""
 
     def __init__(self, bar: "Progress", task: "TaskID") -> None:
         self._bar, self._task = bar, task
@@ -112,25 +120,25 @@ class _Watch:
         """End every robot's recording at its next record."""
         self._stopped = True
 
-    def __call__(self, robot: "SimulatedRobot") -> "Iterator[RecordedItem]":
-        from fcslam.records import LaserScan
+    def __call__(self, items: "Iterator[RecordedItem]") -> "Iterator[RecordedItem]":
+        from fcslam.records import GroundTruth
 
-        with closing(robot.items()) as items:
-            for item in items:
-                if self._stopped:
-                    return
-                yield item
-                if isinstance(item, LaserScan):
-                    self._bar.advance(self._task)
+        for item in items:
+            if self._stopped:
+                return
+            yield item
+            if isinstance(item, GroundTruth):
+                self._bar.advance(self._task)
 
 
 @contextmanager
 def _progress(fleet: "SimulatedFleet", console: "Console") -> "Iterator[_Watch]":
-    """A live line over all robots' scans."""
+    """A live line over all robots' scans and images."""
     from rich.progress import Progress
 
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        yield _Watch(bar, bar.add_task("simulating", total=sum(len(robot.stamps) for robot in fleet.robots)))
+        total = sum(len(robot.stamps) + len(robot.image_stamps) for robot in fleet.robots)
+        yield _Watch(bar, bar.add_task("simulating", total=total))
 
 
 def _report(fleet: "SimulatedFleet", recordings: list[Path], elapsed_s: float, console: "Console") -> None:

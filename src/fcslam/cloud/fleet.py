@@ -12,8 +12,10 @@ from pydantic import Field
 from fcslam.cloud.joining import first_estimate, judge
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger, Entry
-from fcslam.cloud.result import FleetResult, conclude
+from fcslam.cloud.result import FleetResult, Fusion, conclude
+from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.robots import RobotStore
+from fcslam.cloud.strategy import FusionStrategy
 from fcslam.cloud.submaps import SubmapShelf
 from fcslam.cloud.verdict import reconsider
 from fcslam.config import Settings
@@ -22,6 +24,7 @@ from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
 from fcslam.records import (
+    Channel,
     ClosureStatus,
     Constraint,
     ConstraintKind,
@@ -41,6 +44,10 @@ class FleetConfig(Settings):
     """The cloud's part."""
 
     join_maps: bool = Field(default=True, description="look for places that several robots saw")
+    fusion: FusionStrategy = Field(
+        default=FusionStrategy.JOINT,
+        description="joint: one robust graph; two_point, n_point: rigid maps laid on one another by matched points",
+    )
     sight_m: float = Field(default=6.0, gt=0, description="in a joint map, places this near are compared")
     near_visits: int = Field(
         default=2, ge=0, description="so many of another robot's visits are compared with one place"
@@ -52,6 +59,9 @@ class FleetConfig(Settings):
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place matching")
     consistency: ConsistencySettings = Field(default=ConsistencySettings(), description="pairwise consistency")
 
+
+_Words = tuple[Channel, str]
+"""Channel and detector version of places that can be compared."""
 
 MORE_DOUBTS = 1.1
 """Growth of the number of closures after which a doubt that was dispelled is taken up again."""
@@ -67,10 +77,10 @@ class Fleet:
         self._graph = JointGraph()
         self._ledger = ClosureLedger()
         self._submaps = SubmapShelf(self._store, self._graph, config.submaps_kept)
-        self._matchers: dict[str, PlaceMatcher] = {}
-        """By detector version: words of different ones are never compared."""
-        self._places: dict[tuple[str, str], list[KeyscanId]] = {}
-        """By detector version and robot."""
+        self._matchers: dict[_Words, PlaceMatcher] = {}
+        """Words of different channels or detectors are never compared."""
+        self._places: dict[tuple[_Words, str], list[KeyscanId]] = {}
+        """By kind of words and robot."""
         self._maps: list[list[str]] = []
         """Robots by map; maps and the robots in them in the order in which they started."""
         self._vetoes: list[Veto] = []
@@ -108,8 +118,10 @@ class Fleet:
 
     def _conclude(self) -> FleetResult:
         self._disturbed = True
-        self._reconsider()
-        return conclude(self._store, self._graph, self._ledger, self._maps, self._version)
+        fusion = self._reconsider()
+        if self._config.fusion is not FusionStrategy.JOINT:
+            fusion = fuse_rigidly(self._ledger, fusion.T_local_base, self._config.fusion)
+        return conclude(self._store, self._graph, self._ledger, fusion, self._version)
 
     def veto(self, veto: Veto) -> None:
         """From now on these closures count for nothing; maps that only they held together part."""
@@ -138,9 +150,9 @@ class Fleet:
         for ready in self._store.admit(packet):
             try:
                 self._take(ready)
-            except PacketError:
-                self._store.withdraw(ready)
-                if ready is packet:
+            except Exception as error:
+                self._store.withdraw(ready)  # what did not take effect must not count as received
+                if ready is packet or not isinstance(error, PacketError):
                     raise
                 return
 
@@ -173,31 +185,32 @@ class Fleet:
     def _add_place(self, place: Place) -> None:
         """Match a place (Algorithm 1), judge what it brings, join maps, optimise."""
         if self._config.join_maps:
-            matcher = self._matcher(place.detector_version)
+            words = place.channel, place.detector_version
+            matcher = self._matcher(words)
             matches = matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
             entries = [self._ledger.add(match) for match in matches]
             waiting = [entry for entry in entries if not self._is_vetoed(entry) and self._accept_or_wait(entry)]
             for other in dict.fromkeys(entry.closure.i.robot for entry in waiting):
                 self._judge_pair(other, place.id.robot)
-            self._places.setdefault((place.detector_version, place.id.robot), []).append(place.id)
+            self._places.setdefault((words, place.id.robot), []).append(place.id)
         # A robot alone needs no estimate before the end.
         if len(self._store.robots) > 1 and self._graph.is_due(self._config.solve_every):
             self._optimize()
         if self._doubted and len(self._ledger) >= self._patience:
             self._reconsider()
 
-    def _matcher(self, version: str) -> PlaceMatcher:
-        if version not in self._matchers:
+    def _matcher(self, words: _Words) -> PlaceMatcher:
+        if words not in self._matchers:
             rng = np.random.default_rng(self._seed)
-            self._matchers[version] = PlaceMatcher(self._config.matcher, self._submaps.of, rng)
-        return self._matchers[version]
+            self._matchers[words] = PlaceMatcher(self._config.matcher, self._submaps.of, rng)
+        return self._matchers[words]
 
     def _predicted(self, place: Place) -> dict[KeyscanId, FloatArray]:
         """T_i_j of the nearest place of each visit of the robots in the same map."""
-        pose = self._graph.pose(place.id)
+        pose, words = self._graph.pose(place.id), (place.channel, place.detector_version)
         near: dict[KeyscanId, FloatArray] = {}
         for robot in self._map_of(place.id.robot):
-            ids = self._places.get((place.detector_version, robot), []) if robot != place.id.robot else []
+            ids = self._places.get((words, robot), []) if robot != place.id.robot else []
             anchors = np.array([self._graph.pose(i) for i in ids]).reshape(-1, 3)
             distance = np.hypot(anchors[:, 0] - pose[0], anchors[:, 1] - pose[1])
             close = np.flatnonzero(distance < self._config.sight_m)
@@ -289,11 +302,13 @@ class Fleet:
         self._graph.optimize()
         self._version += 1
 
-    def _reconsider(self) -> None:
+    def _reconsider(self) -> Fusion:
         """Decide every closure anew: revoke what is outvoted, part the maps that only that held together."""
-        self._maps = reconsider(self._graph, self._ledger, self._config.consistency)
+        fusion = reconsider(self._graph, self._ledger, self._config.consistency)
+        self._maps = [list(robots) for robots in fusion.maps]
         self._doubted, self._patience = False, int(MORE_DOUBTS * len(self._ledger))
         self._version += 1
+        return fusion
 
     def _replies(self, packet: Packet) -> list[bytes]:
         """Acknowledgement and, after a place, where the robot's odometry lies in the map."""

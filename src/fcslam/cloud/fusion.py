@@ -1,20 +1,11 @@
-"""One occupancy map from the keyscans of several robots, and its files for ROS map_server."""
+"""One occupancy map from the keyscans of several robots."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
 
-import numpy as np
-import yaml
-
-from fcslam.lidar.occupancy import Cells, Occupancy, OccupancyConfig, OccupancyGrid, cast, classify
+from fcslam.lidar.occupancy import OccupancyConfig, OccupancyGrid, cast, classify
+from fcslam.map_files import Cells
 from fcslam.records import FloatArray, Keyscan, LaserModel
-
-OCCUPIED_THRESHOLD: Final = 0.65
-FREE_THRESHOLD: Final = 0.196
-"""map_server: occupied above, free below, unknown between; a pixel p stands for the occupancy (255 - p) / 255."""
-
-PIXELS: Final = {Occupancy.UNKNOWN: 205, Occupancy.FREE: 254, Occupancy.OCCUPIED: 0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +15,16 @@ class FusedMap:
     grid: OccupancyGrid
     cells: Cells
     """``Occupancy`` of every cell, shape (H, W), row 0 at the lowest y."""
+
+    @property
+    def resolution_m(self) -> float:
+        """Side of a cell."""
+        return self.grid.resolution_m
+
+    @property
+    def origin_xy(self) -> tuple[float, float]:
+        """Lower left corner of cell (0, 0) in ``map``."""
+        return self.grid.origin_xy
 
 
 def fuse(
@@ -40,27 +41,3 @@ def fuse(
     ]
     grid = cast(castings, config)
     return FusedMap(grid, classify(grid, config))
-
-
-def pgm_bytes(fused: FusedMap) -> bytes:
-    """The map as a binary PGM for map_server: row 0 at the highest y; 254 free, 0 occupied, 205 unknown."""
-    pixels = np.zeros(len(Occupancy), np.uint8)
-    for occupancy, pixel in PIXELS.items():
-        pixels[occupancy] = pixel
-    height, width = fused.cells.shape
-    return f"P5\n{width} {height}\n255\n".encode("ascii") + pixels[fused.cells[::-1]].tobytes()
-
-
-def map_yaml(fused: FusedMap, image: str) -> str:
-    """What map_server needs to know about the PGM file named ``image``, which lies beside the YAML file."""
-    content = {
-        "image": image,
-        "mode": "trinary",
-        "resolution": fused.grid.resolution_m,
-        "origin": [*(round(value, 9) for value in fused.grid.origin_xy), 0.0],
-        "negate": 0,
-        "occupied_thresh": OCCUPIED_THRESHOLD,
-        "free_thresh": FREE_THRESHOLD,
-    }
-    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
-    return text

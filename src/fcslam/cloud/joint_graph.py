@@ -1,6 +1,6 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +53,13 @@ class JointGraph:
         """T_odom_base of keyscans first to last (inclusive): the robot's motions alone, before any correction."""
         return np.array(self._chains[robot][first : last + 1])
 
-    def T_map_odom(self, robot: str) -> FloatArray:
-        """Where the robot's odometry (the chain of its motions) starts in the map, by its newest keyscan."""
-        return se2.compose(self._poses[self._variables[robot][-1]], se2.inverse(self._chains[robot][-1]))
+    def T_map_odom(self, robot: str, T_map_newest: FloatArray | None = None) -> FloatArray:
+        """Where the robot's odometry (the chain of its motions) starts in the map, by its newest keyscan.
+
+        ``T_map_newest`` (3,) says where that is, by default where it is estimated now.
+        """
+        T_map_base = self._poses[self._variables[robot][-1]] if T_map_newest is None else T_map_newest
+        return se2.compose(T_map_base, se2.inverse(self._chains[robot][-1]))
 
     def start(self, robot: str) -> None:
         """First keyscan of a robot: the origin of a map of its own."""
@@ -108,10 +112,12 @@ class JointGraph:
         self._poses[: len(poses)] = poses
         self._unsolved = 0
 
-    def held(self) -> PoseGraph:
-        """The present estimate with the constraints that hold: what a run leaves behind."""
-        edges = [edge for number, edge in enumerate(self.graph.edges) if number not in self._left_out]
-        return PoseGraph(self._poses[: len(self.graph)], edges)
+    def held(self, T_map_base: Mapping[str, FloatArray], left_out: Container[int | None]) -> PoseGraph:
+        """All robots at poses (N, 3), with the constraints that are not left out: what a run leaves behind."""
+        poses = np.zeros((len(self.graph), 3))
+        for robot, variables in self._variables.items():
+            poses[variables] = T_map_base[robot]
+        return PoseGraph(poses, [edge for number, edge in enumerate(self.graph.edges) if number not in left_out])
 
     def robots(self) -> dict[str, NDArray[np.int64]]:
         """Variables of every robot in the order of its path; robots in the order in which they started."""

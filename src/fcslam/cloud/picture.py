@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.cloud import palette
 from fcslam.cloud.fusion import FusedMap
-from fcslam.lidar.occupancy import Cells, Occupancy
-from fcslam.records import FloatArray
+from fcslam.map_files import Cells, Occupancy
+from fcslam.records import Channel, FloatArray
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
@@ -51,13 +52,12 @@ def _bgr(rgb: int) -> Color:
     return rgb & 255, rgb >> 8 & 255, rgb >> 16
 
 
-PAPER: Final = _bgr(0xECEFF1)
-FLOOR: Final = _bgr(0xFFFFFF)
-WALL: Final = _bgr(0x1F2A33)
-INK: Final = _bgr(0x37474F)
-CLOSURE: Final = _bgr(0xC2185B)
-# Told apart by people with colour-blind eyes too (after Okabe and Ito).
-ROBOTS: Final = tuple(map(_bgr, (0x0072B2, 0xE66100, 0x009E73, 0x7B4FB5, 0xE0A800, 0x56B4E9, 0x8C564B, 0x607D3B)))
+PAPER: Final = _bgr(palette.PAPER)
+FLOOR: Final = _bgr(palette.FLOOR)
+WALL: Final = _bgr(palette.WALL)
+INK: Final = _bgr(palette.INK)
+CLOSURE: Final = _bgr(palette.CLOSURES[Channel.LIDAR])
+ROBOTS: Final = tuple(map(_bgr, palette.ROBOTS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,11 +156,11 @@ def _shrunk(cells: Cells, factor: int) -> Cells:
 
 
 def _canvas(view: _View) -> Image:
-    palette = np.zeros((len(Occupancy), 3), np.uint8)
-    palette[Occupancy.UNKNOWN], palette[Occupancy.FREE], palette[Occupancy.OCCUPIED] = PAPER, FLOOR, WALL
+    colors = np.zeros((len(Occupancy), 3), np.uint8)
+    colors[Occupancy.UNKNOWN], colors[Occupancy.FREE], colors[Occupancy.OCCUPIED] = PAPER, FLOOR, WALL
     rows = view.cells[::-1].repeat(view.cell_px, axis=0).repeat(view.cell_px, axis=1)
     canvas = np.full((rows.shape[0] + 2 * MARGIN_PX, rows.shape[1] + 2 * view.offset_px, 3), PAPER, np.uint8)
-    canvas[MARGIN_PX : MARGIN_PX + rows.shape[0], view.offset_px : view.offset_px + rows.shape[1]] = palette[rows]
+    canvas[MARGIN_PX : MARGIN_PX + rows.shape[0], view.offset_px : view.offset_px + rows.shape[1]] = colors[rows]
     return canvas
 
 

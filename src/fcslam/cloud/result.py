@@ -1,13 +1,13 @@
 """What a fleet's packets say in the end: every closure decided, every robot placed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger
 from fcslam.cloud.robots import RobotStore
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.records import Correction, FloatArray, Keyscan, LaserModel, LoopClosure, frozen
+from fcslam.records import ClosureStatus, Correction, FloatArray, Keyscan, LaserModel, LoopClosure, frozen
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +20,9 @@ class MappedRobot:
     keyscans: tuple[Keyscan, ...]
     T_map_base: FloatArray
     """Of each keyscan, in the frame of its map, shape (N, 3)."""
+    T_local_base: FloatArray
+    """Of each keyscan, in the robot's own map, which its own measurements alone made, shape (N, 3); the origin is its
+    first keyscan."""
     laser: LaserModel
 
 
@@ -35,18 +38,42 @@ class FleetResult:
     """All keyscans at their optimised poses, with the constraints that hold."""
 
 
-def conclude(
-    store: RobotStore, graph: JointGraph, ledger: ClosureLedger, maps: Sequence[Sequence[str]], version: int
-) -> FleetResult:
+@dataclass(frozen=True, slots=True, eq=False)
+class Fusion:
+    """Who shares a map, where everybody is, and what that rests on."""
+
+    maps: Sequence[Sequence[str]]
+    """Robots of each map, maps and robots in the order in which they started."""
+    T_map_base: Mapping[str, FloatArray]
+    """Every robot's keyscans in the frame of its map, shape (N, 3)."""
+    T_local_base: Mapping[str, FloatArray]
+    """Every robot's keyscans in its own map, shape (N, 3)."""
+    closures: tuple[LoopClosure, ...]
+    """In the order in which they were found, with their verdicts."""
+
+
+def conclude(store: RobotStore, graph: JointGraph, ledger: ClosureLedger, fusion: Fusion, version: int) -> FleetResult:
     """Collect the result; the map of most robots is the first."""
-    by_size = sorted(maps, key=lambda robots: -len(robots))
+    by_size = sorted(fusion.maps, key=lambda robots: -len(robots))
     index = {robot: k for k, robots in enumerate(by_size) for robot in robots}
     robots = tuple(
-        MappedRobot(robot, index[robot], store.keyscans(robot), frozen(graph.trajectory(robot)), store.laser(robot))
+        MappedRobot(
+            robot,
+            index[robot],
+            store.keyscans(robot),
+            fusion.T_map_base[robot],
+            fusion.T_local_base[robot],
+            store.laser(robot),
+        )
         for robot in store.robots
     )
     corrections = tuple(
-        Correction(robot, version, index[robot], frozen(graph.T_map_odom(robot))) for robot in store.robots
+        Correction(robot, version, index[robot], frozen(graph.T_map_odom(robot, fusion.T_map_base[robot][-1])))
+        for robot in store.robots
     )
-    closures = tuple(entry.closure for entry in ledger)
-    return FleetResult(robots, closures, corrections, graph.held())
+    left_out = {
+        entry.edge
+        for entry, closure in zip(ledger, fusion.closures, strict=True)
+        if closure.status is not ClosureStatus.ACCEPTED
+    }
+    return FleetResult(robots, fusion.closures, corrections, graph.held(fusion.T_map_base, left_out))

@@ -6,19 +6,19 @@ import numpy as np
 
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger, Entry
+from fcslam.cloud.result import Fusion
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.joint import HOLDS, JointEvidence, JointSolution, solve_jointly
-from fcslam.records import ClosureStatus
+from fcslam.records import ClosureStatus, FloatArray, frozen
 
 CONTRADICTS = "contradicts the joint graph"
 VETOED = "vetoed by hand"
 
 
-def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> list[list[str]]:
+def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> Fusion:
     """Solve from the evidence alone; the graph takes the poses over, every entry learns its status.
 
-    Returns the robots of each map, maps and robots in the order in which they started. No earlier estimate, join or
-    verdict plays a part: what joined two maps once and is outvoted now is revoked.
+    No earlier estimate, join or verdict plays a part: what joined two maps once and is outvoted now is revoked.
     """
     entries = [entry for entry in ledger if entry.closure.status is not ClosureStatus.CANDIDATE]
     _enter(graph, (entry for entry in entries if entry.edge is None))
@@ -33,7 +33,10 @@ def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySe
         apart = len({maps[robot] for robot in pair}) > 1
         _decide(entry, bool(solution.weights[entry.edge] > HOLDS), reasons.get(pair, CONTRADICTS) if apart else "")
         graph.count(entry.edge, holds=entry.closure.status is ClosureStatus.ACCEPTED)
-    return [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
+    members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
+    T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
+    T_local_base = dict(zip(robots, solution.own, strict=True))
+    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in ledger))
 
 
 def _enter(graph: JointGraph, entries: Iterable[Entry]) -> None:

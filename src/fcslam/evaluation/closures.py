@@ -85,7 +85,7 @@ def evaluate_closures(run: Path, relations: Path, criteria: ClosureCriteria) -> 
     evidence = _gather(opened, poses, graph, node_rows, criteria)
     scores = {
         (within, status): evidence.score(members, within, status in STAGES)
-        for (within, status), members in _sets(opened).items()
+        for (within, status), members in closure_sets(opened).items()
     }
     return ClosureReport(scores, graph, int(np.sum(node_rows >= 0)))
 
@@ -198,7 +198,7 @@ def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable, criteria: Clos
     return longer
 
 
-def _sets(run: Run) -> dict[tuple[Within, ClosureStatus], Mask]:
+def closure_sets(run: Run) -> dict[tuple[Within, ClosureStatus], Mask]:
     """The closures of each stage, and those turned down, as masks (K,)."""
     between = np.array([c.robot_i != c.robot_j for c in run.closures], dtype=np.bool_)
     sets: dict[tuple[Within, ClosureStatus], Mask] = {}

@@ -1,26 +1,55 @@
-"""What a detector of keypoints in camera images gives, whichever it is: ORB today, a network tomorrow."""
+"""What a detector of keypoints in camera images gives, whichever it is, and the one that is a network.
 
-from dataclasses import dataclass
-from typing import Protocol
+A network is an ONNX file, run by ONNX Runtime on the processor. Its contract, ``fcslam_format`` 1:
+
+- input ``image``, float32 (1, 1, H, W): grey levels in [0, 1]; H and W are any multiples of 8;
+- output ``scores``, float32 (1, H, W): the probability that there is a keypoint, for every pixel;
+- output ``logits``, float32 (1, 256, H / 8, W / 8): of the descriptor's bits, for cells as ``dense`` places them;
+- metadata ``fcslam_format``, and ``fcslam_version``: the version that stamps every descriptor.
+"""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Final, Protocol, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from fcslam.records import CODE_BYTES, Codes, frozen
+from fcslam.config import Settings
+from fcslam.errors import FeatureError
+from fcslam.features.codes import CODE_BITS
+from fcslam.features.dense import CELL_PX, Logits, Probabilities, find_peaks, sample_codes
+from fcslam.records import CODE_BYTES, NAME, Codes, frozen
+
+NETWORK_FORMAT: Final = "1"
+SHIPPED_NETWORK: Final = Path(__file__).parent / "networks" / "detector.onnx"
+"""Network weights that come with the package, where they do."""
 
 GreyImage = NDArray[np.uint8]
 """Shape (height, width)."""
 
 
 @dataclass(frozen=True, slots=True)
-class ImageFeatures:
-    """Features of one image, the strongest first."""
+class Keypoints:
+    """Keypoints of one image, the strongest first."""
 
     keypoints_px: NDArray[np.float32]
     """Shape (K, 2): x to the right, y down; (0, 0) is the centre of the first pixel."""
     scores: NDArray[np.float32]
     """Shape (K,), on the detector's own scale."""
+
+    def take(self, rows: NDArray[np.int64] | slice) -> Self:
+        """Those keypoints, in that order, with all that is known of them."""
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: frozen(array[rows], array.dtype.type) for name, array in arrays.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFeatures(Keypoints):
+    """Keypoints with what the image shows around them, in 256 bits each."""
+
     descriptors: Codes
     """Shape (K, 32)."""
 
@@ -30,7 +59,14 @@ NO_FEATURES = ImageFeatures(
 )
 
 
-class Detector(Protocol):
+class KeypointDetector(Protocol):
+    """Finds keypoints."""
+
+    def detect(self, image: GreyImage) -> Keypoints:
+        """Keypoints of an image; none where there is nothing to see."""
+
+
+class Detector(KeypointDetector, Protocol):
     """Finds keypoints and describes each by 256 bits."""
 
     @property
@@ -41,10 +77,118 @@ class Detector(Protocol):
         """Features of an image; none where there is nothing to see."""
 
 
+class OnnxConfig(Settings):
+    """A network. Other weights make old and new places incomparable."""
+
+    weights: Path | None = Field(default=None, description="network weights, .onnx; null: those that come with fcslam")
+    most_features: int = Field(default=300, ge=1, le=2000, description="features kept of an image, strongest first")
+    nms_px: float = Field(
+        default=4.0, ge=0.0, le=64.0, description="side of boxes around keypoints, hardly overlapping"
+    )
+    least_score: float = Field(default=0.005, ge=0.0, lt=1.0, description="weakest keypoint, as a probability")
+    threads: int = Field(default=1, ge=1, le=64, description="threads of the network")
+
+
+class OnnxDetector:
+    """Keypoints and codes by a network."""
+
+    def __init__(self, config: OnnxConfig) -> None:
+        """Load the network.
+
+        Raises:
+            FeatureError: there is no such file, or it is no network of this contract.
+        """
+        self._config = config
+        if config.weights is None and not SHIPPED_NETWORK.is_file():
+            raise FeatureError("no network weights come with this version of fcslam; name an .onnx file, or take orb")
+        path = SHIPPED_NETWORK if config.weights is None else config.weights
+        self._session, metadata = _load(path, config.threads)
+        if metadata.get("fcslam_format") != NETWORK_FORMAT:
+            found = metadata.get("fcslam_format", "none")
+            raise FeatureError(
+                f"{path}: its format is {found}, not {NETWORK_FORMAT}; give weights made for this fcslam"
+            )
+        self._version = metadata.get("fcslam_version", "")
+        if not NAME.fullmatch(self._version):
+            raise FeatureError(f"{path}: '{self._version}' is no detector version; export the network with one")
+        self._check(path)
+
+    @property
+    def version(self) -> str:
+        """As in ``Detector``."""
+        return self._version
+
+    def detect(self, image: GreyImage) -> ImageFeatures:
+        """Features of an image of any size, ranked by keypoint probability."""
+        height, width = image.shape
+        if not image.size:
+            return NO_FEATURES
+        scores, logits = self._run(_padded(image))
+        positions, strengths = find_peaks(
+            scores[:height, :width], self._config.least_score, self._config.nms_px, self._config.most_features
+        )
+        return ImageFeatures(
+            frozen(positions, np.float32),
+            frozen(strengths, np.float32),
+            frozen(sample_codes(logits, positions), np.uint8),
+        )
+
+    def _run(self, image: GreyImage) -> tuple[Probabilities, Logits]:
+        grey = (image.astype(np.float32) / np.float32(255.0))[None, None]
+        scores, logits = self._session.run(["scores", "logits"], {"image": grey})
+        return scores[0], logits[0]
+
+    def _check(self, path: Path) -> None:
+        """Try the network on a small image: whatever else its file says, this is what it gives."""
+        rows, columns = 3, 5
+        try:
+            scores, logits = self._run(np.full((rows * CELL_PX, columns * CELL_PX), 128, np.uint8))
+        except Exception as error:  # ONNX Runtime has no common exception
+            raise FeatureError(
+                f"{path}: the network does not run ({error}); give weights of an fcslam detector"
+            ) from error
+        expected = ((rows * CELL_PX, columns * CELL_PX), (CODE_BITS, rows, columns))
+        if (scores.shape, logits.shape) != expected or not (np.isfinite(scores).all() and np.isfinite(logits).all()):
+            raise FeatureError(
+                f"{path}: for {columns * CELL_PX} x {rows * CELL_PX} pixels it gives {scores.shape} scores and "
+                f"{logits.shape} logits, not finite ones of {expected[0]} and {expected[1]}; give other weights"
+            )
+
+
 def decode_grey(encoded: bytes) -> GreyImage | None:
-    """The picture in a JPEG or PNG file in grey levels; None if it is broken."""
+    """The picture in an image file in grey levels, 8 bits each, as its pixels are stored; None if it is broken.
+
+    Colours are weighed as in ITU-R BT.601, transparency is left out, and of 16 bits the upper 8 count.
+    """
     try:
-        decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+        decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:  # of no bytes at all, for one
         return None
     return None if decoded is None else np.asarray(decoded, np.uint8)
+
+
+def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
+    """An ONNX Runtime session and the file's own metadata."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise FeatureError(f"{path}: cannot read the network weights ({error}); name an .onnx file") from error
+
+    import onnxruntime
+
+    onnxruntime.disable_telemetry_events()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 4  # what is wrong is raised
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime has no common exception
+        raise FeatureError(f"{path}: no ONNX network ({error}); give weights of an fcslam detector") from error
+    return session, dict(session.get_modelmeta().custom_metadata_map)
+
+
+def _padded(image: GreyImage) -> GreyImage:
+    """Mirrored at the lower and right edge to whole cells."""
+    height, width = image.shape
+    padded = cv2.copyMakeBorder(image, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REFLECT_101)
+    return np.asarray(padded, np.uint8)

@@ -7,7 +7,7 @@ returned. Wrong remains what sticks out over or under the scan plane (a table to
 submaps have to bear it.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,29 +21,39 @@ SAME_SURFACE_M: Final = 0.20
 """Returns next to each other and closer than this lie on one surface ..."""
 SLANT: Final = 4.0
 """... or than so many times what their beams are apart there: surfaces seen at a grazing angle."""
-WIDEST_GAP_RAD: Final = 0.07
-"""Between returns that are farther apart in direction, nothing is known."""
+WIDEST_GAP: Final = 2.5
+"""Between returns that are more beams apart, nothing is known: one beam in a row may fail."""
 EDGE_M: Final = 0.08
 """A ray that passes an edge this closely ends there: what stands out in an image is often an edge."""
 
 
+class LidarView(NamedTuple):
+    """One scan as the camera's ``base`` sees it."""
+
+    returns: FloatArray
+    """Shape (N, 2), metres, in the order of their beams."""
+    origin: FloatArray
+    """Where the LiDAR is, shape (2,)."""
+    spacing_rad: float
+    """Between neighbouring beams."""
+
+
 def place_keypoints(
-    keypoints_px: NDArray[np.float32], camera: CameraModel, returns: FloatArray, origin: FloatArray, ceiling_m: float
+    keypoints_px: NDArray[np.float32], camera: CameraModel, lidar: LidarView, ceiling_m: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Positions of keypoints in ``base``, shape (K, 2) in metres, and for which of them there is one, shape (K,).
+    """Positions of keypoints in ``base``, shape (K, 3) in metres, and for which of them there is one, shape (K,).
 
     Args:
         keypoints_px: shape (K, 2), pixels.
         camera: its geometry; ``base`` lies on the floor.
-        returns: shape (N, 2), the LiDAR's returns in ``base``, in the order of their beams.
-        origin: shape (2,), where the LiDAR is in ``base``.
+        lidar: what the LiDAR saw at that moment.
         ceiling_m: height that no wall exceeds.
     """
     rays = _rays(keypoints_px.astype(np.float64), camera)
     level = np.hypot(rays[:, 0], rays[:, 1])
     eye, height = np.array(camera.T_base_camera.translation_m[:2]), camera.T_base_camera.translation_m[2]
     directions = rays[:, :2] / np.maximum(level, 1e-9)[:, None]
-    distances = _distances(eye, directions, returns, origin)
+    distances = _distances(eye, directions, lidar.returns, lidar.origin, WIDEST_GAP * lidar.spacing_rad)
     heights = height + distances * rays[:, 2] / np.maximum(level, 1e-9)
     placed = np.isfinite(distances) & (heights > FLOOR_MARGIN_M) & (heights < ceiling_m)
     positions = np.column_stack((eye + distances[:, None] * directions, heights))
@@ -69,7 +79,9 @@ def _rotation(quaternion: tuple[float, float, float, float]) -> FloatArray:
 
 
 @njit(cache=True)
-def _distances(eye: FloatArray, directions: FloatArray, returns: FloatArray, origin: FloatArray) -> FloatArray:
+def _distances(
+    eye: FloatArray, directions: FloatArray, returns: FloatArray, origin: FloatArray, widest_gap_rad: float
+) -> FloatArray:
     """How far each ray from ``eye`` goes until it meets a surface between neighbouring returns; NaN if none."""
     nearest = np.full(len(directions), np.inf)
     count = len(returns)
@@ -80,7 +92,7 @@ def _distances(eye: FloatArray, directions: FloatArray, returns: FloatArray, ori
         dot = (ax - origin[0]) * (bx - origin[0]) + (ay - origin[1]) * (by - origin[1])
         cross = (ax - origin[0]) * (by - origin[1]) - (ay - origin[1]) * (bx - origin[0])
         gap = abs(np.arctan2(cross, dot))
-        if gap > WIDEST_GAP_RAD:
+        if gap > widest_gap_rad:
             continue
         length = np.hypot(bx - ax, by - ay)
         surface = length < max(SAME_SURFACE_M, SLANT * gap * max(range_a, range_b))

@@ -72,6 +72,8 @@ class JointSolution:
     """Number of each robot's map, counted in the order of their first robots."""
     links: tuple[Link, ...]
     """Of every two robots between whom there are independent closures."""
+    own: tuple[FloatArray, ...]
+    """Each robot's poses by its own measurements alone, (N_k, 3); its first stays where the graph has it."""
 
 
 def solve_jointly(
@@ -98,7 +100,8 @@ def solve_jointly(
             solution = _settled(evidence.graph, inside, trusted, gnc)
         lasting = [link for link in holding if _lasts(link, paths, solution, evidence.informative, consistency)]
         if len(lasting) == len(holding):
-            return JointSolution(solution.poses, solution.weights, tuple(maps), tuple(links))
+            own_poses: tuple[FloatArray, ...] = tuple(frozen(path.poses) for path in paths)
+            return JointSolution(solution.poses, solution.weights, tuple(maps), tuple(links), own_poses)
         holding = lasting
 
 

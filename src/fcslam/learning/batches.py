@@ -11,7 +11,6 @@ from torch import Tensor
 
 from fcslam.learning.pairs import Example, Pair, draw_pair
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.warps import Crop
 
 TAUGHT_POINTS = 192
 """Points of the teacher in a pair."""
@@ -49,7 +48,7 @@ def draw_batch(examples: Sequence[Example], settings: TrainingSettings, step: in
     for index in range(settings.pairs):
         rng = np.random.default_rng([settings.seed, step, index])
         example = examples[int(rng.integers(len(examples)))]
-        pairs.append(draw_pair(example, Crop(settings.side_px, settings.side_px), settings.points, TAUGHT_POINTS, rng))
+        pairs.append(draw_pair(example, (settings.side_px, settings.side_px), settings.points, TAUGHT_POINTS, rng))
     return collate(pairs)
 
 

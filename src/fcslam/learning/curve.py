@@ -7,7 +7,7 @@ from typing import Final
 from fcslam.errors import TrainingError
 
 LOSSES: Final = ("detector", "contrastive", "triplet", "distillation")
-SHARES: Final = ("repeatability", "mma_3px", "matching_score", "shift_repeatability")
+SHARES: Final = ("repeatability", "mma_3px", "shift_repeatability")
 BITS: Final = ("code_spread_bits",)
 
 Curves = dict[str, tuple[list[int], list[float]]]

@@ -14,7 +14,6 @@ from fcslam.learning.trainer import PROGRESS_FILE
 FIGURES = {
     "repeatability": "keypoints found again within 3 px",
     "mma_3px": "matches within 3 px, by bits",
-    "matching_score": "keypoints matched within 3 px",
     "shift_repeatability": "keypoints found again within 1 px after a shift by 1 to 7 px",
     "bit_bias": "distance of a bit's mean from a half",
     "code_spread_bits": "bits between codes of different points",

@@ -20,10 +20,10 @@ import torch
 from torch import Tensor, nn
 
 from fcslam.errors import OutputError
-from fcslam.features.detector import GreyImage
-from fcslam.learning.network import CELL_PX, KeypointNetwork
+from fcslam.features.dense import CELL_PX
+from fcslam.features.detector import NETWORK_FORMAT, GreyImage
+from fcslam.learning.network import KeypointNetwork
 
-FORMAT: Final = "1"
 OPSET: Final = 17
 CALIBRATION_IMAGES: Final = 64
 TRACED_SIZE: Final = (240, 320)
@@ -140,7 +140,7 @@ def _write(graph: Any, version: str, path: Path) -> None:
     import onnx
 
     del graph.metadata_props[:]
-    for key, value in (("fcslam_format", FORMAT), ("fcslam_version", version)):
+    for key, value in (("fcslam_format", NETWORK_FORMAT), ("fcslam_version", version)):
         graph.metadata_props.add(key=key, value=value)
     onnx.checker.check_model(graph)
     unfinished = path.with_suffix(".part")

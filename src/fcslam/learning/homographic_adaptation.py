@@ -11,8 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.features.dense import find_peaks
 from fcslam.features.detector import GreyImage
-from fcslam.learning.warps import Crop, inverse, random_change, warp
+from fcslam.learning.labels import Points
+from fcslam.learning.warps import random_change, warp_image
+from fcslam.metrics.homography import inverse
 from fcslam.records import FloatArray
 
 Response = NDArray[np.float32]
@@ -28,14 +31,13 @@ def adapt(
     detector: Callable[[GreyImage], Response], image: GreyImage, copies: int, rng: np.random.Generator
 ) -> Response:
     """Mean response of ``detector`` over the image itself and ``copies`` warped ones, where these see it."""
-    height, width = image.shape
-    crop = Crop(width, height)
+    size = (image.shape[1], image.shape[0])
     total = detector(image).astype(np.float32)
     count = np.ones(image.shape, np.float32)
     for _ in range(copies):
-        homography = random_change(crop, rng)
+        homography = random_change(size, rng)
         back = inverse(homography)
-        response = detector(warp(image, homography, crop))
+        response = detector(warp_image(image, homography, size))
         everywhere = np.zeros(image.shape, np.float32)
         everywhere[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 1.0
         total += _unwarp(response * everywhere, back)
@@ -50,34 +52,13 @@ def harris(image: GreyImage) -> Response:
     return response
 
 
-def peaks(response: Response, radius_px: int, most: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The strongest local maxima, to a fraction of a pixel.
-
-    Returns:
-        Shape (N, 2), x and y in pixels, and shape (N,), the response there; strongest first.
-    """
-    around = cv2.dilate(response, np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8))
-    found = (response >= around) & (response > 0.0)
-    found[:BORDER_PX], found[-BORDER_PX:], found[:, :BORDER_PX], found[:, -BORDER_PX:] = False, False, False, False
-    rows, columns = np.nonzero(found)
-    order = np.argsort(-response[rows, columns], kind="stable")[:most]
-    rows, columns = rows[order], columns[order]
-    points = np.stack((columns, rows), axis=1) + _vertices(response, rows, columns)
-    return points.astype(np.float32), response[rows, columns]
-
-
-def _vertices(response: Response, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> FloatArray:
-    """Offsets (N, 2) of the tops of the parabolas through a maximum and its neighbours, at most half a pixel."""
-    middle = response[rows, columns]
-    offsets = []
-    for left, right in (
-        (response[rows, columns - 1], response[rows, columns + 1]),
-        (response[rows - 1, columns], response[rows + 1, columns]),
-    ):
-        bend = left - 2.0 * middle + right
-        offsets.append(np.where(bend < 0.0, 0.5 * (left - right) / np.where(bend < 0.0, bend, 1.0), 0.0))
-    clipped: FloatArray = np.clip(np.stack(offsets, axis=1), -0.5, 0.5)
-    return clipped
+def peaks(response: Response, nms_px: float, most: int) -> Points:
+    """The strongest local maxima, shape (N, 2), to a fraction of a pixel, strongest first."""
+    within = np.zeros_like(response)
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    within[inner] = response[inner]
+    points, _ = find_peaks(within, 0.0, nms_px, most)
+    return points
 
 
 def _unwarp(response: Response, homography: FloatArray) -> Response:

@@ -9,8 +9,9 @@ from typing import Final
 import cv2
 import numpy as np
 
-from fcslam.errors import TrainingError
-from fcslam.features.detector import GreyImage, decode_grey
+from fcslam.errors import FeatureError, TrainingError
+from fcslam.features.detector import GreyImage
+from fcslam.features.files import read_grey
 
 SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 SMALLEST_SIDE_PX: Final = 96
@@ -52,13 +53,11 @@ def find_images(roots: Sequence[Path]) -> list[ImageFile]:
     return [found[name] for name in sorted(found)]
 
 
-def read_grey(path: Path) -> GreyImage | None:
+def read_image(path: Path) -> GreyImage | None:
     """An image in grey levels, its longer side at most ``LARGEST_SIDE_PX``; None if the file is no image."""
     try:
-        image = decode_grey(path.read_bytes())
-    except OSError:
-        return None
-    if image is None:
+        image = read_grey(path)
+    except FeatureError:
         return None
     shrink = LARGEST_SIDE_PX / max(image.shape)
     if shrink < 1.0:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from fcslam.features.dense import CELL_PX
 from fcslam.learning.network import cell_log_probabilities
 
 ROUNDING = 0.01
@@ -79,12 +80,12 @@ def detector_loss(point_logits: Tensor, targets: Tensor, valid: Tensor) -> Tenso
         valid: (B, H, W) bool; a cell counts if all of it does.
     """
     log_places, log_none = cell_log_probabilities(point_logits)
-    wanted = F.pixel_unshuffle(targets.unsqueeze(1), 8)
+    wanted = F.pixel_unshuffle(targets.unsqueeze(1), CELL_PX)
     total = wanted.sum(1, keepdim=True)
     wanted = wanted / total.clamp(min=1.0)
     none = 1.0 - wanted.sum(1)
     terms = -(wanted * log_places).sum(1) - none * log_none
-    return masked_mean(terms, F.pixel_unshuffle(valid.unsqueeze(1).float(), 8).amin(1) > 0.5)
+    return masked_mean(terms, F.pixel_unshuffle(valid.unsqueeze(1).float(), CELL_PX).amin(1) > 0.5)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

@@ -16,9 +16,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from fcslam.features.codes import CODE_BITS
+from fcslam.features.dense import CELL_PX
 from fcslam.learning.settings import Encoder
-
-CELL_PX = 8
 
 _CONTRAST_FLOOR = 1e-4
 """Variance of grey levels in [0, 1] below which an image counts as blank and is not stretched."""

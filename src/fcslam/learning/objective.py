@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from fcslam.features.codes import CODE_BITS
+from fcslam.features.dense import CELL_PX
 from fcslam.learning import losses
 from fcslam.learning.batches import Batch
-from fcslam.learning.network import CELL_PX, Maps, sample_codes
+from fcslam.learning.network import Maps, sample_codes
 from fcslam.learning.settings import Encoder, LossSettings
 
 APART_PX = 8.0

@@ -17,18 +17,19 @@ import torch
 from torch import Tensor
 
 from fcslam.errors import OutputError, TrainingError
+from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
 from fcslam.learning.homographic_adaptation import Response, adapt, harris, peaks
-from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_grey
+from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_image
 from fcslam.learning.labels import MOST_POINTS, Labels, Teacher, fuse, read_labels, read_teacher, write_labels
-from fcslam.learning.network import CELL_PX, KeypointNetwork
+from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits, teacher_bits
 from fcslam.learning.pairs import Example
 from fcslam.learning.settings import LossSettings, TrainingSettings
 from fcslam.learning.synthetic_shapes import draw_shapes
 from fcslam.learning.trainer import Pace, Run, Status
 
-LABEL_RADIUS_PX: Final = 3
+LABEL_NMS_PX: Final = 4.0
 DESCRIPTORS_OF_AN_IMAGE: Final = 32
 FEWEST_IMAGES: Final = 2
 SHAPE_COUNT: Final = 1_000_000
@@ -108,7 +109,7 @@ def gather(
     train: list[Example] = []
     held_out: list[Example] = []
     for index, file in enumerate(files):
-        image = read_grey(file.path)
+        image = read_image(file.path)
         if image is not None and is_usable(image):
             taught = None if teacher is None else read_teacher(teacher / f"{file.name}.npz")
             place = cache / f"{file.name}.npz"
@@ -137,11 +138,11 @@ def _labels(
     if known is not None:
         return known
     rng = np.random.default_rng([settings.seed, key])
-    corners, _ = peaks(adapt(harris, image, settings.label_copies, rng), LABEL_RADIUS_PX, MOST_POINTS)
+    corners = peaks(adapt(harris, image, settings.label_copies, rng), LABEL_NMS_PX, MOST_POINTS)
     if teacher is not None:
         others = teacher.keypoints
     elif detector is not None:
-        others, _ = peaks(adapt(detector, image, settings.label_copies, rng), LABEL_RADIUS_PX, MOST_POINTS)
+        others = peaks(adapt(detector, image, settings.label_copies, rng), LABEL_NMS_PX, MOST_POINTS)
     else:
         others = corners
     labels = fuse(corners, others)

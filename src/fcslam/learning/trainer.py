@@ -22,7 +22,6 @@ from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits, grid_shift, objective
 from fcslam.learning.pairs import Example, Pair, draw_pair
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.warps import Crop
 
 AVERAGE_DECAY: Final = 0.999
 WARM_UP_STEPS: Final = 300
@@ -31,7 +30,7 @@ DECAY_SHARE: Final = 0.3
 CLIP_NORM: Final = 1.0
 WEIGHT_DECAY: Final = 1e-4
 VALIDATION_PAIRS: Final = 24
-VALIDATION_VIEW: Final = Crop(320, 240)
+VALIDATION_VIEW: Final = (320, 240)
 VALIDATION_SEED: Final = 2026
 CHECKPOINT_FILE: Final = "checkpoint.npz"
 PROGRESS_FILE: Final = "progress.csv"

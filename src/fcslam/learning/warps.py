@@ -1,6 +1,5 @@
 """Random homographies and random light: how one image becomes two views of the same thing."""
 
-from dataclasses import dataclass
 from typing import Final
 
 import cv2
@@ -8,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
+from fcslam.metrics.framing import Size
+from fcslam.metrics.homography import Mask
 from fcslam.records import FloatArray
 
 SCALE_SPREAD: Final = 0.5
@@ -20,72 +21,47 @@ ANY_TURN_SHARE: Final = 0.06
 """Views that are turned by any angle: robots roll little, but held and mounted cameras do."""
 
 
-@dataclass(frozen=True, slots=True)
-class Crop:
-    """A window of an image: how large it is in pixels of its own, width and height."""
-
-    width: int
-    height: int
-
-
-def random_view(image: GreyImage, crop: Crop, rng: np.random.Generator) -> FloatArray:
-    """A window somewhere in the image: homography (3, 3) that takes pixels of the image to pixels of the crop."""
-    height, width = image.shape
-    largest = min(width / crop.width, height / crop.height)
-    zoom = min(np.exp(rng.uniform(np.log(0.7), np.log(1.5))), 1.15 * largest)
-    slack_x, slack_y = max(width - zoom * crop.width, 0.0), max(height - zoom * crop.height, 0.0)
-    x, y = rng.uniform(0.0, slack_x), rng.uniform(0.0, slack_y)
+def random_view(image: GreyImage, size: Size, rng: np.random.Generator) -> FloatArray:
+    """A window somewhere in the image: homography (3, 3) that takes pixels of the image to pixels of the window."""
+    whole, wanted = np.array(image.shape[::-1], np.float64), np.array(size, np.float64)
+    zoom = min(np.exp(rng.uniform(np.log(0.7), np.log(1.5))), 1.15 * float((whole / wanted).min()))
+    x, y = rng.uniform(0.0, np.maximum(whole - zoom * wanted, 0.0))
     return np.array([[1 / zoom, 0.0, -x / zoom], [0.0, 1 / zoom, -y / zoom], [0.0, 0.0, 1.0]])
 
 
-def random_change(crop: Crop, rng: np.random.Generator) -> FloatArray:
-    """Homography (3, 3) of a crop onto itself: turned, scaled, shifted, tilted about its middle."""
-    size = np.array([crop.width, crop.height], np.float64)
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (size - 1.0)
-    middle = 0.5 * (size - 1.0)
+def random_change(size: Size, rng: np.random.Generator) -> FloatArray:
+    """Homography (3, 3) of a view of this size onto itself: turned, scaled, shifted, tilted about its middle."""
+    sides = np.array(size, np.float64)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (sides - 1.0)
+    middle = 0.5 * (sides - 1.0)
     turn = rng.uniform(-np.pi, np.pi) if rng.random() < ANY_TURN_SHARE else rng.normal(0.0, SMALL_TURN_RAD)
     scale = np.exp(rng.uniform(-0.5, 0.5) * SCALE_SPREAD)
     rotation = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    shift = rng.uniform(-0.1, 0.1, 2) * size
-    tilted = corners + rng.uniform(-TILT, TILT, (4, 2)) * size
+    shift = rng.uniform(-0.1, 0.1, 2) * sides
+    tilted = corners + rng.uniform(-TILT, TILT, (4, 2)) * sides
     moved = (tilted - middle) @ rotation.T + middle + shift
     homography: FloatArray = cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32))
     return homography
 
 
-def warp(image: GreyImage, homography: FloatArray, crop: Crop) -> GreyImage:
-    """The crop; beyond the image it is mirrored, so that its border is no edge."""
-    size = (crop.width, crop.height)
+def warp_image(image: GreyImage, homography: FloatArray, size: Size) -> GreyImage:
+    """The view of this size; beyond the image it is mirrored, so that its border is no edge."""
     warped = cv2.warpPerspective(image, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     return np.asarray(warped, np.uint8)
 
 
-def seen(shape: tuple[int, int], homography: FloatArray, crop: Crop, border: int = 2) -> NDArray[np.bool_]:
-    """Which pixels (height, width) of the crop show the image of this shape, ``border`` pixels of it left out."""
+def seen(shape: tuple[int, int], homography: FloatArray, size: Size, border: int = 2) -> NDArray[np.bool_]:
+    """Which pixels (height, width) of a view show the image of this shape, ``border`` pixels of it left out."""
     own = np.zeros(shape, np.uint8)
     own[border:-border, border:-border] = 1
-    warped = cv2.warpPerspective(own, homography, (crop.width, crop.height), flags=cv2.INTER_NEAREST)
+    warped = cv2.warpPerspective(own, homography, size, flags=cv2.INTER_NEAREST)
     return np.asarray(warped, np.bool_)
 
 
-def inverse(homography: FloatArray) -> FloatArray:
-    """The homography back."""
-    return np.asarray(np.linalg.inv(homography), np.float64)
-
-
-def project(points: FloatArray, homography: FloatArray) -> FloatArray:
-    """Points (N, 2) through a homography; those at or behind infinity become NaN."""
-    moved = points @ homography[:, :2].T + homography[:, 2]
-    depth = moved[:, 2:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(depth > 1e-6, moved[:, :2] / depth, np.nan)
-
-
-def inside(points: FloatArray, width: int, height: int, border: float) -> NDArray[np.bool_]:
+def well_inside(points: FloatArray, size: Size, border: float) -> Mask:
     """Whether points (N, 2) are in an image, ``border`` pixels from its rim."""
-    low, high = border, np.array([width - 1.0, height - 1.0]) - border
-    with np.errstate(invalid="ignore"):
-        return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
+    low, high = border, np.array(size, np.float64) - 1.0 - border
+    return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
 
 
 def relight(image: GreyImage, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +12,10 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.map_files import Cells
 from fcslam.records import FloatArray, LaserModel, Ranges
 
 Counts = NDArray[np.uint32]
-Cells = NDArray[np.uint8]
 
 FARTHEST_M = 1e7
 """Poses beyond it are taken for a mistake: a float no longer resolves cells out there."""
@@ -30,14 +29,6 @@ class OccupancyConfig(Settings):
     minimum_passes: int = Field(default=2, ge=1, description="beams through a cell before it counts as known")
     occupied_ratio: float = Field(default=0.15, gt=0, lt=1, description="hits per pass above which a cell is occupied")
     maximum_cells: int = Field(default=64_000_000, ge=1024, description="a larger grid gets a coarser resolution")
-
-
-class Occupancy(IntEnum):
-    """What is known of a cell."""
-
-    UNKNOWN = 0
-    FREE = 1
-    OCCUPIED = 2
 
 
 @dataclass(frozen=True, slots=True)

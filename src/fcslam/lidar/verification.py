@@ -96,11 +96,13 @@ def verify(
         T_a_b_guess: where the alignment starts, shape (3,).
         config: what the pair has to show.
         prior: information of the guess from elsewhere, of (x, y, theta) in a's coordinates, shape (3, 3): along a
-            corridor, where no wall holds the alignment, matched keypoints do.
+            corridor, where no wall holds the alignment, matched keypoints do. It makes nothing informative: what
+            repeats along a corridor repeats in images, too, and only walls may say that a match is fixed.
     """
     forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, prior, _ALIGNMENT)
-    T_b_a = se2.inverse(forward.T_field_base)
-    backward = match_scan(_sample(a.surface), b.field, T_b_a, _of_inverse(prior, forward.T_field_base), _ALIGNMENT)
+    # A prior must not be believed twice: backward it holds the alignment where it did forward, at the guess.
+    start = T_a_b_guess if prior.any() else forward.T_field_base
+    backward = match_scan(_sample(a.surface), b.field, se2.inverse(start), _of_inverse(prior, start), _ALIGNMENT)
     T_a_b, T_a_b_back = forward.T_field_base, se2.inverse(backward.T_field_base)
     gap = se2.between(T_a_b, T_a_b_back)
     T_a_b = se2.compose(T_a_b, 0.5 * gap)
@@ -114,7 +116,7 @@ def verify(
         worse.normal_tensor,
     )
     symmetric = np.hypot(gap[0], gap[1]) < config.symmetry_m and abs(gap[2]) < config.symmetry_rad
-    informative = worse.weakest >= config.informative or _fixes(prior, config)
+    informative = worse.weakest >= config.informative
     strict_reason = _shortfall(worse, config.strict)
     reason = strict_reason or ("" if informative else "fixed in one direction only, as in a corridor")
     return Verification(
@@ -155,15 +157,6 @@ def _of_inverse(information: FloatArray, T_a_b: FloatArray) -> FloatArray:
     jacobian = np.array([[-cos, -sin, sin * x - cos * y], [sin, -cos, cos * x + sin * y], [0.0, 0.0, -1.0]])
     inverse = np.linalg.inv(jacobian)
     return np.asarray(inverse.T @ information @ inverse)
-
-
-def _fixes(prior: FloatArray, config: VerificationConfig) -> bool:
-    """Whether a prior alone fixes the pose in every direction."""
-    if not prior.any():
-        return False
-    covariance = np.linalg.inv(prior)
-    sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-    return bool(sigma_m <= config.symmetry_m and np.sqrt(covariance[2, 2]) <= 2.0 * config.symmetry_rad)
 
 
 def _information(points: FloatArray, T_a_b: FloatArray, config: VerificationConfig) -> FloatArray:

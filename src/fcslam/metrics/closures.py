@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.metrics.relations import PoseTable
+from fcslam.metrics.relations import PoseTable, motion_errors
 from fcslam.records import FloatArray, frozen
 
 Rows = NDArray[np.int64]
@@ -130,16 +130,15 @@ class ClosureErrors:
 def closure_errors(pairs: Rows, T_i_j: FloatArray, run: PoseTable, reference: Reference) -> ClosureErrors:
     """Errors of closures ``T_i_j`` (K, 3) between the rows ``pairs`` (K, 2) of ``run``."""
     ends = np.full((len(pairs), 2), -1, dtype=np.int64)
-    error = np.full((len(pairs), 3), np.nan)
+    true = np.full((len(pairs), 3), np.nan)
     for k, (i, j) in enumerate(pairs.tolist()):
         motion = reference.motion(i, j) if min(i, j) >= 0 else None
         if motion is not None:
             ends[k] = motion.a, motion.b
             T_i_a = se2.between(run.T_map_base[i], run.T_map_base[motion.a])
             T_b_j = se2.between(run.T_map_base[motion.b], run.T_map_base[j])
-            error[k] = se2.between(se2.compose(se2.compose(T_i_a, motion.T_a_b), T_b_j), T_i_j[k])
-    translation_m = np.hypot(error[:, 0], error[:, 1])
-    return ClosureErrors(frozen(ends, np.int64), frozen(translation_m), frozen(np.degrees(np.abs(error[:, 2]))))
+            true[k] = se2.compose(se2.compose(T_i_a, motion.T_a_b), T_b_j)
+    return ClosureErrors(frozen(ends, np.int64), *motion_errors(true, T_i_j))
 
 
 @dataclass(frozen=True, slots=True)

@@ -165,10 +165,13 @@ def relation_errors(relations: Relations, poses: PoseTable) -> RelationErrors:
     usable = np.all(row >= 0, axis=1) & (poses.maps[row[:, 0]] == poses.maps[row[:, 1]])
     first, second = row[usable].T
     estimated = se2.between(poses.T_map_base[first], poses.T_map_base[second])
-    error = se2.between(relations.T_1_2[usable], estimated)
-    return RelationErrors(
-        frozen(np.hypot(error[:, 0], error[:, 1])), frozen(np.degrees(np.abs(error[:, 2]))), len(relations)
-    )
+    return RelationErrors(*motion_errors(relations.T_1_2[usable], estimated), len(relations))
+
+
+def motion_errors(T_true: FloatArray, T_estimated: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """|translation| in metres and |rotation| in degrees, (N,) each, of what lies between motions (N, 3)."""
+    error = se2.between(T_true, T_estimated)
+    return frozen(np.hypot(error[:, 0], error[:, 1])), frozen(np.degrees(np.abs(error[:, 2])))
 
 
 def read_relations(path: Path) -> Relations:

@@ -5,7 +5,7 @@ nearness does. A proposal is a rigid motion; the submaps laid on each other by i
 """
 
 import heapq
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,10 +46,10 @@ class PlaceMatch:
     j: KeyscanId
     channel: Channel
     similarity: float
-    """Eq. (4) on the scale of [0, 1]; the share of matching descriptors before the first vocabulary."""
+    """Eq. (4) on the scale of [0, 1]; before the first vocabulary the share of matching descriptors, where asked."""
     check: Verification
     predicted: bool
-    """Whether the robots shared a map already and the guess came from it."""
+    """Whether the robots shared a map already, which put the places here."""
 
     @property
     def M(self) -> bool:
@@ -121,17 +121,20 @@ class PlaceMatcher:
     def _near_match(
         self, i: KeyscanId, place: Place, T_i_j: FloatArray, similarity: Mapping[KeyscanId, float]
     ) -> PlaceMatch | None:
-        """Verify a prediction. Submaps that are near show the same; images need not, so they have to bear it out."""
+        """Verify a prediction. Submaps that are near show the same; images need not, so they have to bear it out.
+
+        Images that show something else instead are compared as if nothing were known: the map may be wrong.
+        """
         stored = self._places[i]
         if place.channel is Channel.LIDAR:
             check = verify(self._submap_of(stored), self._submap_of(place), T_i_j, self._config.verification)
-        else:
-            seen = (motion for motion in motions(stored, place, self._config.motions) if self._bears_out(motion, T_i_j))
-            motion = next(seen, None)
-            if motion is None:
-                return None
-            check = self._verify(stored, place, motion)
-        return PlaceMatch(i, place.id, place.channel, similarity.get(i, 0.0), check, predicted=True)
+            return PlaceMatch(i, place.id, place.channel, similarity.get(i, 0.0), check, predicted=True)
+        proposed = motions(stored, place, self._config.motions)
+        motion = next((motion for motion in proposed if self._bears_out(motion, T_i_j)), None)
+        if motion is None:
+            return self._best(stored, place, proposed, similarity)
+        check = self._verify(stored, place, motion)
+        return PlaceMatch(i, place.id, place.channel, similarity.get(i, motion.share), check, predicted=True)
 
     def _bears_out(self, motion: Motion, T_i_j: FloatArray) -> bool:
         off = se2.between(T_i_j, motion.T_a_b)
@@ -140,12 +143,17 @@ class PlaceMatcher:
     def _far_match(self, i: KeyscanId, place: Place, similarity: Mapping[KeyscanId, float]) -> PlaceMatch | None:
         """Verify the motions that the keypoints propose; the most convincing one, None if there is none."""
         stored = self._places[i]
-        proposed = motions(stored, place, self._config.motions)
+        return self._best(stored, place, motions(stored, place, self._config.motions), similarity)
+
+    def _best(
+        self, stored: Place, place: Place, proposed: Sequence[Motion], similarity: Mapping[KeyscanId, float]
+    ) -> PlaceMatch | None:
         if not proposed:
             return None
         checks = [self._verify(stored, place, motion) for motion in proposed]
         best = max(checks, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
-        return PlaceMatch(i, place.id, place.channel, similarity.get(i, proposed[0].share), best, predicted=False)
+        alike = similarity.get(stored.id, proposed[0].share)
+        return PlaceMatch(stored.id, place.id, place.channel, alike, best, predicted=False)
 
     def _verify(self, stored: Place, place: Place, motion: Motion) -> Verification:
         a, b = self._submap_of(stored), self._submap_of(place)

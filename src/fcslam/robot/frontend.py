@@ -86,7 +86,9 @@ class RobotFrontend:
             bodies.append(self._lidar_place(submap))
         ripe = [view for view in self._views if at_end or view.keyscan <= submap.anchor]
         self._views = self._views[len(ripe) :]
-        return [*bodies, *(self._camera_place(view, submap) for view in ripe)]
+        # Between two scans a robot may jump: a view whose surroundings no submap shows is no place.
+        shown = [view for view in ripe if submap.first <= view.keyscan <= submap.last]
+        return [*bodies, *(self._camera_place(view, submap) for view in shown)]
 
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
         features = describe(submap.surface, self._config.birdseye)

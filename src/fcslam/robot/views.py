@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.classical import Orb, OrbConfig
-from fcslam.features.detector import Detector, decode_grey
-from fcslam.features.placing import place_keypoints
+from fcslam.features.choice import make_detector
+from fcslam.features.classical import OrbConfig
+from fcslam.features.detector import OnnxConfig, decode_grey
+from fcslam.features.kinds import DetectorKind
+from fcslam.features.placing import LidarView, place_keypoints
 from fcslam.geometry import se2
 from fcslam.lidar.mapper import ScanPose
 from fcslam.lidar.scan import point_scan
@@ -23,7 +25,9 @@ class ViewsConfig(Settings):
     every_rad: float = Field(default=0.5, gt=0.0, description="or turn: half of what a camera sees is new [rad]")
     fewest_keypoints: int = Field(default=20, ge=1, description="an image of a bare wall is no place")
     ceiling_m: float = Field(default=3.0, gt=0.0, description="keypoints above this lie on no wall [m]")
-    orb: OrbConfig = Field(default=OrbConfig(), description="the detector")
+    detector: DetectorKind = Field(default=DetectorKind.ORB, description="what describes images: orb, onnx (a network)")
+    orb: OrbConfig = Field(default=OrbConfig(), description="settings of detector orb")
+    onnx: OnnxConfig = Field(default=OnnxConfig(), description="settings of detector onnx")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +45,13 @@ class ViewFinder:
     """Picks images that show something new and turns them into views."""
 
     def __init__(self, config: ViewsConfig) -> None:
+        """Load the detector.
+
+        Raises:
+            FeatureError: it is a network whose weights cannot be used.
+        """
         self._config = config
-        self._detector: Detector = Orb(config.orb)
+        self._detector = make_detector(config.detector, config.orb, config.onnx)
         self._scan: LaserScan | None = None
         self._pose: ScanPose | None = None
         self._last: tuple[int, FloatArray] | None = None
@@ -68,15 +77,16 @@ class ViewFinder:
         if not self._is_new(self._pose.keyscan, odometry):
             return None
         picture = decode_grey(image.encoded)
-        if picture is None:
+        if picture is None or picture.shape != (image.camera.height, image.camera.width):
             return None
         self._last = self._pose.keyscan, odometry
         features = self._detector.detect(picture)
         T_scan_image = se2.between(self._scan.T_odom_base, odometry)
         returns = point_scan(self._scan.ranges_m, self._scan.laser)
+        spacing_rad = abs(self._scan.laser.angle_increment_rad)
         ends = se2.transform(se2.inverse(T_scan_image), np.vstack((returns.origin, returns.points)))
         positions, placed = place_keypoints(
-            features.keypoints_px, image.camera, ends[1:], ends[0], self._config.ceiling_m
+            features.keypoints_px, image.camera, LidarView(ends[1:], ends[0], spacing_rad), self._config.ceiling_m
         )
         if placed.sum() < self._config.fewest_keypoints:
             return None

@@ -1,14 +1,15 @@
 """A fleet with LiDARs and cameras in one furnished building: who drives where, sees what, and where it really was.
 
-One seed decides everything. The building, its looks and the furniture come from the seed alone, each robot's route,
-odometry, noise and the furniture that moved before it came from the seed and its number: a further robot changes
-nothing for the others, and cameras change nothing for the LiDARs.
+One seed decides everything. The building, its looks, the furniture and the fleet's goals come from the seed alone,
+each robot's route, odometry, noise and the furniture that moved before it came from the seed and its number: a further
+robot changes nothing for the others, and cameras change nothing for the LiDARs.
 """
 
 import math
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from pydantic import Field
@@ -28,14 +29,18 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.simulation.decoration import Decoration, decorate
-from fcslam.simulation.drawn_fleet import FIRST_STAMP, STAMP_SHIFT_S, DriftSettings, LidarSettings, disturb, drift
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
 from fcslam.simulation.kinds import Building, Lighting
 from fcslam.simulation.lighting import light_of
-from fcslam.simulation.route import Schedule, plan_route, schedule
+from fcslam.simulation.noise import LidarSettings, disturb
+from fcslam.simulation.odometry import DriftSettings, drift
+from fcslam.simulation.route import Schedule, draw_goals, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster
 
+FIRST_STAMP = 1000.0
+STAMP_SHIFT_S = 0.001
+"""Between robots, so that a stamp tells which robot it belongs to."""
 LANE_PER_ROBOT_M = 2.0
 """Robots do not see each other, but a corridor full of them would be no fleet."""
 IMAGE_DELAY_S = 0.03
@@ -105,54 +110,84 @@ class SimulatedRobot:
     decoration: Decoration | None
     route: Schedule
     first_stamp: float
-    noise_seed: tuple[int, int]
-    """Of all chance that is left: noise, dropouts, which lamps fail."""
+    seed: int
+    number: int
+    """Counts the fleet's robots from 0."""
 
     @property
     def duration_s(self) -> float:
         """From the first scan to the last."""
         return float(self.stamps[-1] - self.stamps[0])
 
-    def items(self) -> Generator[RecordedItem, None, None]:
+    def items(self, first_scan: int = 0, first_image: int = 0) -> Generator[RecordedItem, None, None]:
         """Scans, images and the truth at the stamp of each, as they come.
+
+        Scans before number ``first_scan`` and images before ``first_image`` are not made, the truth at their stamps is.
 
         Raises:
             SimulationError: MuJoCo or, with a camera, a GL library is missing.
         """
-        with closing(self._images()) as images:
-            image = next(images, None)
-            for scan in self._scans():
-                while image is not None and image.stamp < scan.stamp:
-                    yield from (image, self._truth(image.stamp))
-                    image = next(images, None)
-                yield from (scan, self._truth(scan.stamp))
+        stamps = np.concatenate((self.stamps, self.image_stamps))
+        scans, count = self.scans(first_scan), len(self.stamps)
+        with closing(self._images(first_image)) as images:
+            for k in np.argsort(stamps, kind="stable"):
+                if first_scan <= k < count:
+                    yield next(scans)
+                elif k >= count + first_image:
+                    yield next(images)
+                yield self._truth(float(stamps[k]))
 
     def _truth(self, stamp: float) -> GroundTruth:
         return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
 
-    def _scans(self) -> Iterator[LaserScan]:
-        caster = RayCaster(bare_model(self.plan), self.laser)
-        rng = np.random.default_rng((*self.noise_seed, 0))
-        for stamp, pose, odometry in zip(self.stamps, self.T_building_base, self.T_odom_base, strict=True):
-            ranges = disturb(caster.cast(pose), self.laser, self.settings.lidar, rng)
-            yield LaserScan(float(stamp), frozen(ranges, np.float32), self.laser, frozen(odometry))
+    def scans(self, first: int = 0) -> Iterator[LaserScan]:
+        """Scans from number ``first`` on; each time the same.
 
-    def _images(self) -> Generator[CameraImage, None, None]:
+        Raises:
+            SimulationError: MuJoCo is missing.
+        """
+        caster = RayCaster(bare_model(self.plan), self.laser)
+        for k in range(first, len(self.stamps)):
+            rng = self._generator(_Chance.SCANS, k)
+            ranges = disturb(caster.cast(self.T_building_base[k]), self.laser, self.settings.lidar, rng)
+            yield LaserScan(float(self.stamps[k]), frozen(ranges, np.float32), self.laser, self.T_odom_base[k])
+
+    def _images(self, first: int) -> Generator[CameraImage, None, None]:
         settings = self.settings.camera
         if self.camera is None or self.decoration is None or settings is None:
             return
-        rng = np.random.default_rng((*self.noise_seed, 1))
-        light = light_of(self.plan, self.lighting, rng)
+        light = light_of(self.plan, self.lighting, self._generator(_Chance.LAMPS))
         fov_y_rad = 2.0 * math.atan(0.5 * self.camera.height / self.camera.fy)
         model = furnished_model(self.plan, self.decoration, light, (settings.width, settings.height), fov_y_rad)
         poses = self.route.at(self.image_stamps - self.first_stamp)
         odometry = _between(self.image_stamps, self.stamps, self.T_odom_base)
         shape = (settings.height, settings.width, 1)
         with Camera(model, self.camera, light) as camera:
-            for stamp, pose, T_odom_base in zip(self.image_stamps, poses, odometry, strict=True):
-                pixels = camera.take(pose) + settings.noise * rng.standard_normal(shape, dtype=np.float32)
-                encoded = _jpeg(pixels, settings.jpeg_quality)
-                yield CameraImage(float(stamp), encoded, self.camera, frozen(T_odom_base))
+            for k in range(first, len(self.image_stamps)):
+                noise = self._generator(_Chance.IMAGES, k).standard_normal(shape, dtype=np.float32)
+                encoded = _jpeg(camera.take(poses[k]) + settings.noise * noise, settings.jpeg_quality)
+                yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, frozen(odometry[k]))
+
+    def _generator(self, purpose: "_Chance", record: int = 0) -> np.random.Generator:
+        """Each record has its own, so that a recording can go on anywhere."""
+        return _generator(self.seed, purpose, self.number, record)
+
+
+class _Chance(IntEnum):
+    """What chance decides: each with a generator of its own, so that none moves another."""
+
+    BUILDING = 0
+    LOOKS = 1
+    GOALS = 2
+    ROBOTS = 3
+    """Furniture that moved before a robot came, its route, its odometry."""
+    LAMPS = 4
+    SCANS = 5
+    IMAGES = 6
+
+
+def _generator(seed: int, purpose: _Chance, robot: int = 0, record: int = 0) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose, robot, record)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,15 +202,14 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
     """Draw a building and plan what each robot does; the same seed gives the same fleet.
 
     Raises:
-        SimulationError: the building is too small for so many robots.
+        SimulationError: the building is too small for so many robots, or to drive in.
     """
-    rng = np.random.default_rng(seed)
-    plan = draw_floor_plan(rng, settings.building)
+    plan = draw_floor_plan(_generator(seed, _Chance.BUILDING), settings.building)
     _check_room(plan, settings)
-    decoration = decorate(plan, rng) if settings.camera else None
-    return SimulatedFleet(
-        plan, tuple(_robot(plan, decoration, number, settings, seed) for number in range(settings.robots))
-    )
+    goals = draw_goals(plan, settings.robots, settings.path_length_m, _generator(seed, _Chance.GOALS))
+    decoration = decorate(plan, _generator(seed, _Chance.LOOKS)) if settings.camera else None
+    robots = (_robot(plan, decoration, number, goals[number], settings, seed) for number in range(settings.robots))
+    return SimulatedFleet(plan, tuple(robots))
 
 
 def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
@@ -189,12 +223,17 @@ def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
 
 
 def _robot(
-    plan: FloorPlan, decoration: Decoration | None, number: int, settings: SimulationSettings, seed: int
+    plan: FloorPlan,
+    decoration: Decoration | None,
+    number: int,
+    goals: FloatArray,
+    settings: SimulationSettings,
+    seed: int,
 ) -> SimulatedRobot:
-    rng = np.random.default_rng((seed, number))
+    rng = _generator(seed, _Chance.ROBOTS, number)
     if number:
         plan = move_furniture(plan, settings.moved_furniture, rng)
-    route = schedule(plan_route(plan, number % len(plan.loops), settings.path_length_m, rng))
+    route = schedule(plan_route(plan, goals, settings.path_length_m, rng))
     times = np.arange(0.0, route.duration_s, 1.0 / settings.lidar.rate_hz)
     poses, lidar, camera = route.at(times), settings.lidar, settings.camera
     first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
@@ -213,7 +252,8 @@ def _robot(
         decoration=decoration,
         route=route,
         first_stamp=first_stamp,
-        noise_seed=(seed, number),
+        seed=seed,
+        number=number,
     )
 
 

@@ -18,7 +18,7 @@ from fcslam.simulation.layouts import Lane, Layout, Row, draw_layout
 WALL_M = 0.12
 DOOR_M = 1.0
 CLEARANCE_M = 0.5
-"""Furniture keeps this far from where robots drive."""
+"""Furniture keeps this far from the corridors' centre lines and the ways into rooms."""
 
 _ATTEMPTS = 20
 """Tries to place a piece of furniture before it is left out."""
@@ -67,12 +67,12 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A room that a robot visits by driving straight through its door."""
+    """A room with one door, and a straight way in that furniture keeps clear of."""
 
     doorway: FloatArray
     """The point on the corridor's centre line in front of the door, shape (2,)."""
     inside: FloatArray
-    """Where a visitor turns, shape (2,)."""
+    """The other end of this way, shape (2,)."""
     low: FloatArray
     """The south-west corner, shape (2,)."""
     high: FloatArray
@@ -90,9 +90,6 @@ class FloorPlan:
     """Ends x1 y1 x2 y2 of every side of a wall or a piece of furniture, shape (S, 4)."""
     lanes: tuple[Lane, ...]
     """Centre lines of the corridors."""
-    loops: tuple[FloatArray, ...]
-    """Corners (K, 2) of closed walks along the corridors; of the default building the west loop, the east loop, around
-    both."""
     rooms: tuple[Room, ...]
 
     @property
@@ -118,13 +115,13 @@ def build(layout: Layout, rng: np.random.Generator) -> FloorPlan:
         rooms += row_rooms
     pieces += _corridor_cabinets(layout, [(room.doorway, room.inside) for room in rooms], rng)
     size_m = (layout.width, layout.height)
-    return FloorPlan(size_m, tuple(pieces), _segments(pieces), layout.lanes, layout.loops, tuple(rooms))
+    return FloorPlan(size_m, tuple(pieces), _segments(pieces), layout.lanes, tuple(rooms))
 
 
 def move_furniture(plan: FloorPlan, share: float, rng: np.random.Generator) -> FloorPlan:
     """The same building after ``share`` of its rooms' furniture was shifted and turned a little.
 
-    Every piece stays in its room and clear of where robots drive; what finds no such place stays where it was.
+    Every piece stays in its room and clear of the way in; what finds no such place stays where it was.
     """
     moved = [
         _moved(piece, room, rng) if (room := _room_of(piece, plan)) and rng.random() < share else piece

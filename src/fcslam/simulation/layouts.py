@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fcslam.records import FloatArray, frozen
+from fcslam.records import FloatArray
 from fcslam.simulation.kinds import Building
 
 Lane = tuple[FloatArray, FloatArray]
@@ -49,8 +49,6 @@ class Layout:
     """Width of every corridor."""
     rows: tuple[Row, ...]
     lanes: tuple[Lane, ...]
-    loops: tuple[FloatArray, ...]
-    """Corners (K, 2) of closed walks along the lanes; two corners are a way there and back."""
     door_limits: tuple[float, float]
     """Where doors may be, between the west and the east corridor."""
     cabinets: int
@@ -89,10 +87,8 @@ def _two_loops(rng: np.random.Generator) -> Layout:
         split = west + rng.uniform(0.4, 0.6) * (east - west)
         rows.append(Row((west, split), high, low, lanes_y[0], rooms=1))
         rows.append(Row((split, east), low, high, lanes_y[1], rooms=1))
-    west, middle, east = lanes_x
-    loops = tuple(_rectangle(x, lanes_y) for x in ((west, middle), (middle, east), (west, east)))
     doors = (corridor, width - corridor)
-    return Layout(width, height, corridor, tuple(rows), _lanes(lanes_x, lanes_y), loops, doors, cabinets=14)
+    return Layout(width, height, corridor, tuple(rows), _lanes(lanes_x, lanes_y), doors, cabinets=14)
 
 
 def _grid(rng: np.random.Generator) -> Layout:
@@ -117,11 +113,8 @@ def _grid(rng: np.random.Generator) -> Layout:
             x = (float(west), float(east))
             rows.append(Row(x, middle, low, lanes_y[below], rooms=int(rng.integers(3, 5))))
             rows.append(Row(x, middle, high, lanes_y[above], rooms=int(rng.integers(3, 5))))
-    # Neighbours in this order share corridors; the last walk surrounds them all.
-    squares = [(0, 1, 0, 1), (1, 2, 0, 1), (1, 2, 1, 2), (0, 1, 1, 2), (2, 3, 0, 1), (2, 3, 1, 2), (0, 3, 0, 2)]
-    loops = tuple(_rectangle((lanes_x[a], lanes_x[b]), (lanes_y[c], lanes_y[d])) for a, b, c, d in squares)
     doors = (corridor, width - corridor)
-    return Layout(width, height, corridor, tuple(rows), _lanes(lanes_x, lanes_y), loops, doors, cabinets=40)
+    return Layout(width, height, corridor, tuple(rows), _lanes(lanes_x, lanes_y), doors, cabinets=40)
 
 
 def _one_corridor(
@@ -140,15 +133,10 @@ def _one_corridor(
         Row((0.0, width), height, south + corridor, lane, rooms=rooms[1]),
     )
     ends = (np.array([1.0, lane]), np.array([width - 1.0, lane]))
-    return Layout(width, height, corridor, rows, (ends,), (frozen(ends),), (1.0, width - 1.0), cabinets, alike)
+    return Layout(width, height, corridor, rows, (ends,), (1.0, width - 1.0), cabinets, alike)
 
 
 def _lanes(lanes_x: tuple[float, ...], lanes_y: tuple[float, ...]) -> tuple[Lane, ...]:
     across = [(np.array([lanes_x[0], y]), np.array([lanes_x[-1], y])) for y in lanes_y]
     along = [(np.array([x, lanes_y[0]]), np.array([x, lanes_y[-1]])) for x in lanes_x]
     return (*across, *along)
-
-
-def _rectangle(x: tuple[float, float], y: tuple[float, ...]) -> FloatArray:
-    (left, right), (low, high) = x, y
-    return frozen([[left, low], [right, low], [right, high], [left, high]])

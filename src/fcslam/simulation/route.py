@@ -1,47 +1,77 @@
 """Where a robot drives in a floor plan, and when it is where."""
 
 from dataclasses import dataclass
+from itertools import cycle
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fcslam.errors import SimulationError
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, frozen
-from fcslam.simulation.floorplan import FloorPlan, Room
+from fcslam.simulation.floorplan import FloorPlan
+from fcslam.simulation.free_space import FreeSpace
 
 SPEED_M_S = 0.5
 TURN_RATE_RAD_S = 0.9
-SWAY_M = 0.2
-"""No two passes through a corridor follow the same line."""
-DOOR_SWAY_M = 0.08
+_STRETCH, _SHIFT = 0.85, 0.55
+"""How long a robot's stretch of the walk is, and how much later its neighbour's begins, as shares of its path."""
+_NEXT = 2
+"""A walk goes on to one of so many nearest spots."""
+_LANE_SPOTS_M = 15.0
+_SWAY_M = 0.2
+"""No two passes follow the same line."""
+_LEAST_SPREAD_M = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Stop:
-    """A corner of a loop, or a door on it."""
+def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:
+    """Goals (G, 2) of each robot that is to drive ``length_m``: stretches of one walk through rooms and corridors.
 
-    position_m: float
-    """Along the loop from its first corner."""
-    point: FloatArray
-    room: Room | None
+    Neighbours' stretches overlap. A further robot changes nothing for those before it.
 
-
-def plan_route(plan: FloorPlan, loop: int, length_m: float, rng: np.random.Generator) -> FloatArray:
-    """Waypoints (K, 2) of a robot that walks round loop ``loop`` and visits rooms until it has driven ``length_m``.
-
-    It starts anywhere on the loop, in either direction; whoever drives longer than one round sees its start again.
+    Raises:
+        SimulationError: the building has no free space, or too little to drive about in.
     """
-    corners = plan.loops[loop]
-    perimeter = float(np.sum(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)))
-    stops = _stops(plan, corners)
-    doors = [stop.room for stop in stops if stop.room is not None]
-    visits = int(np.clip((length_m - 1.15 * perimeter) / _visit_length(doors), 1, len(doors)))
-    start, forward = rng.uniform(0.0, perimeter), rng.random() < 0.5
-    stops.sort(key=lambda stop: ((stop.position_m - start) if forward else (start - stop.position_m)) % perimeter)
-    waypoints = [_point_on(corners, start)]
-    while _length(waypoints) < length_m:
-        visited = {id(doors[k]) for k in rng.choice(len(doors), visits, replace=False)}
-        for stop in stops:
-            waypoints += _pass(stop, id(stop.room) in visited, rng)
+    space = FreeSpace(plan)
+    spots = _draw_spots(plan, space, rng)
+    _check_spread(space.points[spots])
+    wanted_m = (_STRETCH + _SHIFT * (robots - 1)) * length_m
+    walk, driven = [int(rng.integers(len(spots)))], [0.0]
+    while driven[-1] < wanted_m:
+        costs = space.costs(spots[walk[-1]])[spots]
+        costs[walk[-max(1, 3 * len(spots) // 4) :]] = np.inf
+        nearest = np.argsort(costs, kind="stable")[: min(_NEXT, int(np.sum(np.isfinite(costs))))]
+        walk.append(int(rng.choice(nearest)))
+        driven.append(driven[-1] + float(costs[walk[-1]]))
+    goals = space.points[[spots[k] for k in walk]]
+    begins = np.searchsorted(driven, _SHIFT * length_m * np.arange(robots), side="right") - 1
+    ends = np.searchsorted(driven, length_m * (_SHIFT * np.arange(robots) + _STRETCH), side="right")
+    ends = np.maximum(ends, begins + 2)
+    return [frozen(goals[begin:end]) for begin, end in zip(begins, ends, strict=True)]
+
+
+def plan_route(plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
+    """Waypoints (K, 2) of a robot that drives from goal to goal (G, 2), then from the first again: ``length_m`` in all.
+
+    It begins with any of them and goes either way round. Goals where furniture stands in ``plan`` move aside.
+
+    Raises:
+        SimulationError: there is no free space, or too little to drive about in.
+    """
+    space = FreeSpace(plan)
+    goals = space.points[[space.nearest(goal) for goal in goals]]
+    _check_spread(goals)
+    goals = np.roll(goals, rng.integers(len(goals)), axis=0)[:: rng.choice((-1, 1))]
+    here, driven_m = space.nearest(goals[0]), 0.0
+    waypoints = [space.points[here]]
+    for goal in cycle([*goals[1:], goals[0]]):
+        there = space.nearest(goal + rng.uniform(-_SWAY_M, _SWAY_M, 2))
+        leg = _swayed(space.path(here, there), space, rng)
+        waypoints.extend(leg[1:])
+        driven_m += _length(leg)
+        here = there
+        if driven_m >= length_m:
+            break
     return _cut(np.array(waypoints), length_m)
 
 
@@ -87,47 +117,38 @@ def drive(waypoints: FloatArray, period_s: float) -> tuple[FloatArray, FloatArra
     return stamps, plan.at(stamps)
 
 
-def _stops(plan: FloorPlan, corners: FloatArray) -> list[_Stop]:
-    stops: list[_Stop] = []
-    position = 0.0
-    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        stops.append(_Stop(position, start, None))
-        length = float(np.linalg.norm(end - start))
-        along = (end - start) / length
-        for room in plan.rooms:
-            offset = room.doorway - start
-            ahead = float(offset @ along)
-            if abs(float(along[0] * offset[1] - along[1] * offset[0])) < 1e-6 and 0.0 < ahead < length:
-                stops.append(_Stop(position + ahead, room.doorway, room))
-        position += length
-    return stops
+def _draw_spots(plan: FloorPlan, space: FreeSpace, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Numbers (S,) of free points worth going to: one in each room, and some along each corridor."""
+    spots = []
+    for room in plan.rooms:
+        inside = np.flatnonzero(np.all((space.points > room.low) & (space.points < room.high), axis=1))
+        if len(inside):
+            spots.append(int(rng.choice(inside)))
+    for start, end in plan.lanes:
+        count = max(1, round(float(np.linalg.norm(end - start)) / _LANE_SPOTS_M))
+        shares = (np.arange(count) + rng.uniform(0.1, 0.9, count)) / count
+        spots += [space.nearest(start + share * (end - start)) for share in shares]
+    return np.unique(np.array(spots, dtype=np.intp))
 
 
-def _pass(stop: _Stop, visit: bool, rng: np.random.Generator) -> list[FloatArray]:
-    """Waypoints at a stop: round the corner, past the door, or in and out again."""
-    if stop.room is None:
-        return [stop.point + rng.uniform(-SWAY_M, SWAY_M, 2)]
-    if not visit:
-        return []
-    inward = np.sign(stop.room.inside[1] - stop.point[1])
-    sway = np.array([rng.uniform(-DOOR_SWAY_M, DOOR_SWAY_M), 0.0])
-    before = stop.point + sway + [0.0, inward * rng.uniform(-SWAY_M, SWAY_M)]
-    return [before, stop.room.inside + sway, before]
+def _check_spread(points: FloatArray) -> None:
+    """Refuse points (N, 2) between which a robot would not drive."""
+    if not len(points) or np.ptp(points, axis=0).max() < _LEAST_SPREAD_M:
+        raise SimulationError("the building's free space is too small or too divided to drive in; take a larger one")
 
 
-def _visit_length(rooms: list[Room]) -> float:
-    return float(np.mean([2.0 * np.linalg.norm(room.inside - room.doorway) for room in rooms]))
+def _swayed(leg: FloatArray, space: FreeSpace, rng: np.random.Generator) -> FloatArray:
+    """The leg (K, 2) with its corners moved a little, where that keeps it free."""
+    swayed = leg.copy()
+    for k in range(1, len(leg) - 1):
+        corner = leg[k] + rng.uniform(-_SWAY_M, _SWAY_M, 2)
+        if np.all(np.isfinite(space.leg_costs(corner, np.array([swayed[k - 1], leg[k + 1]])))):
+            swayed[k] = corner
+    return swayed
 
 
-def _length(waypoints: list[FloatArray]) -> float:
+def _length(waypoints: FloatArray) -> float:
     return float(np.sum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
-
-
-def _point_on(corners: FloatArray, position_m: float) -> FloatArray:
-    """The point that lies ``position_m`` along a closed polygon."""
-    closed = np.vstack((corners, corners[:1]))
-    positions = np.insert(np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)), 0, 0.0)
-    return np.array([np.interp(position_m, positions, closed[:, axis]) for axis in (0, 1)])
 
 
 def _cut(waypoints: FloatArray, length_m: float) -> FloatArray:

@@ -1,23 +1,34 @@
-"""Where the robots of a fleet, drawn or simulated, really were: poses, and relations between them."""
+"""What a fleet could have known without any error: relations between its scans, and the map of what its beams met."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.map_files import Cells, Occupancy, map_yaml, pgm_bytes
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
-from fcslam.records import FloatArray, frozen
-from fcslam.runs import write_tum
+from fcslam.records import FloatArray, LaserModel, frozen
+from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot
+from fcslam.simulation.scene import bare_model
+from fcslam.simulation.sensors import RayCaster
+
+RESOLUTION_M = 0.05
+
+_STEP_M, _TURN_RAD = 0.2, 0.2
+"""Scans closer together add next to nothing to the map."""
+_INTO_M = 1e-3
+"""A beam ends on a surface; the cell is that of the wall behind it."""
+_MARGIN = 2
+"""Cells around the building."""
+_FRACTION_BITS = 8
+"""Of cells, when beams are drawn."""
 
 
 class HasTruth(Protocol):
     """A robot whose true poses are known."""
-
-    @property
-    def name(self) -> str:
-        """The robot's name."""
 
     @property
     def stamps(self) -> FloatArray:
@@ -28,30 +39,39 @@ class HasTruth(Protocol):
         """The truth at these stamps, shape (N, 3)."""
 
 
-class HasRobots(Protocol):
-    """A fleet of such robots."""
+@dataclass(frozen=True, slots=True)
+class TrueMap:
+    """An occupancy map in ``building``."""
 
-    @property
-    def robots(self) -> Sequence[HasTruth]:
-        """In the order of their numbers."""
+    cells: Cells
+    """``Occupancy`` of every cell, shape (H, W), row 0 at the lowest y."""
+    resolution_m: float
+    origin_xy: tuple[float, float]
+    """Lower left corner of cell (0, 0)."""
 
 
-def write_truth(fleet: HasRobots, folder: Path, rng: np.random.Generator) -> None:
-    """Write ``ground_truth/<robot>.tum`` and ``ground_truth/relations`` into ``folder``.
+def write_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -> None:
+    """Write ``ground_truth/relations``, ``map.pgm`` and ``map.yaml`` into ``folder``.
 
-    The relations let a map be measured without a common coordinate frame.
+    Where each robot was stands in its recording. The relations let a map be measured without a common frame.
+
+    Raises:
+        SimulationError: MuJoCo is missing.
     """
     place = folder / "ground_truth"
     place.mkdir(parents=True, exist_ok=True)
-    for robot in fleet.robots:
-        write_tum(place / f"{robot.name}.tum", robot.stamps, robot.T_building_base)
-    write_relations(place / "relations", true_relations(fleet, rng))
+    write_relations(place / "relations", true_relations(fleet.robots, rng))
+    seen = true_map(fleet)
+    (place / "map.pgm").write_bytes(pgm_bytes(seen))
+    (place / "map.yaml").write_text(map_yaml(seen, "map.pgm"), encoding="utf-8")
 
 
-def true_relations(fleet: HasRobots, rng: np.random.Generator, count: int = 2000, reach_m: float = 5.0) -> Relations:
+def true_relations(
+    robots: Sequence[HasTruth], rng: np.random.Generator, count: int = 2000, reach_m: float = 5.0
+) -> Relations:
     """Up to ``count`` true relations between scans of any robots less than ``reach_m`` and more than 20 s apart."""
-    stamps = np.concatenate([robot.stamps for robot in fleet.robots])
-    poses = np.concatenate([robot.T_building_base for robot in fleet.robots])
+    stamps = np.concatenate([robot.stamps for robot in robots])
+    poses = np.concatenate([robot.T_building_base for robot in robots])
     first, second = rng.integers(0, len(stamps), (2, 50 * count))
     near = np.hypot(*(poses[first, :2] - poses[second, :2]).T) < reach_m
     apart = np.abs(stamps[first] - stamps[second]) > ACROSS_ROBOTS_GAP_S
@@ -60,3 +80,52 @@ def true_relations(fleet: HasRobots, rng: np.random.Generator, count: int = 2000
     return Relations(
         frozen(np.column_stack((stamps[first], stamps[second]))), frozen(se2.between(poses[first], poses[second]))
     )
+
+
+def true_map(fleet: SimulatedFleet) -> TrueMap:
+    """What the robots' beams meet without noise, from where they truly scanned: surfaces, and free space before them.
+
+    Beams that return nothing tell nothing. Where furniture moved, a surface that any robot saw stands.
+
+    Raises:
+        SimulationError: MuJoCo is missing.
+    """
+    width, height = (int(np.ceil(size / RESOLUTION_M)) + 2 * _MARGIN for size in fleet.plan.size_m)
+    passed, hit = (np.zeros((height, width), dtype=np.uint8) for _ in range(2))
+    for robot in fleet.robots:
+        _draw_beams(robot, passed, hit)
+    cells = np.full((height, width), Occupancy.UNKNOWN, dtype=np.uint8)
+    cells[passed > 0] = Occupancy.FREE
+    cells[hit > 0] = Occupancy.OCCUPIED
+    return TrueMap(cells, RESOLUTION_M, (-_MARGIN * RESOLUTION_M,) * 2)
+
+
+def _draw_beams(robot: SimulatedRobot, passed: Cells, hit: Cells) -> None:
+    import cv2
+
+    caster, laser = RayCaster(bare_model(robot.plan), robot.laser), robot.laser
+    for pose in _spaced(robot.T_building_base):
+        start, ends = _beams(caster.cast(pose), laser, pose)
+        columns, rows = np.floor(ends).astype(int).T
+        hit[rows, columns] = 1
+        # OpenCV counts from the middle of the first cell.
+        lines = np.stack((np.broadcast_to(start, ends.shape), ends), axis=1) - 0.5
+        drawn = np.round(lines * 2**_FRACTION_BITS).astype(np.int32)
+        cv2.polylines(passed, list(drawn), False, 1, shift=_FRACTION_BITS)
+
+
+def _spaced(poses: FloatArray) -> FloatArray:
+    """Those of the poses (N, 3) at which the robot had gone or turned a step further."""
+    x, y, turn = se2.relative(poses).T
+    steps = np.insert(np.cumsum(np.hypot(x, y) / _STEP_M + np.abs(turn) / _TURN_RAD), 0, 0.0)
+    return poses[np.unique(np.floor(steps), return_index=True)[1]]
+
+
+def _beams(ranges_m: FloatArray, laser: LaserModel, T_building_base: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where the beams that hit something start (2,) and end (N, 2), in cells."""
+    x, y, heading = se2.compose(T_building_base, np.array(laser.T_base_laser))
+    returned = ranges_m < laser.max_range_m
+    angles = heading + laser.angles_rad()[returned]
+    start = np.array([x, y])
+    ends = start + (ranges_m[returned] + _INTO_M)[:, None] * np.column_stack((np.cos(angles), np.sin(angles)))
+    return start / RESOLUTION_M + _MARGIN, ends / RESOLUTION_M + _MARGIN

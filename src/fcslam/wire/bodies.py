@@ -68,7 +68,7 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
     codes = [detector.channel for detector in message.detectors]
     if codes != sorted(set(codes)):
         raise PacketError("hello: detectors are not in ascending order of their channels")
-    versions = {_read_channel(detector.channel): detector.version for detector in message.detectors}
+    versions = {read_channel(detector.channel): detector.version for detector in message.detectors}
     return Hello(envelope.robot, envelope.epoch, laser, MappingProxyType(versions))
 
 
@@ -119,7 +119,7 @@ def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
         raise PacketError(f"place: {len(message.descriptors)} bytes of descriptors, not {CODE_BYTES} for each")
     if count > MAXIMUM_KEYPOINTS:
         raise PacketError(f"place: {count} descriptors, at most {MAXIMUM_KEYPOINTS}")
-    channel = _read_channel(message.channel)
+    channel = read_channel(message.channel)
     axes = KEYPOINT_AXES[channel]
     if len(message.keypoints) != BYTES_PER_AXIS * axes * count:
         raise PacketError(f"place: {len(message.keypoints)} bytes of keypoints for {count} descriptors")
@@ -165,7 +165,12 @@ def _read_pose(message: Message, field: str) -> FloatArray:
     return frozen((pose.x_m, pose.y_m, pose.theta_rad))
 
 
-def _read_channel(code: int) -> Channel:
+def read_channel(code: int) -> Channel:
+    """The channel that a packet's number stands for.
+
+    Raises:
+        PacketError: none does.
+    """
     channel = _CHANNEL_OF_CODE.get(code)
     if channel is None:
         raise PacketError(f"channel {code} is unknown")

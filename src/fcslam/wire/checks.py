@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
+from fcslam.records import CODE_BYTES, NAME, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
 from fcslam.wire.limits import (
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
@@ -20,7 +20,6 @@ from fcslam.wire.limits import (
     MAXIMUM_SEQUENCE,
     MINIMUM_CORRELATION_EIGENVALUE,
     MINIMUM_INFORMATION,
-    NAME,
 )
 from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise, unpack_information
@@ -114,6 +113,8 @@ def _check_place(place: Place, _: Packet) -> None:
     _check_count(place.first, "place: first", MAXIMUM_NUMBER)
     _check_count(place.last, "place: last", MAXIMUM_NUMBER)
     _require(place.first <= place.last, f"place: first = {place.first} is after last = {place.last}")
+    within = place.first <= place.id.number <= place.last
+    _require(within, f"place: number = {place.id.number} is not in {place.first}..{place.last}")
     check_name(place.detector_version, "place: detector version")
     count = len(place.keypoints)
     _require(count <= MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {MAXIMUM_KEYPOINTS}")

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from fcslam.wire.messages import Kind
+from fcslam.records import Channel
+from fcslam.wire.messages import UPLINK, Kind
 from fcslam.wire.packets import Label
 
 
@@ -24,18 +25,22 @@ class Ledger:
     """The traffic up to one moment."""
 
     accepted: Mapping[Label, Traffic]
-    """By robot and kind; the kind also tells the direction."""
+    """By robot, kind and, of places, channel; the kind also tells the direction."""
     refused: Traffic
     """Not by robot: whom refused bytes come from is not known."""
 
-    def total(self, robot: str | None = None, kind: Kind | None = None) -> Traffic:
-        """Accepted traffic of one robot or of all, of one kind or of all."""
+    def total(self, robot: str | None = None, kind: Kind | None = None, channel: Channel | None = None) -> Traffic:
+        """Accepted traffic of one robot or of all, of one kind or of all, of places of one channel or of everything."""
         chosen = (
             traffic
             for label, traffic in self.accepted.items()
-            if robot in (None, label.robot) and kind in (None, label.kind)
+            if robot in (None, label.robot) and kind in (None, label.kind) and channel in (None, label.channel)
         )
         return sum(chosen, Traffic())
+
+    def uplink(self, robot: str) -> Traffic:
+        """What the cloud accepted from one robot."""
+        return sum((self.total(robot, kind) for kind in UPLINK), Traffic())
 
 
 class Counter:

@@ -1,16 +1,11 @@
 """Every limit of the format, version 1. A packet beyond one of them is neither written nor read."""
 
-import re
-
 from fcslam.records import Channel
 
 PROTOCOL_VERSION = 1
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
-
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,63}", re.ASCII)
-"""Names of robots and detector versions: also safe as file names."""
 
 MAXIMUM_SEQUENCE = 2**63 - 1
 """Epochs and sequence numbers fit a signed 64-bit column."""

@@ -18,6 +18,10 @@ class Kind(StrEnum):
     ACKNOWLEDGEMENT = "acknowledgement"
 
 
+UPLINK = frozenset({Kind.HELLO, Kind.KEYSCAN, Kind.CONSTRAINT, Kind.PLACE})
+"""What robots send; the other kinds come back from the cloud."""
+
+
 @dataclass(frozen=True, slots=True)
 class Hello:
     """The first packet of an epoch: how to read the ones that follow."""

@@ -5,18 +5,21 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
+from fcslam.records import Channel
 from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS
+from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
 from fcslam.wire.limits import MAXIMUM_PACKET_BYTES, PROTOCOL_VERSION
 from fcslam.wire.messages import Kind, Packet
 
 
 class Label(NamedTuple):
-    """What the outside of a packet says."""
+    """What a packet's traffic is counted by."""
 
     robot: str
     kind: Kind
+    channel: Channel | None = None
+    """Of a place; None for every other kind."""
 
 
 def encode(packet: Packet) -> bytes:
@@ -53,14 +56,14 @@ def decode(data: bytes) -> Packet:
 
 
 def read_label(data: bytes) -> Label:
-    """Robot and kind of a packet without the cost, and without the checks, of reading its body.
+    """Robot, kind and channel of a packet without the cost, and without the checks, of reading its body.
 
     Raises:
-        PacketError: ``data`` is not a packet of a known version, with the reason.
+        PacketError: ``data`` is not a packet of a known version, or a place of an unknown channel, with the reason.
     """
     message, kind = _parse(data)
     check_name(message.robot, "robot")
-    return Label(message.robot, kind)
+    return Label(message.robot, kind, read_channel(message.place.channel) if kind is Kind.PLACE else None)
 
 
 def _parse(data: bytes) -> tuple[pb.Packet, Kind]:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from io import BytesIO, FileIO
 from math import nan
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 from zlib import crc32
 
 import numpy as np
@@ -33,6 +33,15 @@ from fcslam.sources.recording.layout import (
 )
 
 _NO_POSE = (nan, nan, nan)
+
+
+class Held(NamedTuple):
+    """How many records of each kind a recording holds."""
+
+    scans: int
+    odometry: int
+    images: int
+    ground_truth: int
 
 
 class RecordingWriter:
@@ -66,7 +75,7 @@ class RecordingWriter:
 
     @classmethod
     def resume(cls, folder: Path) -> Self:
-        """Go on with the recording at ``folder`` where it was cut off; a last record that is not whole is removed.
+        """Go on with the recording at ``folder`` where it was cut off; last records that are not whole are removed.
 
         Raises:
             SourceError: there is no recording.
@@ -94,6 +103,18 @@ class RecordingWriter:
     def camera(self) -> CameraModel | None:
         """The camera of all images."""
         return self._meta.camera
+
+    @property
+    def held(self) -> Held:
+        """What is there already."""
+        truth = self._appenders[GROUND_TRUTH]
+        scans, odometry, images = (self._count(frames) for frames in (self._scans, ODOMETRY_FILE, IMAGES_FILE))
+        return Held(scans, odometry, images, truth.content(0, truth.size).count(b"\n"))
+
+    @property
+    def is_gapless(self) -> bool:
+        """Whether no record before another one is missing, as a power cut may have left it."""
+        return self._next_sequence == sum(self.held[:3])
 
     def write(self, item: RecordedItem) -> None:
         """Append one record.
@@ -134,6 +155,8 @@ class RecordingWriter:
         for frames in files:
             appender = self._appenders[frames.name] = _Appender(self._folder / frames.name)
             self._next_sequence = max(self._next_sequence, _cut_to_whole_frames(appender, frames))
+        for unfinished in (self._folder / IMAGES).glob(f"{self._count(IMAGES_FILE):08d}.*"):
+            unfinished.unlink()
         truth = self._appenders[GROUND_TRUTH] = _Appender(self._folder / GROUND_TRUTH)
         truth.cut(truth.content(0, truth.size).rfind(b"\n") + 1)
 
@@ -155,11 +178,15 @@ class RecordingWriter:
         self._appenders[frames.name].append(frames.packed(self._next_sequence, *values))
         self._next_sequence += 1
 
+    def _count(self, frames: FrameFile) -> int:
+        """Frames in a file; 0 if the recording has none of this kind."""
+        appender = self._appenders.get(frames.name)
+        return (appender.size - HEADER_BYTES) // frames.frame_bytes if appender else 0
+
     def _append_image(self, image: CameraImage) -> None:
         """The file first: a frame without its file would be a fault, a file without its frame is overwritten."""
         suffix, encoded = image_suffix(image.encoded), image.encoded
-        index = (self._appenders[IMAGES_FILE.name].size - HEADER_BYTES) // IMAGES_FILE.frame_bytes
-        image_path(self._folder, index, suffix).write_bytes(encoded)
+        image_path(self._folder, self._count(IMAGES_FILE), suffix).write_bytes(encoded)
         pose = _NO_POSE if image.T_odom_base is None else image.T_odom_base
         self._append(IMAGES_FILE, image.stamp, pose, suffix.encode(), len(encoded), crc32(encoded))
 

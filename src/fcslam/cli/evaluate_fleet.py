@@ -1,0 +1,185 @@
+"""`fcslam evaluate fleet`: a run against where its robots really were."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from fcslam.evaluation.closures import Within
+    from fcslam.evaluation.fleet import FleetReport
+
+_KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
+
+
+def fleet(
+    run: Annotated[Path, typer.Argument(help="The run folder to measure.")],
+    *,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with ROBOT/ground_truth.tum or ROBOT.tum of each robot and, if it is known, the true map "
+            "ground_truth/map.yaml. [default: recordings beside the run, else the folder that the run is in]"
+        ),
+    ] = None,
+    wrong_m: Annotated[float, typer.Option(min=0.0, help="A closure or a join that is off by more is wrong.")] = 0.5,
+    wrong_deg: Annotated[float, typer.Option(min=0.0, help="Or turned by more.")] = 10.0,
+    csv: Annotated[
+        Path | None, typer.Option(help="Write the numbers to this file as well (as JSON if it ends in .json).")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw the robots' maps, matched places, the fused map and the truth to a PNG.")
+    ] = None,
+) -> None:
+    """A run against the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
+    from rich.console import Console
+
+    from fcslam.evaluation.fleet import evaluate_fleet
+    from fcslam.evaluation.fleet_metrics import fleet_metrics
+    from fcslam.evaluation.relations import write_metrics
+    from fcslam.metrics.closures import ClosureCriteria
+
+    report = evaluate_fleet(run, truth, ClosureCriteria(wrong_m=wrong_m, wrong_deg=wrong_deg))
+    show_fleet(report, Console())
+    if csv is not None:
+        write_metrics(fleet_metrics(report), csv)
+    if figure is not None:
+        from fcslam.evaluation.charts import fleet_charts
+        from fcslam.evaluation.figure import write_figure
+
+        write_figure(fleet_charts(run, truth), figure)
+
+
+def show_fleet(report: "FleetReport", console: "Console", explained: bool = True) -> None:
+    """The report as tables and, if it is to be ``explained``, what they rest on."""
+    from fcslam.evaluation.closures import Within
+
+    closures = (_closures(report, within) for within in Within)
+    for table in (_robots(report), _relative(report), *closures, _traffic(report)):
+        console.print(table)
+    for line in (*_findings(report), *(_explanations(report) if explained else ())):
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+def percent(share: float) -> str:
+    """In tenths of a percent, never rounded up to all."""
+    return "-" if math.isnan(share) else f"{math.floor(1000.0 * share) / 10.0:.1f}%"
+
+
+def _robots(report: "FleetReport") -> "Table":
+    from rich.table import Table
+
+    table = Table("robot", "map", "path, m", "ATE, m", "mean", "max", "aligned alone")
+    for score in report.robots:
+        errors = (score.joint.rmse_m, score.joint.mean_m, score.joint.max_m, score.alone.rmse_m)
+        cells = (_number(score.path_length_m, 1), *(_number(error, 3) for error in errors))
+        table.add_row(score.robot, str(score.map_index), *cells)
+    return table
+
+
+def _relative(report: "FleetReport") -> "Table":
+    from rich.table import Table
+
+    table = Table("relative poses", "pairs", "in one map", "mean, m", "max, m", "mean, deg", "max, deg")
+    for name, errors in (("within robots", report.within), ("across robots", report.across)):
+        metres, degrees = errors.translation, errors.rotation
+        figures = (metres.mean, metres.maximum, degrees.mean, degrees.maximum)
+        table.add_row(name, str(errors.total), str(errors.used), *(_number(figure, 3) for figure in figures))
+    return table
+
+
+def _closures(report: "FleetReport", within: "Within") -> "Table":
+    """Of the channels that closed something; of both together where both did."""
+    from rich.table import Table
+
+    from fcslam.evaluation.fleet_closures import BOTH
+
+    table = Table(_KINDS[within], "channel", "all", "wrong", "precision", "recall", "like heading", "at 100 %")
+    scores = {(status, channel): score for (kind, status, channel), score in report.closures.items() if kind is within}
+    seen = {channel for (_, channel), score in scores.items() if channel != BOTH and score.precision.closures}
+    for (status, channel), score in scores.items():
+        if channel in seen or (channel == BOTH and len(seen) != 1):
+            found, recalls = score.precision, (score.recall, score.recall_like_heading, score.recall_full_precision)
+            shares = (found.precision, *(each.recall for each in recalls))
+            table.add_row(str(status), channel, str(found.closures), str(found.wrong), *map(percent, shares))
+    return table
+
+
+def _traffic(report: "FleetReport") -> "Table":
+    from rich.table import Table
+
+    table = Table("sent", "kB", "kB/s", "kB/m", "places", "kB a place")
+    for score in report.robots:
+        kilobytes = score.uplink_bytes / 1e3
+        rates = (_ratio(kilobytes, score.duration_s), _ratio(kilobytes, score.path_length_m))
+        table.add_row(score.robot, _number(kilobytes, 1), *(_number(rate, 2) for rate in rates))
+    for channel, places in report.places.items():
+        kilobytes = places.bytes / 1e3
+        size = _number(_ratio(kilobytes, places.packets), 2)
+        table.add_row(f"{channel} places, all", _number(kilobytes, 1), "", "", _number(places.packets, 0), size)
+    return table
+
+
+def _findings(report: "FleetReport") -> "Iterator[str]":
+    yield f"Maps: {report.maps}. Pairs of robots in one map: {len(report.joins)}, of them falsely joined: " + (
+        ", ".join(f"{j.robot_a} and {j.robot_b} ({j.translation_m:.2f} m, {j.rotation_deg:.1f} deg)" for j in false)
+        if (false := report.false_joins)
+        else "none."
+    )
+    if report.agreement is None:
+        yield f"Map: not compared, {report.truth} has no ground_truth/map.yaml."
+        return
+    found = report.agreement
+    yield (
+        f"Map: F1 of occupied cells {_number(found.f1, 3)} (precision {_number(found.precision, 3)}, recall "
+        f"{_number(found.recall, 3)}), IoU of free space {_number(found.free_iou, 3)}."
+    )
+
+
+def _explanations(report: "FleetReport") -> "Iterator[str]":
+    from fcslam.evaluation.closures import Within
+    from fcslam.evaluation.fleet_closures import LIKE_HEADING_DEG
+    from fcslam.metrics.grid import TOLERANCE_M
+    from fcslam.metrics.revisits import RevisitCriteria
+
+    asked, criteria = RevisitCriteria(), report.criteria
+    scans, covered = (sum(counts) for counts in zip(*((s.poses, s.covered) for s in report.robots), strict=True))
+    yield f"Truth: {report.truth}, at {covered} of {scans} scans."
+    yield "ATE: root mean square, each map moved onto the truth as a whole, no scale; 'alone': each robot by itself."
+    yield "Relative poses: drawn evenly from pairs of scans less than 5 m apart in truth, 2,000 at most."
+    yield f"Wrong, of closures and joins: off by more than {criteria.wrong_m:g} m or {criteria.wrong_deg:g} deg."
+    counts = ", ".join(_revisits(report, within) for within in Within)
+    yield (
+        f"Recall: share of revisits found: {counts}. At every {asked.every_m:g} m of each path there is one for each "
+        f"robot whose path passes within {asked.radius_m:g} m (its own: over {asked.within_gap_s:g} s away), found "
+        f"if a correct closure ends within {criteria.reach_m:g} m of path at both sides. Like heading: within "
+        f"{LIKE_HEADING_DEG:g} deg. At 100 %: by the closures more similar than every wrong one of their channel."
+    )
+    yield "A robot reports only closures that it accepts, so candidates within robots are not all known."
+    if report.agreement is not None:
+        yield (
+            f"Occupied cells: within {TOLERANCE_M:g} m of one another. The map's surfaces count wherever they are: "
+            "the true map has all that beams could reach."
+        )
+
+
+def _revisits(report: "FleetReport", within: "Within") -> str:
+    from fcslam.evaluation.fleet_closures import BOTH
+    from fcslam.records import ClosureStatus
+
+    score = report.closures[within, ClosureStatus.ACCEPTED, BOTH]
+    return f"{score.recall.revisits} {_KINDS[within]} ({score.recall_like_heading.revisits} with like heading)"
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"

@@ -1,0 +1,210 @@
+"""`fcslam evaluate homography`: detectors and descriptors on scenes with known homographies."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.features.kinds import ContenderKind
+from fcslam.metrics.framing import GroundTruth
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from fcslam.evaluation.homography import HomographyReport, PairResult
+    from fcslam.metrics.bootstrap import Interval
+
+
+def homography(
+    scenes: Annotated[list[Path], typer.Argument(metavar="SCENES...", help="Folders of scenes as HPatches has them.")],
+    *,
+    detector: Annotated[
+        list[ContenderKind] | None,
+        typer.Option(help="Only this one; may be given several times."),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="Network weights (.onnx) of detector onnx, if not those that come with fcslam."),
+    ] = None,
+    features: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of extracted features, SCENE/1.npz ..., as fcslam extract writes them, instead of running "
+            "detectors; may be given several times, and beside --detector."
+        ),
+    ] = None,
+    ground_truth: Annotated[
+        GroundTruth, typer.Option(help="legacy repeats a fault on which published tables rest.")
+    ] = GroundTruth.CORRECTED,
+    csv: Annotated[Path | None, typer.Option(help="Write every measure of every pair to this file.")] = None,
+    figures: Annotated[Path | None, typer.Option(help="Draw matches and curves into this folder.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 1,
+) -> None:
+    """Repeatability, homography accuracy, matching accuracy and matching score of detectors, side by side."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from fcslam.evaluation.contenders import choose_contenders
+    from fcslam.evaluation.homography import evaluate_homography
+    from fcslam.evaluation.homography_figures import draw_figures
+    from fcslam.evaluation.homography_measures import write_pairs
+    from fcslam.evaluation.scenes import find_scenes
+
+    found = find_scenes(scenes)
+    contenders = choose_contenders(detector or (), weights, features or ())
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("evaluating", total=len(found) * len(contenders))
+        report = evaluate_homography(found, contenders, ground_truth, lambda: bar.advance(task))
+        if figures is not None:
+            task = bar.add_task("drawing", total=len(found))
+            draw_figures(figures, report, found, contenders, ground_truth, lambda: bar.advance(task))
+    if csv is not None:
+        write_pairs(report, csv)
+    _show(Console(), report, ground_truth, seed)
+
+
+def _show(console: "Console", report: "HomographyReport", truth: GroundTruth, seed: int) -> None:
+    described = [name for name in report.contenders if report.of(name)[0].matching]
+    console.print(_repeatability_table(report, seed))
+    if described:
+        console.print(_homography_table(report, described, seed))
+        console.print(_matching_table(report, described))
+    console.print(_scene_table(report))
+    if len(report.contenders) > 1:
+        console.print(_difference_table(report, seed))
+    for line in (
+        f"{len(report.of(report.contenders[0]))} pairs, {truth} ground truth. In brackets: 95 % intervals by bootstrap "
+        "over pairs.",
+        "Repeatability at 320 x 240, NMS 4, of the 300 strongest keypoints in common view; correct to 3 px.",
+        "Homography at 640 x 480 by mutual nearest neighbours among the 1000 strongest in common view, RANSAC at 3 px: "
+        "share of pairs whose corners are right to e px on average.",
+        "MMA: share of the matches right to so many px, mean over pairs; matching score: share of the keypoints in "
+        "common view whose nearest neighbour is right to 3 px; both of the 1000 strongest of each image.",
+        "NMS 0: keypoints as the detector gives them.",
+    ):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":
+    from rich.table import Table
+
+    from fcslam.evaluation.homography import LARGE, SMALL
+    from fcslam.evaluation.homography_measures import interval, mean
+    from fcslam.evaluation.scenes import SceneKind
+
+    table = Table(title="I. Repeatability", title_justify="left")
+    for heading in ("", "illumination", "viewpoint", "all", "localisation error, px", "ms 320x240", "ms 640x480"):
+        table.add_column(heading)
+    for name in report.contenders:
+        pairs = report.of(name)
+        kinds = (mean(pairs, "repeatability", kind) for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT))
+        times = (report.milliseconds.get((name, size), math.nan) for size in (SMALL, LARGE))
+        table.add_row(
+            name,
+            *map(_share, kinds),
+            _interval(interval(pairs, "repeatability", seed)),
+            _number(mean(pairs, "localisation_error_px"), 2),
+            *(_number(time, 1) for time in times),
+        )
+    return table
+
+
+def _homography_table(report: "HomographyReport", described: "Sequence[str]", seed: int) -> "Table":
+    from rich.table import Table
+
+    from fcslam.evaluation.homography import MATCHING_NMS_PX
+    from fcslam.evaluation.homography_measures import CORRECT_CORNERS_PX, interval, mean
+    from fcslam.evaluation.scenes import SceneKind
+
+    table = Table(title="II. Homography estimation", title_justify="left")
+    for heading in ("", "NMS", "illumination, e=3", "viewpoint, e=3", *(f"all, e={px}" for px in CORRECT_CORNERS_PX)):
+        table.add_column(heading)
+    for nms_px in MATCHING_NMS_PX:
+        for name in described:
+            pairs = report.of(name)
+            measure = f"homography_3px_nms{nms_px}"
+            kinds = (mean(pairs, measure, kind) for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT))
+            shares = (interval(pairs, f"homography_{px}px_nms{nms_px}", seed) for px in CORRECT_CORNERS_PX)
+            table.add_row(name, str(nms_px), *map(_share, kinds), *map(_interval, shares))
+        table.add_section()
+    return table
+
+
+def _matching_table(report: "HomographyReport", described: "Sequence[str]") -> "Table":
+    from rich.table import Table
+
+    from fcslam.evaluation.homography import MATCHING_NMS_PX
+    from fcslam.evaluation.homography_measures import mean
+    from fcslam.evaluation.scenes import SceneKind
+
+    table = Table(title="Matching", title_justify="left")
+    accuracy = ("MMA@1", "MMA@3", "MMA@5", "MMA@10", "illumination MMA@3", "viewpoint MMA@3")
+    for heading in ("", "NMS", *accuracy, "matching score", "matches"):
+        table.add_column(heading)
+    for nms_px in MATCHING_NMS_PX:
+        for name in described:
+            pairs = report.of(name)
+            shares = [mean(pairs, f"accuracy_{px}px_nms{nms_px}") for px in (1, 3, 5, 10)]
+            for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT):
+                shares.append(mean(pairs, f"accuracy_3px_nms{nms_px}", kind))
+            shares.append(mean(pairs, f"score_nms{nms_px}"))
+            table.add_row(name, str(nms_px), *map(_share, shares), _number(mean(pairs, f"matches_nms{nms_px}"), 0))
+        table.add_section()
+    return table
+
+
+def _scene_table(report: "HomographyReport") -> "Table":
+    from rich.table import Table
+
+    from fcslam.evaluation.homography_measures import mean
+
+    titles = {
+        "repeatability": "repeatability",
+        **{f"homography_3px_nms{nms}": f"homography e=3, NMS {nms}" for nms in (8, 0)},
+        **{f"accuracy_3px_nms{nms}": f"MMA@3, NMS {nms}" for nms in (8, 0)},
+        **{f"score_nms{nms}": f"score, NMS {nms}" for nms in (8, 0)},
+    }
+    table = Table("scene", "", *titles.values(), title="Scene by scene", title_justify="left")
+    for scene in dict.fromkeys(pair.scene for pair in report.pairs):
+        for name in report.contenders:
+            pairs: list[PairResult] = [pair for pair in report.of(name) if pair.scene == scene]
+            table.add_row(scene, name, *(_share(mean(pairs, measure)) for measure in titles))
+        table.add_section()
+    return table
+
+
+def _difference_table(report: "HomographyReport", seed: int) -> "Table":
+    from rich.table import Table
+
+    from fcslam.evaluation.homography_measures import difference
+
+    first, *others = report.contenders
+    titles = {
+        "repeatability": "repeatability",
+        **{f"homography_3px_nms{nms}": f"homography e=3, NMS {nms}" for nms in (8, 0)},
+        **{f"accuracy_3px_nms{nms}": f"MMA@3, NMS {nms}" for nms in (8, 0)},
+    }
+    table = Table("", *titles.values(), title=f"{first} less the others, pair by pair", title_justify="left")
+    for name in others:
+        gains = (difference(report.of(first), report.of(name), measure, seed) for measure in titles)
+        table.add_row(name, *(_interval(gain, sign="+") for gain in gains))
+    return table
+
+
+def _share(value: float) -> str:
+    return _number(value, 3)
+
+
+def _number(value: float, digits: int) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _interval(value: "Interval", sign: str = "") -> str:
+    if math.isnan(value.mean):
+        return ""
+    return f"{value.mean:{sign}.3f} [{value.low:{sign}.2f}, {value.high:{sign}.2f}]"

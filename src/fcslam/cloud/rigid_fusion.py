@@ -1,0 +1,129 @@
+"""Map fusion to the letter of the paper (FC-SLAM, section III.C): rigid maps laid on one another by matched points.
+
+"When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
+translation between the two, eqs. (5) and (6). No closure is doubted and nothing is optimised: a false match turns a
+whole map, and the drift within the robots' maps stays. ``n_point`` is the same with all matched points, in the least
+squares sense. Both are here to be compared with the joint graph.
+
+The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
+closure knows better: the matched point is the position of its keyscan j, which ``T_i_j`` tells in the other map, too.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fcslam.cloud.ledger import ClosureLedger, Entry
+from fcslam.cloud.result import Fusion
+from fcslam.cloud.strategy import FusionStrategy
+from fcslam.geometry import se2
+from fcslam.geometry.alignment import n_point_alignment, two_point_alignment
+from fcslam.graph.cluster import DIRECTION_M
+from fcslam.records import ClosureStatus, FloatArray, LoopClosure, frozen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Match:
+    """One point that two robots know, (2,) in the own map of each."""
+
+    entry: Entry
+    robots: tuple[str, str]
+    """a and b, a the one that started first."""
+    xy_a: FloatArray
+    xy_b: FloatArray
+
+    def is_distinct(self, other: "_Match") -> bool:
+        """Whether the two points give a direction, in both maps: places are the same place until they lie apart."""
+        sides = self.xy_a - other.xy_a, self.xy_b - other.xy_b
+        return all(float(np.hypot(*side)) >= DIRECTION_M for side in sides)
+
+
+_Links = Mapping[tuple[str, str], Sequence[_Match]]
+
+
+def fuse_rigidly(ledger: ClosureLedger, T_local_base: Mapping[str, FloatArray], strategy: FusionStrategy) -> Fusion:
+    """Every robot's own map (N, 3) moved as a whole, into the frame of the robot of its map that started first.
+
+    ``T_local_base`` has the robots in the order in which they started. Whatever geometry verified between two robots
+    and nobody vetoed is a match, closures that the joint map predicted included. Those that the relation of two maps
+    rests on end accepted, the others verified; closures within robots keep their verdict.
+    """
+    order = list(T_local_base)
+    matches = [_match(entry, T_local_base, order) for entry in ledger if _is_valid(entry)]
+    links = _links(matches, strategy)
+    maps, frames = [[robot] for robot in order], {robot: np.zeros(3) for robot in order}
+    used: dict[Entry, str] = {}
+    for robots, members in links.items():
+        if _join(robots, _relation(members, strategy), maps, frames):
+            used |= {match.entry: f"one of {len(members)} matched points of {strategy}" for match in members}
+    T_map_base: dict[str, FloatArray] = {
+        robot: frozen(se2.compose(frames[robot], poses)) for robot, poses in T_local_base.items()
+    }
+    return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used, strategy) for entry in ledger))
+
+
+def _is_valid(entry: Entry) -> bool:
+    return entry.is_between and not entry.vetoed and entry.closure.status is not ClosureStatus.CANDIDATE
+
+
+def _match(entry: Entry, T_local_base: Mapping[str, FloatArray], order: Sequence[str]) -> _Match:
+    i, j = entry.closure.i, entry.closure.j
+    xy_i = se2.compose(T_local_base[i.robot][i.number], entry.closure.T_i_j)[:2]
+    xy_j = T_local_base[j.robot][j.number][:2]
+    if order.index(i.robot) < order.index(j.robot):
+        return _Match(entry, (i.robot, j.robot), xy_i, xy_j)
+    return _Match(entry, (j.robot, i.robot), xy_j, xy_i)
+
+
+def _links(matches: Sequence[_Match], strategy: FusionStrategy) -> _Links:
+    """Of every two robots the matches that lay their maps on one another; pairs in the order in which they had two."""
+    known: dict[tuple[str, str], list[_Match]] = {}
+    first_two: dict[tuple[str, str], Sequence[_Match]] = {}
+    for match in matches:
+        earlier = known.setdefault(match.robots, [])
+        partner = next((other for other in earlier if match.is_distinct(other)), None)
+        if partner is not None:
+            first_two.setdefault(match.robots, (partner, match))
+        earlier.append(match)
+    return first_two if strategy is FusionStrategy.TWO_POINT else {robots: known[robots] for robots in first_two}
+
+
+def _relation(matches: Sequence[_Match], strategy: FusionStrategy) -> FloatArray:
+    """T_a_b of two robots' own maps; NaN where the points contradict each other so much that no rotation is better."""
+    # A robot may claim to be so far away that its two points are one to a computer.
+    align = two_point_alignment if strategy is FusionStrategy.TWO_POINT else n_point_alignment
+    try:
+        return align([match.xy_a for match in matches], [match.xy_b for match in matches])
+    except ValueError:
+        return np.full(3, np.nan)
+
+
+def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], frames: dict[str, FloatArray]) -> bool:
+    """Put the younger of two robots' maps into the older one's frame; False if they are one or no relation is known.
+
+    ``maps`` and ``frames`` (T_map_local of each robot) are changed.
+    """
+    map_a, map_b = (next(members for members in maps if robot in members) for robot in robots)
+    if map_a is map_b or not np.isfinite(T_a_b).all():
+        return False
+    T_older_younger = se2.compose(se2.compose(frames[robots[0]], T_a_b), se2.inverse(frames[robots[1]]))
+    older, younger = map_a, map_b
+    if maps.index(older) > maps.index(younger):
+        older, younger, T_older_younger = younger, older, se2.inverse(T_older_younger)
+    for robot in younger:
+        frames[robot] = se2.compose(T_older_younger, frames[robot])
+    maps.remove(younger)
+    older.extend(younger)
+    older.sort(key=list(frames).index)
+    return True
+
+
+def _closure(entry: Entry, used: Mapping[Entry, str], strategy: FusionStrategy) -> LoopClosure:
+    """The closure with its verdict."""
+    if not _is_valid(entry):
+        return entry.closure
+    reason = used.get(entry)
+    if reason is None:
+        return replace(entry.closure, status=ClosureStatus.VERIFIED, reason=f"not needed by {strategy}")
+    return replace(entry.closure, status=ClosureStatus.ACCEPTED, reason=reason)

@@ -1,0 +1,164 @@
+"""What is compared on scenes: detectors run here, and features that any program extracted."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fcslam.errors import EvaluationError
+from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, Shi, Sift
+from fcslam.features.detector import (
+    SHIPPED_NETWORK,
+    GreyImage,
+    ImageFeatures,
+    KeypointDetector,
+    Keypoints,
+    OnnxConfig,
+    OnnxDetector,
+)
+from fcslam.features.files import read_features, read_grey
+from fcslam.features.kinds import ContenderKind
+from fcslam.metrics.framing import Framing, Size
+from fcslam.metrics.homography import inside
+
+_CANDIDATES = 1500
+"""Features that ORB and SIFT are asked for, as in SuperPoint's evaluation."""
+_NETWORK_CANDIDATES = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """An image of a scene, brought to a size."""
+
+    path: Path
+    file_size: Size
+    """Of the image in its file."""
+    framing: Framing
+    grey: GreyImage
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """Something that finds keypoints in pictures, the strongest first, in pixels of the framed picture."""
+
+    name: str
+    find: Callable[[Picture], Keypoints]
+    is_timed: bool
+    """Whether its time is that of finding."""
+
+
+class Stopwatch:
+    """How long contenders take for a picture."""
+
+    def __init__(self) -> None:
+        self._seconds: defaultdict[tuple[str, Size], list[float]] = defaultdict(list)
+
+    def find(self, contender: Contender, picture: Picture) -> Keypoints:
+        """What the contender finds."""
+        began = time.perf_counter()
+        found = contender.find(picture)
+        if contender.is_timed:
+            height, width = picture.grey.shape
+            self._seconds[contender.name, (width, height)].append(time.perf_counter() - began)
+        return found
+
+    def milliseconds(self) -> Mapping[tuple[str, Size], float]:
+        """Median for each contender and size."""
+        return {key: 1e3 * float(np.median(seconds)) for key, seconds in self._seconds.items()}
+
+
+def frame(path: Path, size: Size) -> Picture:
+    """The image in a file, scaled bilinearly and cropped to ``size``.
+
+    Raises:
+        FeatureError: it cannot be read.
+    """
+    image = read_grey(path)
+    height, width = image.shape
+    framing = Framing.of((width, height), size)
+    scaled = cv2.resize(image, (max(size[0], int(width * framing.scale)), max(size[1], int(height * framing.scale))))
+    left, top = framing.crop_px
+    return Picture(path, (width, height), framing, np.ascontiguousarray(scaled[top:, left:][: size[1], : size[0]]))
+
+
+def choose_contenders(
+    names: Sequence[ContenderKind], weights: Path | None, folders: Sequence[Path]
+) -> tuple[Contender, ...]:
+    """The folders' features first, then the named detectors; if nothing is named, all there are.
+
+    Raises:
+        FeatureError: the network's weights cannot be used.
+        EvaluationError: two folders have one name, or there is none of that name.
+    """
+    if not names and not folders:
+        names = [name for name in ContenderKind if name is not ContenderKind.ONNX]
+        if weights is not None or SHIPPED_NETWORK.is_file():
+            names = [ContenderKind.ONNX, *names]
+    contenders = [_extracted(folder) for folder in folders] + [_run_here(name, weights) for name in names]
+    doubled = {each.name for each in contenders if [other.name for other in contenders].count(each.name) > 1}
+    if doubled:
+        raise EvaluationError(f"{min(doubled)}: named twice; give each detector once, and folders other names")
+    return tuple(contenders)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """OpenCV on a single thread, as a robot would run it and as times are comparable."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _run_here(name: ContenderKind, weights: Path | None) -> Contender:
+    shown, detector = name.value, _detector(name, weights)
+    if isinstance(detector, OnnxDetector):
+        shown = detector.version
+    detector.detect(np.zeros((32, 32), np.uint8))  # what the first call alone costs is nobody's time
+    return Contender(shown, lambda picture: detector.detect(picture.grey), is_timed=True)
+
+
+def _detector(name: ContenderKind, weights: Path | None) -> KeypointDetector:
+    match name:
+        case ContenderKind.ONNX:
+            return OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES))
+        case ContenderKind.FAST:
+            return Fast()
+        case ContenderKind.HARRIS:
+            return Harris()
+        case ContenderKind.SHI:
+            return Shi()
+        case ContenderKind.SIFT:
+            return Sift(_CANDIDATES)
+        case ContenderKind.ORB:
+            return Orb(OrbConfig(most_features=_CANDIDATES, fast_threshold=20))
+
+
+def _extracted(folder: Path) -> Contender:
+    if not folder.is_dir():
+        raise EvaluationError(f"{folder}: no such folder; name one with features, SCENE/1.npz ...")
+    return Contender(folder.resolve().name, lambda picture: _read_framed(folder, picture), is_timed=False)
+
+
+def _read_framed(folder: Path, picture: Picture) -> ImageFeatures:
+    """Features of the image in its file, brought to where they are in the framed picture."""
+    path = folder / picture.path.parent.name / f"{picture.path.stem}.npz"
+    features, size = read_features(path)
+    if size != picture.file_size:
+        raise EvaluationError(
+            f"{path}: of an image of {size[0]} x {size[1]} pixels, but {picture.path} has "
+            f"{picture.file_size[0]} x {picture.file_size[1]}; extract from these scenes"
+        )
+    scale, crop = picture.framing.scale, np.array(picture.framing.crop_px)
+    points = scale * features.keypoints_px.astype(np.float64) - crop
+    height, width = picture.grey.shape
+    rows = np.flatnonzero(inside(points, (width, height)))
+    kept = features.take(rows)
+    return ImageFeatures(points[rows].astype(np.float32), kept.scores, kept.descriptors)

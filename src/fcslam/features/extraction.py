@@ -1,0 +1,80 @@
+"""Features of every image in a folder, one file each."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fcslam.errors import FeatureError, OutputError
+from fcslam.features.detector import Detector, GreyImage, ImageFeatures
+from fcslam.features.files import read_grey, write_features
+from fcslam.features.nms import box_nms
+from fcslam.records import frozen
+
+
+@dataclass(frozen=True, slots=True)
+class Extraction:
+    """What became of one file."""
+
+    path: Path
+    keypoints: int
+    skipped: str = ""
+    """Why no features were written; empty if they were."""
+
+
+def find_files(images: Path) -> list[Path]:
+    """The file itself, or every file in the folder and those below it, in order.
+
+    Raises:
+        FeatureError: there is nothing.
+    """
+    files = [images] if images.is_file() else sorted(path for path in images.rglob("*") if path.is_file())
+    if not files:
+        raise FeatureError(f"{images}: no file there; name an image or a folder of images")
+    return files
+
+
+def extract_all(
+    files: list[Path], root: Path, output: Path, detector: Detector, longest_side_px: int, nms_px: float
+) -> Iterator[Extraction]:
+    """Write the features of each image to the same place below ``output`` as it has below ``root``.
+
+    What cannot be read is passed over.
+
+    Raises:
+        OutputError: features cannot be written.
+    """
+    written: dict[Path, Path] = {}
+    for path in files:
+        target = output / path.relative_to(root).with_suffix(".npz")
+        try:
+            if target in written:
+                raise FeatureError(f"{path}: has the features' name in common with {written[target]}; rename one")
+            image = read_grey(path)
+        except FeatureError as error:
+            yield Extraction(path, 0, str(error))
+            continue
+        features = extract(image, detector, longest_side_px)
+        features = features.take(box_nms(features.keypoints_px, nms_px))
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{target.parent}: cannot be made ({error}); choose another folder") from error
+        write_features(target, features, (image.shape[1], image.shape[0]))
+        written[target] = path
+        yield Extraction(path, len(features.scores))
+
+
+def extract(image: GreyImage, detector: Detector, longest_side_px: int) -> ImageFeatures:
+    """Features of an image; one that is larger is shrunk for the detector, its keypoints are in its own pixels."""
+    height, width = image.shape
+    share = longest_side_px / max(height, width)
+    if share >= 1.0:
+        return detector.detect(image)
+    size = (max(1, round(width * share)), max(1, round(height * share)))
+    found = detector.detect(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8))
+    scale = np.array([width / size[0], height / size[1]])
+    positions = (found.keypoints_px + 0.5) * scale - 0.5
+    return ImageFeatures(frozen(positions, np.float32), found.scores, found.descriptors)

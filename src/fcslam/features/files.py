@@ -1,0 +1,90 @@
+"""Image files in; extracted features out and in again, one ``.npz`` an image.
+
+Arrays: ``keypoints`` (N, 2) float32, x y in pixels of the image, (0, 0) the centre of its first pixel; ``scores`` (N,)
+float32; ``descriptors`` (N, 32) uint8, the bits packed; ``image_size`` (2,), width and height.
+"""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.errors import FeatureError, OutputError
+from fcslam.features.detector import GreyImage, ImageFeatures, decode_grey
+from fcslam.records import CODE_BYTES, frozen
+from fcslam.sources.images import MAX_SIDE_PX, image_size
+
+_ARRAYS = ("keypoints", "scores", "descriptors", "image_size")
+
+MOST_IMAGE_BYTES = 1 << 28
+
+
+def read_grey(path: Path) -> GreyImage:
+    """The grey levels of an image file.
+
+    Raises:
+        FeatureError: it cannot be read, is no image, or is larger than any camera's.
+    """
+    try:
+        encoded = path.read_bytes() if path.stat().st_size <= MOST_IMAGE_BYTES else None
+    except OSError as error:
+        raise FeatureError(f"{path}: cannot be read ({error})") from error
+    if encoded is None or _longer_side(encoded) > MAX_SIDE_PX:
+        raise FeatureError(f"{path}: an image has at most {MAX_SIDE_PX} pixels a side and {MOST_IMAGE_BYTES} bytes")
+    image = decode_grey(encoded)
+    if image is None or not image.size:
+        raise FeatureError(f"{path}: no image that can be read; give JPEG, PNG, PPM or TIFF")
+    return image
+
+
+def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, int]) -> None:
+    """Write the features of an image of ``image_size`` (width, height).
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        np.savez(
+            path,
+            keypoints=features.keypoints_px,
+            scores=features.scores,
+            descriptors=features.descriptors,
+            image_size=np.array(image_size, np.int32),
+        )
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another folder") from error
+
+
+def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
+    """The features in a file, the strongest first, and width and height of their image.
+
+    Raises:
+        FeatureError: the file cannot be read, or is not of this format.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            keypoints, scores, descriptors, size = (archive[name] for name in _ARRAYS)
+    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise FeatureError(f"{path}: cannot read the features ({error}); write {', '.join(_ARRAYS)}") from error
+    count = len(scores) if scores.ndim == 1 else -1
+    shapes = (keypoints.shape, descriptors.shape, size.shape)
+    if shapes != ((count, 2), (count, CODE_BYTES), (2,)) or descriptors.dtype != np.uint8:
+        raise FeatureError(
+            f"{path}: keypoints {keypoints.shape}, scores {scores.shape}, descriptors {descriptors.shape} "
+            f"{descriptors.dtype}, image_size {size.shape}; expected (N, 2), (N,), (N, {CODE_BYTES}) uint8, (2,)"
+        )
+    if any(array.dtype.kind not in "fiu" or not np.isfinite(array).all() for array in (keypoints, scores, size)):
+        raise FeatureError(f"{path}: keypoints, scores and image_size must be finite numbers")
+    order = np.argsort(-scores.astype(np.float64), kind="stable")
+    features = ImageFeatures(
+        frozen(keypoints[order], np.float32), frozen(scores[order], np.float32), frozen(descriptors[order], np.uint8)
+    )
+    return features, (int(size[0]), int(size[1]))
+
+
+def _longer_side(encoded: bytes) -> int:
+    """In pixels, told by the header before anything is decoded; 0 where this is neither JPEG nor PNG."""
+    try:
+        return max(image_size(encoded))
+    except ValueError:
+        return 0

@@ -1,0 +1,21 @@
+"""Names of detectors, for the command line and the configuration."""
+
+from enum import StrEnum
+
+
+class DetectorKind(StrEnum):
+    """Detectors that describe places."""
+
+    ORB = "orb"
+    ONNX = "onnx"
+
+
+class ContenderKind(StrEnum):
+    """Detectors that can be compared."""
+
+    ONNX = "onnx"
+    ORB = "orb"
+    SIFT = "sift"
+    FAST = "fast"
+    HARRIS = "harris"
+    SHI = "shi"

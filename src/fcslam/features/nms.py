@@ -1,0 +1,53 @@
+"""Non-maximum suppression as benchmarks of detectors do it: boxes around keypoints may hardly overlap."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+MOST_OVERLAP = 0.1
+"""Share of the union of two boxes that their intersection may be. For whole pixels and boxes of side 4, keypoints 4 px
+apart along an axis stay, and so do those 3 px apart along one and 2 px along the other."""
+
+
+def box_nms(positions_px: ArrayLike, side_px: float) -> NDArray[np.int64]:
+    """Rows of the keypoints that stay, ascending.
+
+    From the strongest to the weakest, a keypoint goes if its box overlaps that of one that stays by more than
+    ``MOST_OVERLAP``.
+
+    Args:
+        positions_px: shape (N, 2), the strongest first; finite.
+        side_px: side of the boxes; 0 keeps everything.
+    """
+    points = np.asarray(positions_px, np.float64).reshape(-1, 2)
+    if side_px <= 0.0 or not len(points):
+        return np.arange(len(points))
+    cells = np.floor((points - points.min(axis=0)) / side_px).astype(np.int64)
+    rows: NDArray[np.int64] = np.flatnonzero(_keep(points, cells, float(side_px)))
+    return rows
+
+
+@njit(cache=True)
+def _keep(points: NDArray[np.float64], cells: NDArray[np.int64], side: float) -> NDArray[np.bool_]:
+    """Only boxes in neighbouring cells can overlap; each cell chains the keypoints in it that stay."""
+    columns, rows = cells[:, 0].max() + 3, cells[:, 1].max() + 3
+    newest = np.full((rows, columns), -1)
+    before = np.full(len(points), -1)
+    kept = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        column, row = cells[i, 0] + 1, cells[i, 1] + 1
+        free = True
+        for v in range(row - 1, row + 2):
+            for u in range(column - 1, column + 2):
+                j = newest[v, u]
+                while free and j >= 0:
+                    width = side - abs(points[i, 0] - points[j, 0])
+                    height = side - abs(points[i, 1] - points[j, 1])
+                    if width > 0.0 and height > 0.0:
+                        common = width * height
+                        free = common <= MOST_OVERLAP * (2.0 * side * side - common)
+                    j = before[j]
+        if free:
+            kept[i] = True
+            before[i], newest[row, column] = newest[row, column], i
+    return kept

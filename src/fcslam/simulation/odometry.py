@@ -1,0 +1,58 @@
+"""How wheel odometry goes wrong."""
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.geometry import se2
+from fcslam.records import FloatArray
+
+
+class DriftSettings(Settings):
+    """How wheel odometry goes wrong: chance along the way, and a bias drawn once for each robot."""
+
+    travel_noise_m: float = Field(
+        default=0.01, ge=0.0, description="standard deviation after 1 m; grows with the square root"
+    )
+    heading_noise_rad: float = Field(default=0.01, ge=0.0, description="standard deviation of the heading after 1 m")
+    turn_noise_rad: float = Field(
+        default=0.02, ge=0.0, description="standard deviation of the heading after turning 1 rad"
+    )
+    scale_bias: float = Field(
+        default=0.01, ge=0.0, description="standard deviation of the wrong scale of travel and of turns"
+    )
+    veer_bias_rad_m: float = Field(default=0.003, ge=0.0, description="standard deviation of the constant veer a metre")
+    slips_per_m: float = Field(default=0.0, ge=0.0, description="how often wheels turn without moving the robot")
+    slip_m: float = Field(default=0.05, ge=0.0, description="mean travel that a slip makes up")
+
+
+def drift(T_building_base: FloatArray, settings: DriftSettings, rng: np.random.Generator) -> FloatArray:
+    """Odometry (N, 3) of a robot that drove the true poses (N, 3): zero at first, then ever more wrong."""
+    twists = se2.log(se2.relative(T_building_base))
+    travel, turn = np.abs(twists[:, 0]), np.abs(twists[:, 2])
+    scale_travel, scale_turn = 1.0 + rng.normal(0.0, settings.scale_bias, 2)
+    veer = rng.normal(0.0, settings.veer_bias_rad_m)
+    noise = rng.normal(0.0, 1.0, (3, len(twists)))
+    wrong = np.column_stack(
+        (
+            scale_travel * twists[:, 0] + settings.travel_noise_m * np.sqrt(travel) * noise[0],
+            twists[:, 1],
+            scale_turn * twists[:, 2]
+            + veer * travel
+            + settings.heading_noise_rad * np.sqrt(travel) * noise[1]
+            + settings.turn_noise_rad * np.sqrt(turn) * noise[2],
+        )
+    )
+    if settings.slips_per_m:
+        slips = rng.poisson(settings.slips_per_m * travel)
+        wrong[:, 0] += rng.exponential(settings.slip_m, len(travel)) * slips * np.sign(twists[:, 0])
+    return _chain(se2.exp(wrong))
+
+
+def _chain(motions: FloatArray) -> FloatArray:
+    """Poses (N + 1, 3) that start at zero and follow ``motions`` (N, 3)."""
+    headings = np.insert(np.cumsum(motions[:, 2]), 0, 0.0)
+    steps = np.column_stack((motions[:, :2], np.zeros(len(motions))))
+    turned = se2.compose(np.column_stack((np.zeros((len(motions), 2)), headings[:-1])), steps)
+    positions = np.vstack((np.zeros(2), np.cumsum(turned[:, :2], axis=0)))
+    return np.column_stack((positions, se2.wrap_angle(headings)))

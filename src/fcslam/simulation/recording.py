@@ -1,0 +1,95 @@
+"""A fleet's recordings on disk. What was interrupted goes on to the bytes that it would have had without."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import fcslam
+from fcslam.config import dump
+from fcslam.errors import OutputError
+from fcslam.records import GroundTruth, RecordedItem
+from fcslam.simulation.fleet import SimulatedRobot, SimulationSettings
+from fcslam.sources import RecordingWriter
+from fcslam.sources.recording.layout import META
+
+SETTINGS = "simulation.yaml"
+"""What a folder's fleet is simulated from; everything in it follows from this."""
+
+Watch = Callable[[Iterator[RecordedItem]], Iterator[RecordedItem]]
+
+
+def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int, resume: bool) -> None:
+    """A folder for the fleet with its settings in it; with ``resume`` it may hold an interrupted one of the same.
+
+    Raises:
+        OutputError: the folder holds something else, or cannot be written.
+    """
+    text = f"# What `fcslam simulate` recorded here.\nfcslam: {fcslam.__version__}\nseed: {seed}\n{dump(settings)}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / SETTINGS).is_file() and resume:
+            _check_same(folder / SETTINGS, yaml.safe_load(text))
+            return
+        if any(path.name != f".{SETTINGS}" for path in folder.iterdir()):
+            hint = ", or go on with it by --resume" if (folder / SETTINGS).is_file() else ""
+            raise OutputError(f"{folder}: is not empty; choose another place{hint}")
+        # Whole or not there.
+        (folder / f".{SETTINGS}").write_text(text, encoding="utf-8")
+        os.replace(folder / f".{SETTINGS}", folder / SETTINGS)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be used as the output folder ({error})") from error
+
+
+def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter, resume: bool = False) -> None:
+    """Write the robot's recording at ``folder``; with ``resume`` what is there already stays and is not made again.
+
+    ``watch`` is given the records and hands them on; where it ends, the recording ends.
+
+    Raises:
+        SimulationError: MuJoCo or, with a camera, a GL library is missing.
+        OutputError: something is in the way, or cannot be written.
+        SourceError: what is there is no recording that can go on.
+    """
+    with _writer(robot, folder, resume) as writer:
+        held = writer.held
+        known = held.ground_truth
+        with closing(robot.items(held.scans, held.images)) as items:
+            for item in watch(items):
+                if isinstance(item, GroundTruth) and known:
+                    known -= 1
+                else:
+                    writer.write(item)
+
+
+def _writer(robot: SimulatedRobot, folder: Path, resume: bool) -> RecordingWriter:
+    if resume and (folder / META).is_file():
+        writer = RecordingWriter.resume(folder)
+        if writer.is_gapless:
+            return writer
+        # A power cut may have taken records before others that are there: their order is lost.
+        writer.close()
+    if resume and folder.exists():
+        shutil.rmtree(folder)
+    return RecordingWriter.create(folder, robot.laser, robot.camera)
+
+
+def _check_same(path: Path, wanted: dict[str, Any]) -> None:
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise OutputError(f"{path}: cannot be read, so nothing can go on here; choose another place") from error
+    if found != wanted:
+        raise OutputError(f"{path}: {_difference(found, wanted)}; give what was given before, or choose another place")
+
+
+def _difference(found: Any, wanted: Any, key: str = "") -> str:
+    """The first key that differs, in words."""
+    if not isinstance(found, dict) or not isinstance(wanted, dict):
+        return f"{key or 'the fleet'} was {found} and is now {wanted}"
+    name = next(name for name in {**wanted, **found} if found.get(name) != wanted.get(name))
+    return _difference(found.get(name), wanted.get(name), f"{key}.{name}" if key else name)

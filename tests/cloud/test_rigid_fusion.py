@@ -1,0 +1,290 @@
+"""The paper's literal fusion: rigid maps on matched points, as good as these points and not a bit better."""
+
+from dataclasses import replace
+from itertools import pairwise, permutations
+
+import numpy as np
+import pytest
+import small_fleet
+from cloud.scripted import ALIAS, closures, rectangle, stream, verified
+from small_fleet import feed, fingerprint, in_order, map_of
+
+from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.ledger import ClosureLedger
+from fcslam.cloud.rigid_fusion import fuse_rigidly
+from fcslam.cloud.strategy import FusionStrategy
+from fcslam.geometry import se2
+from fcslam.places.matcher import PlaceMatch
+from fcslam.records import Channel, ClosureStatus, Veto
+
+POSES = rectangle()
+A, B = ("a", POSES), ("b", POSES)
+LATER = 1000.0
+MEETINGS = [(0, 0), (8, 8), (16, 16), (24, 24), (32, 32), (40, 40)]
+RIGID = [FusionStrategy.TWO_POINT, FusionStrategy.N_POINT]
+
+rigid = pytest.mark.parametrize("strategy", RIGID)
+
+
+def two_robots():
+    return [*stream(*A, start_s=0.0), *stream(*B, start_s=LATER)]
+
+
+def error_m(result, robot_a="a", robot_b="b"):
+    """How far b's keyscans lie from the truth, seen from a's first; both drove the same poses."""
+    poses = {robot.robot: robot.T_map_base for robot in result.robots}
+    seen = se2.between(poses[robot_a][0], poses[robot_b])
+    return np.hypot(*(seen - se2.between(POSES[0], POSES))[:, :2].T).max()
+
+
+def between(result, status):
+    return [c for c in result.closures if c.i.robot != c.j.robot and c.status is status]
+
+
+def ledger_of(*scripts, turned=()):
+    """Verified matches in this order; ``turned`` ones are told from the other end."""
+    ledger = ClosureLedger()
+    for number, line in enumerate(line for script in scripts for line in script):
+        told = replace(line, i=line.j, j=line.i, T_i_j=se2.inverse(line.T_i_j)) if number in turned else line
+        ledger.add(PlaceMatch(told.i, told.j, Channel.LIDAR, 0.5, verified(told), predicted=False))
+    return ledger
+
+
+def own_maps(**moved):
+    """Every robot drove POSES and sees it from a frame of its own."""
+    return {robot: se2.compose(np.asarray(T, dtype=float), POSES) for robot, T in moved.items()}
+
+
+# Real scans
+
+
+@pytest.fixture(scope="module")
+def results(packets):
+    return {
+        strategy: feed(Fleet(FleetConfig(fusion=strategy), seed=0), packets).finalize() for strategy in FusionStrategy
+    }
+
+
+@rigid
+def test_clean_matches_put_every_robot_near_its_true_pose(results, drawn, strategy):
+    """Rigid maps keep their drift, and a direction from two near points is a rough one: a decimetre over 30 m."""
+    assert set(map_of(results[strategy]).values()) == {0}
+    truth = {robot.name: robot for robot in drawn.robots}
+    first, *others = results[strategy].robots
+    T_first = small_fleet.truth_at(truth[first.robot], [k.stamp for k in first.keyscans])
+    for other in others:
+        T_other = small_fleet.truth_at(truth[other.robot], [k.stamp for k in other.keyscans])
+        true, seen = se2.between(T_first[0], T_other), se2.between(first.T_map_base[0], other.T_map_base)
+        assert np.hypot(*(seen - true)[:, :2].T).max() < 0.2
+
+
+@rigid
+def test_robots_own_maps_stay_rigid(results, strategy):
+    for robot, joint in zip(results[strategy].robots, results[FusionStrategy.JOINT].robots, strict=True):
+        assert robot.T_local_base.tobytes() == joint.T_local_base.tobytes()
+        motions = [se2.between(poses[:-1], poses[1:]) for poses in (robot.T_map_base, robot.T_local_base)]
+        assert np.allclose(*motions, atol=1e-9)
+
+
+@rigid
+def test_the_strategy_changes_what_is_concluded_and_nothing_that_was_found(results, strategy):
+    found, joint = results[strategy].closures, results[FusionStrategy.JOINT].closures
+    assert [(c.i, c.j, c.T_i_j.tobytes(), c.informative) for c in found] == [
+        (c.i, c.j, c.T_i_j.tobytes(), c.informative) for c in joint
+    ]
+    for c, reference in zip(found, joint, strict=True):
+        if c.i.robot == c.j.robot or reference.status is ClosureStatus.CANDIDATE:
+            assert (c.status, c.reason) == (reference.status, reference.reason)
+        else:
+            assert c.status in (ClosureStatus.ACCEPTED, ClosureStatus.VERIFIED)
+
+
+def test_two_points_of_each_further_robot_are_used(results):
+    """Three robots in one map are two relations."""
+    used = between(results[FusionStrategy.TWO_POINT], ClosureStatus.ACCEPTED)
+    assert len(used) == 4
+    assert {c.reason for c in used} == {"one of 2 matched points of two_point"}
+    every = between(results[FusionStrategy.N_POINT], ClosureStatus.ACCEPTED)
+    assert len(every) > len(used)
+    assert {(c.i, c.j) for c in used} <= {(c.i, c.j) for c in every}
+
+
+@rigid
+def test_corrections_and_graph_say_the_same_as_the_poses(results, strategy):
+    result, joint = results[strategy], results[FusionStrategy.JOINT]
+    for robot, correction, before, reference in zip(
+        result.robots, result.corrections, joint.robots, joint.corrections, strict=True
+    ):
+        # the chain of motions is the robot's own, whatever the fusion
+        chain = se2.between(reference.T_map_odom, before.T_map_base[-1])
+        assert np.allclose(se2.compose(correction.T_map_odom, chain), robot.T_map_base[-1], atol=1e-9)
+    stacked = np.concatenate([robot.T_map_base for robot in result.robots])
+    poses = result.graph.poses()
+    assert np.array_equal(poses[np.lexsort(poses.T)], stacked[np.lexsort(stacked.T)])
+    accepted = sum(c.status is ClosureStatus.ACCEPTED for c in result.closures)
+    assert sum(edge.robust for edge in result.graph.edges) == accepted
+
+
+# Evidence written by hand
+
+
+@pytest.mark.parametrize(("strategy", "off_m"), [("two_point", 3.0), ("n_point", 0.5), ("joint", 0.0)])
+def test_a_false_first_match_ruins_who_trusts_it(scripted, strategy, off_m):
+    script = [*closures(A, B, MEETINGS[:1], shift=ALIAS), *closures(A, B, MEETINGS[1:])]
+    result = feed(scripted(script, fusion=strategy), two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert error_m(result) > off_m if off_m else error_m(result) < 1e-3
+
+
+@rigid
+def test_true_matches_of_robots_without_drift_leave_no_error(scripted, strategy):
+    result = feed(scripted(closures(A, B, MEETINGS), fusion=strategy), two_robots()).finalize()
+    assert error_m(result) < 1e-3
+    used = between(result, ClosureStatus.ACCEPTED)
+    assert len(used) == (2 if strategy is FusionStrategy.TWO_POINT else len(MEETINGS))
+    assert {c.reason for c in between(result, ClosureStatus.VERIFIED)} <= {"not needed by two_point"}
+
+
+@rigid
+def test_two_matches_join_what_the_joint_graph_leaves_apart(scripted, strategy):
+    """The paper asks for no third witness."""
+    script = closures(A, B, MEETINGS[:2])
+    assert map_of(feed(scripted(script), two_robots()).finalize()) == {"a": 0, "b": 1}
+    assert map_of(feed(scripted(script, fusion=strategy), two_robots()).finalize()) == {"a": 0, "b": 0}
+
+
+@rigid
+def test_a_veto_takes_a_match_away(scripted, strategy):
+    fleet = scripted(closures(A, B, MEETINGS[:2]), fusion=strategy)
+    fleet.veto(Veto("a", "b", (8.0, LATER + 8.0)))
+    result = feed(fleet, two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    (revoked,) = between(result, ClosureStatus.REVOKED)
+    assert revoked.reason == "vetoed by hand"
+
+
+@rigid
+def test_looking_at_the_result_does_not_change_it(scripted, strategy):
+    packets = in_order([*stream(*A, start_s=0.0), *stream(*B, start_s=5.5)])
+    script = closures(A, B, MEETINGS)
+    reference = fingerprint(feed(scripted(script, fusion=strategy), packets).finalize())
+    looked = scripted(script, fusion=strategy)
+    for first, last in pairwise(range(0, len(packets) + 1, len(packets) // 5)):
+        feed(looked, packets[first:last])
+        assert fingerprint(looked.finalize()) == fingerprint(looked.finalize())
+    assert fingerprint(feed(looked, packets[last:]).finalize()) == reference
+
+
+# Laws
+
+
+def agree(one, other):
+    assert [list(robots) for robots in one.maps] == [list(robots) for robots in other.maps]
+    for robot in one.T_map_base:
+        assert np.allclose(se2.between(one.T_map_base[robot], other.T_map_base[robot]), 0.0, atol=1e-9)
+
+
+NOISY = [
+    replace(line, T_i_j=line.T_i_j + offset)
+    for line, offset in zip(
+        closures(A, B, MEETINGS), np.random.default_rng(0).normal(0.0, 0.05, (len(MEETINGS), 3)), strict=True
+    )
+]
+
+
+@rigid
+def test_where_a_robots_own_map_has_its_origin_does_not_matter(strategy):
+    reference = fuse_rigidly(ledger_of(NOISY), own_maps(a=(0, 0, 0), b=(0, 0, 0)), strategy)
+    agree(fuse_rigidly(ledger_of(NOISY), own_maps(a=(0, 0, 0), b=(70.0, -30.0, 2.5)), strategy), reference)
+    moved = fuse_rigidly(ledger_of(NOISY), own_maps(a=(5.0, 2.0, -1.0), b=(0, 0, 0)), strategy)
+    for robot, poses in reference.T_map_base.items():
+        T = se2.compose(np.array([5.0, 2.0, -1.0]), poses)
+        assert np.allclose(se2.between(T, moved.T_map_base[robot]), 0.0, atol=1e-9), "a's frame is the map's"
+
+
+@rigid
+def test_it_does_not_matter_which_end_tells_a_true_match(strategy):
+    maps = own_maps(a=(0, 0, 0), b=(3.0, 4.0, 2.0))
+    reference = fuse_rigidly(ledger_of(closures(A, B, MEETINGS[:2])), maps, strategy)
+    assert reference.maps == [["a", "b"]]
+    for turned in ((0,), (1,), (0, 1)):
+        agree(fuse_rigidly(ledger_of(closures(A, B, MEETINGS[:2]), turned=turned), maps, strategy), reference)
+
+
+def test_the_matched_points_lie_on_a_line_with_one_middle():
+    """Eqs. (5) and (6): the direction between the two points is the same in both maps, and so is their middle."""
+    fused = fuse_rigidly(ledger_of(NOISY), own_maps(a=(0, 0, 0), b=(9.0, 9.0, 3.0)), FusionStrategy.TWO_POINT)
+    first = NOISY[:2]
+    in_a = [se2.compose(fused.T_map_base["a"][line.i.number], line.T_i_j)[:2] for line in first]
+    in_b = [fused.T_map_base["b"][line.j.number][:2] for line in first]
+    assert np.allclose(np.mean(in_a, axis=0), np.mean(in_b, axis=0))
+    side_a, side_b = in_a[1] - in_a[0], in_b[1] - in_b[0]
+    assert side_a[0] * side_b[1] - side_a[1] * side_b[0] == pytest.approx(0.0, abs=1e-9)
+    assert side_a @ side_b > 0.0
+
+
+def test_n_points_have_the_least_squares():
+    fused = fuse_rigidly(ledger_of(NOISY), own_maps(a=(0, 0, 0), b=(9.0, 9.0, 3.0)), FusionStrategy.N_POINT)
+    in_a = np.array([se2.compose(fused.T_map_base["a"][line.i.number], line.T_i_j)[:2] for line in NOISY])
+    own = fused.T_map_base["b"][[line.j.number for line in NOISY]][:, :2]
+    least = np.sum((in_a - own) ** 2)
+    for step in (*np.eye(3) * 1e-3, *np.eye(3) * -1e-3):
+        moved = se2.compose(step, np.column_stack((own, np.zeros(len(own)))))[:, :2]
+        assert np.sum((in_a - moved) ** 2) > least
+
+
+@rigid
+@pytest.mark.parametrize(
+    "pairs",
+    [[(8, 8)], [(8, 8), (8, 8), (8, 8)], [(0, 8), (8, 8)], [(8, 0), (8, 8)]],
+    ids=["one", "one thrice", "one place of b", "one place of a"],
+)
+def test_a_place_seen_again_is_no_second_point(strategy, pairs):
+    """No direction, no relation; points that coincide in one of the maps only are as useless."""
+    lines = [replace(line, T_i_j=np.zeros(3)) for line in closures(A, B, pairs)]
+    fused = fuse_rigidly(ledger_of(lines), own_maps(a=(0, 0, 0), b=(0, 0, 0)), strategy)
+    assert fused.maps == [["a"], ["b"]]
+    assert {c.status for c in fused.closures} == {ClosureStatus.VERIFIED}
+
+
+def test_the_first_two_points_that_lie_apart_are_taken():
+    fused = fuse_rigidly(
+        ledger_of(closures(A, B, [(8, 8), (8, 8), (16, 16), (24, 24)])),
+        own_maps(a=(0, 0, 0), b=(0, 0, 1)), FusionStrategy.TWO_POINT,
+    )  # fmt: skip
+    assert [c.status is ClosureStatus.ACCEPTED for c in fused.closures] == [True, False, True, False]
+
+
+@rigid
+@pytest.mark.parametrize("pairs", list(permutations(["ab", "ac", "bc"])), ids="-".join)
+def test_robots_are_chained_whoever_meets_first(strategy, pairs):
+    """All end in the frame of a by the two pairs that meet first; what the third pair says is not needed."""
+    maps = own_maps(a=(0, 0, 0), b=(1.0, 2.0, 3.0), c=(-4.0, 2.0, 1.0))
+    meetings = [
+        closures((one, POSES), (other, POSES), MEETINGS[:2], shift=ALIAS if one + other == pairs[2] else None)
+        for one, other in pairs
+    ]
+    fused = fuse_rigidly(ledger_of(*meetings), maps, strategy)
+    assert fused.maps == [["a", "b", "c"]]
+    for poses in fused.T_map_base.values():
+        assert np.allclose(se2.between(poses, POSES), 0.0, atol=1e-9)
+    assert [c.status for c in fused.closures[4:]] == [ClosureStatus.VERIFIED] * 2
+
+
+@rigid
+def test_who_meets_nobody_keeps_a_map_alone(strategy):
+    fused = fuse_rigidly(ledger_of(closures(A, B, MEETINGS)), own_maps(a=(0, 0, 0), c=(1, 1, 1), b=(2, 2, 2)), strategy)
+    assert fused.maps == [["a", "b"], ["c"]]
+    assert np.array_equal(fused.T_map_base["c"], fused.T_local_base["c"])
+
+
+def test_matches_that_cancel_each_other_join_nothing():
+    """Two say straight on, two say turned round: no rotation is better than another."""
+    turn = np.array([0.0, 0.0, np.pi])
+    square = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
+    pairs = [(0, 0), (1, 1), (2, 2), (3, 3)]
+    half = closures(("a", square), ("b", square), pairs[:2])
+    other = closures(("a", square), ("b", square), pairs[2:], shift=turn)
+    fused = fuse_rigidly(ledger_of(half, other), {"a": square, "b": square}, FusionStrategy.N_POINT)
+    assert fused.maps == [["a"], ["b"]]
+    assert {c.status for c in fused.closures} == {ClosureStatus.VERIFIED}

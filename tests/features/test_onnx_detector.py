@@ -1,0 +1,124 @@
+"""Networks as detectors: the contract, images of any size, and what breaks the contract."""
+
+import sys
+
+import numpy as np
+import pytest
+from features.networks import tiny_network
+
+from fcslam.errors import FeatureError
+from fcslam.features.choice import make_detector
+from fcslam.features.classical import Orb, OrbConfig
+from fcslam.features.detector import OnnxConfig, OnnxDetector
+from fcslam.features.kinds import DetectorKind
+
+pytest.importorskip("onnxruntime")
+
+
+def image_with_dots(shape, dots):
+    image = np.zeros(shape, np.uint8)
+    for x, y, level in dots:
+        image[y, x] = level
+    return image
+
+
+@pytest.fixture
+def weights(tmp_path):
+    path = tmp_path / "tiny.onnx"
+    tiny_network(path)
+    return path
+
+
+def test_keypoints_are_where_the_probability_peaks(weights):
+    detector = OnnxDetector(OnnxConfig(weights=weights))
+    found = detector.detect(image_with_dots((50, 61), [(10, 20, 200), (58, 48, 255), (30, 5, 100)]))
+    assert detector.version == "tiny-1"
+    assert found.keypoints_px.tolist() == [[58, 48], [10, 20], [30, 5]]
+    assert np.allclose(found.scores, (np.array([255, 200, 100]) / 255) ** 2, atol=1e-6)
+    assert found.descriptors.shape == (3, 32)
+
+
+def test_bits_are_the_signs_of_the_logits_at_a_cells_centre(tmp_path):
+    kernel = tiny_network(tmp_path / "n.onnx")
+    image = np.zeros((16, 24), np.uint8)
+    image[3:5, 11:13] = 250  # a flat top around (11.5, 3.5), the centre of cell (0, 1)
+    found = OnnxDetector(OnnxConfig(weights=tmp_path / "n.onnx", nms_px=4)).detect(image)
+    assert found.keypoints_px.tolist() == [[11.5, 3.5]]
+    cell = image[:8, 8:16].astype(np.float32) / 255
+    expected = np.einsum("bchw,hw->b", kernel, cell) >= 0
+    assert np.array_equal(np.unpackbits(found.descriptors[0]), expected)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (7, 300), (8, 8), (240, 320), (241, 317)])
+def test_images_of_any_size_give_keypoints_inside(weights, shape):
+    image = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
+    found = OnnxDetector(OnnxConfig(weights=weights)).detect(image)
+    assert len(found.scores) > 0
+    assert np.all((found.keypoints_px > -0.51) & (found.keypoints_px < np.array(shape[::-1]) - 0.49))
+
+
+def test_nothing_to_see_is_an_empty_well_shaped_result(weights):
+    for shape in ((240, 320), (0, 0)):
+        found = OnnxDetector(OnnxConfig(weights=weights)).detect(np.zeros(shape, np.uint8))
+        assert (found.keypoints_px.shape, found.scores.shape, found.descriptors.shape) == ((0, 2), (0,), (0, 32))
+
+
+def test_settings_bound_what_is_kept(weights):
+    image = np.random.default_rng(1).integers(0, 256, (120, 160), np.uint8)
+    found = OnnxDetector(OnnxConfig(weights=weights, most_features=50, least_score=0.5)).detect(image)
+    assert len(found.scores) == 50
+    assert np.all(np.diff(found.scores) <= 0)
+    assert np.all(found.scores > 0.5)
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ({"form": "2"}, "its format is 2, not 1"),
+        ({"form": None}, "its format is none"),
+        ({"version": None}, "is no detector version"),
+        ({"version": "a b"}, "'a b' is no detector version"),
+        ({"bits": 128}, r"\(128, 3, 5\) logits"),
+        ({"stride": 4}, r"\(256, 6, 10\) logits"),
+        ({"outputs": ("heat", "codes")}, "does not run"),
+    ],
+)
+def test_networks_that_break_the_contract_are_refused(tmp_path, broken, message):
+    tiny_network(tmp_path / "n.onnx", **broken)
+    with pytest.raises(FeatureError, match=message):
+        OnnxDetector(OnnxConfig(weights=tmp_path / "n.onnx"))
+
+
+def test_foreign_and_missing_files_are_refused(tmp_path):
+    (tmp_path / "n.onnx").write_bytes(b"no network at all")
+    with pytest.raises(FeatureError, match="no ONNX network"):
+        OnnxDetector(OnnxConfig(weights=tmp_path / "n.onnx"))
+    with pytest.raises(FeatureError, match="cannot read the network weights"):
+        OnnxDetector(OnnxConfig(weights=tmp_path / "missing.onnx"))
+
+
+def test_without_weights_one_is_told_so(tmp_path, monkeypatch):
+    monkeypatch.setattr("fcslam.features.detector.SHIPPED_NETWORK", tmp_path / "none.onnx")
+    with pytest.raises(FeatureError, match="no network weights come with this version"):
+        OnnxDetector(OnnxConfig())
+
+
+def test_weights_that_come_with_the_package_are_the_default(weights, monkeypatch):
+    monkeypatch.setattr("fcslam.features.detector.SHIPPED_NETWORK", weights)
+    assert OnnxDetector(OnnxConfig()).version == "tiny-1"
+
+
+def test_the_kind_chooses(weights):
+    onnx = OnnxConfig(weights=weights)
+    assert make_detector(DetectorKind.ONNX, OrbConfig(), onnx).version == "tiny-1"
+    assert isinstance(make_detector(DetectorKind.ORB, OrbConfig(), onnx), Orb)
+
+
+def test_the_library_is_loaded_late():
+    import subprocess
+
+    code = "import sys, fcslam.features.detector, fcslam.robot.views; sys.exit('onnxruntime' in sys.modules)"
+    assert (
+        subprocess.run([sys.executable, "-c", code], check=False, env={"PYTHONPATH": ":".join(sys.path)}).returncode
+        == 0
+    )
