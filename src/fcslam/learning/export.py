@@ -26,6 +26,7 @@ from fcslam.learning.network import KeypointNetwork
 
 OPSET: Final = 17
 CALIBRATION_IMAGES: Final = 64
+FEWEST_INPUTS: Final = 8
 TRACED_SIZE: Final = (240, 320)
 
 
@@ -79,7 +80,8 @@ def export(network: KeypointNetwork, path: Path) -> None:
 def quantise(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
     """Write the int8 file of a float32 one, with the ranges that ``images`` give its activations.
 
-    The two last convolutions stay in float: their outputs are compared with each other, and cost little.
+    The two last convolutions stay in float, as what they give is compared with each other, and so do those with so few
+    inputs that int8 would slow them down.
 
     Raises:
         OutputError: it cannot be written.
@@ -99,7 +101,7 @@ def quantise(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
             op_types_to_quantize=["Conv"],
-            nodes_to_exclude=_last_convolutions(graph),
+            nodes_to_exclude=_left_in_float(graph),
         )
         quantised = onnx.load(f"{folder}/{path.name}")
     _write(quantised, f"{version}-int8", path)
@@ -120,8 +122,9 @@ class _Calibration:
         return {"image": image[None, None, :height, :width].astype(np.float32) / np.float32(255.0)}
 
 
-def _last_convolutions(graph: Any) -> list[str]:
-    """Names of the convolutions that no other convolution comes after."""
+def _left_in_float(graph: Any) -> list[str]:
+    """Names of the convolutions that no other one comes after, and of those with few inputs."""
+    inputs = {array.name: array.dims[1] for array in graph.graph.initializer if len(array.dims) == 4}
     consumers: dict[str, list[Any]] = {}
     for node in graph.graph.node:
         for name in node.input:
@@ -132,7 +135,8 @@ def _last_convolutions(graph: Any) -> list[str]:
             each.op_type == "Conv" or leads_on(each) for output in node.output for each in consumers.get(output, [])
         )
 
-    return [node.name for node in graph.graph.node if node.op_type == "Conv" and not leads_on(node)]
+    convolutions = [node for node in graph.graph.node if node.op_type == "Conv"]
+    return [node.name for node in convolutions if not leads_on(node) or inputs[node.input[1]] < FEWEST_INPUTS]
 
 
 def _write(graph: Any, version: str, path: Path) -> None:
