@@ -7,6 +7,7 @@ FcslamError
 │   ├── OutputError       the output folder cannot be used
 │   ├── SimulationError   a fleet cannot be simulated
 │   ├── FeatureError      network weights, images or extracted features cannot be used
+│   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
 │   └── EvaluationError   a reference file or a run folder cannot be evaluated
 └── PacketError           bytes received are not a packet that may be trusted
 """
@@ -38,6 +39,10 @@ class SimulationError(InputError):
 
 class FeatureError(InputError):
     """Network weights, images or extracted features cannot be used."""
+
+
+class TrainingError(InputError):
+    """A detector cannot be trained: images, a teacher's points or a checkpoint do not serve, or torch is missing."""
 
 
 class EvaluationError(InputError):

@@ -7,7 +7,7 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import config, demo, evaluate, extract, simulate
+from fcslam.cli import config, demo, evaluate, extract, simulate, train
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.errors import FcslamError
@@ -38,6 +38,9 @@ app.command(
 )(simulate.simulate)
 app.command("extract", epilog="Example: fcslam extract photos --output features --keypoints 1000")(extract.extract)
 app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo.demo)
+app.command("train", epilog="Example: fcslam train photos --output detector, fcslam train photos -o try --quick")(
+    train.train
+)
 app.add_typer(config.app, name="config")
 app.add_typer(evaluate.app, name="evaluate")
 

@@ -1,0 +1,88 @@
+"""Batches of pairs, drawn ahead in threads. A batch is a function of the seed and its step alone."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fcslam.learning.pairs import Example, Pair, draw_pair
+from fcslam.learning.settings import TrainingSettings
+
+TAUGHT_POINTS = 192
+"""Points of the teacher in a pair."""
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """B pairs; the first B images are first views, the others second views."""
+
+    images: Tensor
+    """Shape (2B, 1, H, W)."""
+    targets: Tensor
+    """Shape (2B, H, W)."""
+    seen: Tensor
+    """Shape (2B, H, W), bool."""
+    points: Tensor
+    """Shape (2B, N, 2) [px]; 0 where not valid."""
+    valid: Tensor
+    """Shape (B, N), bool."""
+    taught_points: Tensor
+    """Shape (2B, M, 2) [px]; 0 where not valid."""
+    taught_valid: Tensor
+    """Shape (B, M), bool."""
+    taught: Tensor
+    """Shape (B, M, D)."""
+
+    def to(self, device: torch.device) -> "Batch":
+        """The batch on another device."""
+        return Batch(**{field.name: getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)})
+
+
+def draw_batch(examples: Sequence[Example], settings: TrainingSettings, step: int) -> Batch:
+    """The batch of a step."""
+    pairs = []
+    for index in range(settings.pairs):
+        rng = np.random.default_rng([settings.seed, step, index])
+        example = examples[int(rng.integers(len(examples)))]
+        pairs.append(draw_pair(example, (settings.side_px, settings.side_px), settings.points, TAUGHT_POINTS, rng))
+    return collate(pairs)
+
+
+def collate(pairs: Sequence[Pair]) -> Batch:
+    """Pairs as one batch."""
+    views = [pair.views[side] for side in (0, 1) for pair in pairs]
+
+    def stack(arrays: Sequence[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.nan_to_num(np.stack(arrays)))
+
+    return Batch(
+        images=stack([view.image for view in views]).unsqueeze(1),
+        targets=stack([view.targets for view in views]),
+        seen=stack([view.valid for view in views]),
+        points=stack([view.points for view in views]),
+        valid=stack([pair.valid for pair in pairs]),
+        taught_points=stack([view.taught for view in views]),
+        taught_valid=stack([pair.taught_valid for pair in pairs]),
+        taught=stack([pair.taught for pair in pairs]),
+    )
+
+
+def stream(
+    examples: Sequence[Example], settings: TrainingSettings, first: int, ahead: int, threads: int
+) -> Iterator[tuple[int, Batch]]:
+    """Batches from step ``first`` on, in order, up to ``ahead`` of them prepared by ``threads`` threads."""
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[Future[Batch]] = deque()
+        asked = first
+        try:
+            for step in range(first, settings.steps):
+                while asked < min(step + ahead, settings.steps):
+                    waiting.append(pool.submit(draw_batch, examples, settings, asked))
+                    asked += 1
+                yield step, waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,64 @@
+"""What a finished training run hands over: the detector as ONNX files, its card, its training curve."""
+
+from pathlib import Path
+
+from fcslam.config import dump
+from fcslam.errors import OutputError
+from fcslam.learning.curve import draw_curves, read_curves
+from fcslam.learning.export import export, quantise, version_of
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.stages import Images
+from fcslam.learning.trainer import PROGRESS_FILE
+
+FIGURES = {
+    "repeatability": "keypoints found again within 3 px",
+    "mma_3px": "matches within 3 px, by bits",
+    "shift_repeatability": "keypoints found again within 1 px after a shift by 1 to 7 px",
+    "bit_bias": "distance of a bit's mean from a half",
+    "code_spread_bits": "bits between codes of different points",
+}
+
+
+def deliver(
+    network: KeypointNetwork, folder: Path, settings: TrainingSettings, images: Images, teacher: Path | None
+) -> list[Path]:
+    """Write `detector.onnx`, `detector-int8.onnx`, `training.png` and `card.md`; returns their paths.
+
+    Raises:
+        OutputError: one cannot be written.
+    """
+    floating, small = folder / "detector.onnx", folder / "detector-int8.onnx"
+    export(network, floating)
+    quantise(floating, small, [example.image for example in images.train])
+    picture, card = folder / "training.png", folder / "card.md"
+    curves = read_curves(folder / "joint" / PROGRESS_FILE, "joint")
+    try:
+        draw_curves(curves, picture)
+        latest = {name: curves[name][1][-1] for name in FIGURES if name in curves}
+        card.write_text(_card(version_of(network), settings, images, teacher, latest), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error}); make room and run the command again") from error
+    return [floating, small, picture, card]
+
+
+def _card(
+    version: str, settings: TrainingSettings, images: Images, teacher: Path | None, figures: dict[str, float]
+) -> str:
+    taught = "none" if teacher is None else f"keypoints and descriptors in {teacher.name}"
+    lines = [
+        f"# Detector {version}",
+        "",
+        f"Trained on {len(images.train)} images; {len(images.held_out)} others were held out, {images.skipped} left "
+        "out.",
+        f"Teacher: {taught}.",
+        "",
+        "| on pairs of held-out images, 320 x 240, warped and lit at random | |",
+        "|---|---|",
+        *(f"| {FIGURES[name]} | {value:.3f} |" for name, value in figures.items()),
+        "",
+        "Settings:",
+        "",
+        *(f"    {line}" for line in dump(settings).splitlines()),
+    ]
+    return "\n".join(lines) + "\n"

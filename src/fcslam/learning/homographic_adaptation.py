@@ -1,0 +1,66 @@
+"""Homographic adaptation (DeTone et al. 2018): a detector's answer averaged over many warped copies of an image.
+
+What is found again from other viewpoints adds up; what was chance fades. Any detector will do that gives a response at
+every pixel: the network itself, or Harris's measure, which on planes is found again best of all.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.features.dense import find_peaks
+from fcslam.features.detector import GreyImage
+from fcslam.learning.labels import Points
+from fcslam.learning.warps import random_change, warp_image
+from fcslam.metrics.homography import inverse
+from fcslam.records import FloatArray
+
+Response = NDArray[np.float32]
+"""Shape (height, width): how much of a keypoint is at each pixel."""
+
+HARRIS_BLOCK_PX: Final = 4
+HARRIS_K: Final = 0.04
+BORDER_PX: Final = 4
+"""Nothing is a keypoint so close to the rim."""
+
+
+def adapt(
+    detector: Callable[[GreyImage], Response], image: GreyImage, copies: int, rng: np.random.Generator
+) -> Response:
+    """Mean response of ``detector`` over the image itself and ``copies`` warped ones, where these see it."""
+    size = (image.shape[1], image.shape[0])
+    total = detector(image).astype(np.float32)
+    count = np.ones(image.shape, np.float32)
+    for _ in range(copies):
+        homography = random_change(size, rng)
+        back = inverse(homography)
+        response = detector(warp_image(image, homography, size))
+        everywhere = np.zeros(image.shape, np.float32)
+        everywhere[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 1.0
+        total += _unwarp(response * everywhere, back)
+        count += _unwarp(everywhere, back)
+    return total / count
+
+
+def harris(image: GreyImage) -> Response:
+    """Harris's corner measure (Harris and Stephens 1988); its root, so that strong contrast does not drown the rest."""
+    measure = np.asarray(cv2.cornerHarris(image, HARRIS_BLOCK_PX, 3, HARRIS_K), np.float32)
+    response: Response = np.sqrt(np.maximum(measure, np.float32(0.0)))
+    return response
+
+
+def peaks(response: Response, nms_px: float, most: int) -> Points:
+    """The strongest local maxima, shape (N, 2), to a fraction of a pixel, strongest first."""
+    within = np.zeros_like(response)
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    within[inner] = response[inner]
+    points, _ = find_peaks(within, 0.0, nms_px, most)
+    return points
+
+
+def _unwarp(response: Response, homography: FloatArray) -> Response:
+    height, width = response.shape
+    return np.asarray(cv2.warpPerspective(response, homography, (width, height), flags=cv2.INTER_LINEAR), np.float32)

@@ -1,0 +1,77 @@
+"""Images to train on: any folder tree of them."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from fcslam.errors import FeatureError, TrainingError
+from fcslam.features.detector import GreyImage
+from fcslam.features.files import read_grey
+
+SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
+SMALLEST_SIDE_PX: Final = 96
+LARGEST_SIDE_PX: Final = 640
+"""Larger images are shrunk to this: a robot's camera has no more, and fine grain there is noise."""
+FEWEST_CORNERS: Final = 60
+CORNER_CONTRAST: Final = 15
+"""Frames with fewer corners of this contrast (bare wall) teach nothing."""
+HELD_OUT_SHARE: Final = 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFile:
+    """An image on disk."""
+
+    path: Path
+    name: str
+    """Path from the folder that was given, which it begins with; the same wherever that folder lies."""
+
+
+def find_images(roots: Sequence[Path]) -> list[ImageFile]:
+    """Every image file in the folder trees, in order of their names.
+
+    Raises:
+        TrainingError: a root is no folder, holds no image, or has the name of another one.
+    """
+    found: dict[str, ImageFile] = {}
+    for root in roots:
+        if not root.is_dir():
+            raise TrainingError(f"{root}: is no folder; give a folder of images")
+        base = root.resolve()
+        files = [file for file in base.rglob("*") if file.suffix.lower() in SUFFIXES and file.is_file()]
+        if not files:
+            raise TrainingError(f"{root}: holds no image ({', '.join(sorted(SUFFIXES))}); give a folder of images")
+        images = {name: ImageFile(file, name) for file in files for name in [file.relative_to(base.parent).as_posix()]}
+        if found.keys() & images.keys():
+            raise TrainingError(f"{root}: another folder has the same name and the same files; rename one of them")
+        found |= images
+    return [found[name] for name in sorted(found)]
+
+
+def read_image(path: Path) -> GreyImage | None:
+    """An image in grey levels, its longer side at most ``LARGEST_SIDE_PX``; None if the file is no image."""
+    try:
+        image = read_grey(path)
+    except FeatureError:
+        return None
+    shrink = LARGEST_SIDE_PX / max(image.shape)
+    if shrink < 1.0:
+        image = np.asarray(cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
+    return image
+
+
+def is_usable(image: GreyImage) -> bool:
+    """Whether an image is large enough and shows enough to learn from."""
+    if min(image.shape) < SMALLEST_SIDE_PX:
+        return False
+    return len(cv2.FastFeatureDetector.create(threshold=CORNER_CONTRAST).detect(image)) >= FEWEST_CORNERS
+
+
+def is_held_out(name: str) -> bool:
+    """Whether the image of this name is kept for validation: the same on every machine, whatever else is there."""
+    return zlib.crc32(name.encode()) < HELD_OUT_SHARE * 2**32

@@ -1,0 +1,113 @@
+"""Labels of an image: keypoints with how good each is, and what a teacher says of some points."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from fcslam.errors import TrainingError
+from fcslam.learning.arrays import read_arrays, write_arrays
+
+SAME_POINT_PX: Final = 3.0
+"""Points of two detectors this close are one."""
+MOST_POINTS: Final = 800
+WORST_QUALITY: Final = 0.1
+
+Points = NDArray[np.float32]
+"""Shape (N, 2): x, y in pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Teacher:
+    """A teacher's answer for one image."""
+
+    keypoints: Points
+    """Strongest first."""
+    descriptors: NDArray[np.float16]
+    """Shape (N, D), of unit length."""
+
+
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """Keypoints of one image."""
+
+    keypoints: Points
+    quality: NDArray[np.float32]
+    """Shape (N,): in (0, 1], 1 for the best of the image."""
+
+
+def fuse(first: Points, second: Points) -> Labels:
+    """Two detectors' keypoints, each strongest first, as one set ranked by the mean of both ranks.
+
+    A point that only one of them found ranks last with the other. Points both found lie midway.
+    """
+    ranks = [1.0 - np.arange(len(points)) / MOST_POINTS for points in (first, second)]
+    if min(len(first), len(second)) == 0:
+        points, score = np.concatenate((first, second)), np.concatenate(ranks) / 2.0
+    else:
+        distances, nearest = cKDTree(second).query(first, distance_upper_bound=SAME_POINT_PX)
+        both = np.isfinite(distances)
+        partner = np.where(both, nearest, 0)
+        alone = np.ones(len(second), np.bool_)
+        alone[partner[both]] = False
+        middle = np.where(both[:, None], 0.5 * (first + second[partner]), first)
+        points = np.concatenate((middle, second[alone]))
+        score = np.concatenate((ranks[0] + np.where(both, ranks[1][partner], 0.0), ranks[1][alone])) / 2.0
+    kept = _suppress(points, score)[:MOST_POINTS]
+    quality = 1.0 - (1.0 - WORST_QUALITY) * np.arange(len(kept)) / MOST_POINTS
+    return Labels(points[kept].astype(np.float32), quality.astype(np.float32))
+
+
+def read_teacher(path: Path) -> Teacher:
+    """A teacher's answer from its file, made by a script of the user's (see docs/training.md).
+
+    Raises:
+        TrainingError: there is no such file, or it does not hold what it should.
+    """
+    try:
+        arrays = read_arrays(path)
+        keypoints, scores, descriptors = arrays["keypoints"], arrays["scores"], arrays["descriptors"]
+        order = np.argsort(-scores, kind="stable")
+        teacher = Teacher(keypoints[order].astype(np.float32), descriptors[order].astype(np.float16))
+        sound = keypoints.shape == (len(scores), 2) and descriptors.ndim == 2 and len(descriptors) == len(scores)
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise TrainingError(f"{path}: is no file of a teacher's points ({error})") from error
+    if not sound or not np.isfinite(teacher.keypoints).all() or not np.isfinite(teacher.descriptors).all():
+        raise TrainingError(f"{path}: keypoints (N, 2), scores (N,) and descriptors (N, D) do not fit together")
+    return teacher
+
+
+def write_labels(path: Path, labels: Labels, key: int) -> None:
+    """Keep labels for the next run; ``key`` tells the image they belong to.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    write_arrays(path, {"keypoints": labels.keypoints, "quality": labels.quality, "key": np.array(key)})
+
+
+def read_labels(path: Path, key: int) -> Labels | None:
+    """Labels kept for this very image, if there are."""
+    try:
+        arrays = read_arrays(path)
+        return Labels(arrays["keypoints"], arrays["quality"]) if int(arrays["key"]) == key else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _suppress(points: Points, score: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices of the points, best first, that have no better one close by."""
+    order = np.argsort(-score, kind="stable")
+    rank = np.empty(len(points), np.int64)
+    rank[order] = np.arange(len(points))
+    kept = np.ones(len(points), np.bool_)
+    neighbours = cKDTree(points).query_ball_point(points, SAME_POINT_PX) if len(points) else []
+    for index in order:
+        if kept[index]:
+            for other in neighbours[index]:
+                if rank[other] > rank[index]:
+                    kept[other] = False
+    return order[kept[order]]

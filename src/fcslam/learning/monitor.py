@@ -1,0 +1,95 @@
+"""What a network can do, on pairs from images it never trained on; and whether its codes collapse."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from fcslam.features.codes import CODE_BITS, hamming_matrix, mutual_matches
+from fcslam.features.dense import find_peaks, sample_codes
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.pairs import Pair
+from fcslam.learning.warps import well_inside
+from fcslam.metrics.homography import inverse, match_errors, matching_accuracy
+from fcslam.metrics.repeatability import CORRECT_PX, in_common_view, repeatability
+from fcslam.records import Codes, FloatArray
+
+NMS_PX: Final = 4.0
+LEAST_SCORE: Final = 0.001
+ROLLED_RIM_PX: Final = 12.0
+"""What was rolled in at one side is seen by points so close to it."""
+MOST_POINTS: Final = 300
+SHIFTS: Final = ((1, 0), (0, 2), (3, 3), (4, 1), (5, 0), (2, 6), (7, 7))
+LEAST_SPREAD_BITS: Final = 0.3 * CODE_BITS
+"""Codes of different points closer than this on average (a half of all bits would be chance) are collapsing."""
+LARGEST_BIAS: Final = 0.25
+"""A mean bit farther from a half than this carries little."""
+
+
+@torch.inference_mode()
+def detect(network: KeypointNetwork, image: Tensor, most: int = MOST_POINTS) -> tuple[FloatArray, Codes]:
+    """Keypoints (N, 2) [px] of one image (1, 1, H, W), strongest first, and their codes (N, 32), as on a robot."""
+    maps = network(image)
+    points, _ = find_peaks(network.scores(maps)[0].cpu().numpy(), LEAST_SCORE, NMS_PX, most)
+    return points.astype(np.float64), sample_codes(maps.code_logits[0].cpu().numpy(), points)
+
+
+def validate(network: KeypointNetwork, pairs: Sequence[Pair], device: torch.device) -> dict[str, float]:
+    """Means over pairs: repeatability, MMA at 3 px by bits, shift, bits' bias and spread."""
+    training = network.training
+    network.eval()
+    rows = [_validate_pair(network, pair, device) for pair in pairs]
+    network.train(training)
+    return {name: _mean([row[name] for row in rows]) for name in rows[0]}
+
+
+def alarms(figures: dict[str, float]) -> list[str]:
+    """What is wrong with the codes, in words; empty while they are sound."""
+    found = []
+    if figures["code_spread_bits"] < LEAST_SPREAD_BITS:
+        found.append(f"codes collapse: those of different points differ in {figures['code_spread_bits']:.0f} bits")
+    if figures["bit_bias"] > LARGEST_BIAS:
+        found.append(f"bits are stuck: their means are {figures['bit_bias']:.2f} from a half")
+    return found
+
+
+def shift_repeatability(network: KeypointNetwork, image: Tensor, most: int = MOST_POINTS) -> float:
+    """Share of the best points found within 1 px again after the image was rolled by 1 to 7 px; NaN without any."""
+    points, _ = detect(network, image, most)
+    size = (image.shape[-1], image.shape[-2])
+    shares = []
+    for row, column in SHIFTS:
+        rolled, _ = detect(network, image.roll((row, column), (-2, -1)), most)
+        expected = points + np.array([column, row])
+        kept = expected[well_inside(expected, size, ROLLED_RIM_PX)]
+        if len(kept):
+            distances = np.asarray(KDTree(rolled).query(kept)[0]) if len(rolled) else np.full(len(kept), np.inf)
+            shares.append(float(np.mean(distances <= 1.0)))
+    return _mean(shares)
+
+
+def _validate_pair(network: KeypointNetwork, pair: Pair, device: torch.device) -> dict[str, float]:
+    images = [torch.from_numpy(view.image)[None, None].to(device) for view in pair.views]
+    (first, first_codes), (second, second_codes) = (detect(network, image) for image in images)
+    size = (images[0].shape[-1], images[0].shape[-2])
+    here, there = in_common_view(first, pair.homography, size), in_common_view(second, inverse(pair.homography), size)
+    matches = mutual_matches(first_codes[here], second_codes[there]).pairs
+    errors = match_errors(first[here][matches[:, 0]], second[there][matches[:, 1]], pair.homography)
+    bits = np.unpackbits(first_codes, axis=1)
+    pairs = len(first) * (len(first) - 1)
+    return {
+        "repeatability": repeatability(first, second, pair.homography, size, MOST_POINTS).repeatability,
+        "mma_3px": float(matching_accuracy(errors, [CORRECT_PX])[0]),
+        "shift_repeatability": shift_repeatability(network, images[0]),
+        "bit_bias": float(np.abs(bits.mean(axis=0) - 0.5).mean()) if len(first) else np.nan,
+        "code_spread_bits": float(hamming_matrix(first_codes, first_codes).sum()) / pairs if pairs else np.nan,
+    }
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Mean of the values that are numbers; NaN if none is."""
+    numbers = [value for value in values if not np.isnan(value)]
+    return sum(numbers) / len(numbers) if numbers else float("nan")

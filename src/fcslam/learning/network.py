@@ -1,0 +1,161 @@
+"""The network: where keypoints are, and 256 logits whose signs are their descriptors.
+
+Two encoders behind one class. `vgg` is the paper's: convolutions in pairs, pooled three times, a detector head of 65
+channels for each cell of 8 x 8 pixels (64 places and "none") that sub-pixel convolution lays out to full size. `light`
+has a tenth of its work: strided convolutions, context from 1/16, and a detector head at half resolution whose sub-pixel
+step is 2 x 2, refined at full resolution, so that a point is found wherever it lies and not once a cell.
+
+All resampling is symmetric about the middle of a pixel block, so cell (r, c) of the logits is centred at the pixel
+(8 c + 3.5, 8 r + 3.5), where (0, 0) is the centre of the first one.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from fcslam.features.codes import CODE_BITS
+from fcslam.features.dense import CELL_PX
+from fcslam.learning.settings import Encoder
+
+_CONTRAST_FLOOR = 1e-4
+"""Variance of grey levels in [0, 1] below which an image counts as blank and is not stretched."""
+
+
+class Maps(NamedTuple):
+    """What the network says about a batch of images."""
+
+    point_logits: Tensor
+    """Shape (B, H, W): log odds that a keypoint is at a pixel, against none being there."""
+    code_logits: Tensor
+    """Shape (B, 256, H/8, W/8): positive where a bit is set."""
+
+
+class KeypointNetwork(nn.Module):
+    """Grey images (B, 1, H, W) in [0, 1], H and W multiples of 8, to ``Maps``."""
+
+    def __init__(self, encoder: Encoder = "light") -> None:
+        super().__init__()
+        self.encoder: Encoder = encoder
+        self.body: nn.Module = LightBody() if encoder == "light" else VggBody()
+
+    def forward(self, image: Tensor) -> Maps:
+        """Maps of a batch.
+
+        Raises:
+            ValueError: a side is no multiple of 8.
+        """
+        if image.shape[-1] % CELL_PX or image.shape[-2] % CELL_PX:
+            raise ValueError(f"sides must be multiples of {CELL_PX}, not {tuple(image.shape[-2:])}")
+        maps: Maps = self.body(image)
+        return maps
+
+    def scores(self, maps: Maps) -> Tensor:
+        """Probability of a keypoint at every pixel, shape (B, H, W)."""
+        if self.encoder == "light":
+            return maps.point_logits.sigmoid()
+        return cell_probabilities(maps.point_logits)
+
+
+class LightBody(nn.Module):
+    """About 2 GMAC at 640 x 480; strides of 2 by kernels of 4, which keep blocks centred and alias less than 3."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.to_half = nn.Sequential(_convolution(1, 16, 4, 2), _convolution(16, 16))
+        self.to_quarter = nn.Sequential(_convolution(16, 24, 4, 2), _convolution(24, 24))
+        self.to_eighth = nn.Sequential(_convolution(24, 64, 4, 2), _convolution(64, 64), _convolution(64, 64))
+        self.to_sixteenth = nn.Sequential(
+            nn.MaxPool2d(2, ceil_mode=True), _convolution(64, 96), _convolution(96, 96), _convolution(96, 64, 1)
+        )
+        self.joint = nn.Sequential(_convolution(64, 64), _convolution(64, 64))
+        self.code_head = nn.Sequential(_convolution(64, 128), nn.Conv2d(128, CODE_BITS, 1))
+        self.context_eighth = nn.Conv2d(64, 16, 1)
+        self.context_quarter = nn.Conv2d(24, 16, 1)
+        self.point_head = nn.Sequential(_convolution(20, 16), nn.Conv2d(16, 4, 3, padding=1))
+        self.refine = nn.Sequential(_convolution(2, 8), nn.Conv2d(8, 1, 3, padding=1))
+        nn.init.zeros_(self.refine[-1].weight)  # begins as no change
+
+    def forward(self, image: Tensor) -> Maps:
+        """As in ``KeypointNetwork``."""
+        image = _even_contrast(image)
+        half = self.to_half(image)
+        quarter = self.to_quarter(half)
+        eighth = self.to_eighth(quarter)
+        around = _twice(self.to_sixteenth(eighth))[..., : eighth.shape[-2], : eighth.shape[-1]]
+        joint = self.joint(eighth + around)
+        context = _twice(self.context_quarter(quarter) + _twice(self.context_eighth(joint)))
+        detail = torch.cat((half + context, F.pixel_unshuffle(image, 2)), dim=1)
+        points = F.pixel_shuffle(self.point_head(detail), 2)
+        points = points + self.refine(torch.cat((image, points), dim=1))
+        return Maps(points.squeeze(1), self.code_head(joint))
+
+
+class VggBody(nn.Module):
+    """The paper's shallow VGG-style network, with batch normalisation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Sequential(
+            _convolution(1, 64), _convolution(64, 64), nn.MaxPool2d(2),
+            _convolution(64, 64), _convolution(64, 64), nn.MaxPool2d(2),
+            _convolution(64, 128), _convolution(128, 128), nn.MaxPool2d(2),
+            _convolution(128, 128), _convolution(128, 128),
+        )  # fmt: skip
+        self.point_head = nn.Sequential(_convolution(128, 256), nn.Conv2d(256, CELL_PX**2 + 1, 1))
+        self.code_head = nn.Sequential(_convolution(128, 256), nn.Conv2d(256, CODE_BITS, 1))
+
+    def forward(self, image: Tensor) -> Maps:
+        """As in ``KeypointNetwork``."""
+        features = self.encoder(image)
+        cells = self.point_head(features)
+        places = cells[:, :-1] - cells[:, -1:]
+        return Maps(F.pixel_shuffle(places, CELL_PX).squeeze(1), self.code_head(features))
+
+
+def cell_probabilities(point_logits: Tensor) -> Tensor:
+    """Softmax over the 64 places of each cell and none of them; (B, H, W) to (B, H, W)."""
+    log_places, _ = cell_log_probabilities(point_logits)
+    return F.pixel_shuffle(log_places.exp(), CELL_PX).squeeze(1)
+
+
+def cell_log_probabilities(point_logits: Tensor) -> tuple[Tensor, Tensor]:
+    """Logarithms of a cell's probabilities: of its places (B, 64, H/8, W/8) and of none (B, H/8, W/8)."""
+    places = F.pixel_unshuffle(point_logits.unsqueeze(1), CELL_PX)
+    none = torch.zeros_like(places[:, :1])
+    logs = torch.cat((places, none), dim=1).log_softmax(dim=1)
+    return logs[:, :-1], logs[:, -1]
+
+
+def sample_codes(code_logits: Tensor, points_px: Tensor) -> Tensor:
+    """Logits at points, interpolated before any sign is taken.
+
+    Args:
+        code_logits: shape (B, 256, H/8, W/8).
+        points_px: shape (B, N, 2), x and y in pixels.
+
+    Returns:
+        Shape (B, N, 256).
+    """
+    rows, columns = code_logits.shape[-2:]
+    size = points_px.new_tensor([columns * CELL_PX, rows * CELL_PX])
+    grid = (2.0 * points_px + 1.0) / size - 1.0
+    sampled = F.grid_sample(code_logits, grid.unsqueeze(1), mode="bilinear", padding_mode="border", align_corners=False)
+    return sampled.squeeze(2).transpose(1, 2)
+
+
+def _convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding=(kernel - stride + 1) // 2, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+def _even_contrast(image: Tensor) -> Tensor:
+    mean = image.mean(dim=(-2, -1), keepdim=True)
+    centred = image - mean
+    variance = (centred * centred).mean(dim=(-2, -1), keepdim=True)
+    return centred / (variance + _CONTRAST_FLOOR).sqrt()
+
+
+def _twice(maps: Tensor) -> Tensor:
+    return F.interpolate(maps, scale_factor=2.0, mode="bilinear", align_corners=False)

@@ -1,0 +1,189 @@
+"""From a folder of images to a trained network: shapes, labels, joint training. Each stage resumes where it stopped.
+
+Without a teacher, a detector first learns corners on synthetic shapes, and labels the images by homographic
+adaptation, together with Harris's measure. With one, its keypoints take that detector's place, and its descriptors say
+which bits are wanted.
+"""
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fcslam.errors import OutputError, TrainingError
+from fcslam.features.dense import CELL_PX
+from fcslam.features.detector import GreyImage
+from fcslam.learning.homographic_adaptation import Response, adapt, harris, peaks
+from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_image
+from fcslam.learning.labels import MOST_POINTS, Labels, Teacher, fuse, read_labels, read_teacher, write_labels
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.objective import TeacherBits, teacher_bits
+from fcslam.learning.pairs import Example
+from fcslam.learning.settings import LossSettings, TrainingSettings
+from fcslam.learning.synthetic_shapes import draw_shapes
+from fcslam.learning.trainer import Pace, Run, Status
+
+LABEL_NMS_PX: Final = 4.0
+DESCRIPTORS_OF_AN_IMAGE: Final = 32
+FEWEST_IMAGES: Final = 2
+SHAPE_COUNT: Final = 1_000_000
+HELD_OUT_SHAPES: Final = 32
+SHAPE_SIDE_PX: Final = 240
+SHAPE_LOSSES: Final = LossSettings(triplet=0.0, contrastive=0.0, distillation=0.0, balance=0.0)
+
+Watch = Callable[[str, Status], None]
+"""Is told the stage and where it stands."""
+
+
+@dataclass(frozen=True, slots=True)
+class Images:
+    """What there is to learn from."""
+
+    train: list[Example]
+    held_out: list[Example]
+    """Not trained on, unless there are too few images to hold any out."""
+    skipped: int
+    """Files that are no images, too small or too bare."""
+
+
+class Shapes(Sequence[Example]):
+    """Endless synthetic shapes; the same number gives the same picture."""
+
+    def __init__(self, first: int, count: int) -> None:
+        self._first, self._count = first, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> Example: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Example]: ...
+    def __getitem__(self, index: int | slice) -> Example | Sequence[Example]:
+        if isinstance(index, slice):
+            return [self[position] for position in range(*index.indices(self._count))]
+        rng = np.random.default_rng([self._first, index])
+        return Example(*draw_shapes(SHAPE_SIDE_PX, SHAPE_SIDE_PX, rng))
+
+
+def train_detector(
+    roots: Sequence[Path], folder: Path, settings: TrainingSettings, pace: Pace, teacher: Path | None, watch: Watch
+) -> tuple[KeypointNetwork, Images]:
+    """Train on every image below ``roots``; all that is made goes into ``folder``.
+
+    Raises:
+        TrainingError: no usable image, a teacher's file is missing or broken, or ``folder`` holds another run.
+        OutputError: something cannot be written; what was written before stays.
+    """
+    files = find_images(roots)
+    start: dict[str, Tensor] | None = None
+    detector: Callable[[GreyImage], Response] | None = None
+    if teacher is None:
+        first = _train_on_shapes(folder / "shapes", settings, pace, watch)
+        start, detector = first.state_dict(), _as_detector(first, torch.device(pace.device))
+    images = gather(files, folder / "labels", settings, detector, teacher, watch)
+    run = Run(settings, "joint", _made(folder / "joint"), pace, start)
+    return run.train(images.train, images.held_out, _bits(images.train, settings.seed), partial(watch, "joint")), images
+
+
+def gather(
+    files: Sequence[ImageFile],
+    cache: Path,
+    settings: TrainingSettings,
+    detector: Callable[[GreyImage], Response] | None,
+    teacher: Path | None,
+    watch: Watch,
+) -> Images:
+    """Read the images and label those that have no labels in ``cache`` yet.
+
+    Raises:
+        TrainingError: too few can be used, or a teacher's file is missing or broken.
+        OutputError: labels cannot be written.
+    """
+    train: list[Example] = []
+    held_out: list[Example] = []
+    for index, file in enumerate(files):
+        image = read_image(file.path)
+        if image is not None and is_usable(image):
+            taught = None if teacher is None else read_teacher(teacher / f"{file.name}.npz")
+            place = cache / f"{file.name}.npz"
+            (held_out if is_held_out(file.name) else train).append(
+                Example(image, _labels(image, place, settings, detector, taught), taught)
+            )
+        watch("labels", Status(index + 1, len(files), {}))
+    if len(train) < FEWEST_IMAGES:
+        raise TrainingError(
+            f"only {len(train)} of {len(files)} image files can be trained on: the others are no images, "
+            "smaller than 96 px or bare; give more"
+        )
+    return Images(train, held_out or train[:1], len(files) - len(train) - len(held_out))
+
+
+def _labels(
+    image: GreyImage,
+    place: Path,
+    settings: TrainingSettings,
+    detector: Callable[[GreyImage], Response] | None,
+    teacher: Teacher | None,
+) -> Labels:
+    """Labels of an image, from the cache if they were made from these very pixels."""
+    key = zlib.crc32(image.tobytes())
+    known = read_labels(place, key)
+    if known is not None:
+        return known
+    rng = np.random.default_rng([settings.seed, key])
+    corners = peaks(adapt(harris, image, settings.label_copies, rng), LABEL_NMS_PX, MOST_POINTS)
+    if teacher is not None:
+        others = teacher.keypoints
+    elif detector is not None:
+        others = peaks(adapt(detector, image, settings.label_copies, rng), LABEL_NMS_PX, MOST_POINTS)
+    else:
+        others = corners
+    labels = fuse(corners, others)
+    try:
+        write_labels(place, labels, key)
+    except OSError as error:
+        raise OutputError(f"{place}: cannot be written ({error}); make room and run the same command again") from error
+    return labels
+
+
+def _train_on_shapes(folder: Path, settings: TrainingSettings, pace: Pace, watch: Watch) -> KeypointNetwork:
+    shapes = settings.model_copy(update={"steps": settings.shape_steps, "loss": SHAPE_LOSSES})
+    run = Run(shapes, "shapes", _made(folder), pace)
+    return run.train(Shapes(0, SHAPE_COUNT), Shapes(1, HELD_OUT_SHAPES), watch=partial(watch, "shapes"))
+
+
+def _bits(examples: Sequence[Example], seed: int) -> TeacherBits | None:
+    """A teacher's bits, fitted to some of its descriptors of each image."""
+    taught = [example.teacher.descriptors for example in examples if example.teacher is not None]
+    if not taught:
+        return None
+    some = [descriptors[:: max(len(descriptors) // DESCRIPTORS_OF_AN_IMAGE, 1)] for descriptors in taught]
+    return teacher_bits(torch.from_numpy(np.concatenate(some).astype(np.float32)), seed)
+
+
+def _as_detector(network: KeypointNetwork, device: torch.device) -> Callable[[GreyImage], Response]:
+    @torch.inference_mode()
+    def detector(image: GreyImage) -> Response:
+        height, width = (side // CELL_PX * CELL_PX for side in image.shape)
+        batch = torch.from_numpy(image[:height, :width]).to(device)[None, None].float() / 255.0
+        response = np.zeros(image.shape, np.float32)
+        response[:height, :width] = network.scores(network(batch))[0].cpu().numpy()
+        return response
+
+    answer: Callable[[GreyImage], Response] = detector
+    return answer
+
+
+def _made(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be used as the output folder ({error})") from error
+    return folder

@@ -1,0 +1,220 @@
+"""The training loop: draw pairs, step, average, look now and then how good the network is, keep a checkpoint.
+
+A step depends on the seed, its number and the state before it, so an interrupted run goes on as if it had not been.
+"""
+
+import csv
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fcslam.errors import OutputError, TrainingError
+from fcslam.learning.batches import Batch, stream
+from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from fcslam.learning.monitor import alarms, validate
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.objective import TeacherBits, grid_shift, objective
+from fcslam.learning.pairs import Example, Pair, draw_pair
+from fcslam.learning.settings import TrainingSettings
+
+AVERAGE_DECAY: Final = 0.999
+WARM_UP_STEPS: Final = 300
+LAST_RATE: Final = 1e-5
+DECAY_SHARE: Final = 0.3
+CLIP_NORM: Final = 1.0
+WEIGHT_DECAY: Final = 1e-4
+VALIDATION_PAIRS: Final = 24
+VALIDATION_VIEW: Final = (320, 240)
+VALIDATION_SEED: Final = 2026
+CHECKPOINT_FILE: Final = "checkpoint.npz"
+PROGRESS_FILE: Final = "progress.csv"
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How often what happens, and on what; none of it changes the result."""
+
+    validate_every: int = 500
+    checkpoint_every_s: float = 120.0
+    log_every: int = 50
+    threads: int = 1
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Where a stage stands."""
+
+    step: int
+    """Steps done."""
+    steps: int
+    figures: Mapping[str, float]
+    """The latest losses and validation figures."""
+    alarms: tuple[str, ...] = ()
+    """What the latest validation found wrong with the codes."""
+
+
+class Run:
+    """One stage of training in a folder: resumes where its checkpoint stands."""
+
+    def __init__(
+        self, settings: TrainingSettings, stage: str, folder: Path, pace: Pace, start: dict[str, Tensor] | None = None
+    ) -> None:
+        self.settings, self.stage, self.folder, self.pace = settings, stage, folder, pace
+        self.device = torch.device(pace.device)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(settings.seed)
+            network = KeypointNetwork(settings.encoder)
+        self.network = network.to(self.device, memory_format=torch.channels_last)
+        if start is not None:
+            self.network.load_state_dict(start)
+        self.average = KeypointNetwork(settings.encoder).to(self.device)
+        self.average.load_state_dict(self.network.state_dict())
+        self.average.eval()
+        self.optimiser = torch.optim.AdamW(self.network.parameters(), weight_decay=WEIGHT_DECAY)
+        self.step = 0
+        self._saved = time.monotonic()
+
+    def train(
+        self,
+        examples: Sequence[Example],
+        held_out: Sequence[Example],
+        bits: TeacherBits | None = None,
+        watch: Callable[[Status], None] = lambda _status: None,
+    ) -> KeypointNetwork:
+        """Train to the last step; returns the averaged network.
+
+        Args:
+            examples: to train on.
+            held_out: to validate on.
+            bits: a teacher's, if the examples have one.
+            watch: is told after every step.
+
+        Raises:
+            TrainingError: the folder's checkpoint is another run's, or training diverged.
+            OutputError: a checkpoint or the log cannot be written.
+        """
+        self._resume()
+        bits = None if bits is None else bits.to(self.device)
+        views = validation_pairs(held_out)
+        figures: dict[str, float] = {}
+        warnings: tuple[str, ...] = ()
+        for step, batch in stream(examples, self.settings, self.step, 4 * self.pace.threads, self.pace.threads):
+            parts = self._step(step, batch.to(self.device), bits)
+            self.step = step + 1
+            last = self.step == self.settings.steps
+            if self.step % self.pace.log_every == 0 or last:
+                losses = {name: float(part) for name, part in parts.items()}
+                figures |= losses
+                self._log(losses)
+            if self.step % self.pace.validate_every == 0 or last:
+                found = validate(self.average, views, self.device)
+                figures |= found
+                warnings = tuple(alarms(found))
+                self._log(found | {"alarms": float(len(warnings))})
+            if last or time.monotonic() - self._saved > self.pace.checkpoint_every_s:
+                self._save()
+            watch(Status(self.step, self.settings.steps, dict(figures), warnings))
+        trained: KeypointNetwork = self.average
+        return trained
+
+    def _step(self, step: int, batch: Batch, bits: TeacherBits | None) -> dict[str, Tensor]:
+        self.network.train()
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(self.settings, step)
+        progress = step / self.settings.steps
+        with torch.autocast(self.device.type, torch.bfloat16):
+            maps = self.network(batch.images.contiguous(memory_format=torch.channels_last))
+        shift = grid_shift(self.settings.encoder, self.settings.seed, step)
+        total, parts = objective(maps, batch, self.settings.loss, progress, shift, bits)
+        if not torch.isfinite(total):
+            raise TrainingError(f"{self.folder}: training diverged at step {step}; lower the learning rate")
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP_NORM)
+        self.optimiser.step()
+        self._average(step)
+        return {name: part.detach() for name, part in parts.items()}
+
+    @torch.no_grad()
+    def _average(self, step: int) -> None:
+        decay = min(AVERAGE_DECAY, (1.0 + step) / (10.0 + step))
+        for mean, value in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(value, 1.0 - decay)
+            else:
+                mean.copy_(value)
+
+    def _resume(self) -> None:
+        path = self.folder / CHECKPOINT_FILE
+        if not path.exists():
+            return
+        checkpoint = read_checkpoint(path)
+        fixed = self.settings.model_dump(mode="json") | {"steps": checkpoint.settings.get("steps")}
+        if checkpoint.settings != fixed or checkpoint.stage != self.stage:
+            raise TrainingError(f"{path}: is of a run with other settings; give them again, or another --output")
+        try:
+            self._load(checkpoint)
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise TrainingError(f"{path}: does not fit this network ({error})") from error
+
+    def _load(self, checkpoint: Checkpoint) -> None:
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {k.removeprefix(prefix): v for k, v in checkpoint.tensors.items() if k.startswith(prefix)}
+
+        self.network.load_state_dict(part("network/"))
+        self.average.load_state_dict(part("average/"))
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, tensor in part("optimiser/").items():
+            index, key = name.split("/")
+            state.setdefault(int(index), {})[key] = tensor
+        self.optimiser.load_state_dict({"state": state, "param_groups": self.optimiser.state_dict()["param_groups"]})
+        self.step = checkpoint.step
+
+    def _save(self) -> None:
+        tensors = {f"network/{name}": value for name, value in self.network.state_dict().items()}
+        tensors |= {f"average/{name}": value for name, value in self.average.state_dict().items()}
+        for index, entries in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser/{index}/{name}": value for name, value in entries.items()}
+        settings = self.settings.model_dump(mode="json")
+        write_checkpoint(self.folder / CHECKPOINT_FILE, Checkpoint(self.stage, self.step, settings, tensors))
+        self._saved = time.monotonic()
+
+    def _log(self, figures: Mapping[str, float]) -> None:
+        path = self.folder / PROGRESS_FILE
+        try:
+            new = not path.exists()
+            with path.open("a", newline="", encoding="utf-8") as file:
+                rows = csv.writer(file)
+                if new:
+                    rows.writerow(("stage", "step", "name", "value"))
+                rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in figures.items())
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written ({error}); make room and run the command again") from error
+
+
+def learning_rate(settings: TrainingSettings, step: int) -> float:
+    """Linear warm-up, a plateau, and a straight way down over the last part.
+
+    On the plateau it does not depend on how many steps there will be, so a run may be made longer.
+    """
+    warm = min(WARM_UP_STEPS, settings.steps // 10)
+    rise = (step + 1) / max(warm, 1)
+    fall = (settings.steps - step) / (DECAY_SHARE * settings.steps)
+    return max(settings.learning_rate * min(rise, fall, 1.0), LAST_RATE)
+
+
+def validation_pairs(held_out: Sequence[Example]) -> list[Pair]:
+    """The same pairs each time, from images spread over those held out."""
+    pairs = []
+    for index in range(min(VALIDATION_PAIRS, len(held_out))):
+        rng = np.random.default_rng([VALIDATION_SEED, index])
+        example = held_out[index * len(held_out) // min(VALIDATION_PAIRS, len(held_out))]
+        pairs.append(draw_pair(example, VALIDATION_VIEW, 16, 0, rng))
+    return pairs

@@ -1,0 +1,111 @@
+"""Random homographies and random light: how one image becomes two views of the same thing."""
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.features.detector import GreyImage
+from fcslam.metrics.framing import Size
+from fcslam.metrics.homography import Mask
+from fcslam.records import FloatArray
+
+SCALE_SPREAD: Final = 0.5
+"""Two views of a pair differ by exp(+-this) in scale at most."""
+TILT: Final = 0.12
+"""How far a corner of a view moves, in sides of the view."""
+SMALL_TURN_RAD: Final = 0.2
+"""Standard deviation of a view's turn."""
+ANY_TURN_SHARE: Final = 0.06
+"""Views that are turned by any angle: robots roll little, but held and mounted cameras do."""
+
+
+def random_view(image: GreyImage, size: Size, rng: np.random.Generator) -> FloatArray:
+    """A window somewhere in the image: homography (3, 3) that takes pixels of the image to pixels of the window."""
+    whole, wanted = np.array(image.shape[::-1], np.float64), np.array(size, np.float64)
+    zoom = min(np.exp(rng.uniform(np.log(0.7), np.log(1.5))), 1.15 * float((whole / wanted).min()))
+    x, y = rng.uniform(0.0, np.maximum(whole - zoom * wanted, 0.0))
+    return np.array([[1 / zoom, 0.0, -x / zoom], [0.0, 1 / zoom, -y / zoom], [0.0, 0.0, 1.0]])
+
+
+def random_change(size: Size, rng: np.random.Generator) -> FloatArray:
+    """Homography (3, 3) of a view of this size onto itself: turned, scaled, shifted, tilted about its middle."""
+    sides = np.array(size, np.float64)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (sides - 1.0)
+    middle = 0.5 * (sides - 1.0)
+    turn = rng.uniform(-np.pi, np.pi) if rng.random() < ANY_TURN_SHARE else rng.normal(0.0, SMALL_TURN_RAD)
+    scale = np.exp(rng.uniform(-0.5, 0.5) * SCALE_SPREAD)
+    rotation = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    shift = rng.uniform(-0.1, 0.1, 2) * sides
+    tilted = corners + rng.uniform(-TILT, TILT, (4, 2)) * sides
+    moved = (tilted - middle) @ rotation.T + middle + shift
+    homography: FloatArray = cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32))
+    return homography
+
+
+def warp_image(image: GreyImage, homography: FloatArray, size: Size) -> GreyImage:
+    """The view of this size; beyond the image it is mirrored, so that its border is no edge."""
+    warped = cv2.warpPerspective(image, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    return np.asarray(warped, np.uint8)
+
+
+def seen(shape: tuple[int, int], homography: FloatArray, size: Size, border: int = 2) -> NDArray[np.bool_]:
+    """Which pixels (height, width) of a view show the image of this shape, ``border`` pixels of it left out."""
+    own = np.zeros(shape, np.uint8)
+    own[border:-border, border:-border] = 1
+    warped = cv2.warpPerspective(own, homography, size, flags=cv2.INTER_NEAREST)
+    return np.asarray(warped, np.bool_)
+
+
+def well_inside(points: FloatArray, size: Size, border: float) -> Mask:
+    """Whether points (N, 2) are in an image, ``border`` pixels from its rim."""
+    low, high = border, np.array(size, np.float64) - 1.0 - border
+    return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
+
+
+def relight(image: GreyImage, rng: np.random.Generator) -> NDArray[np.float32]:
+    """The image under other light, by another lens and sensor: float32 in [0, 1]."""
+    changed = image.astype(np.float32) / 255.0
+    if rng.random() < 0.5:
+        changed = changed ** np.float32(np.exp(rng.uniform(np.log(0.45), np.log(2.2))))
+    if rng.random() < 0.3:
+        changed = _shade(changed, rng)
+    contrast, brightness = np.exp(rng.uniform(np.log(0.35), np.log(1.6))), rng.uniform(-0.2, 0.2)
+    changed = (changed - 0.5) * np.float32(contrast) + np.float32(0.5 + brightness)
+    if rng.random() < 0.3:
+        changed = _blur(changed, rng)
+    if rng.random() < 0.8:
+        noise = rng.standard_normal(changed.shape, dtype=np.float32)
+        changed = changed + np.float32(rng.uniform(0.0, 0.04)) * noise
+    changed = np.clip(changed, 0.0, 1.0)
+    return _compress(changed, rng) if rng.random() < 0.3 else changed
+
+
+def _shade(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """A soft-edged shadow or beam of light in the form of an ellipse."""
+    height, width = image.shape
+    mask = np.zeros(image.shape, np.float32)
+    centre = (int(rng.integers(width)), int(rng.integers(height)))
+    axes = (int(rng.integers(10, 3 * width // 4)), int(rng.integers(10, 3 * height // 4)))
+    cv2.ellipse(mask, centre, axes, float(rng.uniform(0, 180)), 0, 360, 1.0, -1)
+    mask = np.asarray(cv2.GaussianBlur(mask, (0, 0), float(rng.uniform(1.0, 25.0))), np.float32)
+    return image * (1.0 + np.float32(rng.uniform(-0.7, 0.6)) * mask)
+
+
+def _blur(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Out of focus, or moved while the shutter was open."""
+    if rng.random() < 0.5:
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.4, 1.6))), np.float32)
+    length, angle = int(rng.integers(2, 4)), rng.uniform(0, np.pi)
+    kernel = np.zeros((2 * length + 1, 2 * length + 1), np.float32)
+    end = np.rint(length * np.array([np.cos(angle), np.sin(angle)])).astype(int)
+    cv2.line(kernel, (length - int(end[0]), length - int(end[1])), (length + int(end[0]), length + int(end[1])), 1.0)
+    return np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()), np.float32)
+
+
+def _compress(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    quality = int(rng.integers(30, 95))
+    _, encoded = cv2.imencode(".jpg", (255.0 * image).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    decoded = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
+    return np.asarray(decoded, np.float32) / np.float32(255.0)

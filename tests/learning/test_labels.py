@@ -1,0 +1,111 @@
+"""Labels: where peaks are, how two detectors become one, what an average over warped copies keeps."""
+
+import cv2
+import numpy as np
+import pytest
+from learning.textures import textured
+
+from fcslam.errors import TrainingError
+from fcslam.learning.homographic_adaptation import adapt, harris, peaks
+from fcslam.learning.labels import Labels, fuse, read_labels, read_teacher, write_labels
+from fcslam.learning.synthetic_shapes import FAMILIES, background, ellipses, noise
+
+
+def points(*pairs):
+    return np.array(pairs, np.float32).reshape(-1, 2)
+
+
+def test_peaks_are_found_between_pixels_strongest_first():
+    columns, rows = np.meshgrid(np.arange(60), np.arange(50))
+    bumps = [(20.3, 15.8, 1.0), (40.6, 30.2, 2.0)]
+    response = sum(h * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 8) for x, y, h in bumps).astype(np.float32)
+    found = peaks(response, 4, 10)
+    assert found == pytest.approx(np.array([[40.6, 30.2], [20.3, 15.8]]), abs=0.15)
+    assert len(peaks(response, 4, 1)) == 1
+
+
+def test_a_detector_that_answers_the_same_everywhere_averages_to_itself():
+    mean = adapt(lambda image: np.ones(image.shape, np.float32), textured(0), 6, np.random.default_rng(0))
+    assert mean == pytest.approx(np.ones_like(mean), abs=1e-5)
+
+
+def test_what_one_copy_alone_saw_fades():
+    calls = []
+
+    def sees_a_ghost_once(image):
+        calls.append(1)
+        response = harris(image)
+        if len(calls) == 1:
+            response[80, 100] = 10 * response.max()
+        return response
+
+    once = sees_a_ghost_once(textured(1))
+    calls.clear()
+    mean = adapt(sees_a_ghost_once, textured(1), 15, np.random.default_rng(0))
+    assert mean[80, 100] / mean.max() < 0.5 * once[80, 100] / once.max() or mean[80, 100] < 0.2 * once[80, 100]
+
+
+def test_points_of_both_come_first_and_lie_midway():
+    labels = fuse(points((10, 10), (50, 50)), points((80, 80), (52, 50)))
+    assert labels.keypoints[0] == pytest.approx([51, 50])
+    assert len(labels.keypoints) == 3
+    assert (np.diff(labels.quality) < 0).all()
+    assert labels.quality[0] == 1.0
+
+
+def test_one_detector_may_find_nothing():
+    assert len(fuse(points(), points((5, 5))).keypoints) == 1
+    assert len(fuse(points(), points()).keypoints) == 0
+
+
+def test_no_two_labels_are_one_point():
+    rng = np.random.default_rng(0)
+    kept = fuse(*(rng.uniform(0, 60, (200, 2)).astype(np.float32) for _ in range(2))).keypoints
+    distances = np.linalg.norm(kept[:, None] - kept[None], axis=2) + 1e3 * np.eye(len(kept))
+    assert distances.min() > 3.0
+
+
+def test_labels_are_kept_for_the_image_they_belong_to(tmp_path):
+    labels = fuse(points((10, 10)), points((30, 30)))
+    write_labels(tmp_path / "a" / "b.npz", labels, 7)
+    assert np.array_equal(read_labels(tmp_path / "a" / "b.npz", 7).keypoints, labels.keypoints)
+    assert read_labels(tmp_path / "a" / "b.npz", 8) is None
+    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 no archive")
+    assert read_labels(tmp_path / "broken.npz", 7) is None
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 no archive"])
+def test_a_broken_teacher_is_said(tmp_path, content):
+    (tmp_path / "x.npz").write_bytes(content)
+    with pytest.raises(TrainingError, match=r"x\.npz"):
+        read_teacher(tmp_path / "x.npz")
+
+
+def test_a_teacher_whose_parts_do_not_fit_is_said(tmp_path):
+    np.savez(tmp_path / "x.npz", keypoints=np.zeros((3, 2)), scores=np.zeros(3), descriptors=np.full((3, 8), np.nan))
+    with pytest.raises(TrainingError, match="do not fit"):
+        read_teacher(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("family", dict.fromkeys(FAMILIES), ids=lambda family: family.__name__)
+def test_corners_of_shapes_are_corners(family):
+    """Near most of them Harris answers more than he does almost everywhere else."""
+    shares = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        picture = background(320, 240, rng)
+        corners = family(picture, rng)
+        assert corners.shape[1:] == (2,)
+        if family in (ellipses, noise):
+            assert len(corners) == 0
+            continue
+        response = cv2.dilate(harris(np.asarray(cv2.GaussianBlur(picture, (3, 3), 0))), np.ones((9, 9), np.uint8))
+        whole = np.rint(corners).astype(int)
+        shown = whole[((whole >= 0) & (whole < [320, 240])).all(axis=1)]
+        shares.extend(response[shown[:, 1], shown[:, 0]] > np.quantile(response, 0.8))
+    assert not shares or np.mean(shares) > 0.75
+
+
+def test_labels_without_points_are_well_shaped():
+    empty = Labels(points(), np.empty(0, np.float32))
+    assert empty.keypoints.shape == (0, 2)

@@ -1,0 +1,103 @@
+"""Pairs: both views see the same thing where they say so, and labels land where the picture shows them."""
+
+import cv2
+import numpy as np
+import pytest
+from learning.textures import textured
+
+from fcslam.learning.labels import Labels, Teacher
+from fcslam.learning.pairs import Example, draw_pair, splat
+from fcslam.learning.warps import random_change, random_view, relight, seen, warp_image, well_inside
+from fcslam.metrics.homography import inverse, warp
+
+SIZE = (96, 80)
+
+
+def example(seed=0, taught=True):
+    image = textured(seed)
+    rng = np.random.default_rng(seed)
+    keypoints = rng.uniform(5, 150, (120, 2)).astype(np.float32)
+    labels = Labels(keypoints, np.linspace(1, 0.1, 120, dtype=np.float32))
+    return Example(image, labels, Teacher(keypoints, rng.normal(size=(120, 16)).astype(np.float16)) if taught else None)
+
+
+def blob(x, y, width, height):
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    return (255 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 30)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_points_go_where_the_picture_goes(seed):
+    rng = np.random.default_rng(seed)
+    image = blob(101, 77, 200, 160)
+    homography = random_change(SIZE, rng) @ random_view(image, SIZE, rng)
+    ((x, y),) = warp(homography, np.array([[101.0, 77.0]]))
+    if 12 < x < SIZE[0] - 12 and 12 < y < SIZE[1] - 12:
+        warped = warp_image(image, homography, SIZE)
+        row, column = np.unravel_index(np.argmax(cv2.GaussianBlur(warped, (5, 5), 0)), warped.shape)
+        assert np.hypot(column - x, row - y) < 2.5
+
+
+def test_points_nowhere_are_not_inside():
+    assert well_inside(np.array([[np.nan, 1.0], [0.0, 0.0], [3.0, 3.0], [8.0, 3.0]]), (10, 10), 2.0).tolist() == [
+        False,
+        False,
+        True,
+        False,
+    ]
+
+
+def test_what_is_seen_is_the_image():
+    rng = np.random.default_rng(3)
+    homography = random_change(SIZE, rng) @ random_view(textured(0), SIZE, rng)
+    mask = seen((160, 200), homography, SIZE)
+    columns, rows = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    places = warp(inverse(homography), np.stack((columns, rows), -1).reshape(-1, 2).astype(float))
+    expected = well_inside(places, (200, 160), 2.0).reshape(mask.shape)
+    assert (mask != expected).mean() < 0.03
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_light_keeps_images_images(seed):
+    lit = relight(textured(seed), np.random.default_rng(seed))
+    assert lit.dtype == np.float32
+    assert lit.shape == (160, 200)
+    assert (lit.min() >= 0.0) & (lit.max() <= 1.0)
+
+
+def test_weights_are_shared_among_four_pixels_about_their_point():
+    points, weight = np.array([[10.25, 5.5], [30.0, 7.0]]), np.array([0.8, 0.5], np.float32)
+    spread = splat(points, weight, SIZE)
+    assert spread.sum() == pytest.approx(1.3, rel=1e-6)
+    assert spread[7, 30] == pytest.approx(0.5)
+    assert spread[5, 10] == pytest.approx(0.8 * 0.75 * 0.5)
+    assert np.count_nonzero(spread) == 5
+
+
+def test_points_of_a_pair_belong_together():
+    pair = draw_pair(example(), SIZE, 64, 32, np.random.default_rng(5))
+    first, second = pair.views
+    assert pair.valid.sum() > 20
+    there = warp(pair.homography, first.points[pair.valid].astype(float))
+    assert there == pytest.approx(second.points[pair.valid], abs=1e-2)
+    for view in pair.views:
+        assert well_inside(view.points[pair.valid].astype(float), SIZE, 4.0).all()
+
+
+def test_the_teachers_descriptors_stay_with_their_points():
+    source = example()
+    pair = draw_pair(source, SIZE, 64, 32, np.random.default_rng(5))
+    assert pair.taught_valid.any()
+    for told in pair.taught[pair.taught_valid]:
+        assert (source.teacher.descriptors.astype(np.float32) == told).all(axis=1).any()
+
+
+def test_without_a_teacher_nothing_is_taught():
+    pair = draw_pair(example(taught=False), SIZE, 64, 32, np.random.default_rng(5))
+    assert pair.taught.shape == (32, 0)
+
+
+def test_the_same_generator_draws_the_same_pair():
+    a, b = (draw_pair(example(), SIZE, 64, 32, np.random.default_rng(8)) for _ in range(2))
+    assert np.array_equal(a.views[0].image, b.views[0].image)
+    assert np.array_equal(a.views[1].targets, b.views[1].targets)

@@ -1,0 +1,60 @@
+"""What becomes of a folder of images: which are found, which are used, which are held out."""
+
+import cv2
+import numpy as np
+import pytest
+from learning.textures import textured
+
+from fcslam.errors import TrainingError
+from fcslam.learning.images import LARGEST_SIDE_PX, find_images, is_held_out, is_usable, read_image
+
+
+def write(path, image):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), image)
+
+
+def test_images_of_all_folders_are_found_under_their_names(tmp_path):
+    write(tmp_path / "x" / "a" / "1.png", textured(1))
+    write(tmp_path / "x" / "0.JPG", textured(2))
+    write(tmp_path / "y" / "1.png", textured(3))
+    (tmp_path / "x" / "notes.txt").write_text("no image")
+    names = [file.name for file in find_images([tmp_path / "y", tmp_path / "x"])]
+    assert names == ["x/0.JPG", "x/a/1.png", "y/1.png"]
+
+
+def test_folders_of_one_name_with_the_same_files_are_refused(tmp_path):
+    for place in ("here", "there"):
+        write(tmp_path / place / "photos" / "1.png", textured(1))
+    with pytest.raises(TrainingError, match="same name"):
+        find_images([tmp_path / "here" / "photos", tmp_path / "there" / "photos"])
+
+
+@pytest.mark.parametrize("kind", ["grey", "colour", "alpha", "deep"])
+def test_every_kind_of_image_becomes_grey(tmp_path, kind):
+    grey = textured(5)
+    image = {
+        "grey": grey,
+        "colour": cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR),
+        "alpha": cv2.cvtColor(grey, cv2.COLOR_GRAY2BGRA),
+        "deep": grey.astype(np.uint16) * 257,
+    }[kind]
+    write(tmp_path / "1.png", image)
+    assert read_image(tmp_path / "1.png").astype(int) == pytest.approx(grey.astype(int), abs=1)
+
+
+def test_huge_images_are_shrunk_and_others_are_not(tmp_path):
+    write(tmp_path / "huge.png", textured(1, 1600, 800))
+    assert read_image(tmp_path / "huge.png").shape == (LARGEST_SIDE_PX // 2, LARGEST_SIDE_PX)
+    assert read_image(tmp_path / "nowhere.png") is None
+
+
+def test_what_teaches_nothing_is_not_used():
+    assert is_usable(textured(1))
+    assert not is_usable(textured(1)[:90])
+    assert not is_usable(np.full((200, 200), 90, np.uint8))
+
+
+def test_a_small_share_is_held_out_by_name_alone():
+    share = np.mean([is_held_out(f"photos/{number}.jpg") for number in range(5000)])
+    assert 0.03 < share < 0.05
