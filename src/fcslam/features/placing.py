@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraModel, FloatArray
 
 FLOOR_MARGIN_M: Final = 0.03
@@ -64,18 +65,7 @@ def _rays(keypoints_px: FloatArray, camera: CameraModel) -> FloatArray:
     """Viewing rays in ``base``, shape (K, 3)."""
     x = (keypoints_px[:, 0] - camera.cx) / camera.fx
     y = (keypoints_px[:, 1] - camera.cy) / camera.fy
-    return np.column_stack((x, y, np.ones(len(x)))) @ _rotation(camera.T_base_camera.rotation).T
-
-
-def _rotation(quaternion: tuple[float, float, float, float]) -> FloatArray:
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.column_stack((x, y, np.ones(len(x)))) @ rotation_matrix(camera.T_base_camera.rotation).T
 
 
 @njit(cache=True)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraModel, FloatArray, LaserModel
 from fcslam.simulation.engine import ALONE, gl_context, mujoco
 from fcslam.simulation.lighting import Light
@@ -118,13 +119,8 @@ class Camera:
 
 def _matrix(camera: CameraModel) -> FloatArray:
     """``T_base_camera`` as a matrix (4, 4)."""
-    x, y, z, w = camera.T_base_camera.rotation
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = rotation_matrix(camera.T_base_camera.rotation)
     matrix[:3, 3] = camera.T_base_camera.translation_m
     return matrix
 
