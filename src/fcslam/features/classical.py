@@ -24,9 +24,8 @@ ORB_VERSION = "orb-1"
 _CORNERS: Final = 600
 """Corners kept of an image, as in the evaluation of SuperPoint."""
 _SIFT_NUMBERS: Final = 128
-
-
-_PYRAMID_STEP = 1.2
+_PYRAMID_STEP: Final = 1.2
+"""Of ORB, from one scale to the next."""
 
 
 class OrbConfig(Settings):
