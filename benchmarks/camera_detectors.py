@@ -12,6 +12,7 @@ Recall is that of revisits between robots by correct verified closures: of all, 
 95 % intervals by bootstrap over seeds.
 """
 
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -88,9 +89,10 @@ def main() -> None:
 
 
 def recorded(case: str, seed: int, folder: Path) -> Path:
-    """The recordings of one fleet; what is there already stays and is not made again."""
+    """The recordings of one fleet; what is there already is not made again."""
     fleet, (simulated, _) = folder / f"{case.replace(',', '').replace(' ', '-')}-{seed}", CASES[case]
-    common.run_fcslam("simulate", "--robots", ROBOTS, "--seed", seed, *simulated, "--output", fleet, "--resume")
+    if not (fleet / "ground_truth" / "map.yaml").exists():  # the last file to be written
+        common.run_fcslam("simulate", "--robots", ROBOTS, "--seed", seed, *simulated, "--output", fleet, "--resume")
     return fleet
 
 
@@ -113,7 +115,9 @@ def mapped(case: str, seed: int, fleet: Path, detector: str, configuration: Path
         robots = [fleet / f"robot_{k + 1}" for k in range(ROBOTS)]
         cost = common.run_fcslam("map", *robots, "--config", configuration, "--output", run)
         common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result)
-        return Outcome(case, seed, detector, read(result), cost.wall_s)
+        outcome = Outcome(case, seed, detector, read(result), cost.wall_s)
+    print(case, seed, detector, *(f"{recall:.3f}" for recall in outcome.recalls), file=sys.stderr)
+    return outcome
 
 
 def gains(outcomes: Sequence[Outcome], cases: Sequence[str], detectors: Sequence[str]) -> Iterator[tuple]:
