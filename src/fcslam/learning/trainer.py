@@ -210,7 +210,8 @@ def trained_network(path: Path) -> KeypointNetwork:
         network.load_state_dict(checkpoint.part(AVERAGE))
     except (KeyError, RuntimeError) as error:
         raise TrainingError(f"{path}: does not fit this network ({error})") from error
-    return network.eval()
+    network.eval()
+    return network
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
