@@ -115,3 +115,22 @@ def test_the_teacher_is_met_where_the_odds_are_its_own():
     best = losses.distillation_loss(torch.logit(wanted), wanted, valid)
     assert float(best) == pytest.approx(float(torch.distributions.Bernoulli(wanted).entropy().mean()), rel=1e-5)
     assert float(losses.distillation_loss(torch.zeros(1, 1, 2), wanted, valid)) > float(best)
+
+
+def test_maps_agree_whatever_their_scale_and_disagree_where_their_peaks_differ():
+    peaks = torch.zeros(1, 32, 32)
+    peaks[0, 5::8, 5::8] = 0.9
+    everywhere = torch.ones(1, 32, 32, dtype=torch.bool)
+    assert float(losses.agreement_loss(peaks, 0.5 * peaks, everywhere)) == pytest.approx(0.0, abs=1e-3)
+    assert float(losses.agreement_loss(peaks, peaks.roll(1, 2), everywhere)) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_windows_that_are_not_seen_throughout_do_not_count():
+    first, second = torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(1)), torch.zeros(1, 32, 32)
+    valid = torch.ones(1, 32, 32, dtype=torch.bool)
+    valid[0, 3, 3] = False
+    second[valid] = first[valid]
+    elsewhere = losses.agreement_loss(first, second, valid)
+    assert float(elsewhere) == pytest.approx(0.0, abs=1e-6)
+    assert float(losses.agreement_loss(first, second, valid | True)) > float(elsewhere) + 1e-5
+    assert float(losses.agreement_loss(first, second, valid & False)) == 0.0

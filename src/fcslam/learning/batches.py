@@ -36,6 +36,8 @@ class Batch:
     """Shape (B, M), bool."""
     taught: Tensor
     """Shape (B, M, D)."""
+    homographies: Tensor
+    """Shape (B, 3, 3): take pixels of the first view to pixels of the second."""
 
     def to(self, device: torch.device) -> "Batch":
         """The batch on another device."""
@@ -68,6 +70,7 @@ def collate(pairs: Sequence[Pair]) -> Batch:
         taught_points=stack([view.taught for view in views]),
         taught_valid=stack([pair.taught_valid for pair in pairs]),
         taught=stack([pair.taught for pair in pairs]),
+        homographies=stack([pair.homography.astype(np.float32) for pair in pairs]),
     )
 
 

@@ -14,7 +14,11 @@ from fcslam.learning.network import cell_log_probabilities
 
 ROUNDING = 0.01
 """Keeps the slope of the square root finite where two codes are equal."""
+AGREEMENT_WINDOW_PX = 16
 _FAR = 1e4
+_FAINT = 1e-4
+"""Mean square of a keypoint map below which a window counts as empty."""
+_WHOLE = 0.999
 
 
 def binary_activation(logits: Tensor) -> Tensor:
@@ -86,6 +90,19 @@ def detector_loss(point_logits: Tensor, targets: Tensor, valid: Tensor) -> Tenso
     none = 1.0 - wanted.sum(1)
     terms = -(wanted * log_places).sum(1) - none * log_none
     return masked_mean(terms, F.pixel_unshuffle(valid.unsqueeze(1).float(), CELL_PX).amin(1) > 0.5)
+
+
+def agreement_loss(first: Tensor, second: Tensor, valid: Tensor) -> Tensor:
+    """One minus the cosine of two keypoint maps (B, H, W) of the same pixels, in windows that are valid throughout.
+
+    Only where a window's peaks are and how they compare counts, as in R2D2 (Revaud et al. 2019, eq. 1).
+    """
+
+    def mean(values: Tensor) -> Tensor:
+        return F.avg_pool2d(values, AGREEMENT_WINDOW_PX, AGREEMENT_WINDOW_PX // 2)
+
+    norms = (mean(first.square()) * mean(second.square()) + _FAINT**2).sqrt()
+    return masked_mean(1.0 - mean(first * second) / norms, mean(valid.to(first.dtype)) > _WHOLE)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

@@ -59,22 +59,28 @@ class KeypointNetwork(nn.Module):
 
 
 class LightBody(nn.Module):
-    """About 2 GMAC at 640 x 480; strides of 2 by kernels of 4, which keep blocks centred and alias less than 3."""
+    """About 1.9 GMAC at 640 x 480; strides of 2 by kernels of 4, which keep blocks centred and alias less than 3.
+
+    Widths are multiples of 16 or what fills them up: processors with vectors of 16 floats compute that many anyway.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.to_half = nn.Sequential(_convolution(1, 16, 4, 2), _convolution(16, 16))
-        self.to_quarter = nn.Sequential(_convolution(16, 24, 4, 2), _convolution(24, 24))
-        self.to_eighth = nn.Sequential(_convolution(24, 64, 4, 2), _convolution(64, 64), _convolution(64, 64))
+        self.to_quarter = nn.Sequential(_convolution(16, 32, 4, 2), _convolution(32, 32))
+        self.to_eighth = nn.Sequential(_convolution(32, 64, 4, 2), _convolution(64, 64), _convolution(64, 64))
         self.to_sixteenth = nn.Sequential(
             nn.MaxPool2d(2, ceil_mode=True), _convolution(64, 96), _convolution(96, 96), _convolution(96, 64, 1)
         )
         self.joint = nn.Sequential(_convolution(64, 64), _convolution(64, 64))
-        self.code_head = nn.Sequential(_convolution(64, 128), nn.Conv2d(128, CODE_BITS, 1))
+        self.code_head = nn.Sequential(_convolution(64, 128, 1), nn.Conv2d(128, CODE_BITS, 1))
         self.context_eighth = nn.Conv2d(64, 16, 1)
-        self.context_quarter = nn.Conv2d(24, 16, 1)
-        self.point_head = nn.Sequential(_convolution(20, 16), nn.Conv2d(16, 4, 3, padding=1))
-        self.refine = nn.Sequential(_convolution(2, 8), nn.Conv2d(8, 1, 3, padding=1))
+        self.context_quarter = nn.Conv2d(32, 16, 1)
+        self.point_head = nn.Sequential(_convolution(16, 16), nn.Conv2d(16, 4, 1))
+        # What is found at half resolution depends on whether it lies on an even pixel; these layers see every pixel.
+        self.refine = nn.Sequential(
+            _convolution(2, 16), _separable(16), _separable(16), _each_alone(16), nn.Conv2d(16, 1, 1)
+        )
         nn.init.zeros_(self.refine[-1].weight)  # begins as no change
 
     def forward(self, image: Tensor) -> Maps:
@@ -86,8 +92,7 @@ class LightBody(nn.Module):
         around = _twice(self.to_sixteenth(eighth))[..., : eighth.shape[-2], : eighth.shape[-1]]
         joint = self.joint(eighth + around)
         context = _twice(self.context_quarter(quarter) + _twice(self.context_eighth(joint)))
-        detail = torch.cat((half + context, F.pixel_unshuffle(image, 2)), dim=1)
-        points = F.pixel_shuffle(self.point_head(detail), 2)
+        points = smoothed(F.pixel_shuffle(self.point_head(half + context), 2))
         points = points + self.refine(torch.cat((image, points), dim=1))
         return Maps(points.squeeze(1), self.code_head(joint))
 
@@ -145,9 +150,25 @@ def sample_codes(code_logits: Tensor, points_px: Tensor) -> Tensor:
     return sampled.squeeze(2).transpose(1, 2)
 
 
+def smoothed(maps: Tensor) -> Tensor:
+    """Maps (B, 1, H, W) without what alternates from pixel to pixel: it would tell even pixels from odd ones."""
+    binomial = maps.new_tensor([0.25, 0.5, 0.25])
+    return F.conv2d(F.pad(maps, (1, 1, 1, 1), mode="replicate"), torch.outer(binomial, binomial)[None, None])
+
+
 def _convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
     convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding=(kernel - stride + 1) // 2, bias=False)
     return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+def _separable(channels: int) -> nn.Sequential:
+    """A convolution in two steps: each channel alone, then all at each pixel."""
+    mix = nn.Conv2d(channels, channels, 1, bias=False)
+    return nn.Sequential(_each_alone(channels), mix, nn.BatchNorm2d(channels), nn.ReLU(inplace=True))
+
+
+def _each_alone(channels: int) -> nn.Conv2d:
+    return nn.Conv2d(channels, channels, 3, padding=1, groups=channels, bias=False)
 
 
 def _even_contrast(image: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX
@@ -16,6 +17,7 @@ APART_PX = 8.0
 """Points this close to a match are no negatives: their codes should be alike."""
 TEACHER_SHARPNESS = 2.0
 """A bit the teacher is one standard deviation sure of is 1 with 88 %."""
+_SEEN = 0.999
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,7 @@ def objective(
         ),
         "balance": losses.balance_loss(torch.tanh(logits), batch.valid.repeat(2, 1)),
         "detector": losses.detector_loss(*shift_grid(points, grid_shift)),
+        "agreement": losses.agreement_loss(*views_aligned(points[0].sigmoid(), batch)),
     }
     factors = {name: getattr(weights, name) for name in parts}
     if bits is not None:
@@ -77,6 +80,22 @@ def objective(
         factors["distillation"] = weights.distillation * 0.25**progress
     total = sum((factors[name] * part for name, part in parts.items()), start=torch.zeros_like(parts["detector"]))
     return total, parts
+
+
+def views_aligned(maps: Tensor, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    """Maps (2B, H, W) of the first views, of the second ones as the first ones' pixels see them, and where both see."""
+    first, second = maps.chunk(2)
+    seen_first, seen_second = batch.seen.chunk(2)
+    height, width = maps.shape[-2:]
+    size = maps.new_tensor([width, height])
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack((x, y, torch.ones_like(x)), dim=-1).to(maps).reshape(-1, 3)
+    there = pixels @ batch.homographies.transpose(-1, -2)
+    grid = (2.0 * there[..., :2] / there[..., 2:] + 1.0) / size - 1.0
+    grid = grid.reshape(-1, height, width, 2)
+    both = torch.stack((second, seen_second.to(maps.dtype)), dim=1)
+    moved, seen = F.grid_sample(both, grid, mode="bilinear", padding_mode="zeros", align_corners=False).unbind(1)
+    return first, moved, seen_first & (seen > _SEEN)
 
 
 def negatives(points: Tensor, valid: Tensor) -> Tensor:

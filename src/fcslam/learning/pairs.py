@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
 from fcslam.learning.labels import Labels, Teacher
-from fcslam.learning.warps import random_change, random_view, relight, seen, warp_image, well_inside
+from fcslam.learning.warps import random_change, random_shift, random_view, relight, seen, warp_image, well_inside
 from fcslam.metrics.framing import Size
 from fcslam.metrics.homography import Mask, inverse, warp
 from fcslam.records import FloatArray
@@ -17,6 +17,9 @@ BORDER_PX: Final = 4
 """Points so close to the rim of a view do not count."""
 GRID_SHARE: Final = 0.35
 """Points of a pair that are drawn anywhere instead of at keypoints: every pixel has to have a code."""
+
+SHIFT_SHARE: Final = 0.15
+"""Pairs whose views differ by a shift by whole pixels, and in light."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +67,8 @@ def draw_pair(example: Example, size: Size, points: int, taught: int, rng: np.ra
     image = example.image
     window = random_view(image, size, rng)
     homographies = [random_change(size, rng) @ window for _ in range(2)]
+    if rng.random() < SHIFT_SHARE:
+        homographies[1] = random_shift(rng) @ homographies[0]
     chosen = _choose(example, homographies, size, points, rng)
     told, descriptors = _choose_taught(example.teacher, homographies, size, taught, rng)
     views = [_view(example, homography, size, chosen, told, rng) for homography in homographies]

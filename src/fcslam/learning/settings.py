@@ -19,6 +19,7 @@ class LossSettings(Settings):
     distillation: float = Field(default=30.0, ge=0.0, description="weight of the teacher's bits; a quarter at the end")
     balance: float = Field(default=0.1, ge=0.0, description="weight of the bits' balance")
     detector: float = Field(default=1.0, ge=0.0, description="weight of the detector's cross entropy")
+    agreement: float = Field(default=1.0, ge=0.0, description="weight of both views' keypoint maps being alike")
 
 
 class TrainingSettings(Settings):

@@ -11,14 +11,16 @@ from fcslam.metrics.framing import Size
 from fcslam.metrics.homography import Mask
 from fcslam.records import FloatArray
 
-SCALE_SPREAD: Final = 0.5
+SCALE_SPREAD: Final = 0.7
 """Two views of a pair differ by exp(+-this) in scale at most."""
 TILT: Final = 0.12
 """How far a corner of a view moves, in sides of the view."""
 SMALL_TURN_RAD: Final = 0.2
 """Standard deviation of a view's turn."""
-ANY_TURN_SHARE: Final = 0.06
+ANY_TURN_SHARE: Final = 0.1
 """Views that are turned by any angle: robots roll little, but held and mounted cameras do."""
+
+LARGEST_SHIFT_PX: Final = 15
 
 
 def random_view(image: GreyImage, size: Size, rng: np.random.Generator) -> FloatArray:
@@ -42,6 +44,12 @@ def random_change(size: Size, rng: np.random.Generator) -> FloatArray:
     moved = (tilted - middle) @ rotation.T + middle + shift
     homography: FloatArray = cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32))
     return homography
+
+
+def random_shift(rng: np.random.Generator) -> FloatArray:
+    """A shift by whole pixels, as homography (3, 3): a network with strides must be taught that it changes nothing."""
+    x, y = rng.integers(-LARGEST_SHIFT_PX, LARGEST_SHIFT_PX + 1, 2)
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
 def warp_image(image: GreyImage, homography: FloatArray, size: Size) -> GreyImage:
