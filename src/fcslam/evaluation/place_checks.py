@@ -6,10 +6,9 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from fcslam.evaluation.place_scoring import DescribedSet
-from fcslam.features.detector import ImageFeatures
-from fcslam.features.matching import mutual_pairs
+from fcslam.evaluation.place_scoring import DescribedSet, PlaceFeatures
 from fcslam.features.codes import hamming_matrix
+from fcslam.features.matching import mutual_pairs
 from fcslam.records import FloatArray
 
 RATIO: Final = 0.9
@@ -46,11 +45,11 @@ class PairChecker:
         """Matches that agree on one scene."""
         if (query, place) not in self._inliers:
             pair = self._described.queries[query], self._described.gallery[place]
-            self._inliers[query, place] = agreeing_matches(*pair)
+            self._inliers[query, place] = self._described.agreeing(*pair)
         return self._inliers[query, place]
 
 
-def agreeing_matches(a: ImageFeatures, b: ImageFeatures) -> int:
+def agreeing_in_images(a: PlaceFeatures, b: PlaceFeatures) -> int:
     """The most matches of two images that one homography or one fundamental matrix explains."""
     first, second = distinct_matches(a, b)
     if len(first) < _FEWEST:
@@ -70,12 +69,12 @@ def _inliers(estimate: Callable[[], tuple[Any, Any]]) -> int:
     return 0 if mask is None else int(mask.sum())
 
 
-def distinct_matches(a: ImageFeatures, b: ImageFeatures) -> tuple[FloatArray, FloatArray]:
+def distinct_matches(a: PlaceFeatures, b: PlaceFeatures) -> tuple[FloatArray, FloatArray]:
     """Where mutual nearest neighbours are that pass the ratio test, shape (K, 2) twice."""
-    if min(len(a.scores), len(b.scores)) < 2:
+    if min(len(a.descriptors), len(b.descriptors)) < 2:
         return np.empty((0, 2)), np.empty((0, 2))
     distances = hamming_matrix(a.descriptors, b.descriptors)
     pairs = mutual_pairs(distances.argmin(axis=1), distances.argmin(axis=0))
     nearest = np.partition(distances[pairs[:, 0]], 1, axis=1)[:, :2].astype(np.float64)
     kept = pairs[nearest[:, 0] < RATIO * nearest[:, 1]]
-    return a.keypoints_px[kept[:, 0]].astype(np.float64), b.keypoints_px[kept[:, 1]].astype(np.float64)
+    return a.positions[kept[:, 0]].astype(np.float64), b.positions[kept[:, 1]].astype(np.float64)

@@ -3,7 +3,7 @@
 Each gives similarities (Q, G) of queries and gallery, 0 where a place is not retrieved or not admitted.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from fcslam.evaluation.place_sets import PlaceSet
 from fcslam.features.codes import code_words, mutual_matches
-from fcslam.features.detector import ImageFeatures
 from fcslam.places.index import PlaceIndex
 from fcslam.places.kmeans_tree import Tree, TreeShape, descend, grow
 from fcslam.places.similarity import BagOfWords, bag_of_words
@@ -27,12 +26,24 @@ FOREIGN_SHAPE: Final = TreeShape(branching=10, depth=4, smallest_split=2, iterat
 
 
 @dataclass(frozen=True, slots=True)
+class PlaceFeatures:
+    """What describes a place."""
+
+    positions: NDArray[np.float32]
+    """Shape (N, 2): pixels of an image, or metres in a submap."""
+    descriptors: Codes
+    """Shape (N, 32)."""
+
+
+@dataclass(frozen=True, slots=True)
 class DescribedSet:
     """A set of places and the features of each."""
 
     place_set: PlaceSet
-    queries: Sequence[ImageFeatures]
-    gallery: Sequence[ImageFeatures]
+    queries: Sequence[PlaceFeatures]
+    gallery: Sequence[PlaceFeatures]
+    agreeing: Callable[[PlaceFeatures, PlaceFeatures], int]
+    """Geometry: how many matches of two places one motion explains."""
 
 
 Scorer = Callable[[DescribedSet], FloatArray]
@@ -54,7 +65,7 @@ def matching_descriptors(a: Codes, b: Codes) -> float:
 class ForeignTree:
     """Bags of words as DBoW2 has them: a k-means tree and idf of other images, and neither ever changes."""
 
-    def __init__(self, training: Iterable[Codes], seed: int, shape: TreeShape = FOREIGN_SHAPE) -> None:
+    def __init__(self, training: Sequence[Codes], seed: int, shape: TreeShape = FOREIGN_SHAPE) -> None:
         """Grow the tree on the descriptors (N, 32) of each of the other images."""
         images = [code_words(codes) for codes in training]
         self._tree: Tree = grow(np.concatenate(images), shape, np.uint64(seed))

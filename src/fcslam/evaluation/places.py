@@ -11,10 +11,7 @@ import numpy as np
 from fcslam.errors import OutputError
 from fcslam.evaluation.place_checks import PairChecker
 from fcslam.evaluation.place_scoring import DescribedSet, Scorer
-from fcslam.evaluation.place_sets import PlaceSet, all_images
-from fcslam.features.detector import Detector, ImageFeatures
-from fcslam.features.extraction import extract
-from fcslam.features.files import read_features, read_grey
+from fcslam.evaluation.place_sets import PlaceSet
 from fcslam.metrics.bootstrap import Interval, mean_interval, measure_interval
 from fcslam.metrics.retrieval import (
     Answers,
@@ -30,10 +27,6 @@ from fcslam.metrics.retrieval import (
 from fcslam.records import FloatArray
 
 RANKS: Final = (1, 5, 10)
-FEATURES_PER_IMAGE: Final = 500
-LONGEST_SIDE_PX: Final = 400
-
-Extractor = Callable[[Path], ImageFeatures]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,31 +59,6 @@ class SetResult:
     scores: tuple[Score, ...]
 
 
-def image_extractor(detector: Detector, longest_side_px: int = LONGEST_SIDE_PX) -> Extractor:
-    """Features of image files, shrunk to that size."""
-    return lambda path: extract(read_grey(path), detector, longest_side_px)
-
-
-def folder_extractor(features: Path, root: Path, most: int = FEATURES_PER_IMAGE) -> Extractor:
-    """Features that lie below ``features`` where their images lie below ``root``, as ``fcslam extract`` writes them."""
-    return lambda path: read_features(features / path.relative_to(root).with_suffix(".npz"))[0].take(slice(most))
-
-
-def describe_set(place_set: PlaceSet, extractor: Extractor, watch: Callable[[], None] = lambda: None) -> DescribedSet:
-    """The features of every image of a set, each taken once.
-
-    Raises:
-        FeatureError: an image or its features cannot be read.
-    """
-    features: dict[Path, ImageFeatures] = {}
-    for path in all_images(place_set):
-        features[path] = extractor(path)
-        watch()
-    return DescribedSet(
-        place_set, [features[path] for path in place_set.queries], [features[path] for path in place_set.gallery]
-    )
-
-
 def evaluate_set(
     described: DescribedSet,
     scorers: Mapping[str, Scorer],
@@ -121,9 +89,7 @@ def evaluate_set(
     return SetResult(described.place_set, similarities, verified, tuple(scores))
 
 
-def measure(
-    similarity: FloatArray, truth: PairTruth, rng: np.random.Generator
-) -> tuple[dict[str, Interval], Answers]:
+def measure(similarity: FloatArray, truth: PairTruth, rng: np.random.Generator) -> tuple[dict[str, Interval], Answers]:
     """All measures of a similarity matrix (Q, G) under the names of ``Score``, and the single best answers."""
     answers = single_best(similarity, truth)
     count = len(similarity)

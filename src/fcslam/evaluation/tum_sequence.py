@@ -85,7 +85,7 @@ def _read_depth(path: Path) -> FloatArray:
     depth = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
         raise EvaluationError(f"{path}: no depth image of 16 bits")
-    return depth.astype(np.float64) / DEPTH_UNITS_PER_M
+    return np.asarray(depth, np.float64) / DEPTH_UNITS_PER_M
 
 
 def _calibration(folder: Path) -> FloatArray:

@@ -52,7 +52,7 @@ def view_overlap(depths_m: FloatArray, T_world_camera: FloatArray, camera: Depth
     limit = _BEYOND * float(np.linalg.norm(far, axis=1).max())
     lens = np.concatenate((camera.intrinsics, camera.distortion))
     seen = _seen_again(np.ascontiguousarray(depths_m), T_world_camera, pixels, np.ascontiguousarray(rays), lens, limit)
-    return np.minimum(seen, seen.T)
+    return np.asarray(np.minimum(seen, seen.T))
 
 
 @njit(cache=True)
@@ -64,8 +64,10 @@ def _seen_again(
     lens: FloatArray,
     limit: float,
 ) -> FloatArray:
-    """Share of the pixels of image a (row) that image b (column) sees at the same depth, of those with a depth in a that
-    do not fall where b has none."""
+    """Share of the pixels of image a (row) that image b (column) sees at the same depth.
+
+    Of those with a depth in a that do not fall where b has none.
+    """
     count = depths_m.shape[0]
     shares = np.zeros((count, count))
     for a in range(count):

@@ -34,9 +34,7 @@ def mean_interval(values: FloatArray, rng: np.random.Generator) -> Interval:
     return Interval(float(known.mean()), float(low), float(high))
 
 
-def measure_interval(
-    measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator
-) -> Interval:
+def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator) -> Interval:
     """The same for any measure of some of ``count`` samples, which is given their numbers; the first value is of all.
 
     Draws for which the measure is NaN are left out.

@@ -38,8 +38,7 @@ class PairTruth:
     @property
     def answerable(self) -> NDArray[np.bool_]:
         """Queries that have a match, shape (Q,)."""
-        answerable: NDArray[np.bool_] = self.matches.any(axis=1)
-        return answerable
+        return np.asarray(self.matches.any(axis=1), np.bool_)
 
     def take(self, queries: NDArray[np.int64] | NDArray[np.bool_]) -> "PairTruth":
         """The truth of those queries."""
@@ -75,7 +74,9 @@ def recall_at(similarity: FloatArray, truth: PairTruth, k: int) -> FloatArray:
 
     Between 0 and 1 where equals compete for the last of the ``k`` ranks. Queries without a match are left out.
     """
-    return np.array([_found_within(similarity[q], truth, q, k) for q in np.flatnonzero(truth.answerable)], np.float64)
+    return np.array(
+        [_found_within(similarity[q], truth, int(q), k) for q in np.flatnonzero(truth.answerable)], np.float64
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,4 +165,3 @@ def _curve(scores: FloatArray, right: FloatArray, to_find: int) -> PrecisionReca
     found = np.cumsum(right)[last]
     recall = found / to_find if to_find else np.full(len(last), np.nan)
     return PrecisionRecall(scores[last], found / (last + 1.0), recall)
-

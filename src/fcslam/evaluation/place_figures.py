@@ -1,0 +1,63 @@
+"""Precision over recall of every way to compare places, one panel for each question of each set."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fcslam.errors import OutputError
+from fcslam.evaluation.places import SetResult
+
+COLOURS: Final = ("#000000", "#7f7f7f", "#d95f02", "#7570b3", "#1b9e77", "#e7298a", "#66a61e", "#a6761d")
+
+
+def draw_curves(path: Path, results: Sequence[SetResult]) -> None:
+    """Single best answers: lines before geometry, dashes after it.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    panels = [(result, question) for result in results for question in result.place_set.questions]
+    columns = min(3, len(panels))
+    figure, axes = panel_figure(-(-len(panels) // columns), columns, 4.6, 3.8)
+    for axis, (result, question) in zip(axes, panels, strict=False):
+        names = list(result.similarities)
+        for score in (score for score in result.scores if score.question == question):
+            curve = score.curve
+            axis.plot(
+                np.concatenate(([0.0], curve.recall)),
+                np.concatenate((curve.precision[:1], curve.precision)),
+                color=COLOURS[names.index(score.scorer) % len(COLOURS)],
+                linestyle="--" if score.is_verified else "-",
+                linewidth=1.2,
+                label=None if score.is_verified else score.scorer,
+            )
+        title = f"{result.place_set.name}, {question}"
+        axis.set(xlabel="recall", ylabel="precision", xlim=(0, 1.02), ylim=(0, 1.02), title=title)
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8, loc="lower left")
+    save(figure, path)
+
+
+def panel_figure(rows: int, columns: int, width_in: float, height_in: float) -> tuple[Any, list[Any]]:
+    """A figure that belongs to no window, and its axes row by row."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(columns * width_in, rows * height_in), layout="constrained")
+    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write a figure as PNG, without panels that stayed empty.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    for axis in figure.axes:
+        axis.set_visible(axis.has_data())
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=120, metadata={"Software": None})
+    except OSError as error:
+        raise OutputError(f"{path}: cannot write the figure ({error})") from error
