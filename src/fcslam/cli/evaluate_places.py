@@ -22,8 +22,8 @@ def places(
         list[Path],
         typer.Argument(
             metavar="SETS...",
-            help="Folders of images with their truth (dataset.csv, loop_pairs.txt, associations.txt or matches.csv), or "
-            "recordings of a LiDAR.",
+            help="Folders of images with their truth (dataset.csv, loop_pairs.txt, associations.txt or matches.csv), "
+            "or recordings of a LiDAR.",
         ),
     ],
     *,
