@@ -59,7 +59,7 @@ def places(
 
     from fcslam.evaluation.place_checks import PairChecker
     from fcslam.evaluation.place_features import choose_features, describe_sets, describe_training
-    from fcslam.evaluation.place_figures import draw_curves
+    from fcslam.evaluation.place_figures import curves_figure, save
     from fcslam.evaluation.place_scoring import choose_scorers
     from fcslam.evaluation.places import evaluate_set, write_results
     from fcslam.places.vocabulary import VocabularyConfig
@@ -78,7 +78,7 @@ def places(
             for each in described
         ]
     write_results(output, results)
-    draw_curves(output / "precision_recall.png", results)
+    save(curves_figure(results), output / "precision_recall.png")
     _show(Console(), results, output)
 
 

@@ -12,12 +12,8 @@ from fcslam.evaluation.places import SetResult
 COLOURS: Final = ("#000000", "#7f7f7f", "#d95f02", "#7570b3", "#1b9e77", "#e7298a", "#66a61e", "#a6761d")
 
 
-def draw_curves(path: Path, results: Sequence[SetResult]) -> None:
-    """Single best answers: lines before geometry, dashes after it.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+def curves_figure(results: Sequence[SetResult]) -> Any:
+    """Single best answers: lines before geometry, dashes after it."""
     panels = [(result, question) for result in results for question in result.place_set.questions]
     columns = min(3, len(panels))
     figure, axes = panel_figure(-(-len(panels) // columns), columns, 4.6, 3.8)
@@ -37,7 +33,7 @@ def draw_curves(path: Path, results: Sequence[SetResult]) -> None:
         axis.set(xlabel="recall", ylabel="precision", xlim=(0, 1.02), ylim=(0, 1.02), title=title)
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8, loc="lower left")
-    save(figure, path)
+    return figure
 
 
 def panel_figure(rows: int, columns: int, width_in: float, height_in: float) -> tuple[Any, list[Any]]:

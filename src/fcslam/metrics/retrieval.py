@@ -104,7 +104,8 @@ class Answers:
 def single_best(similarity: FloatArray, truth: PairTruth) -> Answers:
     """The most similar place of every query, ignored pairs left out."""
     best = _best(similarity, truth.matches | truth.different)
-    right, wrong = (((similarity == best[:, None]) & of).sum(axis=1) for of in (truth.matches, truth.different))
+    first = (similarity == best[:, None]) & (similarity > 0.0)
+    right, wrong = ((first & of).sum(axis=1) for of in (truth.matches, truth.different))
     return Answers(best, right / np.maximum(right + wrong, 1), truth.answerable)
 
 
