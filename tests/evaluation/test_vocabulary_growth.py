@@ -41,7 +41,7 @@ def test_measures_are_those_of_each_group():
         ahead = true - max(wrong)
         relative = max(-1.0, ahead / true) if true else -1.0
         mean = sum(wrong) / 8
-        expected = (ahead, relative, ahead <= 0, mean, sum((x - mean) ** 2 for x in wrong) / 8)
+        expected = (ahead, relative, float(ahead <= 0), mean, sum((x - mean) ** 2 for x in wrong) / 8)
         assert [measured[name][g] for name in MEASURES] == pytest.approx(list(expected))
 
 

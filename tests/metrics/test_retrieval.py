@@ -1,6 +1,6 @@
 """Retrieval measures against plain loops over every order of equals and every threshold, and their laws."""
 
-from itertools import permutations
+from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
@@ -36,9 +36,7 @@ def questions(draw, most_queries=4, most_places=6):
 def orders(row, truth, query):
     """Every order of the candidates of a query that its similarities allow, retrieved ones only."""
     known = np.flatnonzero((truth.matches | truth.different)[query] & (row > 0))
-    return [
-        order for order in permutations(known) if all(row[a] >= row[b] for a, b in zip(order, order[1:], strict=False))
-    ]
+    return [order for order in permutations(known) if all(row[a] >= row[b] for a, b in pairwise(order))]
 
 
 @given(questions(), st.integers(1, 4))

@@ -19,7 +19,7 @@ def curves_figure(results: Sequence[SetResult]) -> Any:
     figure, axes = panel_figure(-(-len(panels) // columns), columns, 4.6, 3.8)
     for axis, (result, question) in zip(axes, panels, strict=False):
         names = list(result.similarities)
-        for score in (score for score in result.scores if score.question == question):
+        for score in (score for score in result.scores if score.question == question and len(score.curve.recall)):
             curve = score.curve
             axis.plot(
                 np.concatenate(([0.0], curve.recall)),
