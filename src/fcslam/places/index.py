@@ -1,20 +1,20 @@
 """The place index: which stored places are like a new one, in words that follow the places as they arrive."""
 
-from collections.abc import Callable, Container, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.features.codes import CODE_WORDS, CodeWords, code_words
+from fcslam.places.kmeans_tree import TreeShape
+from fcslam.places.likeness import Found, Likeness, PlaceId
 from fcslam.places.postings import Postings
 from fcslam.places.scoring import TINY, score_matches, score_words
 from fcslam.places.similarity import BagOfWords, similarity
-from fcslam.places.vocabulary import Scoring, Strategy, Training, Vocabulary, VocabularyConfig
+from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
 from fcslam.records import Codes, FloatArray
-
-PlaceId = TypeVar("PlaceId")
-
 
 _MOST_LEVELS = 16
 """Of a tree whose leaves split: no limit in practice."""
@@ -22,62 +22,25 @@ _MERGED_SHARE = 4
 """A merged word is at most so much smaller than one that splits, so that it does not split again at once."""
 _ROWS_KEPT = 2
 """Rows for every stored place at most: those of forgotten ones are closed up then."""
-_NO_ROWS, _NO_SCORES = np.empty(0, np.int32), np.empty(0)
 _NO_CODES = np.empty((0, CODE_WORDS), np.uint64)
 
 
-class Found(NamedTuple, Generic[PlaceId]):
-    """A stored place that is like the query."""
+@dataclass(frozen=True, slots=True)
+class IndexState(Generic[PlaceId]):
+    """All that an index is; postings follow from it."""
 
-    id: PlaceId
-    similarity: float
-    """In [0, 1], as ``VocabularyConfig.scoring`` has it."""
-
-
-class Likeness(Generic[PlaceId]):
-    """How alike all stored places are to one query. Valid until the index changes."""
-
-    def __init__(
-        self,
-        ids: Sequence[PlaceId] = (),
-        rows: NDArray[np.int32] = _NO_ROWS,
-        scores: FloatArray = _NO_SCORES,
-    ) -> None:
-        self._ids, self._rows, self._scores = ids, rows, scores
-        self._by_place: dict[PlaceId, float] | None = None
-
-    def of(self, place: PlaceId, default: float = 0.0) -> float:
-        """The similarity of one place, ``default`` if it has nothing in common with the query."""
-        if self._by_place is None:
-            ids = (self._ids[row] for row in self._rows)
-            self._by_place = dict(zip(ids, self._scores.tolist(), strict=True))
-        return self._by_place.get(place, default)
-
-    def best(self, top_k: int, wanted: Callable[[PlaceId], bool] = lambda _: True) -> list[Found[PlaceId]]:
-        """The most similar places of those wanted, the most similar first; of equals the one stored first comes first.
-
-        Places that have nothing in common with the query are never among them.
-        """
-        found: list[Found[PlaceId]] = []
-        looked_at, count = 0, 2 * top_k + 16
-        while looked_at < len(self._rows) and len(found) < top_k:
-            order = self._order(count)
-            for position in order[looked_at:]:
-                place = self._ids[self._rows[position]]
-                if wanted(place):
-                    found.append(Found(place, float(self._scores[position])))
-                    if len(found) == top_k:
-                        break
-            looked_at, count = len(order), 4 * count
-        return found
-
-    def _order(self, count: int) -> NDArray[np.int64]:
-        """The first ``count`` positions at least, by falling score, then by row."""
-        if count >= len(self._rows):
-            return np.lexsort((self._rows, -self._scores))
-        least = np.partition(self._scores, len(self._scores) - count)[len(self._scores) - count]
-        chosen = np.flatnonzero(self._scores >= least)
-        return chosen[np.lexsort((self._rows[chosen], -self._scores[chosen]))]
+    config: VocabularyConfig
+    descriptor_version: str
+    training: Training | None
+    places_seen: int
+    tree: TreeState
+    ids: Sequence[PlaceId]
+    counts: NDArray[np.int32]
+    """Shape (P,): descriptors of each place."""
+    codes: CodeWords
+    """Shape (D, 4), place by place."""
+    leaves: NDArray[np.int32]
+    """Shape (D,): vertices of ``tree``."""
 
 
 class PlaceIndex(Generic[PlaceId]):
@@ -90,10 +53,7 @@ class PlaceIndex(Generic[PlaceId]):
     def __init__(self, config: VocabularyConfig, rng: np.random.Generator, descriptor_version: str = "") -> None:
         self._config = config
         self._descriptor_version = descriptor_version
-        shape = config.tree.shape
-        if config.strategy is Strategy.INCREMENTAL:
-            shape = shape._replace(depth=_MOST_LEVELS, smallest_split=config.leaf_capacity + 1)
-        self._vocabulary = Vocabulary(shape, int(rng.integers(0, 2**63)))
+        self._vocabulary = Vocabulary(_shape(config), int(rng.integers(0, 2**63)))
         self._postings = Postings(vertices=1)
         self._ids: list[PlaceId] = []
         """By row; what stood there once stays after the place was forgotten, until rows are closed up."""
@@ -188,6 +148,28 @@ class PlaceIndex(Generic[PlaceId]):
         """Grow the tree now from the descriptors of these places, each (N, 32), which need not be stored."""
         self._train(np.concatenate([_NO_CODES, *map(code_words, places)]), len(places))
 
+    def state(self) -> IndexState[PlaceId]:
+        """All that the index is."""
+        rows = self._rows()
+        tree, number_of = self._vocabulary.state()
+        leaves = np.concatenate([np.empty(0, np.int32), *map(self._postings.leaves, rows.tolist())])
+        return IndexState(
+            self._config, self._descriptor_version, self._training, self._places_seen, tree, list(self._row_of),
+            self._postings.entries.counts[rows], self._postings.gather(rows), number_of[leaves],
+        )  # fmt: skip
+
+    @classmethod
+    def restored(cls, state: IndexState[PlaceId]) -> Self:
+        """The index that had this state; it goes on as that one."""
+        index = cls(state.config, np.random.default_rng(0), state.descriptor_version)
+        index._training, index._places_seen = state.training, state.places_seen
+        index._vocabulary = Vocabulary.restored(_shape(state.config), state.tree)
+        index._postings = Postings(index._vocabulary.vertex_count)
+        index._postings.add_all(state.codes, state.leaves, state.counts)
+        index._ids = list(state.ids)
+        index._row_of = {place: row for row, place in enumerate(index._ids)}
+        return index
+
     def _is_due(self, i: int) -> bool:
         """Algorithm 1, line 4: whether the tree is grown when place i has come."""
         since = i - self._config.train_batch - 1
@@ -237,31 +219,43 @@ class PlaceIndex(Generic[PlaceId]):
 
     def _split(self, overfull: NDArray[np.integer[Any]]) -> None:
         """Split words that hold too many descriptors, and what they split into."""
-        waiting = [int(leaf) for leaf in overfull]
+        waiting = sorted(overfull.tolist(), key=self._word, reverse=True)
         while waiting:
             leaf = waiting.pop()
-            _, codes = self._postings.content((leaf,))
-            targets = self._vocabulary.split(leaf, codes)
+            content = self._postings.content((leaf,))
+            targets = self._vocabulary.split(leaf, content.codes)
             if targets is None:
                 continue
             self._postings.grow_vertices(self._vocabulary.vertex_count)
-            self._postings.move((leaf,), targets)
+            self._postings.move((leaf,), content, targets)
             sizes = self._postings.entries.sizes
-            waiting += [int(child) for child in np.unique(targets) if sizes[child] > self._config.leaf_capacity]
+            waiting += [child for child in np.unique(targets).tolist() if sizes[child] > self._config.leaf_capacity]
 
     def _merge(self, leaves: NDArray[np.int32]) -> None:
         """Merge words that have become nearly empty with their siblings, level by level."""
-        waiting = {int(self._vocabulary.parents[leaf]) for leaf in leaves}
-        while waiting:
-            vertex = max(waiting)
-            waiting.remove(vertex)
-            children = self._vocabulary.children(vertex) if vertex >= 0 else slice(0, 0)
-            size = int(self._postings.entries.sizes[children].sum())
-            is_lowest = children.stop > children.start and not self._vocabulary.tree.child_count[children].any()
-            if is_lowest and size <= self._config.leaf_capacity // _MERGED_SHARE:
-                self._postings.move(range(children.start, children.stop), np.full(size, vertex, np.int32))
+        while len(leaves):
+            above = np.unique(self._vocabulary.parents[leaves])
+            nearly_empty = [vertex for vertex in above.tolist() if self._is_nearly_empty(vertex)]
+            for vertex in sorted(nearly_empty, key=lambda v: self._word(self._vocabulary.children(v).start)):
+                children = self._vocabulary.children(vertex)
+                content = self._postings.content(range(children.start, children.stop))
+                targets = np.full(len(content.rows), vertex, np.int32)
+                self._postings.move(range(children.start, children.stop), content, targets)
                 self._vocabulary.merge(vertex)
-                waiting.add(int(self._vocabulary.parents[vertex]))
+            leaves = np.array(nearly_empty, np.int32)
+
+    def _is_nearly_empty(self, vertex: int) -> bool:
+        """Whether the children of a vertex are leaves, and one word can hold all that lies in them."""
+        if vertex < 0:
+            return False
+        children = self._vocabulary.children(vertex)
+        if self._vocabulary.tree.child_count[children].any():
+            return False
+        return bool(self._postings.entries.sizes[children].sum() <= self._config.leaf_capacity // _MERGED_SHARE)
+
+    def _word(self, leaf: int) -> int:
+        """Numbers of words, unlike those of vertices, do not depend on where the tree lies in memory."""
+        return int(self._vocabulary.words[leaf])
 
     def _weigh(self, codes: CodeWords) -> tuple[NDArray[np.int32], FloatArray]:
         """Leaves, each once, and tf-idf with an L1 norm of 1. Words that all or no places have tell nothing."""
@@ -271,3 +265,10 @@ class PlaceIndex(Generic[PlaceId]):
         telling = weights > 0.0
         values: FloatArray = weights[telling] / max(weights.sum(), TINY)
         return leaves[telling], values
+
+
+def _shape(config: VocabularyConfig) -> TreeShape:
+    """A tree whose leaves split has no other limit than their capacity."""
+    if config.strategy is not Strategy.INCREMENTAL:
+        return config.tree.shape
+    return config.tree.shape._replace(depth=_MOST_LEVELS, smallest_split=config.leaf_capacity + 1)

@@ -14,7 +14,8 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import Verification, VerificationConfig, verify
-from fcslam.places.index import Likeness, PlaceIndex
+from fcslam.places.index import PlaceIndex
+from fcslam.places.likeness import Likeness
 from fcslam.places.motions import Motion, MotionConfig, motions
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, FloatArray, KeyscanId, Place

@@ -49,6 +49,17 @@ class Entries(NamedTuple):
     """Shape (R,): sum of ln(documents) over a place's descriptors. Its L1 norm is n ln(N) minus this, whatever N is."""
 
 
+class Content(NamedTuple):
+    """Descriptors that lie in some leaves, in the order of places."""
+
+    rows: NDArray[np.int32]
+    """Shape (K,)."""
+    indices: NDArray[np.int32]
+    """Shape (K,)."""
+    codes: CodeWords
+    """Shape (K, 4)."""
+
+
 class Postings:
     """Entries with room for more."""
 
@@ -103,15 +114,20 @@ class Postings:
         begin = self.entries.starts[row]
         return self.entries.leaves[begin : begin + self.entries.counts[row]]
 
-    def content(self, leaves: Sequence[int]) -> tuple[NDArray[np.int32], CodeWords]:
-        """What lies in some leaves, in the order of places: rows (K,) and codes (K, 4)."""
-        rows, _, codes = _content(self.entries, np.array(leaves, np.int32))
-        return rows, codes
+    def content(self, leaves: Sequence[int]) -> Content:
+        """What lies in some leaves."""
+        numbers = np.array(leaves, np.int32)
+        size = int(self.entries.sizes[numbers].sum())
+        content = Content(np.empty(size, np.int32), np.empty(size, np.int32), np.empty((size, CODE_WORDS), np.uint64))
+        _read(self.entries, numbers, content)
+        order = np.lexsort((content.indices, content.rows))
+        return Content(content.rows[order], content.indices[order], content.codes[order])
 
-    def move(self, leaves: Sequence[int], targets: NDArray[np.int32]) -> None:
-        """Empty ``leaves`` into other ones: ``targets`` (K,) has one for each entry, as ``content`` orders them."""
-        self._make_room(blocks=len(targets) // BLOCK + len(np.unique(targets)))
-        _move(self.entries, np.array(leaves, np.int32), targets)
+    def move(self, leaves: Sequence[int], content: Content, targets: NDArray[np.int32]) -> None:
+        """Empty ``leaves``, whose ``content`` this is, into other ones: ``targets`` (K,), one for each entry."""
+        receiving = np.unique(targets)
+        self._make_room(blocks=len(targets) // BLOCK + len(receiving))
+        _move(self.entries, np.array(leaves, np.int32), content, targets, receiving)
 
     def grow_vertices(self, vertices: int) -> None:
         """Make room for so many vertices of the tree."""
@@ -254,34 +270,34 @@ def _drop(entries: Entries, leaf: int, block: int, place: int) -> None:
 
 
 @njit(cache=True)
-def _content(entries: Entries, leaves: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32], CodeWords]:
-    """Rows, indices and codes in some leaves in the order of places."""
-    size = entries.sizes[leaves].sum()
-    rows, indices = np.empty(size, np.int32), np.empty(size, np.int32)
-    codes = np.empty((size, CODE_WORDS), np.uint64)
-    end = 0
+def _read(entries: Entries, leaves: NDArray[np.int32], content: Content) -> None:
+    count = 0
     for leaf in leaves:
         block, filled = entries.newest[leaf], block_size(entries, leaf)
         while block >= 0:
-            begin, end = end, end + filled
-            rows[begin:end], indices[begin:end] = entries.rows[block, :filled], entries.indices[block, :filled]
-            codes[begin:end] = entries.codes[block, :filled]
+            for place in range(filled):
+                content.rows[count], content.indices[count] = entries.rows[block, place], entries.indices[block, place]
+                content.codes[count] = entries.codes[block, place]
+                count += 1
             block, filled = entries.older[block], BLOCK
-    order = np.argsort(rows.astype(np.int64) * (1 << 31) + indices, kind="mergesort")
-    return rows[order], indices[order], codes[order]
 
 
 @njit(cache=True)
-def _move(entries: Entries, leaves: NDArray[np.int32], targets: NDArray[np.int32]) -> None:
-    rows, indices, codes = _content(entries, leaves)
+def _move(
+    entries: Entries,
+    leaves: NDArray[np.int32],
+    content: Content,
+    targets: NDArray[np.int32],
+    receiving: NDArray[np.int32],
+) -> None:
     for leaf in leaves:
         if entries.sizes[leaf]:
             _shift(entries, leaf, -np.log(entries.documents[leaf]), -1)
         _clear(entries, leaf)
-    for k in range(rows.shape[0]):
-        _append(entries, targets[k], rows[k], indices[k], codes[k])
-    for target in np.unique(targets):
-        _shift(entries, target, np.log(entries.documents[target]), -1)
+    for k in range(targets.shape[0]):
+        _append(entries, targets[k], content.rows[k], content.indices[k], content.codes[k])
+    for leaf in receiving:
+        _shift(entries, leaf, np.log(entries.documents[leaf]), -1)
 
 
 @njit(cache=True)

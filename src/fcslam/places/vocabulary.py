@@ -6,6 +6,7 @@ they are: then every other descriptor's word stays as well. Numbers of words are
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +79,20 @@ class Training:
     """Of the detector; empty if not told."""
 
 
+class TreeState(NamedTuple):
+    """A tree whose vertices are numbered level by level, so that the numbers of children say where they are."""
+
+    seed: int
+    version: int
+    words_given: int
+    centres: CodeWords
+    """Shape (V, 4)."""
+    child_count: NDArray[np.int32]
+    """Shape (V,)."""
+    words: NDArray[np.int64]
+    """Shape (V,)."""
+
+
 class Vocabulary:
     """The living tree. Leaves are numbered as vertices while they live, as words for ever."""
 
@@ -98,7 +113,7 @@ class Vocabulary:
     @property
     def word_count(self) -> int:
         """Number of words."""
-        return int((self.words[: self.vertex_count] >= 0).sum())
+        return int((self.words >= 0).sum())
 
     def train(self, codes: CodeWords) -> None:
         """Grow a new tree from codes (N, 4)."""
@@ -109,11 +124,34 @@ class Vocabulary:
         self.words = np.full(self.vertex_count, -1, np.int64)
         self.words[leaves] = self._words_given + np.arange(len(leaves))
         self._words_given += len(leaves)
-        inner = np.flatnonzero(self.tree.child_count)
-        self.parents = np.full(self.vertex_count, -1, np.int32)
-        for vertex in inner.tolist():
-            self.parents[self.children(vertex)] = vertex
+        self.parents = _parents(self.tree.child_count)
         self._free.clear()
+
+    def state(self) -> tuple[TreeState, NDArray[np.int32]]:
+        """The tree without gaps, and the new number of every vertex (V,)."""
+        order = np.zeros(1, np.int64)
+        level = order
+        while len(level):
+            below = [np.arange(family.start, family.stop) for family in map(self.children, level.tolist())]
+            level = np.concatenate([np.empty(0, np.int64), *below])
+            order = np.concatenate([order, level])
+        number_of = np.full(self.vertex_count, -1, np.int32)
+        number_of[order] = np.arange(len(order))
+        centres, child_count = self.tree.centres[order], self.tree.child_count[order]
+        tree = TreeState(self._seed, self.version, self._words_given, centres, child_count, self.words[order])
+        return tree, number_of
+
+    @classmethod
+    def restored(cls, shape: TreeShape, state: TreeState) -> Self:
+        """The vocabulary that had this state."""
+        vocabulary = cls(shape, state.seed)
+        counts = state.child_count
+        first_child = np.where(counts > 0, 1 + np.cumsum(counts) - counts, 0).astype(np.int32)
+        vocabulary.tree, vocabulary.words = Tree(state.centres, first_child, counts), state.words
+        vocabulary.version, vocabulary._words_given = state.version, state.words_given
+        vocabulary.vertex_count = len(counts)
+        vocabulary.parents = _parents(counts)
+        return vocabulary
 
     def leaves(self, codes: CodeWords) -> NDArray[np.int32]:
         """The vertex of the leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
@@ -163,8 +201,14 @@ class Vocabulary:
             centres, first_child, child_count = self.tree
             self.tree = Tree(longer(centres, length), longer(first_child, length), longer(child_count, length))
             self.words, self.parents = longer(self.words, length), longer(self.parents, length)
+            self.words[first:] = -1
         return first
 
     def _state(self, number: int) -> NDArray[np.uint64]:
         """Random numbers of their own for each training and each word."""
         return np.random.SeedSequence((self._seed, number)).generate_state(1, np.uint64).astype(np.uint64)
+
+
+def _parents(child_count: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The vertex above each one of a tree that is numbered level by level."""
+    return np.concatenate([[-1], np.repeat(np.arange(len(child_count)), child_count)]).astype(np.int32)
