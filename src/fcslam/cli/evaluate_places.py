@@ -55,31 +55,48 @@ def places(
 ) -> None:
     """Recall, precision and mismatches of place recognition: each strategy of the vocabulary beside brute force."""
     from rich.console import Console
+
+    from fcslam.evaluation.place_figures import curves_figure, save
+    from fcslam.evaluation.places import write_results
+
+    strategies = _strategies(strategy or ("static", "windowed", "incremental"))
+    results = _evaluate(sets, features, label or (), train_on or (), strategies, seed, verify=verify)
+    write_results(output, results)
+    save(curves_figure(results), output / "precision_recall.png")
+    _show(Console(), results, output)
+
+
+def _evaluate(
+    sets: "Sequence[Path]",
+    features: str,
+    labels: "Sequence[str]",
+    train_on: "Sequence[Path]",
+    strategies: "Sequence[Strategy]",
+    seed: int,
+    *,
+    verify: bool,
+) -> "list[SetResult]":
+    from rich.console import Console
     from rich.progress import Progress
 
     from fcslam.evaluation.place_checks import PairChecker
     from fcslam.evaluation.place_features import choose_features, describe_sets, describe_training
-    from fcslam.evaluation.place_figures import curves_figure, save
     from fcslam.evaluation.place_scoring import choose_scorers
-    from fcslam.evaluation.places import evaluate_set, write_results
+    from fcslam.evaluation.places import evaluate_set
     from fcslam.places.vocabulary import VocabularyConfig
 
-    strategies = _strategies(strategy or ("static", "windowed", "incremental"))
     chosen = choose_features(features)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("describing", total=None)
-        training = describe_training(train_on or (), chosen, lambda: bar.advance(task))
-        described = describe_sets(sets, label or (), chosen, lambda: bar.advance(task))
+        training = describe_training(train_on, chosen, lambda: bar.advance(task))
+        described = describe_sets(sets, labels, chosen, lambda: bar.advance(task))
         scorers = choose_scorers(strategies, VocabularyConfig(), training, seed)
         task = bar.add_task("comparing", total=len(scorers) * len(described))
-        results = [
+        return [
             evaluate_set(each, scorers, PairChecker(each) if verify else None, seed, lambda: bar.advance(task))
             for each in described
         ]
-    write_results(output, results)
-    save(curves_figure(results), output / "precision_recall.png")
-    _show(Console(), results, output)
 
 
 def _strategies(names: "Sequence[str]") -> "list[Strategy]":

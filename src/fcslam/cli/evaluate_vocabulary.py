@@ -8,6 +8,7 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rich.console import Console
     from rich.table import Table
 
     from fcslam.evaluation.vocabulary_growth import Growth
@@ -69,11 +70,14 @@ def vocabulary(
             )
     names = ", ".join(each.place_set.name for each in described)
     write_growth(output, growths, f"{len(arrivals)} places, {len(probes)} groups; sets: {names}", seed)
-    shown = Console()
-    shown.print(_table(growths, seed))
-    note = f"After the last batch; in brackets: 95 % intervals by bootstrap over {len(probes)} groups."
-    line = f"{note} Written: {output}"
-    shown.print(line, highlight=False, markup=False, soft_wrap=True)
+    _show(Console(), growths, seed)
+    typer.echo(f"{len(probes)} groups, {len(arrivals)} places; written: {output}")
+
+
+def _show(console: "Console", growths: "Mapping[str, Growth]", seed: int) -> None:
+    console.print(_table(growths, seed))
+    line = "After the last batch; in brackets: 95 % intervals by bootstrap over groups."
+    console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _table(growths: "Mapping[str, Growth]", seed: int) -> "Table":

@@ -26,8 +26,8 @@ _LOGARITHMIC = ("words", "seconds")
 
 def draw_growth(growths: Mapping[str, Growth], caption: str, seed: int) -> Any:
     """The paper's figure 4 with bands of 95 %, by bootstrap over the groups; ``caption`` says what arrived."""
-    figure, axes = panel_figure(2, 4, 4.4, 3.6)
-    for axis, (measure, title) in zip(axes, _TITLES.items(), strict=False):
+    figure, axes = panel_figure(len(_TITLES), 4, (4.4, 3.6))
+    for axis, (measure, title) in zip(axes, _TITLES.items(), strict=True):
         for colour, (name, growth) in zip(COLOURS, growths.items(), strict=False):
             values = _series(growth, measure, seed)
             if np.isfinite(values[:, 0]).any():
@@ -35,7 +35,7 @@ def draw_growth(growths: Mapping[str, Growth], caption: str, seed: int) -> Any:
                 axis.fill_between(growth.places, values[:, 1], values[:, 2], color=colour, alpha=0.15, linewidth=0)
         axis.set(xlabel="places", title=title, yscale="log" if measure in _LOGARITHMIC else "linear")
         axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="lower right", bbox_to_anchor=(0.94, 0.2))
     figure.supxlabel(caption, fontsize=9)
     return figure
 

@@ -15,9 +15,8 @@ COLOURS: Final = ("#000000", "#7f7f7f", "#d95f02", "#7570b3", "#1b9e77", "#e7298
 def curves_figure(results: Sequence[SetResult]) -> Any:
     """Single best answers: lines before geometry, dashes after it."""
     panels = [(result, question) for result in results for question in result.place_set.questions]
-    columns = min(3, len(panels))
-    figure, axes = panel_figure(-(-len(panels) // columns), columns, 4.6, 3.8)
-    for axis, (result, question) in zip(axes, panels, strict=False):
+    figure, axes = panel_figure(len(panels), 3, (4.6, 3.8))
+    for axis, (result, question) in zip(axes, panels, strict=True):
         names = list(result.similarities)
         for score in (score for score in result.scores if score.question == question and len(score.curve.recall)):
             curve = score.curve
@@ -36,22 +35,25 @@ def curves_figure(results: Sequence[SetResult]) -> Any:
     return figure
 
 
-def panel_figure(rows: int, columns: int, width_in: float, height_in: float) -> tuple[Any, list[Any]]:
-    """A figure that belongs to no window, and its axes row by row."""
+def panel_figure(panels: int, most_columns: int, size_in: tuple[float, float]) -> tuple[Any, list[Any]]:
+    """A figure that belongs to no window, and so many panels of that size row by row."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(columns * width_in, rows * height_in), layout="constrained")
-    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+    columns = min(most_columns, panels)
+    rows = -(-panels // columns)
+    figure = Figure(figsize=(columns * size_in[0], rows * size_in[1]), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for empty in axes[panels:]:
+        empty.remove()
+    return figure, axes[:panels]
 
 
 def save(figure: Any, path: Path) -> None:
-    """Write a figure as PNG, without panels that stayed empty.
+    """Write a figure as PNG.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    for axis in figure.axes:
-        axis.set_visible(axis.has_data())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=120, metadata={"Software": None})
