@@ -33,8 +33,8 @@ def test_what_agrees_is_what_a_rigid_motion_moves():
     assert agreeing_in_plane(here, scattered) < 8
 
 
-def test_a_recording_without_a_place_is_told(tmp_path, logs):
+def test_a_recording_of_a_single_place_is_told(tmp_path, logs):
     short = tmp_path / "short.clf"
     short.write_text("".join(logs[0].read_text(encoding="utf-8").splitlines(keepends=True)[:3]), encoding="utf-8")
-    with pytest.raises(EvaluationError, match="no place in it"):
+    with pytest.raises(EvaluationError, match="1 place in it"):
         describe_recording(short)

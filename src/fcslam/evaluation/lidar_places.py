@@ -35,7 +35,7 @@ def describe_recording(recording: Path) -> DescribedSet:
 
     Raises:
         SourceError: the recording cannot be read.
-        EvaluationError: it has no place.
+        EvaluationError: it has no two places.
     """
     source = open_source(recording)
     robot = RobotFrontend(source.name, RobotConfig(channels=(Channel.LIDAR,)))
@@ -44,8 +44,8 @@ def describe_recording(recording: Path) -> DescribedSet:
         packets += robot.process(record)
     packets += robot.finish()
     places = [packet.body for packet in packets if isinstance(packet.body, Place)]
-    if not places:
-        raise EvaluationError(f"{recording}: the robot found no place in it; give a longer recording")
+    if len(places) < 2:
+        raise EvaluationError(f"{recording}: nothing to compare, {len(places)} place in it; give a longer recording")
     stamps = {packet.body.id: packet.body.stamp for packet in packets if isinstance(packet.body, Keyscan)}
     poses = _corrected(packets)[[place.id.number for place in places]]
 
