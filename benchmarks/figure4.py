@@ -71,7 +71,7 @@ def main() -> None:
         f"{len(groups)} groups of the last three; bands: 95 %"
     )
     figure = draw_growth(growths, caption, SEED)
-    report.picture(caption, figure)
+    report.picture(caption.replace("\n", " "), figure)
     save(figure, PICTURE)
     report.write()
 

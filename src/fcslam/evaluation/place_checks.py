@@ -14,7 +14,7 @@ from fcslam.records import FloatArray
 RATIO: Final = 0.9
 """A match is kept if the second nearest is farther by this factor at least."""
 ACCEPTED_INLIERS: Final = 20
-CANDIDATES: Final = 20
+CANDIDATES: Final = 50
 """Places of a query that are checked, the most similar first."""
 _INLIER_PX = 3.0
 _EPIPOLAR_PX = 1.5
