@@ -69,12 +69,12 @@ def words_oracle(index, places, query):
 
 def matches_oracle(places, query, near_bits):
     """Every descriptor with every other."""
-    has = {
-        number: (np.bitwise_count(query[:, None] ^ place[None]).sum(axis=2, dtype=int) <= near_bits).any(axis=1)
-        for number, place in places.items()
-    }
-    weights = np.log((len(places) + 1) / np.maximum(sum(has.values()), 1))
-    return {number: float(weights @ of_place / weights.sum()) for number, of_place in has.items()}
+    gives = {}
+    for number, place in places.items():
+        distances = np.bitwise_count(query[:, None] ^ place[None]).sum(axis=2, dtype=int).min(axis=1)
+        gives[number] = np.where(distances <= near_bits, 1.0 - (distances / (near_bits + 1)) ** 2, 0.0)
+    weights = np.log((len(places) + 1) / np.maximum(sum(gives.values()), 1.0))
+    return {number: float(weights @ of_place / weights.sum()) for number, of_place in gives.items()}
 
 
 def check_stored(index, places):

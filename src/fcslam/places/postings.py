@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fcslam.features.codes import CODE_WORDS, CodeWords
 from fcslam.records import FloatArray, Scalar
 
-BLOCK = 16
+BLOCK = 8
 """Entries of a block: more waste memory in words of few descriptors, fewer cost jumps."""
 
 _GROWTH = 1.25

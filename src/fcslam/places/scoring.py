@@ -56,7 +56,11 @@ def score_words(
 def score_matches(
     entries: Entries, tree: Tree, row_count: int, place_count: int, codes: CodeWords, beam: int, near_bits: int
 ) -> tuple[NDArray[np.int32], FloatArray]:
-    """Share of the query's descriptors that a place has, too, each counted by how few places have it.
+    """Share of the query's descriptors that a place has, too, in [0, 1]; a place is wholly like itself.
+
+    A descriptor of the query gives each place 1 - (d / (near_bits + 1))^2 for the nearest one of its own, d bits away:
+    Epanechnikov's kernel. It counts ln((N + 1) / n), where n is the sum of what it gives to all places: what many
+    places have tells little.
 
     Args:
         entries: the stored places.
@@ -67,7 +71,7 @@ def score_matches(
         beam: words that are looked through for each code.
         near_bits: codes that differ in no more bits are of the same thing.
     """
-    scores, latest = np.zeros(row_count), np.full(row_count, -1, np.int32)
+    scores, nearest = np.zeros(row_count), np.full(row_count, near_bits + 1, np.int32)
     touched, here = np.empty(row_count, np.int32), np.empty(row_count, np.int32)
     total, whole = 0, 0.0
     for k in range(codes.shape[0]):
@@ -76,17 +80,23 @@ def score_matches(
             block, filled = entries.newest[leaf], block_size(entries, leaf)
             while block >= 0:
                 for place in range(filled):
-                    if hamming(codes[k], entries.codes[block, place]) <= near_bits:
+                    distance = np.int32(hamming(codes[k], entries.codes[block, place]))
+                    if distance <= near_bits:
                         row = entries.rows[block, place]
-                        if latest[row] != k:
-                            latest[row], here[found] = k, row
+                        if nearest[row] > near_bits:
+                            here[found] = row
                             found += 1
+                        nearest[row] = min(nearest[row], distance)
                 block, filled = entries.older[block], BLOCK
-        weight = np.log((place_count + 1) / max(found, 1))
+        everywhere = 0.0
+        for row in here[:found]:
+            everywhere += 1.0 - (nearest[row] / (near_bits + 1.0)) ** 2
+        weight = np.log((place_count + 1) / max(everywhere, 1.0))
         whole += weight
         for row in here[:found]:
             if scores[row] == 0.0:
                 touched[total] = row
                 total += 1
-            scores[row] += weight
+            scores[row] += weight * (1.0 - (nearest[row] / (near_bits + 1.0)) ** 2)
+            nearest[row] = near_bits + 1
     return touched[:total], scores[touched[:total]] / max(whole, TINY)
