@@ -17,7 +17,7 @@ Online: every image asks for the earlier ones, those that were just before it le
 
 import csv
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -28,8 +28,8 @@ from fcslam.errors import EvaluationError
 from fcslam.evaluation.tum_sequence import read_sequence
 from fcslam.evaluation.view_overlap import view_overlap
 from fcslam.metrics.retrieval import Pairs, PairTruth
-from fcslam.records import FloatArray
 
+LABELLED: Final = "dataset.csv"
 SAME_CLIP_FRAMES: Final = 4
 OTHER_CLIP_FRAMES: Final = 12
 NEAR_PAIR: Final = 8
@@ -65,17 +65,24 @@ def read_place_set(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
     Raises:
         EvaluationError: there is no set of a known kind, its files do not fit together, or nothing has those labels.
     """
-    readers = {"dataset.csv": _read_tower, "loop_pairs.txt": _read_tour, "associations.txt": _read_sequence,
-               "matches.csv": _read_generic}  # fmt: skip
-    for name, reader in readers.items():
-        if (folder / name).is_file():
-            if labels and reader is not _read_tower:
-                raise EvaluationError(f"{folder}: its images have no labels; leave --label out")
-            try:
-                return _read_tower(folder, labels) if reader is _read_tower else reader(folder)
-            except (OSError, ValueError, KeyError, TypeError) as error:
-                raise EvaluationError(f"{folder / name}: cannot be read as a set of places ({error!r})") from error
-    raise EvaluationError(f"{folder}: no set of places; it needs one of {', '.join(readers)}")
+    readers: dict[str, Callable[[], PlaceSet]] = {
+        LABELLED: lambda: _read_tower(folder, labels),
+        "loop_pairs.txt": lambda: _read_tour(folder),
+        "associations.txt": lambda: _read_sequence(folder),
+        "matches.csv": lambda: _read_generic(folder),
+    }
+    kind = next((name for name in readers if (folder / name).is_file()), None)
+    if kind is None:
+        raise EvaluationError(f"{folder}: no set of places; it needs one of {', '.join(readers)}")
+    if labels and kind != LABELLED:
+        raise EvaluationError(f"{folder}: its images have no labels; leave --label out")
+    try:
+        found = readers[kind]()
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise EvaluationError(f"{folder / kind}: cannot be read as a set of places ({error!r})") from error
+    if not (found.queries and found.gallery):
+        raise EvaluationError(f"{folder}: no queries or no gallery; is the folder complete, are the labels right?")
+    return found
 
 
 def all_images(place_set: PlaceSet) -> tuple[Path, ...]:
@@ -83,14 +90,14 @@ def all_images(place_set: PlaceSet) -> tuple[Path, ...]:
     return tuple(dict.fromkeys((*place_set.gallery, *place_set.queries)))
 
 
-def _online(count: int, admitted: Pairs, matches: Pairs, different: Pairs) -> tuple[Pairs, PairTruth]:
-    if not count:
-        raise ValueError("no images")
-    return admitted, PairTruth(matches & admitted, different & admitted)
+def _stream(folder: Path, images: tuple[Path, ...], admitted: Pairs, question: str, truth: PairTruth) -> PlaceSet:
+    """An online set; only what is admitted is asked."""
+    asked = PairTruth(truth.matches & admitted, truth.different & admitted)
+    return PlaceSet(folder.resolve().name, images, images, admitted, {question: asked})
 
 
-def _read_tower(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
-    with (folder / "dataset.csv").open(encoding="utf-8", newline="") as file:
+def _read_tower(folder: Path, labels: Collection[str]) -> PlaceSet:
+    with (folder / LABELLED).open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if not labels or row["label"] in labels]
     frames = [_FRAME.fullmatch(str(Path(row["image"]).with_suffix(""))) for row in rows]
     wrong = [row["image"] for row, frame in zip(rows, frames, strict=True) if frame is None]
@@ -100,8 +107,6 @@ def _read_tower(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
     numbers = np.array([int(frame[2]) for frame in frames if frame])
     floors, areas = (np.array([row[key] for row in rows]) for key in ("label", "area"))
     q, g = (np.flatnonzero([row["split"] == split for row in rows]) for split in ("query", "gallery"))
-    if not (len(q) and len(g)):
-        raise EvaluationError(f"{folder}: no queries or no gallery with these labels")
 
     same_clip = clips[q][:, None] == clips[g]
     apart = np.abs(numbers[q][:, None] - numbers[g])
@@ -132,23 +137,17 @@ def _read_tour(folder: Path) -> PlaceSet:
     for i, j in zip(earlier, later, strict=True):
         near[max(0, j - NEAR_PAIR) : j + NEAR_PAIR + 1, max(0, i - NEAR_PAIR) : i + NEAR_PAIR + 1] = True
     index = np.arange(count)
-    admitted, truth = _online(count, index[:, None] - index >= TOUR_GAP, matches, ~near)
+    admitted = index[:, None] - index >= TOUR_GAP
     paths = tuple(images[number] for number in numbers)
-    return PlaceSet(folder.resolve().name, paths, paths, admitted, {"loops": truth})
+    return _stream(folder, paths, admitted, "loops", PairTruth(matches, ~near))
 
 
 def _read_sequence(folder: Path) -> PlaceSet:
     sequence = read_sequence(folder)
     overlap = view_overlap(sequence.depths_m, sequence.T_world_camera, sequence.camera)
-    admitted, truth = _online(
-        len(overlap), _long_before(sequence.stamps), overlap > SAME_OVERLAP, overlap < OTHER_OVERLAP
-    )
-    return PlaceSet(folder.resolve().name, sequence.images, sequence.images, admitted, {"overlap": truth})
-
-
-def _long_before(stamps: FloatArray) -> Pairs:
-    before: Pairs = stamps[:, None] - stamps >= SEQUENCE_GAP_S
-    return before
+    admitted = np.asarray(sequence.stamps[:, None] - sequence.stamps >= SEQUENCE_GAP_S)
+    truth = PairTruth(overlap > SAME_OVERLAP, overlap < OTHER_OVERLAP)
+    return _stream(folder, sequence.images, admitted, "overlap", truth)
 
 
 def _read_generic(folder: Path) -> PlaceSet:
