@@ -6,7 +6,7 @@
 trained on photographs and street scenes (k=10, L=4). The network learned from other floors of the tower, so it is
 judged on floors 11 to 15 only, and ORB there as well. Places look alike from floor to floor: `near` asks for the right
 one among all, which appearance cannot tell. Verified: the 50 most similar places of each query, ranked by how many
-matches one homography or fundamental matrix explains. rebuild is left out: it would take hours; benchmarks/figure4.py
+matches one fundamental matrix explains. rebuild is left out: it would take hours; benchmarks/figure4.py
 has it. In brackets: 95 % by bootstrap over queries. LiDAR: places of one robot against those at least 60 s older, 1 m
 or less away by its own corrected poses; different is more than 10 m away.
 """

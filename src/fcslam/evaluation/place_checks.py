@@ -1,7 +1,6 @@
 """Whether the images of two places can show the same scene, by where their matching features lie."""
 
-from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -16,7 +15,6 @@ RATIO: Final = 0.9
 ACCEPTED_INLIERS: Final = 20
 CANDIDATES: Final = 50
 """Places of a query that are checked, the most similar first."""
-_INLIER_PX = 3.0
 _EPIPOLAR_PX = 1.5
 _FEWEST = 8
 _TRIALS = 1000
@@ -50,21 +48,14 @@ class PairChecker:
 
 
 def agreeing_in_images(a: PlaceFeatures, b: PlaceFeatures) -> int:
-    """The most matches of two images that one homography or one fundamental matrix explains."""
+    """Matches of two images that one fundamental matrix explains; of a plane it explains as many as a homography."""
     first, second = distinct_matches(a, b)
     if len(first) < _FEWEST:
         return 0
-    return max(
-        _inliers(lambda: cv2.findHomography(first, second, cv2.USAC_MAGSAC, _INLIER_PX, None, _TRIALS, _CONFIDENCE)),
-        _inliers(lambda: cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, _EPIPOLAR_PX, _CONFIDENCE, _TRIALS)),
-    )
-
-
-def _inliers(estimate: Callable[[], tuple[Any, Any]]) -> int:
     cv2.setRNGSeed(0)
     try:
-        _, mask = estimate()
-    except cv2.error:  # of matches on a line, for one: no model is what it finds
+        _, mask = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, _EPIPOLAR_PX, _CONFIDENCE, _TRIALS)
+    except cv2.error:  # of matches on a line, for one: it finds no model
         return 0
     return 0 if mask is None else int(mask.sum())
 
