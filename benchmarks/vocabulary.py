@@ -7,8 +7,8 @@ sun_hays80, kodak24 and camvid, in random order; after them come mixtures: of th
 descriptors and a quarter of another's, every bit flipped with a chance of 1 in 16. Each contender is a process of its
 own on one core; times are CPU time of it alone. "insert" is the mean of all places since the row before, with every
 split, renewal and growing of arrays, "slowest" the longest of these. "query" is the mean of 50 for the 20 most similar
-to a further mixture. "memory" is the growth of the resident set, "peak" its maximum, which the arrays reach for a moment
-when they are moved. Brute force compares every descriptor with every other (at most 48 bits); the static tree is as
+to a further mixture. "memory" is the growth of the resident set, "peak" its maximum, which arrays that move reach for
+a moment. Brute force compares every descriptor with every other (at most 48 bits); the static tree is as
 DBoW's, 10 children and 5 levels, trained on the first 300 places, scored by eq. (4).
 """
 

@@ -164,3 +164,16 @@ def test_in_a_joint_map_what_looks_most_alike_is_still_compared(visits, doubts):
     found = [match for match in matches if not match.predicted]
     assert [match.i for match in found] == [KeyscanId("a", 1)][:doubts]
     assert all(match.M for match in found)
+
+
+@pytest.mark.parametrize("compares", [True, False], ids=["in words", "waiting"])
+def test_of_more_places_than_are_kept_the_oldest_are_forgotten(visits, compares):
+    matcher = visits.matcher(most_places=2, vocabulary=VocabularyConfig(train_batch=0))
+    oldest = visits.visit("a", 0, room(), POSE_A)
+    for place in (oldest, *(visits.visit("a", k, other_room(), (0.3 * k, 0.5, 1.0)) for k in (1, 2))):
+        matcher.match(place, {}, (lambda _: compares))
+    assert len(matcher) == 2
+    visits.asked.clear()
+    matches = matcher.match(visits.visit("b", 0, room(), POSE_B), {oldest.id: np.zeros(3)}, STRANGERS)
+    assert oldest.id not in visits.asked
+    assert not any(match.M for match in matches)

@@ -28,6 +28,9 @@ class MatcherConfig(Settings):
         default=150, ge=0, description="up to this many places are all compared; then words choose"
     )
     candidates: int = Field(default=20, gt=0, description="places that words propose for one place")
+    most_places: int = Field(
+        default=100_000, gt=0, description="places kept of one channel; of more the oldest are forgotten"
+    )
     doubts: int = Field(
         default=2, ge=0, description="places of robots in the same map that are compared wherever the map puts them"
     )
@@ -76,16 +79,18 @@ class PlaceMatcher:
         """Compare a new place with those that may be the same, then store it.
 
         ``predicted``: T_i_j of stored places i that the joint map says are near; ``strangers``: whether a stored
-        place belongs to a robot whose relative pose is not known yet.
+        place belongs to a robot whose relative pose is not known yet. Forgotten places are left out.
         """
         comparable = bool(predicted) or any(strangers(i) for i in self._places)
         likeness = self._likeness(place) if comparable else Likeness[KeyscanId]()  # Algorithm 1, lines 11-13
-        near = [self._near_match(i, place, T_i_j, likeness) for i, T_i_j in predicted.items()]
+        kept = {i: T_i_j for i, T_i_j in predicted.items() if i in self._places}
+        near = [self._near_match(i, place, T_i_j, likeness) for i, T_i_j in kept.items()]
         doubtful = self._doubtful(place.id.robot, likeness, predicted, strangers)
         others = (*self._candidates(likeness, strangers), *doubtful)
         far = [self._far_match(i, place, likeness) for i in others]
         self._places[place.id] = place
         self._backlog.append(place)
+        self._forget_oldest()
         return [match for match in (*near, *far) if match is not None]
 
     def _likeness(self, place: Place) -> Likeness[KeyscanId]:
@@ -93,6 +98,16 @@ class PlaceMatcher:
             self._index.add(stored.id, stored.descriptors)
         self._backlog.clear()
         return self._index.compare(place.descriptors)
+
+    def _forget_oldest(self) -> None:
+        """Bounds the memory: a fleet that goes on for ever keeps its newest places."""
+        while len(self._places) > self._config.most_places:
+            oldest = next(iter(self._places))
+            if oldest in self._index:
+                self._index.forget(oldest)
+            else:
+                self._backlog = [stored for stored in self._backlog if stored.id != oldest]
+            del self._places[oldest]
 
     def _candidates(self, likeness: Likeness[KeyscanId], strangers: Callable[[KeyscanId], bool]) -> list[KeyscanId]:
         """Every stranger's place while there are few, else those that are most alike."""
