@@ -37,8 +37,8 @@ class Scoring(StrEnum):
 class TreeConfig(Settings):
     """Shape of the k-means tree where it is trained."""
 
-    branching: int = Field(default=16, ge=2, le=64, description="children of a tree vertex")
-    depth: int = Field(default=3, ge=1, le=8, description="levels below the root; at most branching ** depth words")
+    branching: int = Field(default=8, ge=2, le=64, description="children of a tree vertex")
+    depth: int = Field(default=4, ge=1, le=8, description="levels below the root; at most branching ** depth words")
     smallest_split: int = Field(default=20, ge=2, description="a cluster of fewer descriptors stays one word")
     iterations: int = Field(default=8, ge=1, le=100, description="rounds of k-means per cluster, at most")
 
@@ -60,7 +60,7 @@ class VocabularyConfig(Settings):
     capacity: int = Field(default=300, ge=1, description="Algorithm 1's C: the newest places that are trained on")
     rebuild_every: int = Field(default=20, ge=1, description="windowed: places between two trainings")
     tree: TreeConfig = Field(default=TreeConfig(), description="shape of the tree where it is trained")
-    leaf_capacity: int = Field(default=256, ge=2, description="incremental: a word of more descriptors splits")
+    leaf_capacity: int = Field(default=64, ge=2, description="incremental: a word of more descriptors splits")
     scoring: Scoring = Field(
         default=Scoring.MATCHES,
         description="words: eq. (4) on [0, 1]; matches: words propose descriptors, their bits decide",
