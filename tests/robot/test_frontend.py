@@ -7,7 +7,7 @@ import pytest
 import small_fleet
 
 from fcslam.features.birdseye import DETECTOR_VERSION
-from fcslam.features.classical import ORB_VERSION
+from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.records import (
     CameraImage,
     CameraModel,
@@ -61,9 +61,8 @@ def test_broken_images_cause_no_packet_and_change_none(scans):
 def test_hello_comes_first_and_once(scans):
     _, packets = drive(scans)
     assert bodies(packets, Hello) == [packets[0].body]
-    assert packets[0].body == Hello(
-        "r", 0, scans[0].laser, {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: ORB_VERSION}
-    )
+    versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: OnnxDetector(OnnxConfig()).version}
+    assert packets[0].body == Hello("r", 0, scans[0].laser, versions)
 
 
 def test_every_keyscan_is_followed_by_the_motion_that_leads_to_it(scans):

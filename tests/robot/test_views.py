@@ -12,8 +12,7 @@ from lidar.worlds import drifting, drive, path, recording, ring
 from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.config import dump, load
 from fcslam.errors import FeatureError
-from fcslam.features.classical import ORB_VERSION
-from fcslam.features.detector import OnnxConfig
+from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.features.kinds import DetectorKind
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place, frozen
@@ -67,7 +66,7 @@ def test_camera_places_come_every_metre_with_heights(seen):
     numbers = [place.id.number for place in found]
     assert numbers == sorted(set(numbers))
     for place in found:
-        assert place.detector_version == ORB_VERSION
+        assert place.detector_version == OnnxDetector(OnnxConfig()).version
         assert place.first <= place.id.number <= place.last
         assert place.keypoints.shape == (len(place.descriptors), 3)
         assert np.all((place.keypoints[:, 2] > 0.0) & (place.keypoints[:, 2] < 3.0))
