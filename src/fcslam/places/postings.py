@@ -17,7 +17,8 @@ from fcslam.records import FloatArray, Scalar
 BLOCK = 8
 """Entries of a block: more waste memory in words of few descriptors, fewer cost jumps."""
 
-_GROWTH = 1.25
+GROWTH = 1.06
+"""Of arrays that run out of room."""
 
 
 class Entries(NamedTuple):
@@ -133,9 +134,10 @@ class Postings:
         """Make room for so many vertices of the tree."""
         entries = self.entries
         if vertices > len(entries.newest):
-            length = max(vertices, int(_GROWTH * len(entries.newest)))
+            length = max(vertices, int(GROWTH * len(entries.newest)))
+            before = len(entries.newest)
             newest, sizes, documents = (longer(array, length) for array in entries[:3])
-            newest[len(entries.newest) :], sizes[len(entries.newest) :], documents[len(entries.newest) :] = -1, 0, 0
+            newest[before:], sizes[before:], documents[before:] = -1, 0, 0
             self.entries = entries._replace(newest=newest, sizes=sizes, documents=documents)
 
     def gather(self, rows: NDArray[np.int64]) -> CodeWords:
@@ -151,28 +153,33 @@ class Postings:
         entries = self.entries
         block_count = int(entries.free[1]) + blocks
         if block_count > len(entries.older):
-            length = max(block_count, int(_GROWTH * len(entries.older)))
+            length = max(block_count, int(GROWTH * len(entries.older)))
             entries = entries._replace(
                 older=longer(entries.older, length), rows=longer(entries.rows, length),
                 indices=longer(entries.indices, length), codes=longer(entries.codes, length),
             )  # fmt: skip
         if self.row_count + rows > len(entries.starts):
-            length = max(self.row_count + rows, int(_GROWTH * len(entries.starts)), 64)
+            length = max(self.row_count + rows, int(GROWTH * len(entries.starts)), 64)
             entries = entries._replace(
                 starts=longer(entries.starts, length), counts=longer(entries.counts, length),
                 log_documents=longer(entries.log_documents, length),
             )  # fmt: skip
         if self.descriptor_count + descriptors > len(entries.leaves):
-            length = max(self.descriptor_count + descriptors, int(_GROWTH * len(entries.leaves)))
+            length = max(self.descriptor_count + descriptors, int(GROWTH * len(entries.leaves)))
             entries = entries._replace(leaves=longer(entries.leaves, length))
         self.entries = entries
 
 
 def longer(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
-    """``array`` with room for ``length`` rows; what is never written costs no memory."""
-    result = np.empty((length, *array.shape[1:]), array.dtype)
-    result[: len(array)] = array
-    return result
+    """``array`` with room for ``length`` rows, those it had being kept; the array given is not to be used any more.
+
+    Large arrays grow in place: the system maps their pages anew instead of copying them, so that no place that comes
+    has to wait for gigabytes to move. Nothing may hold a view of the array.
+    """
+    if not (array.flags.owndata and array.flags.writeable):
+        array = array.copy()
+    array.resize((length, *array.shape[1:]), refcheck=False)
+    return array
 
 
 @njit(cache=True)

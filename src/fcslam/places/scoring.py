@@ -1,5 +1,7 @@
 """How alike a query and stored places are, without touching a place that has nothing in common with it; compiled."""
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -74,9 +76,16 @@ def score_matches(
     scores, nearest = np.zeros(row_count), np.full(row_count, near_bits + 1, np.int32)
     touched, here = np.empty(row_count, np.int32), np.empty(row_count, np.int32)
     total, whole = 0, 0.0
+    leaves = np.full((codes.shape[0], beam), -1, np.int32)
+    for k in range(codes.shape[0]):
+        near = near_leaves(tree, codes[k], beam)
+        leaves[k, : near.shape[0]] = near
+    _fetch(entries, leaves.ravel())
     for k in range(codes.shape[0]):
         found = 0
-        for leaf in near_leaves(tree, codes[k], beam):
+        for leaf in leaves[k]:
+            if leaf < 0:
+                break
             block, filled = entries.newest[leaf], block_size(entries, leaf)
             while block >= 0:
                 for place in range(filled):
@@ -100,3 +109,27 @@ def score_matches(
             scores[row] += weight * (1.0 - (nearest[row] / (near_bits + 1.0)) ** 2)
             nearest[row] = near_bits + 1
     return touched[:total], scores[touched[:total]] / max(whole, TINY)
+
+
+@njit(cache=True)
+def _fetch(entries: Entries, leaves: NDArray[np.int32]) -> Any:
+    """Bring the codes of these leaves (-1 for none) into the cache.
+
+    A chain is read block after block, each a cache miss in a large index. Read abreast, the chains' misses overlap.
+    """
+    blocks = np.empty(leaves.shape[0], np.int32)
+    count, read = 0, np.uint64(0)
+    for leaf in leaves:
+        if leaf >= 0 and entries.newest[leaf] >= 0:
+            blocks[count] = entries.newest[leaf]
+            count += 1
+    while count:
+        left = 0
+        for block in blocks[:count]:
+            read ^= entries.codes[block, 0, 0] ^ entries.codes[block, BLOCK // 4, 0]
+            read ^= entries.codes[block, BLOCK // 2, 0] ^ entries.codes[block, 3 * BLOCK // 4, 0]
+            if entries.older[block] >= 0:
+                blocks[left] = entries.older[block]
+                left += 1
+        count = left
+    return read  # what is computed is not left out by the compiler if it is returned

@@ -15,7 +15,7 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.features.codes import CodeWords
 from fcslam.places.kmeans_tree import Tree, TreeShape, bare_root, descend, grow, k_means
-from fcslam.places.postings import longer
+from fcslam.places.postings import GROWTH, longer
 
 
 class Strategy(StrEnum):
@@ -197,7 +197,7 @@ class Vocabulary:
         first = self.vertex_count
         self.vertex_count += size
         if self.vertex_count > len(self.words):
-            length = max(self.vertex_count, int(1.25 * len(self.words)))
+            length = max(self.vertex_count, int(GROWTH * len(self.words)))
             centres, first_child, child_count = self.tree
             self.tree = Tree(longer(centres, length), longer(first_child, length), longer(child_count, length))
             self.words, self.parents = longer(self.words, length), longer(self.parents, length)
