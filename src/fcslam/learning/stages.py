@@ -86,7 +86,7 @@ def train_detector(
     detector: Callable[[GreyImage], Response] | None = None
     if teacher is None:
         first = _train_on_shapes(folder / "shapes", settings, pace, watch)
-        start, detector = first.state_dict(), _as_detector(first, torch.device(pace.device))
+        start, detector = first.state_dict(), as_detector(first, torch.device(pace.device))
     images = gather(files, folder / "labels", settings, detector, teacher, watch)
     run = Run(settings, "joint", _made(folder / "joint"), pace, start)
     return run.train(images.train, images.held_out, _bits(images.train, settings.seed), partial(watch, "joint")), images
@@ -168,7 +168,9 @@ def _bits(examples: Sequence[Example], seed: int) -> TeacherBits | None:
     return teacher_bits(torch.from_numpy(np.concatenate(some).astype(np.float32)), seed)
 
 
-def _as_detector(network: KeypointNetwork, device: torch.device) -> Callable[[GreyImage], Response]:
+def as_detector(network: KeypointNetwork, device: torch.device) -> Callable[[GreyImage], Response]:
+    """A network as what labels images, on its device."""
+
     @torch.inference_mode()
     def detector(image: GreyImage) -> Response:
         height, width = (side // CELL_PX * CELL_PX for side in image.shape)
