@@ -231,6 +231,8 @@ def test_a_checkpoint_of_another_run_is_refused_but_more_rounds_are_not(tmp_path
     run([Fake("a")], tmp_path)
     with pytest.raises(TrainingError, match="other settings"):
         run([Fake("a")], tmp_path, settings(local_steps=2))
+    with pytest.raises(TrainingError, match="began from"):
+        run([Fake("a")], tmp_path, start=shifted(START, 1.0))
     with pytest.raises(TrainingError, match="does not fit"):
         run([Fake("a")], tmp_path, start={"other": np.zeros(3, np.float32)})
     state, reports = run([Fake("a")], tmp_path, settings(rounds=3))

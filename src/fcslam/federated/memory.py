@@ -36,6 +36,8 @@ class State:
     """The strategy's."""
     taken_part: Mapping[str, int]
     """Rounds by robot."""
+    origin: str
+    """Version of the weights that everything began from."""
 
 
 def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
@@ -44,7 +46,12 @@ def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
     Raises:
         OutputError: it cannot be written; the last one stays.
     """
-    numbers = {"best_score": state.best_score, "best_round": state.best_round, "taken_part": dict(state.taken_part)}
+    numbers = {
+        "best_score": state.best_score,
+        "best_round": state.best_round,
+        "taken_part": dict(state.taken_part),
+        "origin": state.origin,
+    }
     tensors = {
         f"{group}/{name}": torch.from_numpy(np.asarray(array, order="C"))
         for group, arrays in (("weights", state.weights), ("best", state.best), ("memory", state.memory))
@@ -54,8 +61,8 @@ def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
     write_checkpoint(path, Checkpoint(STAGE, state.rounds_done, header, tensors))
 
 
-def read_state(path: Path, settings: FederatedSettings, start: Weights) -> State | None:
-    """The state in a file; None if there is no file.
+def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: str) -> State | None:
+    """The state in a file; None if there is no file. ``start`` are this run's first weights, ``origin`` names them.
 
     Raises:
         TrainingError: the file is no such state, or that of a run with other settings or another network.
@@ -78,6 +85,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights) -> State
             int(header["best_round"]),
             groups["memory"],
             {str(robot): int(rounds) for robot, rounds in header["taken_part"].items()},
+            str(header["origin"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrainingError(f"{path}: is no checkpoint of federated training ({error}); take it away") from error
@@ -87,4 +95,8 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights) -> State
     reason = malformed(state.weights, start)
     if reason is not None:
         raise TrainingError(f"{path}: does not fit this network ({reason})")
+    if state.origin != origin:
+        raise TrainingError(
+            f"{path}: is of a run that began from {state.origin}, not from {origin}; give another --output"
+        )
     return state

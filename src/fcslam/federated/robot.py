@@ -3,6 +3,7 @@
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -53,7 +54,10 @@ class RobotLearner:
     cache: Path
     noise: NoiseSource
     device: str = "cpu"
-    _images: Images | None = None
+    watch: Callable[[str, int], None] = lambda _robot, _steps: None
+    """Is told its name and how many steps of a round are done."""
+    gathered: Images | None = None
+    """Its images with their labels, once they are read."""
 
     def learn(self, weights: Weights, round_number: int, settings: FederatedSettings) -> Learned:
         """As in ``Learner``; the result depends on the arguments, the images, their labels, and the noise.
@@ -71,7 +75,9 @@ class RobotLearner:
             frozen_statistics=frozen,
         )
         own = settings.of_robots().model_copy(update={"seed": own_seed(self.name, settings.training.seed)})
-        network, losses = train_leg(network.state_dict(), examples, own, leg, torch.device(self.device))
+        network, losses = train_leg(
+            network.state_dict(), examples, own, leg, torch.device(self.device), partial(self.watch, self.name)
+        )
         trained = weights_of(network)
         names = trained_names(weights, frozen)
         return Learned(privatised(trained, weights, names, settings.privacy, self.noise(round_number)), losses)
@@ -84,11 +90,11 @@ class RobotLearner:
 
     def _examples(self, weights: Weights, settings: FederatedSettings) -> Images:
         """The images, labelled by the first weights that ever came here, and by no later ones."""
-        if self._images is None:
+        if self.gathered is None:
             device = torch.device(self.device)
             labeller = as_detector(network_of(weights, settings.training.encoder).to(device), device)
-            self._images = gather(find_images([self.folder]), self.cache, settings.training, labeller, None, _silent)
-        return self._images
+            self.gathered = gather(find_images([self.folder]), self.cache, settings.training, labeller, None, _silent)
+        return self.gathered
 
 
 def own_seed(robot: str, seed: int) -> int:

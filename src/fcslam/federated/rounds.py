@@ -83,7 +83,9 @@ class Server:
             OutputError: something cannot be written; what was written before stays.
         """
         roster = Roster(grid, self._settings.deadline_s)
-        state = read_state(self._folder / CHECKPOINT_FILE, self._settings, self._start)
+        state = read_state(
+            self._folder / CHECKPOINT_FILE, self._settings, self._start, self._outside.version(self._start)
+        )
         rows: list[Row] = []
         if state is None:
             state = self._begin(grid, roster)
@@ -101,7 +103,7 @@ class Server:
     def _begin(self, grid: Grid, roster: Roster) -> State:
         """How good the start is: what comes must not be worse."""
         figures = self._judge(self._start, -1, grid, roster)
-        return State(0, self._start, self._start, score_of(figures), 0, {}, {})
+        return State(0, self._start, self._start, score_of(figures), 0, {}, {}, self._outside.version(self._start))
 
     def _round(self, grid: Grid, roster: Roster, state: State) -> tuple[State, RoundReport]:
         began = self._outside.clock()
@@ -125,6 +127,7 @@ class Server:
             best_round=state.rounds_done + 1 if released else state.best_round,
             memory={} if returned else memory_of(self._strategy),
             taken_part=taken_part,
+            origin=state.origin,
         )
         if returned:
             self._strategy = new_strategy(self._settings)

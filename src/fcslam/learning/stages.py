@@ -85,7 +85,7 @@ def train_detector(
     start: dict[str, Tensor] | None = None
     detector: Callable[[GreyImage], Response] | None = None
     if teacher is None:
-        first = _train_on_shapes(folder / "shapes", settings, pace, watch)
+        first = train_on_shapes(folder / "shapes", settings, pace, watch)
         start, detector = first.state_dict(), as_detector(first, torch.device(pace.device))
     images = gather(files, folder / "labels", settings, detector, teacher, watch)
     run = Run(settings, "joint", _made(folder / "joint"), pace, start)
@@ -153,7 +153,13 @@ def _labels(
     return labels
 
 
-def _train_on_shapes(folder: Path, settings: TrainingSettings, pace: Pace, watch: Watch) -> KeypointNetwork:
+def train_on_shapes(folder: Path, settings: TrainingSettings, pace: Pace, watch: Watch) -> KeypointNetwork:
+    """A detector of corners of synthetic shapes, whose codes mean nothing yet; resumes in ``folder``.
+
+    Raises:
+        TrainingError: ``folder`` holds another run.
+        OutputError: something cannot be written.
+    """
     shapes = settings.model_copy(update={"steps": settings.shape_steps, "loss": SHAPE_LOSSES})
     run = Run(shapes, "shapes", _made(folder), pace)
     return run.train(Shapes(0, SHAPE_COUNT), Shapes(1, HELD_OUT_SHAPES), watch=partial(watch, "shapes"))
