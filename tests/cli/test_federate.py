@@ -20,6 +20,13 @@ TINY = {
 }
 
 
+@pytest.fixture(scope="module", autouse=True)
+def brief():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fcslam.learning.trainer.VALIDATION_PAIRS", 1)
+        yield
+
+
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory):
     """Three robots: two with images, one without."""

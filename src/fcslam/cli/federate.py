@@ -9,11 +9,11 @@ import typer
 from fcslam.cli.train import need_torch, pace_on
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from fcslam.federated.history import RoundReport
-    from fcslam.federated.local import Watches
     from fcslam.federated.settings import FederatedSettings
+    from fcslam.federated.task import Task, Watches
     from fcslam.learning.trainer import Status
 
 QUICK = {"rounds": 3, "local_steps": 6}
@@ -22,9 +22,14 @@ QUICK_TRAINING = {"shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 
 
 
 def federate(
-    folders: Annotated[list[Path], typer.Argument(help="One folder of images for each robot, named like it.")],
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(help="One folder of images for each robot, named like it; one with --join, none with --serve."),
+    ] = None,
     *,
     local: Annotated[bool, typer.Option("--local", help="All robots in this process.")] = False,
+    serve: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Robots join this machine, there.")] = None,
+    join: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Be a robot of the server there.")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for all that is made; the same one resumes.")],
     config: Annotated[Path | None, typer.Option(help="YAML file of federated settings.")] = None,
     start: Annotated[
@@ -41,29 +46,55 @@ def federate(
     local_steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps of a robot in a round.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Another seed trains another detector.")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, or auto: cuda if there is one.")] = "auto",
+    ca: Annotated[Path | None, typer.Option(help="Certificate that all others of the fleet are signed by.")] = None,
+    certificate: Annotated[Path | None, typer.Option(help="This machine's certificate.")] = None,
+    key: Annotated[Path | None, typer.Option(help="Its private key.")] = None,
+    robot_key: Annotated[
+        list[Path] | None,
+        typer.Option(help="With --serve public keys of the robots that may join; with --join the private one."),
+    ] = None,
+    insecure: Annotated[bool, typer.Option("--insecure", help="Neither encrypted nor authenticated.")] = False,
     quick: Annotated[
         bool, typer.Option("--quick", help="A minute's run that only shows that everything works.")
     ] = False,
 ) -> None:
     """Train one detector on many robots' images, none of which leaves its robot."""
+    from fcslam.errors import TrainingError
+
+    if local + (serve is not None) + (join is not None) != 1:
+        raise TrainingError("say where the robots are: --local, --serve HOST:PORT or --join HOST:PORT")
+    given = {"strategy": strategy, "rounds": rounds, "local_steps": local_steps}
+    settings = _settings(config, quick, {name: value for name, value in given.items() if value is not None}, seed)
+    need_torch("flwr", extra="federated")
+    from fcslam.federated.task import Task
+
+    task = Task(output, settings, start, tuple(public or ()))
+    if local:
+        _run_locally(folders or [], task, device, quick)
+        return
+    from fcslam.cli.federate_apart import Security, run_robot, run_server
+
+    security = Security(ca, certificate, key, tuple(robot_key or ()), insecure)
+    if serve is not None:
+        run_server(serve, task, device, security, folders or [])
+    elif join is not None:
+        run_robot(join, folders or [], output, device, security)
+
+
+def _run_locally(folders: list[Path], task: "Task", device: str, quick: bool) -> None:
     import time
 
     from rich.console import Console
 
     from fcslam.errors import TrainingError
+    from fcslam.federated.local import federate_locally
 
-    if not local:
-        raise TrainingError("say where the robots are: --local for all of them in this process")
-    given = {"strategy": strategy, "rounds": rounds, "local_steps": local_steps}
-    settings = _settings(config, quick, {name: value for name, value in given.items() if value is not None}, seed)
-    need_torch("flwr", extra="federated")
-    from fcslam.federated.local import Task, federate_locally
-
+    if not folders:
+        raise TrainingError("--local needs a folder of images for each robot")
     console = Console(stderr=True)
     began = time.perf_counter()
-    with _progress(console, settings) as watches:
-        task = Task(folders, output, settings, start, tuple(public or ()))
-        files = federate_locally(task, pace_on(device, quick), watches)
+    with _progress(console, task.settings) as watches:
+        files = federate_locally(folders, task, pace_on(device, quick), watches)
     for file in files:
         typer.echo(str(file))
     console.print(f"{time.perf_counter() - began:.0f} s", highlight=False)
@@ -87,7 +118,7 @@ def _progress(console: Any, settings: "FederatedSettings") -> "Iterator[Watches]
     """A live line for the rounds, one for the robot at work, and one a stage before; a printed line for each round."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from fcslam.federated.local import Watches
+    from fcslam.federated.task import Watches
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
@@ -107,20 +138,22 @@ def _progress(console: Any, settings: "FederatedSettings") -> "Iterator[Watches]
 
         def rounds(report: "RoundReport") -> None:
             show("rounds", report.round_number, settings.rounds)
-            console.print(line_of(report, settings.rounds), highlight=False, soft_wrap=True)
+            console.print(line_of(report.row(), settings.rounds), highlight=False, soft_wrap=True)
 
         yield Watches(stage, steps, rounds)
 
 
-def line_of(report: "RoundReport", rounds: int) -> str:
+def line_of(row: "Mapping[str, str]", rounds: int) -> str:
     """A round in a line."""
+    released, returned = row["released"] == "1", row["returned"] == "1"
+    shown = {"detector": "loss_detector", "contrastive": "loss_contrastive", "repeatability": "repeatability",
+             "MMA": "mma_3px"}  # fmt: skip
     parts = [
-        f"round {report.round_number}/{rounds}",
-        f"{len(report.robots)} robots",
-        *(f"{name} {report.losses[name]:.3f}" for name in ("detector", "contrastive") if name in report.losses),
-        f"down {report.bytes_down / 1e6:.1f} MB, up {report.bytes_up / 1e6:.1f} MB",
-        *(f"{name} {report.figures[name]:.3f}" for name in ("repeatability", "mma_3px") if name in report.figures),
-        f"released {report.version}" if report.released else "back to the best" if report.returned else "not released",
-        *(f"without {robot}: {reason}" for robot, reason in sorted(report.left_out.items())),
+        f"round {row['round']}/{rounds}",
+        f"{len(row['robots'].split(' | '))} robots",
+        *(f"{name} {float(row[column]):.3f}" for name, column in shown.items() if row.get(column)),
+        f"down {float(row['bytes_down']) / 1e6:.1f} MB, up {float(row['bytes_up']) / 1e6:.1f} MB",
+        f"released {row['version']}" if released else "back to the best" if returned else "not released",
+        *([f"without {row['left_out']}"] if row["left_out"] else []),
     ]
     return "  ".join(parts)

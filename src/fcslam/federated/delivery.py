@@ -18,7 +18,6 @@ DETECTOR, INT8, CARD, PICTURE = "detector.onnx", "detector-int8.onnx", "card.md"
 FIGURES: Final = {
     "repeatability": "keypoints found again within 3 px",
     "mma_3px": "matches within 3 px, by bits",
-    "shift_repeatability": "keypoints found again within 1 px after a shift",
 }
 SHOWN_LOSSES: Final = ("detector", "contrastive", "triplet")
 MEGABYTE: Final = 1e6

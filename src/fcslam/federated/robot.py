@@ -36,7 +36,9 @@ class Learned(NamedTuple):
 class Learner(Protocol):
     """Whoever takes part in federated training."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What the robot is called, in the whole fleet."""
 
     def learn(self, weights: Weights, round_number: int, settings: FederatedSettings) -> Learned:
         """Train for a round; rounds count from 0."""
@@ -86,7 +88,7 @@ class RobotLearner:
         """As in ``Learner``, on pairs of images that were held out."""
         network = network_of(weights, settings.training.encoder).to(self.device)
         held_out = self._examples(weights, settings).held_out
-        return validate(network, validation_pairs(held_out), torch.device(self.device))
+        return validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
 
     def _examples(self, weights: Weights, settings: FederatedSettings) -> Images:
         """The images, labelled by the first weights that ever came here, and by no later ones."""

@@ -83,7 +83,7 @@ def judge_by(images: Sequence[GreyImage], encoder: Encoder, device: str) -> Judg
     pairs = validation_pairs([Example(image, unlabelled) for image in images])
 
     def judge(weights: Weights) -> Mapping[str, float]:
-        return validate(network_of(weights, encoder).to(device), pairs, torch.device(device))
+        return validate(network_of(weights, encoder).to(device), pairs, torch.device(device), shifts=False)
 
     return judge
 
