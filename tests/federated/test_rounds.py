@@ -11,8 +11,10 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 from federated.fakes import START, Fake, grid_of, run, settings, shifted
 
 from fcslam.errors import OutputError, TrainingError
+from fcslam.evaluation.poison import Poisoned
 from fcslam.federated.history import ROUNDS_FILE
 from fcslam.federated.memory import CHECKPOINT_FILE
+from fcslam.federated.privacy import epsilon
 
 
 def same(first, second):
@@ -209,6 +211,46 @@ def test_a_worse_detector_is_not_released_and_a_collapsed_one_is_undone(tmp_path
     first = ragged(1)(START, 0)
     assert same(state.weights, ragged(1)(first, 3))
     assert state.best_round == 4
+
+
+def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
+    scores = iter([0.9, 0.1, 0.3])
+    state, reports = run(
+        [Fake("a", 0.5)], tmp_path, judge=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+    )
+    assert [report.returned for report in reports] == [False, False]
+    assert same(state.weights, shifted(START, 1.0))
+
+
+@pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
+def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
+    """The others end where they would have ended without it."""
+    start = {"weight": np.random.default_rng(0).normal(size=2000).astype(np.float32)}
+    common = np.random.default_rng(1).normal(size=2000)
+
+    def towards(seed):
+        def answer(weights, round_number):
+            own = np.random.default_rng([seed, round_number]).normal(size=2000)
+            return {"weight": (weights["weight"] + 0.02 * (0.5 * common + own)).astype(np.float32)}
+
+        return answer
+
+    def fleet():
+        return [Fake(f"r{seed}", answer=towards(seed)) for seed in range(4)]
+
+    chosen = settings(rounds=3, screening={})
+    alone, _ = run(fleet(), tmp_path / "alone", chosen, start=start)
+    bad = Poisoned(Fake("bad", answer=towards(9)), poison)
+    together, reports = run([*fleet(), bad], tmp_path / "together", chosen, start=start)
+    assert all(set(report.left_out) == {"bad"} for report in reports)
+    assert same(alone.weights, together.weights)
+
+
+def test_epsilon_counts_what_was_asked_even_of_those_left_out(tmp_path):
+    private = {"clip_norm": 1.0, "noise_multiplier": 5.0, "delta": 1e-6}
+    chosen = settings(rounds=3, normalisation="frozen", privacy=private)
+    _, reports = run([Fake("good"), Fake("bad", answer=refuses)], tmp_path, chosen)
+    assert [report.epsilon for report in reports] == [epsilon(5.0, rounds, 1e-6) for rounds in (1, 2, 3)]
 
 
 def test_a_start_that_nothing_beats_stays(tmp_path):

@@ -91,15 +91,15 @@ def _column(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:
 
 
 def _card(version: str, state: State, settings: FederatedSettings, rows: Sequence[Row], judged_on: str) -> str:
-    taken = ", ".join(f"{robot} ({rounds})" for robot, rounds in sorted(state.taken_part.items()))
+    asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.asked.items()))
     best = next((row for row in rows if int(row["round"]) == state.best_round), {})
     sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))
     private = f"epsilon {rows[-1]['epsilon']} at delta {settings.privacy.delta:g}" if rows else "nothing was sent"
     lines = [
         f"# Detector {version}",
         "",
-        f"Trained by {len(state.taken_part)} robots together, in {state.rounds_done} rounds; this is round "
-        f"{state.best_round}. Rounds of each robot: {taken or 'none'}.",
+        f"Trained by {len(state.asked)} robots together, in {state.rounds_done} rounds; this is round "
+        f"{state.best_round}. How often each was asked: {asked or 'never'}.",
         "",
         f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB. Privacy of all that a robot has seen: "
         f"{private}.",

@@ -43,7 +43,7 @@ class RoundReport:
     """Weights to and from all robots."""
     seconds: float = 0.0
     epsilon: float = math.inf
-    """What the robot that took part most often has given away so far, see ``privacy``."""
+    """What the robot that was asked most often has given away so far at most, see ``privacy``."""
 
     def row(self) -> Row:
         """As a line of the table."""

@@ -34,8 +34,8 @@ class State:
     """The round they are of; 0 is the start."""
     memory: Mapping[str, NDArray[Any]]
     """The strategy's."""
-    taken_part: Mapping[str, int]
-    """Rounds by robot."""
+    asked: Mapping[str, int]
+    """How often each robot was: at most so many updates have left it."""
     origin: str
     """Version of the weights that everything began from."""
 
@@ -49,7 +49,7 @@ def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
     numbers = {
         "best_score": state.best_score,
         "best_round": state.best_round,
-        "taken_part": dict(state.taken_part),
+        "asked": dict(state.asked),
         "origin": state.origin,
     }
     tensors = {
@@ -84,7 +84,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
             float(header["best_score"]),
             int(header["best_round"]),
             groups["memory"],
-            {str(robot): int(rounds) for robot, rounds in header["taken_part"].items()},
+            {str(robot): int(rounds) for robot, rounds in header["asked"].items()},
             str(header["origin"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -5,6 +5,7 @@ that was killed goes on from its last round as if it had not been.
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -107,18 +108,19 @@ class Server:
 
     def _round(self, grid: Grid, roster: Roster, state: State) -> tuple[State, RoundReport]:
         began = self._outside.clock()
+        asked: list[str] = []
         while True:
-            answers, asked = self._train(grid, roster, state)
+            answers, chosen = self._train(grid, roster, state)
+            asked += chosen
             if len(answers.weights) >= self._settings.minimum_robots:
                 break
             self._wait_or_end(answers.left_out)
         weights = self._merge(answers, state)
         figures = self._judge(weights, state.rounds_done, grid, roster)
         score = score_of(figures)
-        released, returned = score >= state.best_score, score < state.best_score - self._settings.collapse
-        taken_part = dict(state.taken_part)
-        for robot in answers.weights:
-            taken_part[robot] = taken_part.get(robot, 0) + 1
+        released = score >= state.best_score
+        # The start is no place to go back to: nothing would be learnt as long as learning costs something at first.
+        returned = state.best_round > 0 and score < state.best_score - self._settings.collapse
         following = State(
             rounds_done=state.rounds_done + 1,
             weights=state.best if returned else weights,
@@ -126,7 +128,7 @@ class Server:
             best_score=score if released else state.best_score,
             best_round=state.rounds_done + 1 if released else state.best_round,
             memory={} if returned else memory_of(self._strategy),
-            taken_part=taken_part,
+            asked=Counter(state.asked) + Counter(asked),
             origin=state.origin,
         )
         if returned:
@@ -142,15 +144,15 @@ class Server:
             score=score,
             released=released,
             returned=returned,
-            bytes_down=asked * size_of(write_arrays(state.weights)),
+            bytes_down=len(asked) * size_of(write_arrays(state.weights)),
             bytes_up=answers.bytes_up,
             seconds=self._outside.clock() - began,
-            epsilon=epsilon(privacy.noise_multiplier, max(taken_part.values()), privacy.delta),
+            epsilon=epsilon(privacy.noise_multiplier, max(following.asked.values()), privacy.delta),
         )
         return following, report
 
-    def _train(self, grid: Grid, roster: Roster, state: State) -> tuple[Answers, int]:
-        """Answers that may be merged, and how many robots were asked."""
+    def _train(self, grid: Grid, roster: Roster, state: State) -> tuple[Answers, list[str]]:
+        """Answers that may be merged, and the robots that were asked."""
         present = self._await(roster)
         rng = np.random.default_rng([self._settings.training.seed, state.rounds_done, _CHOICE_SEED])
         chosen = choose(present, self._settings.participation, self._settings.minimum_robots, rng)
@@ -167,7 +169,7 @@ class Server:
         for robot, reason in screen(answers.weights, state.weights, self._settings.screening, frozen).items():
             answers.left_out[robot] = reason
             del answers.weights[robot], answers.losses[robot]
-        return answers, len(chosen)
+        return answers, chosen
 
     def _merge(self, answers: Answers, state: State) -> dict[str, NDArray[np.float32]]:
         """By Flower's strategy, in the order of the robots' names: sums of floats depend on it."""
