@@ -102,6 +102,14 @@ def test_the_same_command_with_more_rounds_goes_on(fleet, tmp_path, capsys):
         (["federate", "--local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
         (["federate", "--local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"], "cannot be used as the output folder"),
         (["federate", "--local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"], "is no checkpoint"),
+        (["federate", "--local", "-o", "{out}"], "--local needs a folder"),
+        (["federate", "--local", "--serve", "a:1", "-o", "{out}"], "say where the robots are"),
+        (["federate", "--serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is no HOST:PORT"),
+        (["federate", "--serve", "a:1", "{fleet}/one", "-o", "{out}", "--insecure"], "robots bring their own images"),
+        (["federate", "--serve", "a:1", "-o", "{out}"], "give --ca"),
+        (["federate", "--serve", "a:1", "-o", "{out}", "--ca", "{fleet}/no.crt"], "no.crt: is no file"),
+        (["federate", "--serve", "a:1", "-o", "{out}", "--insecure", "--ca", "{fleet}/tiny.yaml"], "leave out one"),
+        (["federate", "--join", "a:1", "-o", "{out}", "--insecure"], "--join needs one folder"),
     ],
 )
 def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):

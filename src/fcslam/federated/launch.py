@@ -99,7 +99,7 @@ def serve(
     (task.output / STATUS_FILE).unlink(missing_ok=True)
     with tempfile.TemporaryDirectory() as place, (task.output / LOG_FILE).open("ab") as log:
         home = Path(place)
-        environment = {**os.environ, **QUIET, "FLWR_HOME": str(home / "home")}
+        environment = _environment(home / "home")
         _write_app(home, task_text(task, device), address, certificates)
         security = ["--insecure"] if certificates is None else [*certificates.options(), "--enable-supernode-auth"]
         where = ["--host", address.host, "--port", str(address.port)]
@@ -146,7 +146,7 @@ def join(
     with (
         tempfile.TemporaryDirectory() as home,
         log_file.open("ab") as log,
-        _daemon(["flower-supernode", *security, *where], {**os.environ, **QUIET, "FLWR_HOME": home}, log) as node,
+        _daemon(["flower-supernode", *security, *where], _environment(Path(home)), log) as node,
     ):
         return node.wait()
 
@@ -192,6 +192,12 @@ def _flwr(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
     if done.returncode != 0:
         said = " ".join((done.stdout + done.stderr).split())
         raise TrainingError(f"flwr {' '.join(arguments[:2])} {arguments[2]}: {said[-300:]}")
+
+
+def _environment(home: Path) -> dict[str, str]:
+    """For Flower's daemons: they start one another by name, whether or not this Python's commands are on the path."""
+    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)))
+    return {**os.environ, **QUIET, "FLWR_HOME": str(home), "PATH": path}
 
 
 def _program(name: str) -> list[str]:
