@@ -165,7 +165,9 @@ def _write_app(home: Path, task: str, address: Address, certificates: Certificat
     (home / "app" / "pyproject.toml").write_text(_APP % json.dumps(task), encoding="utf-8")
     (home / "app" / "LICENSE").write_text("Apache-2.0\n", encoding="utf-8")
     (package / "__init__.py").write_text('"""fcslam\'s apps, which are installed on every machine."""\n')
-    (package / "apps.py").write_text("from fcslam.federated.deployed import robot, server\n", encoding="utf-8")
+    # Flower looks for assignments in the text.
+    apps = "from fcslam.federated import deployed\n\nrobot = deployed.robot\nserver = deployed.server\n"
+    (package / "apps.py").write_text(apps, encoding="utf-8")
     trust = (
         "insecure = true"
         if certificates is None
