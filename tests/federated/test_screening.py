@@ -41,27 +41,51 @@ def poisoned(kind):
 @pytest.mark.parametrize("kind", ["flipped", "scaled", "random", "huge", "nan", "zero"])
 def test_one_poisoned_robot_of_five_is_refused_and_no_other(kind):
     answers = {f"robot{seed}": honest(seed) for seed in range(4)} | {"bad": poisoned(kind)}
-    refused = screen(answers, BEFORE, ScreeningSettings(), frozen_statistics=False)
+    refused = screen(answers, BEFORE, ScreeningSettings())
     assert set(refused) == {"bad"}
     assert refused["bad"]
+
+
+@pytest.mark.parametrize("kind", ["flipped", "random", "scaled"])
+def test_poison_does_not_hide_behind_honest_statistics(kind):
+    """These may be longer than all else by far, and alike, for all robots see other things than what the start saw."""
+
+    def in_daylight(weights):
+        return weights | {
+            "norm.running_mean": np.full(20, 40.0, np.float32),
+            "norm.running_var": np.full(20, 50.0, np.float32),
+        }
+
+    start = BEFORE | {"norm.running_mean": np.full(20, 90.0, np.float32)}
+    answers = {f"robot{seed}": in_daylight(honest(seed)) for seed in range(4)} | {"bad": in_daylight(poisoned(kind))}
+    assert set(screen(answers, start, ScreeningSettings())) == {"bad"}
+
+
+def test_statistics_may_lie_on_all_sides_but_not_far_away():
+    def lit(seed, by):
+        return honest(seed) | {"norm.running_mean": np.full(20, by, np.float32)}
+
+    answers = {f"robot{seed}": lit(seed, by) for seed, by in enumerate([0.1, -0.1, 0.12, -0.12])}
+    assert screen(answers, BEFORE, ScreeningSettings()) == {}
+    assert set(screen(answers | {"bad": lit(9, 5.0)}, BEFORE, ScreeningSettings())) == {"bad"}
 
 
 @pytest.mark.parametrize("kind", ["huge", "nan"])
 @pytest.mark.parametrize("others", [0, 1, 2])
 def test_even_few_robots_are_safe_from_what_nobody_could_mean(kind, others):
     answers = {f"robot{seed}": honest(seed) for seed in range(others)} | {"bad": poisoned(kind)}
-    assert set(screen(answers, BEFORE, ScreeningSettings(), frozen_statistics=False)) == {"bad"}
+    assert set(screen(answers, BEFORE, ScreeningSettings())) == {"bad"}
 
 
 def test_two_that_disagree_are_not_judged():
     answers = {"a": honest(1), "b": poisoned("flipped")}
-    assert screen(answers, BEFORE, ScreeningSettings(), frozen_statistics=False) == {}
+    assert screen(answers, BEFORE, ScreeningSettings()) == {}
 
 
 def test_bounds_that_are_off_let_everything_finite_pass():
     off = ScreeningSettings(largest_change=None, longest=None, least_agreement=None)
     answers = {kind: poisoned(kind) for kind in ("flipped", "scaled", "random", "huge")}
-    assert screen(answers, BEFORE, off, frozen_statistics=False) == {}
+    assert screen(answers, BEFORE, off) == {}
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans())

@@ -165,8 +165,7 @@ class Server:
         )
         replies = grid.send_and_receive(orders, timeout=self._settings.deadline_s)
         answers = _read(replies, {present[robot]: robot for robot in chosen}, version)
-        frozen = self._settings.normalisation == "frozen"
-        for robot, reason in screen(answers.weights, state.weights, self._settings.screening, frozen).items():
+        for robot, reason in screen(answers.weights, state.weights, self._settings.screening).items():
             answers.left_out[robot] = reason
             del answers.weights[robot], answers.losses[robot]
         return answers, chosen

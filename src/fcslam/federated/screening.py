@@ -8,24 +8,36 @@ from fcslam.federated.settings import ScreeningSettings
 from fcslam.federated.weights import FloatVector, Weights, malformed, trained_names, update_vector
 
 
-def screen(
-    answers: Mapping[str, Weights], asked: Weights, settings: ScreeningSettings, frozen_statistics: bool
-) -> dict[str, str]:
-    """Reasons by robot for every answer that is refused; ``asked`` are the weights that all began from."""
+def screen(answers: Mapping[str, Weights], asked: Weights, settings: ScreeningSettings) -> dict[str, str]:
+    """Reasons by robot for every answer that is refused; ``asked`` are the weights that all began from.
+
+    Batch statistics move many times as far as what is trained, and each robot's lie where its own light puts them: their
+    length is looked at by itself, and their direction not at all.
+    """
     refused = {robot: reason for robot, weights in answers.items() if (reason := malformed(weights, asked))}
-    names = trained_names(asked, frozen_statistics)
-    updates = {robot: update_vector(answers[robot], asked, names) for robot in answers if robot not in refused}
-    refused |= _too_long(updates, update_vector(asked, {name: np.zeros_like(asked[name]) for name in names}, names),
-                         settings)  # fmt: skip
-    rest = {robot: update for robot, update in updates.items() if robot not in refused}
-    return refused | _against_the_others(rest, settings)
+    parameters = trained_names(asked, frozen_statistics=True)
+    statistics = [name for name in asked if name not in set(parameters)]
+    for names in (parameters, statistics):
+        rest = _updates(answers, asked, names, refused)
+        refused |= _too_long(rest, float(np.linalg.norm(_vector(asked, names))), settings)
+    return refused | _against_the_others(_updates(answers, asked, parameters, refused), settings)
 
 
-def _too_long(updates: Mapping[str, FloatVector], asked: FloatVector, settings: ScreeningSettings) -> dict[str, str]:
+def _updates(
+    answers: Mapping[str, Weights], asked: Weights, names: Sequence[str], refused: Mapping[str, str]
+) -> dict[str, FloatVector]:
+    return {robot: update_vector(answers[robot], asked, names) for robot in answers if robot not in refused}
+
+
+def _vector(weights: Weights, names: Sequence[str]) -> FloatVector:
+    return update_vector(weights, {name: np.zeros_like(weights[name]) for name in names}, names)
+
+
+def _too_long(updates: Mapping[str, FloatVector], size: float, settings: ScreeningSettings) -> dict[str, str]:
     lengths = {robot: float(np.linalg.norm(update)) for robot, update in updates.items()}
     limits = []
     if settings.largest_change is not None:
-        limits.append(settings.largest_change * float(np.linalg.norm(asked)))
+        limits.append(settings.largest_change * size)
     if settings.longest is not None and len(lengths) >= settings.quorum:
         limits.append(settings.longest * float(np.median(list(lengths.values()))))
     limit = min(limits, default=np.inf)

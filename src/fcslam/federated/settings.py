@@ -15,7 +15,7 @@ class ScreeningSettings(Settings):
     """Which updates are refused, beside those that are malformed or not finite."""
 
     largest_change: float | None = Field(
-        default=0.5, gt=0.0, description="an update's length, in lengths of the trained weights; null for any"
+        default=1.0, gt=0.0, description="an update's length, in lengths of the weights; null for any"
     )
     longest: float | None = Field(
         default=3.0, gt=1.0, description="its length, in medians of the round's lengths; null for any"
