@@ -225,12 +225,12 @@ def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
 @pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
 def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
     """The others end where they would have ended without it."""
-    start = {"weight": np.random.default_rng(0).normal(size=2000).astype(np.float32)}
-    common = np.random.default_rng(1).normal(size=2000)
+    start = {"weight": np.random.default_rng(0).normal(size=100_000).astype(np.float32)}
+    common = np.random.default_rng(1).normal(size=100_000)
 
     def towards(seed):
         def answer(weights, round_number):
-            own = np.random.default_rng([seed, round_number]).normal(size=2000)
+            own = np.random.default_rng([seed, round_number]).normal(size=100_000)
             return {"weight": (weights["weight"] + 0.02 * (0.5 * common + own)).astype(np.float32)}
 
         return answer

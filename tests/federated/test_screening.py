@@ -11,7 +11,7 @@ from fcslam.federated.weights import malformed, moved, trained_names, update_vec
 
 RNG = np.random.default_rng(4)
 BEFORE = {
-    "convolution.weight": RNG.normal(size=(40, 30)).astype(np.float32),
+    "convolution.weight": RNG.normal(size=(400, 300)).astype(np.float32),
     "norm.running_mean": np.zeros(20, np.float32),
     "norm.running_var": np.ones(20, np.float32),
 }

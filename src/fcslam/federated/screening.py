@@ -11,8 +11,8 @@ from fcslam.federated.weights import FloatVector, Weights, malformed, trained_na
 def screen(answers: Mapping[str, Weights], asked: Weights, settings: ScreeningSettings) -> dict[str, str]:
     """Reasons by robot for every answer that is refused; ``asked`` are the weights that all began from.
 
-    Batch statistics move many times as far as what is trained, and each robot's lie where its own light puts them: their
-    length is looked at by itself, and their direction not at all.
+    Batch statistics move many times as far as what is trained, and each robot's lie where its own light puts them:
+    their length is looked at by itself, and their direction not at all.
     """
     refused = {robot: reason for robot, weights in answers.items() if (reason := malformed(weights, asked))}
     parameters = trained_names(asked, frozen_statistics=True)

@@ -21,7 +21,7 @@ class ScreeningSettings(Settings):
         default=3.0, gt=1.0, description="its length, in medians of the round's lengths; null for any"
     )
     least_agreement: float | None = Field(
-        default=0.03, ge=-1.0, le=1.0, description="its cosine with the median of the others; null for any"
+        default=0.01, ge=-1.0, le=1.0, description="its cosine with the median of the others; null for any"
     )
     quorum: int = Field(default=4, ge=3, description="updates from which on they are compared with one another")
 
