@@ -1,6 +1,6 @@
 """What detectors do when an image is shifted by whole pixels, or turned.
 
-    FCSLAM_DATA=/path/to/data python benchmarks/equivariance.py [--weights detector.onnx]
+    FCSLAM_DATA=/path/to/data python benchmarks/equivariance.py [--weights detector.onnx ...]
 
 The first images of five scenes at 640 x 480. Shift: rolled right and down by so many pixels; of the 500 strongest
 keypoints away from the edges, the share that is found again within 1 px among the 500 strongest there. A detector that
@@ -22,8 +22,10 @@ from fcslam.evaluation.contenders import Contender, Picture, choose_contenders, 
 from fcslam.evaluation.homography import LARGE, described, match_pair
 from fcslam.evaluation.scenes import find_scenes
 from fcslam.features.detector import GreyImage
+from fcslam.features.kinds import ContenderKind
 
 SCENES = ("oxford_affine", "hpatches_subset")
+DETECTORS = [name for name in ContenderKind if name is not ContenderKind.LOGITS]
 SHIFTS_PX = tuple(range(1, 9))
 ANGLES_DEG = tuple(range(0, 181, 15))
 STRONGEST, NEAR_PX = 500, 1.0
@@ -33,12 +35,12 @@ MARGIN_PX = 40
 
 def main() -> None:
     parser = common.options(__doc__ or "")
-    parser.add_argument("--weights", type=Path, help="network weights, if not those that come with fcslam")
+    parser.add_argument("--weights", nargs="+", type=Path, default=[], help="networks, if not the one of fcslam")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
     folder = common.recordings(*SCENES, kind="vision")
     pictures = [frame(scene.reference, LARGE) for scene in find_scenes([folder / name for name in SCENES])]
-    contenders = choose_contenders([], chosen.weights, [])
+    contenders = choose_contenders(DETECTORS, chosen.weights, [])
     with one_thread():
         columns = {"": "s"} | {f"{shift} px": ".3f" for shift in SHIFTS_PX}
         report.table("Shift: keypoints found again", columns, [_shift_row(each, pictures) for each in contenders])

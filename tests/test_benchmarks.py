@@ -10,9 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from features.networks import tiny_network
 from scipy.ndimage import binary_dilation
 
+from fcslam.config import load as load_config
+from fcslam.features.classical import OrbConfig
 from fcslam.geometry import se2
+from fcslam.mission import MissionConfig
+from fcslam.records import Channel
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem != "common")
@@ -132,3 +137,37 @@ def test_the_search_finds_where_a_piece_was_cut_out():
     best, second = wean_hall.search(wean_hall.Plan(cells[0], cells[1] & ~cells[0], 0.1, corner), whole)
     np.testing.assert_allclose(se2.between(T_whole_piece, best.T_target_query), 0.0, atol=0.06)
     assert second.score < 0.7 * best.score
+
+
+@pytest.fixture
+def camera_detectors(common):
+    return load(FOLDER / "camera_detectors.py")
+
+
+def outcome(module, seed, detector, recall):
+    found = {f"{module.VERIFIED}_{name}": recall for name in module.RECALLS.values()}
+    return module.Outcome("default", seed, detector, found, 1.0)
+
+
+def test_detectors_are_compared_fleet_by_fleet(camera_detectors):
+    recalls = {"orb": (0.5, 0.9, 0.7), "net": (0.6, 0.8, 1.0)}
+    outcomes = [
+        outcome(camera_detectors, seed, name, values[seed]) for seed in range(3) for name, values in recalls.items()
+    ]
+    (row,) = camera_detectors.gains(outcomes, ["default"], ("orb", "net"))
+    assert row[:2] == ("default", "net")
+    assert row[-1] == "2 of 3"
+    assert row[2].startswith("+0.100 [-0.100, +0.300]")
+
+
+def test_each_detector_alone_describes_the_camera_places(camera_detectors, tmp_path):
+    paths = [tmp_path / f"{name}.onnx" for name in ("first", "second")]
+    for path in paths:
+        tiny_network(path, version=path.stem)
+    files = camera_detectors.settings(paths, tmp_path)
+    assert list(files) == ["orb", "first", "second"]
+    robots = [load_config(MissionConfig, file).robot for file in files.values()]
+    assert {robot.channels for robot in robots} == {(Channel.CAMERA,)}
+    assert [str(robot.views.detector) for robot in robots] == ["orb", "onnx", "onnx"]
+    assert [robot.views.onnx.weights for robot in robots] == [None, *paths]
+    assert robots[0].views.orb == OrbConfig()

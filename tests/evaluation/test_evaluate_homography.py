@@ -5,8 +5,10 @@ import csv
 import cv2
 import numpy as np
 import pytest
+from features.networks import tiny_network
 
 from fcslam.cli import main
+from fcslam.errors import EvaluationError
 from fcslam.evaluation.contenders import choose_contenders, frame
 from fcslam.evaluation.homography import LARGE, SMALL, evaluate_homography, match_pair, matched_points
 from fcslam.evaluation.homography_measures import column, difference, mean
@@ -49,7 +51,7 @@ def scenes(tmp_path_factory):
 @pytest.fixture(scope="module")
 def report(scenes):
     kinds = [ContenderKind.ORB, ContenderKind.SIFT, ContenderKind.HARRIS]
-    return evaluate_homography(find_scenes([scenes]), choose_contenders(kinds, None, []))
+    return evaluate_homography(find_scenes([scenes]), choose_contenders(kinds, [], []))
 
 
 def test_what_can_be_matched_is(report):
@@ -81,8 +83,33 @@ def test_differences_are_those_of_the_pairs(report):
     assert gain.low <= gain.mean <= gain.high
 
 
+def test_each_network_is_compared_by_its_bits_and_by_its_logits(scenes, tmp_path):
+    paths = [tmp_path / f"{name}.onnx" for name in ("first", "second")]
+    for seed, path in enumerate(paths):
+        tiny_network(path, version=path.stem, seed=seed)
+    kinds = [ContenderKind.ONNX, ContenderKind.LOGITS]
+    report = evaluate_homography(find_scenes([scenes / "v_turn"]), choose_contenders(kinds, paths, []))
+    assert report.contenders == ("first", "second", "first-logits", "second-logits")
+    measured = {name: report.of(name)[0] for name in report.contenders}
+    for name in ("first", "second"):
+        bits, logits = measured[name], measured[f"{name}-logits"]
+        assert bits.repeatability == logits.repeatability == measured["first"].repeatability
+        assert logits.matching[0].matches > 0
+        assert logits.matching[0].score != bits.matching[0].score
+    assert measured["first"].matching[0].score != measured["second"].matching[0].score
+
+
+def test_without_names_there_is_all_but_two_of_one_network(tmp_path):
+    path = tmp_path / "tiny.onnx"
+    tiny_network(path)
+    names = [each.name for each in choose_contenders([], [path], [])]
+    assert names == ["tiny-1", "tiny-1-logits", "orb", "sift", "fast", "harris", "shi"]
+    with pytest.raises(EvaluationError, match="tiny-1: named twice"):
+        choose_contenders([ContenderKind.ONNX], [path, path], [])
+
+
 def test_the_legacy_truth_spares_the_light_and_ruins_the_turn(scenes):
-    contenders = choose_contenders([ContenderKind.ORB], None, [])
+    contenders = choose_contenders([ContenderKind.ORB], [], [])
     found = find_scenes([scenes])
     legacy = evaluate_homography(found, contenders, GroundTruth.LEGACY).of("orb")
     assert mean(legacy, "homography_3px_nms0", SceneKind.ILLUMINATION) == 1.0
@@ -108,7 +135,7 @@ def test_extracted_features_score_as_the_detector_that_runs_here(scenes, tmp_pat
         rows = np.random.default_rng(number).permutation(len(features.scores))  # any order will do
         write_features(path, features.take(rows), size)
     found = find_scenes([scene])
-    theirs, ours = choose_contenders([ContenderKind.ORB], None, [tmp_path / "mine"])
+    theirs, ours = choose_contenders([ContenderKind.ORB], [], [tmp_path / "mine"])
     (extracted,) = evaluate_homography(found, [theirs]).of("mine")
     (run,) = evaluate_homography(found, [ours]).of("orb")
     for nms_px in (8, 0):
@@ -126,7 +153,7 @@ def test_features_of_the_file_are_brought_into_the_framed_picture(scenes, tmp_pa
     for number, positions in ((1, first), (2, warp(TURN, first))):
         features = ImageFeatures(positions.astype(np.float32), np.arange(800, dtype=np.float32), codes)
         write_features(tmp_path / "perfect" / "v_turn" / f"{number}.npz", features, (700, 400))
-    perfect = choose_contenders([], None, [tmp_path / "perfect"])
+    perfect = choose_contenders([], [], [tmp_path / "perfect"])
     (pair,) = evaluate_homography(find_scenes([scenes / "v_turn"]), perfect).pairs
     assert pair.repeatability.repeatability > 0.95  # NMS may take another of two neighbours
     assert pair.repeatability.localisation_error_px < 1e-3
@@ -155,7 +182,7 @@ def test_nothing_found_scores_nothing(scenes, tmp_path):
     (tmp_path / "blind" / "v_turn").mkdir(parents=True)
     for number in (1, 2):
         write_features(tmp_path / "blind" / "v_turn" / f"{number}.npz", none, (700, 400))
-    blind = choose_contenders([], None, [tmp_path / "blind"])
+    blind = choose_contenders([], [], [tmp_path / "blind"])
     (pair,) = evaluate_homography(find_scenes([scenes / "v_turn"]), blind).pairs
     assert np.isnan(pair.repeatability.repeatability)
     assert pair.matching[8].corner_error_px == np.inf

@@ -9,8 +9,8 @@ from lidar.worlds import room
 
 from fcslam.cli import main
 from fcslam.errors import FeatureError
-from fcslam.features.classical import Fast, FloatFeatures, Harris, Orb, OrbConfig, Shi, Sift
-from fcslam.features.detector import NO_FEATURES
+from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, Shi, Sift
+from fcslam.features.detector import NO_FEATURES, FloatFeatures
 from fcslam.features.extraction import extract
 from fcslam.features.files import read_features, read_grey, write_features
 

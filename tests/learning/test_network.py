@@ -9,6 +9,7 @@ from fcslam.learning.network import (  # noqa: E402
     cell_log_probabilities,
     cell_probabilities,
     sample_codes,
+    smoothed,
 )
 
 encoders = pytest.mark.parametrize("encoder", ["light", "vgg"])
@@ -87,3 +88,13 @@ def test_the_light_detector_has_no_grid_of_cells():
     image = torch.rand(1, 1, 64, 64)
     rolled = net(image.roll((2, 2), (-2, -1))).point_logits.roll((-2, -2), (-2, -1))
     assert torch.allclose(net(image).point_logits[0, 12:-12, 12:-12], rolled[0, 12:-12, 12:-12], atol=1e-4)
+
+
+def test_what_alternates_from_pixel_to_pixel_does_not_reach_the_keypoints():
+    """Sub-pixel convolution fills even and odd pixels from other channels; the smoothing makes them alike."""
+    rows, columns = torch.meshgrid(torch.arange(12), torch.arange(16), indexing="ij")
+    for pattern in (rows % 2, columns % 2, (rows + columns) % 2):
+        smooth = smoothed(pattern[None, None].float())
+        assert torch.allclose(smooth[..., 1:-1, 1:-1], torch.tensor(0.5))
+    plane = (2.0 * columns - rows)[None, None].float()
+    assert torch.allclose(smoothed(plane)[..., 1:-1, 1:-1], plane[..., 1:-1, 1:-1], atol=1e-5)

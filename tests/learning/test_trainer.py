@@ -10,6 +10,7 @@ from learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError, TrainingError  # noqa: E402
+from fcslam.learning.checkpoint import Checkpoint, write_checkpoint  # noqa: E402
 from fcslam.learning.descent import learning_rate  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import Teacher, fuse  # noqa: E402
@@ -18,7 +19,7 @@ from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.objective import negatives, shift_grid, teacher_bits  # noqa: E402
 from fcslam.learning.pairs import Example  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.trainer import CHECKPOINT_FILE, Pace, Run, validation_pairs  # noqa: E402
+from fcslam.learning.trainer import CHECKPOINT_FILE, Pace, Run, trained_network, validation_pairs  # noqa: E402
 
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64, points=32)
 PACE = Pace(validate_every=100, checkpoint_every_s=0.0, log_every=1)
@@ -48,6 +49,23 @@ def test_a_run_learns(examples, tmp_path):
     first, last = ([np.mean([row[name] for row in part]) for name in ("detector", "contrastive")]
                    for part in (figures[:3], figures[-3:]))  # fmt: skip
     assert (np.array(last) < 0.85 * np.array(first)).all()
+
+
+def test_a_checkpoint_gives_the_network_that_the_run_handed_over(examples, tmp_path):
+    run = Run(SMALL, "joint", tmp_path, PACE)
+    delivered = run.train(examples, examples[:1])
+    read = trained_network(tmp_path / CHECKPOINT_FILE)
+    assert not read.training
+    assert torch.equal(weights(read), weights(delivered))
+    assert not torch.equal(weights(read), weights(run.network))
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path):
+    tensors = {f"average/{name}": value for name, value in KeypointNetwork("vgg").state_dict().items()}
+    for settings in ({"encoder": "light"}, {}):
+        write_checkpoint(tmp_path / "c.npz", Checkpoint("joint", 1, settings, tensors))
+        with pytest.raises(TrainingError, match="does not fit this network"):
+            trained_network(tmp_path / "c.npz")
 
 
 def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):

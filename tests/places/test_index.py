@@ -1,102 +1,329 @@
+"""One contract for every strategy and both scores: what is stored is where a walk down the tree ends, always."""
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from fcslam.places.index import InvertedIndex
-from fcslam.places.similarity import similarity
-from fcslam.places.vocabulary import VocabularyConfig, train
+from fcslam.places.index import PlaceIndex
+from fcslam.places.similarity import bag_of_words, similarity
+from fcslam.places.vocabulary import Scoring, Strategy, TreeConfig, VocabularyConfig
 
-SMALL = VocabularyConfig(branching=4, depth=3, smallest_split=8)
+SMALL = TreeConfig(branching=4, depth=3, smallest_split=8)
 EMPTY = np.empty((0, 32), np.uint8)
+EVERY = pytest.mark.parametrize("strategy", list(Strategy))
+BOTH = pytest.mark.parametrize("scoring", list(Scoring))
 
 
-def random_places(rng, count):
+def random_places(rng, count, size=60):
     centres = rng.integers(0, 256, (40, 32), dtype=np.uint8)
     places = []
     for _ in range(count):
         own = centres[rng.choice(40, 6, replace=False)]
-        codes = own[rng.integers(0, 6, rng.integers(5, 60))]
+        codes = own[rng.integers(0, 6, rng.integers(5, size))]
         places.append(codes ^ np.packbits(rng.random((len(codes), 256)) < 0.03, axis=1))
     return places
 
 
-def filled_index(seed, count=60):
+def config(strategy, scoring=Scoring.MATCHES, **others):
+    chosen = {"train_batch": 3, "capacity": 30, "rebuild_every": 4, "leaf_capacity": 16, "tree": SMALL}
+    return VocabularyConfig(strategy=strategy, scoring=scoring, **{**chosen, **others})
+
+
+def filled(strategy, scoring=Scoring.MATCHES, seed=0, count=40, **others):
     rng = np.random.default_rng(seed)
-    places = random_places(rng, count)
-    index = InvertedIndex(train(places[:30], SMALL, rng))
-    for number, place in enumerate(places):
-        index.add(f"place {number}", place)
+    places = dict(enumerate(random_places(rng, count)))
+    index = PlaceIndex[int](config(strategy, scoring, **others), rng)
+    for number, place in places.items():
+        index.add(number, place)
     return index, places
 
 
-def query_oracle(vocabulary, places, descriptors):
-    """Compare with every place."""
-    query = vocabulary.bag(descriptors)
-    scores = {f"place {number}": similarity(query, vocabulary.bag(place)) for number, place in enumerate(places)}
-    return {place: score for place, score in scores.items() if score > 0.0}
+def walk(index, codes):
+    """The word of each code by a walk down the tree in plain Python, and all codes of the words around it."""
+    vocabulary = index._vocabulary
+    tree = vocabulary.tree
+    centres = tree.centres.view(np.uint8).reshape(-1, 32)
+    words = []
+    for code in codes:
+        vertex = 0
+        while tree.child_count[vertex]:
+            children = np.arange(tree.first_child[vertex], tree.first_child[vertex] + tree.child_count[vertex])
+            vertex = children[np.bitwise_count(centres[children] ^ code).sum(axis=1, dtype=int).argmin()]
+        words.append(vocabulary.words[vertex])
+    return np.array(words, np.int64)
 
 
-@pytest.mark.parametrize(("seed", "count"), [(0, 31), (1, 60), (2, 60), (3, 900)])
-def test_queries_find_what_brute_force_finds(seed, count):
-    index, places = filled_index(seed, count)
-    for descriptors in places[:: count // 6]:
-        found = index.query(descriptors, top_k=1000)
-        assert dict(found) == pytest.approx(query_oracle(index.vocabulary, places, descriptors), abs=1e-12)
-        scores = [score for _, score in found]
-        assert scores == sorted(scores, reverse=True)
-        assert index.query(descriptors, top_k=3) == found[:3]
+def words_oracle(index, places, query):
+    """Eq. (4) on [0, 1] of the query with every place, with document frequencies counted anew."""
+    words = {number: walk(index, place) for number, place in places.items()}
+    own = walk(index, query)
+    top = max(int(w.max(initial=0)) for w in (*words.values(), own)) + 1
+    documents = np.zeros(top)
+    for of_place in words.values():
+        documents[np.unique(of_place)] += 1
+    idf = np.log(len(places) / np.maximum(documents, 1))
+    bags = {number: bag_of_words(of_place, idf, 1) for number, of_place in words.items()}
+    return {number: similarity(bag_of_words(own, idf, 1), bag) for number, bag in bags.items()}
 
 
-def test_of_equals_the_one_stored_first_comes_first():
-    index, places = filled_index(4)
-    for name in ("twin b", "twin a"):
-        index.add(name, places[9])
-    assert [found.id for found in index.query(places[9], top_k=3)] == ["place 9", "twin b", "twin a"]
+def matches_oracle(places, query, near_bits):
+    """Every descriptor with every other."""
+    gives = {}
+    for number, place in places.items():
+        distances = np.bitwise_count(query[:, None] ^ place[None]).sum(axis=2, dtype=int).min(axis=1)
+        gives[number] = np.where(distances <= near_bits, 1.0 - (distances / (near_bits + 1)) ** 2, 0.0)
+    weights = np.log((len(places) + 1) / np.maximum(sum(gives.values()), 1.0))
+    return {number: float(weights @ of_place / weights.sum()) for number, of_place in gives.items()}
 
 
-def test_a_stored_place_is_found_first():
-    index, places = filled_index(5)
+def check_stored(index, places):
+    """Words, document frequencies and norms are those of a description from scratch."""
+    entries = index._postings.entries
+    words = {number: walk(index, place) for number, place in places.items()}
+    assert set(words) == set(index._row_of)
+    sizes, documents = {}, {}
+    for number, of_place in words.items():
+        stored = index._vocabulary.words[index._postings.leaves(index._row_of[number])]
+        np.testing.assert_array_equal(stored, of_place)
+        for word, count in zip(*np.unique(of_place, return_counts=True), strict=True):
+            sizes[word], documents[word] = sizes.get(word, 0) + count, documents.get(word, 0) + 1
+    used = np.flatnonzero(entries.sizes)
+    assert {int(index._vocabulary.words[v]): int(entries.sizes[v]) for v in used} == sizes
+    assert {int(index._vocabulary.words[v]): int(entries.documents[v]) for v in used} == documents
+    for number, of_place in words.items():
+        expected = sum(np.log(documents[word]) for word in of_place)
+        assert entries.log_documents[index._row_of[number]] == pytest.approx(expected, abs=1e-9)
+    rows = index._rows()
+    kept = np.concatenate([EMPTY, *(places[number] for number in index._row_of)])
+    np.testing.assert_array_equal(index._postings.gather(rows).view(np.uint8).reshape(-1, 32), kept)
+
+
+@EVERY
+@BOTH
+@pytest.mark.parametrize(("seed", "count"), [(0, 5), (1, 40), (2, 90)])
+def test_queries_find_what_comparing_with_every_place_finds(strategy, scoring, seed, count):
+    index, places = filled(strategy, scoring, seed, count, beam=64, leaf_capacity=300)  # the beam sees all words
+    for query in (*list(places.values())[::10], *random_places(np.random.default_rng(seed), 3)):
+        expected = (
+            words_oracle(index, places, query)
+            if scoring is Scoring.WORDS
+            else matches_oracle(places, query, index._config.near_bits)
+        )
+        found = index.query(query, top_k=1000)
+        assert dict(found) == pytest.approx({k: s for k, s in expected.items() if s > 1e-12}, abs=1e-9)
+        assert [score for _, score in found] == sorted((score for _, score in found), reverse=True)
+        for top_k in (1, 3, 20):
+            assert index.query(query, top_k) == found[:top_k]
+
+
+@EVERY
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**16), steps=st.lists(st.sampled_from("aaaf"), max_size=80), equal=st.booleans())
+def test_any_order_of_adding_and_forgetting_leaves_what_a_fresh_description_gives(strategy, seed, steps, equal):
+    rng = np.random.default_rng(seed)
+    pool = random_places(rng, 12 if equal else len(steps))
+    index, places = PlaceIndex[int](config(strategy, Scoring.WORDS), rng), {}
+    for number, step in enumerate(steps):
+        if step == "a":
+            places[number] = pool[number % len(pool)]
+            index.add(number, places[number])
+        elif places:
+            index.forget(gone := list(places)[rng.integers(len(places))])
+            del places[gone]
+    check_stored(index, places)
+    for gone in list(places)[: len(places) * 3 // 4]:
+        index.forget(gone)
+        del places[gone]
+    check_stored(index, places)
+    if index.training and places:
+        query = next(iter(places.values()))
+        expected = {number: score for number, score in words_oracle(index, places, query).items() if score > 1e-12}
+        assert dict(index.query(query, 1000)) == pytest.approx(expected, abs=1e-9)
+
+
+@EVERY
+@BOTH
+def test_a_stored_place_is_found_first_and_wholly_like_itself(strategy, scoring):
+    index, places = filled(strategy, scoring, beam=1)
     best = index.query(places[17], top_k=1)[0]
-    assert best.id == "place 17"
+    assert best.id == 17
     assert best.similarity == pytest.approx(1.0)
+    assert all(0.0 < found.similarity <= 1.0 + 1e-9 for found in index.query(places[17], top_k=1000))
 
 
-def test_excluded_places_make_room_for_the_next():
-    index, places = filled_index(6)
+@EVERY
+def test_of_equals_the_one_stored_first_comes_first(strategy):
+    index, places = filled(strategy)
+    for twin in (200, 100):
+        index.add(twin, places[9])
+    assert [found.id for found in index.query(places[9], top_k=3)] == [9, 200, 100]
+
+
+@EVERY
+@BOTH
+def test_excluded_places_make_room_for_the_next(strategy, scoring):
+    index, places = filled(strategy, scoring)
     everything = index.query(places[3], top_k=1000)
-    excluded = {everything[0].id, everything[2].id}
-    found = index.query(places[3], top_k=3, exclude=excluded)
-    assert found == [everything[1], everything[3], everything[4]]
+    excluded = {found.id for found in everything[:30:2]}
+    expected = [found for found in everything if found.id not in excluded]
+    assert index.query(places[3], top_k=5, exclude=excluded) == expected[:5]
+    likeness = index.compare(places[3])
+    assert [likeness.of(place) for place in places] == [dict(everything).get(place, 0.0) for place in places]
 
 
-def test_describing_again_equals_a_fresh_index():
-    index, places = filled_index(7)
-    other = train(places[30:], SMALL, np.random.default_rng(1), version=2)
-    index.describe_again(other)
-    fresh = InvertedIndex(other)
-    for number, place in enumerate(places):
-        fresh.add(f"place {number}", place)
-    assert index.vocabulary.version == 2
-    assert index.query(places[4], top_k=1000) == fresh.query(places[4], top_k=1000)
+@EVERY
+def test_before_the_first_training_nothing_is_found(strategy):
+    index, places = filled(strategy, count=4)
+    assert (index.query(places[0], 5), index.similarity(places[0], places[0])) == ([], 0.0)
+    assert (index.word_count, index.version, index.training, len(index)) == (0, 0, None, 4)
+    index.add(4, places[0])
+    assert index.query(places[1], 1)[0].id == 1
+    assert index.word_count > 1
+    assert index.training.places == 5
 
 
-def test_places_without_descriptors_are_stored_but_never_found():
-    index, places = filled_index(8)
-    index.add("dark", EMPTY)
-    assert len(index) == 61
-    assert index.query(EMPTY, top_k=5) == []
-    assert "dark" not in [found.id for found in index.query(places[0], top_k=1000)]
+@EVERY
+def test_eq_4_of_two_places_is_that_of_their_bags(strategy):
+    index, places = filled(strategy, Scoring.WORDS)
+    expected = words_oracle(index, places, places[2])
+    for other in (2, 5, 31):
+        assert index.similarity(places[2], places[other]) == pytest.approx(expected[other], abs=1e-9)
 
 
-def test_an_empty_index_answers_nothing():
-    _, places = filled_index(9)
-    index = InvertedIndex[str](train(places, SMALL, np.random.default_rng(0)))
-    assert index.query(places[0], top_k=5) == []
+@EVERY
+@BOTH
+@pytest.mark.parametrize(
+    "codes", [EMPTY, np.zeros((1, 32), np.uint8), np.zeros((200, 32), np.uint8)], ids=["none", "one", "equal"]
+)
+def test_poor_places_are_stored_and_harm_nothing(strategy, scoring, codes):
+    index, places = filled(strategy, scoring, count=20)
+    for number in range(100, 140):
+        places[number] = codes
+        index.add(number, codes)
+    check_stored(index, places)
+    assert len(index) == 60
+    own = index.query(codes, top_k=100)
+    if len(codes) and index.word_count > 1:
+        assert {found.id for found in own if found.similarity > 1.0 - 1e-9} == set(range(100, 140))
+    else:  # rebuilt on such places alone there is one word, which tells nothing
+        assert own == [] or scoring is Scoring.MATCHES
+    for number in range(100, 140):
+        index.forget(number)
+        del places[number]
+    check_stored(index, places)
+
+
+@BOTH
+def test_thousands_of_identical_places_are_one_to_any_query(scoring):
+    place = random_places(np.random.default_rng(3), 1)[0]
+    index = PlaceIndex[int](config(Strategy.INCREMENTAL, scoring), np.random.default_rng(0))
+    for number in range(3000):
+        index.add(number, place)
+    found = index.query(place, top_k=5)
+    expected = [(number, 1.0) for number in range(5)] if scoring is Scoring.MATCHES else []  # idf 0 tells nothing
+    assert [(f.id, round(f.similarity, 9)) for f in found] == expected
+
+
+@EVERY
+@pytest.mark.parametrize("tree", [TreeConfig(branching=2, depth=1), TreeConfig(branching=64, depth=8)])
+def test_extreme_trees_and_a_window_smaller_than_the_first_batch(strategy, tree):
+    index, places = filled(strategy, tree=tree, train_batch=9, capacity=1)
+    assert index.query(places[30], 1)[0].id == 30
+    check_stored(index, places)
 
 
 def test_a_place_is_stored_once_and_a_refused_one_not_at_all():
-    index, places = filled_index(10)
-    with pytest.raises(ValueError, match="place 3"):
-        index.add("place 3", places[3])
+    index, places = filled(Strategy.INCREMENTAL)
+    with pytest.raises(ValueError, match="place 3 is in the index already"):
+        index.add(3, places[3])
     with pytest.raises(ValueError, match="expected codes"):
-        index.add("broken", np.zeros((3, 8), np.uint8))
-    assert len(index) == 60
+        index.add(99, np.zeros((3, 8), np.uint8))
+    with pytest.raises(KeyError):
+        index.forget(99)
+    check_stored(index, places)
+
+
+def trained_on(strategy, count, **others):
+    index = PlaceIndex[int](config(strategy, **others), np.random.default_rng(9))
+    trainings = []
+    for number, place in enumerate(random_places(np.random.default_rng(6), count)):
+        index.add(number, place)
+        trainings.append((index.training.places if index.training else 0, index.version))
+    return trainings
+
+
+def test_algorithm_1_trains_at_every_place_after_the_first_L_on_the_last_C():
+    assert trained_on(Strategy.REBUILD, 9, capacity=6) == [(0, 0)] * 4 + [(5, 1), (6, 2), (6, 3), (6, 4), (6, 5)]
+
+
+def test_the_window_is_the_last_C_places():
+    """What came before it has no say in the tree."""
+    places = random_places(np.random.default_rng(7), 20)
+    trees = []
+    for start in (0, 8):
+        index = PlaceIndex[int](config(Strategy.STATIC, train_batch=18 - start, capacity=6), np.random.default_rng(1))
+        for number in range(start, 20):
+            index.add(number, places[number])
+        trees.append(index._vocabulary.tree.centres.tobytes())
+    assert trees[0] == trees[1]
+
+
+def test_windowed_keeps_the_vocabulary_in_between_and_static_for_ever():
+    assert [version for _, version in trained_on(Strategy.WINDOWED, 14)] == [0] * 4 + [1] * 4 + [2] * 4 + [3] * 2
+    assert [version for _, version in trained_on(Strategy.STATIC, 14)] == [0] * 4 + [1] * 10
+
+
+def test_a_vocabulary_of_other_places_stays_where_it_is_static_and_follows_where_it_is_incremental():
+    foreign, own = random_places(np.random.default_rng(4), 10), random_places(np.random.default_rng(5), 60)
+    for strategy, follows in ((Strategy.STATIC, False), (Strategy.INCREMENTAL, True)):
+        index = PlaceIndex[int](config(strategy), np.random.default_rng(0), "detector-1")
+        index.train(foreign)
+        before = index.word_count
+        for number, place in enumerate(own):
+            index.add(number, place)
+        assert (index.word_count > before) is follows
+        assert (index.training.places, index.training.descriptor_version) == (10, "detector-1")
+        check_stored(index, dict(enumerate(own)))
+
+
+def test_words_stay_under_their_capacity_and_all_others_stay_as_they_are():
+    rng = np.random.default_rng(8)
+    index, places = filled(Strategy.INCREMENTAL, seed=8)
+    before = {number: walk(index, place) for number, place in places.items()}
+    largest = int(index._vocabulary.words.max())
+    sizes = index._postings.entries.sizes
+    assert sizes.max() <= 16
+    index.add(1000, new := random_places(rng, 1)[0])
+    touched = set(walk(index, new))
+    for number, words in before.items():
+        now = walk(index, places[number])
+        fresh = now[now != words]
+        assert (fresh > largest).all()  # numbers are never given twice
+    assert touched
+
+
+def test_forgetting_gives_words_and_memory_back():
+    index, places = filled(Strategy.INCREMENTAL, count=60)
+    words, blocks, vertices = index.word_count, len(index._postings.entries.older), len(index._vocabulary.words)
+    assert words > 60
+    for number in range(59):
+        index.forget(number)
+    assert index.word_count < words / 3
+    for turn in range(1, 20):
+        for number, place in list(places.items())[:59]:
+            index.add(1000 * turn + number, place)
+        for number in range(59):
+            index.forget(1000 * turn + number)
+    assert len(index._postings.entries.older) <= 2 * blocks
+    assert len(index._vocabulary.words) <= 2 * vertices
+    assert len(index._postings.entries.leaves) <= 4 * sum(map(len, places.values()))
+
+
+@EVERY
+def test_the_same_places_give_the_same_index(strategy):
+    answers = []
+    for _ in range(2):
+        index, places = filled(strategy, seed=11)
+        answers.append((index.query(places[7], 50), index._vocabulary.words.tolist(), index.version))
+    assert answers[0] == answers[1]

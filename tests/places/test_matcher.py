@@ -9,7 +9,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.submap import build_submap
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
 from fcslam.places.motions import MotionConfig
-from fcslam.places.vocabulary import DynamicVocabularyConfig
+from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, KeyscanId, Place, frozen
 
 STRANGERS, FRIENDS = (lambda _: True), (lambda _: False)
@@ -109,7 +109,7 @@ def test_a_robot_alone_is_never_compared(visits):
 
 
 def test_a_place_without_features_matches_nothing_and_harms_nothing(visits):
-    matcher = visits.matcher(small_fleet=0, vocabulary=DynamicVocabularyConfig(train_batch=1))
+    matcher = visits.matcher(small_fleet=0, vocabulary=VocabularyConfig(train_batch=1))
     empty = Place(
         KeyscanId("c", 0), Channel.LIDAR, "v", 0, 0, frozen(np.zeros((0, 2)), np.float32),
         frozen(np.zeros((0, 32)), np.uint8),
@@ -121,7 +121,7 @@ def test_a_place_without_features_matches_nothing_and_harms_nothing(visits):
 
 def test_words_choose_the_candidates_of_a_large_fleet(visits):
     """Among twelve visits to another room, one to this: it is among the three that words name."""
-    matcher = visits.matcher(small_fleet=0, candidates=3, vocabulary=DynamicVocabularyConfig(train_batch=4))
+    matcher = visits.matcher(small_fleet=0, candidates=3, vocabulary=VocabularyConfig(train_batch=4))
     for number in range(12):
         matcher.match(visits.visit("a", number, other_room(), (0.2 * number - 1, 0.5, number)), {}, STRANGERS)
     matcher.match(visits.visit("a", 12, room(), POSE_A), {}, STRANGERS)
@@ -132,7 +132,7 @@ def test_words_choose_the_candidates_of_a_large_fleet(visits):
 
 
 def test_places_from_before_the_first_vocabulary_are_found_by_words(visits):
-    matcher = visits.matcher(small_fleet=0, candidates=3, vocabulary=DynamicVocabularyConfig(train_batch=4))
+    matcher = visits.matcher(small_fleet=0, candidates=3, vocabulary=VocabularyConfig(train_batch=4))
     matcher.match(visits.visit("a", 0, room(), POSE_A), {}, FRIENDS)
     for number in range(1, 8):
         matcher.match(visits.visit("a", number, other_room(), (0.3 * number - 1, 0.5, number)), {}, FRIENDS)
@@ -142,7 +142,7 @@ def test_places_from_before_the_first_vocabulary_are_found_by_words(visits):
 
 def test_the_same_places_give_the_same_matches(visits):
     def run():
-        matcher = visits.matcher(small_fleet=0, vocabulary=DynamicVocabularyConfig(train_batch=2))
+        matcher = visits.matcher(small_fleet=0, vocabulary=VocabularyConfig(train_batch=2))
         found = []
         for number, pose in enumerate((POSE_A, POSE_B, POSE_A + 0.3, POSE_B - 0.3)):
             found += matcher.match(visits.visit(f"r{number}", number, room(), pose), {}, STRANGERS)
@@ -154,7 +154,7 @@ def test_the_same_places_give_the_same_matches(visits):
 @pytest.mark.parametrize("doubts", [0, 1])
 def test_in_a_joint_map_what_looks_most_alike_is_still_compared(visits, doubts):
     """The map may be wrong: likeness, not nearness, chooses whom to doubt it with; its own places do not count."""
-    small = DynamicVocabularyConfig(train_batch=1, rebuild_every=1)
+    small = VocabularyConfig(train_batch=1, rebuild_every=1)
     matcher = visits.matcher(doubts=doubts, vocabulary=small)
     matcher.match(visits.visit("a", 0, other_room(), (0.5, 0.5, 1.0)), {}, FRIENDS)
     matcher.match(visits.visit("a", 1, room(), POSE_A), {}, FRIENDS)
@@ -164,3 +164,16 @@ def test_in_a_joint_map_what_looks_most_alike_is_still_compared(visits, doubts):
     found = [match for match in matches if not match.predicted]
     assert [match.i for match in found] == [KeyscanId("a", 1)][:doubts]
     assert all(match.M for match in found)
+
+
+@pytest.mark.parametrize("compares", [True, False], ids=["in words", "waiting"])
+def test_of_more_places_than_are_kept_the_oldest_are_forgotten(visits, compares):
+    matcher = visits.matcher(most_places=2, vocabulary=VocabularyConfig(train_batch=0))
+    oldest = visits.visit("a", 0, room(), POSE_A)
+    for place in (oldest, *(visits.visit("a", k, other_room(), (0.3 * k, 0.5, 1.0)) for k in (1, 2))):
+        matcher.match(place, {}, (lambda _: compares))
+    assert len(matcher) == 2
+    visits.asked.clear()
+    matches = matcher.match(visits.visit("b", 0, room(), POSE_B), {oldest.id: np.zeros(3)}, STRANGERS)
+    assert oldest.id not in visits.asked
+    assert not any(match.M for match in matches)

@@ -1,14 +1,15 @@
+"""The tree: growing, walking down, splitting and merging."""
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from fcslam.places.vocabulary import (
-    DynamicVocabulary,
-    DynamicVocabularyConfig,
-    VocabularyConfig,
-    train,
-)
+from fcslam.features.codes import code_words
+from fcslam.places.kmeans_tree import TreeShape, bare_root, descend, grow, near_leaves
+from fcslam.places.vocabulary import Vocabulary
 
-SMALL = VocabularyConfig(branching=4, depth=3, smallest_split=8)
+SMALL = TreeShape(branching=4, depth=3, smallest_split=8, iterations=8)
 
 
 def clustered_codes(rng, count, centres=None):
@@ -16,137 +17,130 @@ def clustered_codes(rng, count, centres=None):
     if centres is None:
         centres = rng.integers(0, 256, (16, 32), dtype=np.uint8)
     codes = centres[rng.integers(0, len(centres), count)]
-    flips = np.packbits(rng.random((count, 256)) < 0.03, axis=1)
-    return codes ^ flips
+    return code_words(codes ^ np.packbits(rng.random((count, 256)) < 0.03, axis=1))
 
 
-def places_of(rng, count, size=60):
-    centres = rng.integers(0, 256, (16, 32), dtype=np.uint8)
-    return [clustered_codes(rng, size, centres) for _ in range(count)]
+def distances(code, centres):
+    return np.bitwise_count(centres ^ code).sum(axis=1, dtype=int)
 
 
-def words_oracle(vocabulary, codes):
-    """Walk the tree in plain Python."""
-    tree = vocabulary.tree
-    centres = tree.centres.view(np.uint8).reshape(-1, 32)
-    words = []
-    for code in codes:
-        vertex = 0
-        while tree.child_count[vertex]:
-            children = np.arange(tree.first_child[vertex], tree.first_child[vertex] + tree.child_count[vertex])
-            vertex = children[np.bitwise_count(centres[children] ^ code).sum(axis=1, dtype=int).argmin()]
-        words.append(tree.leaf_number[vertex])
-    return np.array(words)
+def walk(tree, code):
+    vertex = 0
+    while tree.child_count[vertex]:
+        children = np.arange(tree.first_child[vertex], tree.first_child[vertex] + tree.child_count[vertex])
+        vertex = children[distances(code, tree.centres[children]).argmin()]
+    return vertex
 
 
-def test_words_are_those_of_a_walk_down_the_tree():
+def beam_oracle(tree, code, beam):
+    """Level by level the nearest ``beam`` vertices, the one on the walk always among them and first."""
+    kept = [0]
+    on_the_way = 0
+    while any(tree.child_count[v] for v in kept):
+        if tree.child_count[on_the_way]:
+            children = np.arange(*(tree.first_child[on_the_way] + np.array([0, tree.child_count[on_the_way]])))
+            on_the_way = children[distances(code, tree.centres[children]).argmin()]
+        candidates = []
+        for v in kept:
+            below = range(tree.first_child[v], tree.first_child[v] + tree.child_count[v])
+            candidates += list(below) or [v]
+        others = [v for v in candidates if v != on_the_way]
+        others.sort(key=lambda v: int(distances(code, tree.centres[[v]])[0]))
+        kept = [on_the_way, *others[: beam - 1]]
+    return kept
+
+
+def test_leaves_are_those_of_a_walk_down_the_tree():
     rng = np.random.default_rng(0)
-    vocabulary = train(places_of(rng, 10), SMALL, rng)
+    tree = grow(clustered_codes(rng, 600), SMALL, np.uint64(1))
     fresh = clustered_codes(rng, 200)
-    np.testing.assert_array_equal(vocabulary.words(fresh), words_oracle(vocabulary, fresh))
-    assert vocabulary.word_count > 16
+    np.testing.assert_array_equal(descend(tree, fresh), [walk(tree, code) for code in fresh])
+    assert (tree.child_count == 0).sum() > 16
+
+
+@pytest.mark.parametrize("beam", [1, 2, 5, 64])
+def test_near_leaves_are_those_of_a_search_by_levels(beam):
+    rng = np.random.default_rng(1)
+    tree = grow(clustered_codes(rng, 600), SMALL, np.uint64(1))
+    for code in clustered_codes(rng, 50):
+        found = near_leaves(tree, code, beam).tolist()
+        expected = beam_oracle(tree, code, beam)
+        assert found[0] == walk(tree, code)
+        assert len(set(found)) == len(found)
+        # Of equally near ones any may be kept.
+        assert [distances(code, tree.centres[[v]])[0] for v in found] == [
+            distances(code, tree.centres[[v]])[0] for v in expected
+        ]
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not():
-    places = places_of(np.random.default_rng(1), 10)
-    first, second, other = (train(places, SMALL, np.random.default_rng(seed)) for seed in (5, 5, 6))
-    assert [array.tobytes() for array in first.tree] == [array.tobytes() for array in second.tree]
-    assert first.idf.tobytes() == second.idf.tobytes()
-    assert first.tree.centres.tobytes() != other.tree.centres.tobytes()
-
-
-def test_words_do_not_depend_on_what_else_is_asked():
-    rng = np.random.default_rng(2)
-    vocabulary = train(places_of(rng, 8), SMALL, rng)
-    codes = clustered_codes(rng, 50)
-    together = vocabulary.words(codes)
-    np.testing.assert_array_equal(together, [vocabulary.words(code[None])[0] for code in codes])
-    np.testing.assert_array_equal(together, vocabulary.words(codes))
+    codes = clustered_codes(np.random.default_rng(1), 600)
+    first, second, other = (grow(codes, SMALL, np.uint64(seed)) for seed in (5, 5, 6))
+    assert [array.tobytes() for array in first] == [array.tobytes() for array in second]
+    assert first.centres.tobytes() != other.centres.tobytes()
 
 
 def test_clear_clusters_become_words_and_centres_are_bit_majorities():
     rng = np.random.default_rng(3)
     centres = rng.integers(0, 256, (4, 32), dtype=np.uint8)
     codes = np.concatenate([clustered_codes(rng, 101, centre[None]) for centre in centres])
-    vocabulary = train([codes], VocabularyConfig(branching=4, depth=1, smallest_split=2, iterations=20), rng)
-    words = vocabulary.words(codes)
-    assert all(len(set(words[101 * k : 101 * (k + 1)])) == 1 for k in range(4))
-    for word in range(vocabulary.word_count):
-        bits = np.unpackbits(codes[words == word], axis=1)
-        majority = np.packbits((2 * bits.sum(axis=0) > len(bits)).astype(np.uint8))
-        centre = vocabulary.tree.centres[vocabulary.tree.leaf_number == word].view(np.uint8)
-        np.testing.assert_array_equal(np.unpackbits(centre), np.unpackbits(majority))
+    tree = grow(codes, TreeShape(branching=4, depth=1, smallest_split=2, iterations=20), np.uint64(0))
+    leaves = descend(tree, codes)
+    assert all(len(set(leaves[101 * k : 101 * (k + 1)])) == 1 for k in range(4))
+    for leaf in set(leaves.tolist()):
+        bits = np.unpackbits(codes[leaves == leaf].view(np.uint8), axis=1)
+        majority = (2 * bits.sum(axis=0) > len(bits)).astype(np.uint8)
+        np.testing.assert_array_equal(np.unpackbits(tree.centres[leaf].view(np.uint8)), majority)
 
 
 def test_limits_of_the_shape_hold():
-    rng = np.random.default_rng(4)
-    codes = rng.integers(0, 256, (500, 32), dtype=np.uint8)
+    codes = code_words(np.random.default_rng(4).integers(0, 256, (500, 32), dtype=np.uint8))
     for depth in (1, 2, 3):
-        vocabulary = train([codes], VocabularyConfig(branching=3, depth=depth, smallest_split=10), rng)
-        assert vocabulary.word_count <= 3**depth
-    coarse = train([codes], VocabularyConfig(branching=3, smallest_split=501), rng)
-    assert coarse.word_count == 1
+        tree = grow(codes, TreeShape(branching=3, depth=depth, smallest_split=10, iterations=8), np.uint64(0))
+        assert 1 < (tree.child_count == 0).sum() <= 3**depth
+    coarse = grow(codes, TreeShape(branching=3, depth=3, smallest_split=501, iterations=8), np.uint64(0))
+    assert len(coarse.centres) == 1
 
 
-def test_idf_counts_the_places_that_have_a_word():
-    rng = np.random.default_rng(5)
-    places = places_of(rng, 12)
-    vocabulary = train(places, SMALL, rng)
-    documents = np.zeros(vocabulary.word_count)
-    for place in places:
-        documents[list(set(words_oracle(vocabulary, place)))] += 1
-    np.testing.assert_allclose(vocabulary.idf, np.log(12 / np.maximum(documents, 1)))
+@pytest.mark.parametrize("count", [0, 1, 300])
+def test_nothing_to_tell_apart_gives_one_word(count):
+    tree = grow(np.zeros((count, 4), np.uint64), SMALL, np.uint64(0))
+    assert len(tree.centres) == len(bare_root().centres) == 1
+    assert descend(tree, np.full((3, 4), 7, np.uint64)).tolist() == [0, 0, 0]
+    assert descend(tree, np.empty((0, 4), np.uint64)).shape == (0,)
 
 
-@pytest.mark.parametrize("places", [[], [np.empty((0, 32), np.uint8)], [np.zeros((300, 32), np.uint8)]])
-def test_nothing_to_tell_apart_gives_one_word(places):
-    vocabulary = train(places, SMALL, np.random.default_rng(0))
-    assert vocabulary.word_count == 1
-    assert vocabulary.words(np.full((3, 32), 255, np.uint8)).tolist() == [0, 0, 0]
-    assert vocabulary.words(np.empty((0, 32), np.uint8)).shape == (0,)
-
-
-def test_malformed_descriptors_are_refused():
-    with pytest.raises(ValueError, match="expected codes"):
-        train([np.zeros((4, 32), np.uint8)], SMALL, np.random.default_rng(0)).words(np.zeros((4, 16), np.uint8))
-
-
-def dynamic(rebuild_every, train_batch=3, capacity=5, seed=9):
-    config = DynamicVocabularyConfig(
-        train_batch=train_batch, capacity=capacity, rebuild_every=rebuild_every, tree=SMALL
-    )
-    return DynamicVocabulary(config, np.random.default_rng(seed))
-
-
-def test_algorithm_1_rebuilds_at_every_place_after_the_first_L():
-    places = places_of(np.random.default_rng(6), 9)
-    vocabulary = dynamic(rebuild_every=1)
-    assert [vocabulary.add(place) for place in places] == [i > 3 for i in range(9)]
-
-
-def test_algorithm_1_trains_on_the_window_of_C_places():
-    places = places_of(np.random.default_rng(7), 9)
-    vocabulary = dynamic(rebuild_every=1)
-    rng = np.random.default_rng(9)
-    for i, place in enumerate(places):
-        vocabulary.add(place)
-        if i <= 3:
-            assert vocabulary.vocabulary is None
-            continue
-        D = places[: i + 1] if i < 5 else places[i - 5 + 1 : i + 1]
-        expected = train(D, SMALL, rng, version=i - 3)
-        assert vocabulary.vocabulary is not None
-        assert vocabulary.vocabulary.version == expected.version
-        assert vocabulary.vocabulary.tree.centres.tobytes() == expected.tree.centres.tobytes()
-
-
-def test_periodic_rebuilding_keeps_the_vocabulary_in_between():
-    places = places_of(np.random.default_rng(8), 14)
-    vocabulary = dynamic(rebuild_every=4)
-    trained, versions = [], []
-    for i, place in enumerate(places):
-        if vocabulary.add(place):
-            trained.append(i)
-        versions.append(vocabulary.vocabulary.version if vocabulary.vocabulary else 0)
-    assert trained == [4, 8, 12]
-    assert versions == [0] * 4 + [1] * 4 + [2] * 4 + [3] * 2
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**16), choices=st.lists(st.booleans(), max_size=25))
+def test_splits_and_merges_keep_a_tree_and_all_other_words(seed, choices):
+    rng = np.random.default_rng(seed)
+    codes = clustered_codes(rng, 300)
+    vocabulary = Vocabulary(SMALL, seed)
+    vocabulary.train(codes[:100])
+    for splits in choices:
+        before, given_so_far = vocabulary.words[vocabulary.leaves(codes)], int(vocabulary.words.max())
+        leaves = np.unique(vocabulary.leaves(codes))
+        if splits:
+            leaf = int(rng.choice(leaves))
+            own = vocabulary.leaves(codes) == leaf
+            targets = vocabulary.split(leaf, codes[own])
+            if targets is not None:
+                np.testing.assert_array_equal(vocabulary.leaves(codes)[own], targets)
+        else:
+            parents = np.unique(vocabulary.parents[leaves])
+            lowest = [
+                v for v in parents.tolist() if v >= 0 and not vocabulary.tree.child_count[vocabulary.children(v)].any()
+            ]
+            if not lowest:
+                continue
+            parent = int(rng.choice(lowest))
+            own = np.isin(vocabulary.parents[vocabulary.leaves(codes)], [parent])
+            vocabulary.merge(parent)
+            assert set(vocabulary.leaves(codes)[own].tolist()) <= {parent}
+        after = vocabulary.words[vocabulary.leaves(codes)]
+        np.testing.assert_array_equal(after[~own], before[~own])
+        assert ((after[own] > given_so_far) | (after[own] == before[own])).all()
+    tree, number_of = vocabulary.state()
+    restored = Vocabulary.restored(SMALL, tree)
+    np.testing.assert_array_equal(number_of[vocabulary.leaves(codes)], restored.leaves(codes))
+    assert restored.word_count == vocabulary.word_count

@@ -8,6 +8,8 @@ import typer
 from fcslam.cli.evaluate_federated import federated
 from fcslam.cli.evaluate_fleet import fleet, percent
 from fcslam.cli.evaluate_homography import homography
+from fcslam.cli.evaluate_places import places
+from fcslam.cli.evaluate_vocabulary import vocabulary
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,6 +24,10 @@ app.command(epilog="Example: fcslam evaluate federated robot1 robot2 robot3 --ou
 app.command(epilog="Example: fcslam evaluate homography hpatches --detector onnx --detector orb --figures figures")(
     homography
 )
+app.command(
+    epilog="Example: fcslam evaluate places corridor tower --features onnx --train-on photos --verify -o places"
+)(places)
+app.command(epilog="Example: fcslam evaluate vocabulary tower corridor --first photos --output growth")(vocabulary)
 
 
 @app.command(epilog="Example: fcslam evaluate relations out/intel intel.relations.gz --across-robots")

@@ -27,8 +27,11 @@ def homography(
         typer.Option(help="Only this one; may be given several times."),
     ] = None,
     weights: Annotated[
-        Path | None,
-        typer.Option(help="Network weights (.onnx) of detector onnx, if not those that come with fcslam."),
+        list[Path] | None,
+        typer.Option(
+            help="Network weights (.onnx) of detectors onnx and logits, if not those that come with fcslam; may be "
+            "given several times."
+        ),
     ] = None,
     features: Annotated[
         list[Path] | None,
@@ -55,7 +58,7 @@ def homography(
     from fcslam.evaluation.scenes import find_scenes
 
     found = find_scenes(scenes)
-    contenders = choose_contenders(detector or (), weights, features or ())
+    contenders = choose_contenders(detector or (), weights or (), features or ())
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("evaluating", total=len(found) * len(contenders))
@@ -85,7 +88,9 @@ def _show(console: "Console", report: "HomographyReport", truth: GroundTruth, se
         "share of pairs whose corners are right to e px on average.",
         "MMA: share of the matches right to so many px, mean over pairs; matching score: share of the keypoints in "
         "common view whose nearest neighbour is right to 3 px; both of the 1000 strongest of each image.",
-        "NMS 0: keypoints as the detector gives them.",
+        "NMS 0: keypoints as the detector gives them. ...-logits: the network's own, compared by the cosine of their "
+        "logits instead of by bits.",
+        "Times: processor time on one thread, from grey levels to described keypoints.",
     ):
         console.print(line, highlight=False, soft_wrap=True)
 

@@ -29,6 +29,7 @@ from fcslam.metrics.homography import inside
 _CANDIDATES = 1500
 """Features that ORB and SIFT are asked for, as in SuperPoint's evaluation."""
 _NETWORK_CANDIDATES = 2000
+_NETWORKS = (ContenderKind.ONNX, ContenderKind.LOGITS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,18 +54,18 @@ class Contender:
 
 
 class Stopwatch:
-    """How long contenders take for a picture."""
+    """How long contenders take for a picture: processor time, which other work on the machine hardly changes."""
 
     def __init__(self) -> None:
         self._seconds: defaultdict[tuple[str, Size], list[float]] = defaultdict(list)
 
     def find(self, contender: Contender, picture: Picture) -> Keypoints:
         """What the contender finds."""
-        began = time.perf_counter()
+        began = time.process_time()
         found = contender.find(picture)
         if contender.is_timed:
             height, width = picture.grey.shape
-            self._seconds[contender.name, (width, height)].append(time.perf_counter() - began)
+            self._seconds[contender.name, (width, height)].append(time.process_time() - began)
         return found
 
     def milliseconds(self) -> Mapping[tuple[str, Size], float]:
@@ -87,22 +88,27 @@ def frame(path: Path, size: Size) -> Picture:
 
 
 def choose_contenders(
-    names: Sequence[ContenderKind], weights: Path | None, folders: Sequence[Path]
+    names: Sequence[ContenderKind], weights: Sequence[Path], folders: Sequence[Path]
 ) -> tuple[Contender, ...]:
     """The folders' features first, then the named detectors; if nothing is named, all there are.
 
+    ``weights``: of networks, each of which is a contender; if none is given, those that come with fcslam.
+
     Raises:
-        FeatureError: the network's weights cannot be used.
-        EvaluationError: two folders have one name, or there is none of that name.
+        FeatureError: a network's weights cannot be used.
+        EvaluationError: two contenders have one name, or there is no folder of that name.
     """
     if not names and not folders:
-        names = [name for name in ContenderKind if name is not ContenderKind.ONNX]
-        if weights is not None or SHIPPED_NETWORK.is_file():
-            names = [ContenderKind.ONNX, *names]
-    contenders = [_extracted(folder) for folder in folders] + [_run_here(name, weights) for name in names]
+        has_network = bool(weights) or SHIPPED_NETWORK.is_file()
+        names = [name for name in ContenderKind if has_network or name not in _NETWORKS]
+    contenders, networks = [_extracted(folder) for folder in folders], list[Path | None](weights) or [None]
+    for name in names:
+        contenders += [_network(name, path) for path in networks] if name in _NETWORKS else [_classical(name)]
     doubled = {each.name for each in contenders if [other.name for other in contenders].count(each.name) > 1}
     if doubled:
-        raise EvaluationError(f"{min(doubled)}: named twice; give each detector once, and folders other names")
+        raise EvaluationError(
+            f"{min(doubled)}: named twice; give each detector and network once, and folders other names"
+        )
     return tuple(contenders)
 
 
@@ -117,28 +123,27 @@ def one_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _run_here(name: ContenderKind, weights: Path | None) -> Contender:
-    shown, detector = name.value, _detector(name, weights)
-    if isinstance(detector, OnnxDetector):
-        shown = detector.version
-    detector.detect(np.zeros((32, 32), np.uint8))  # what the first call alone costs is nobody's time
-    return Contender(shown, lambda picture: detector.detect(picture.grey), is_timed=True)
+def _network(name: ContenderKind, weights: Path | None) -> Contender:
+    network = OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES))
+    if name is ContenderKind.LOGITS:
+        return _run_here(f"{network.version}-logits", network.detect_floats)
+    return _run_here(network.version, network.detect)
 
 
-def _detector(name: ContenderKind, weights: Path | None) -> KeypointDetector:
-    match name:
-        case ContenderKind.ONNX:
-            return OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES))
-        case ContenderKind.FAST:
-            return Fast()
-        case ContenderKind.HARRIS:
-            return Harris()
-        case ContenderKind.SHI:
-            return Shi()
-        case ContenderKind.SIFT:
-            return Sift(_CANDIDATES)
-        case ContenderKind.ORB:
-            return Orb(OrbConfig(most_features=_CANDIDATES, fast_threshold=20))
+def _classical(name: ContenderKind) -> Contender:
+    detectors: dict[ContenderKind, KeypointDetector] = {
+        ContenderKind.FAST: Fast(),
+        ContenderKind.HARRIS: Harris(),
+        ContenderKind.SHI: Shi(),
+        ContenderKind.SIFT: Sift(_CANDIDATES),
+        ContenderKind.ORB: Orb(OrbConfig(most_features=_CANDIDATES, fast_threshold=20)),
+    }
+    return _run_here(name.value, detectors[name].detect)
+
+
+def _run_here(name: str, find: Callable[[GreyImage], Keypoints]) -> Contender:
+    find(np.zeros((32, 32), np.uint8))  # what the first call alone costs is nobody's time
+    return Contender(name, lambda picture: find(picture.grey), is_timed=True)
 
 
 def _extracted(folder: Path) -> Contender:

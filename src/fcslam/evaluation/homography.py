@@ -17,8 +17,7 @@ import numpy as np
 
 from fcslam.evaluation.contenders import Contender, Picture, Stopwatch, frame, one_thread
 from fcslam.evaluation.scenes import Scene, SceneKind
-from fcslam.features.classical import FloatFeatures
-from fcslam.features.detector import ImageFeatures, Keypoints
+from fcslam.features.detector import FloatFeatures, ImageFeatures, Keypoints
 from fcslam.features.matching import mutual_pairs, nearest_neighbours
 from fcslam.features.nms import box_nms
 from fcslam.metrics.framing import GroundTruth, Size, framed_homography
@@ -81,7 +80,7 @@ class HomographyReport:
     contenders: tuple[str, ...]
     pairs: tuple[PairResult, ...]
     milliseconds: Mapping[tuple[str, Size], float]
-    """Median for one picture on one thread."""
+    """Median processor time for one picture on one thread, from grey levels to described keypoints."""
 
     def of(self, contender: str) -> tuple[PairResult, ...]:
         """Its pairs; those of all contenders are in one order."""

@@ -5,7 +5,6 @@ and Shi-Tomasi find corners, SIFT describes by 128 numbers.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import cv2
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.detector import NO_FEATURES, GreyImage, ImageFeatures, Keypoints
+from fcslam.features.detector import NO_FEATURES, FloatFeatures, GreyImage, ImageFeatures, Keypoints
 from fcslam.features.nms import box_nms
 from fcslam.records import FloatArray, frozen
 
@@ -34,14 +33,6 @@ class OrbConfig(Settings):
     most_features: int = Field(default=300, ge=1, le=2000, description="features kept of an image, strongest first")
     fast_threshold: int = Field(default=7, ge=1, le=100, description="least contrast of a corner; low for dim light")
     pyramid_levels: int = Field(default=8, ge=1, le=16, description="scales, each 1.2 times coarser than the last")
-
-
-@dataclass(frozen=True, slots=True)
-class FloatFeatures(Keypoints):
-    """Keypoints that are described by numbers, compared by Euclidean distance."""
-
-    descriptors: NDArray[np.float32]
-    """Shape (K, D)."""
 
 
 class Orb:

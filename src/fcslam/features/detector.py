@@ -20,7 +20,7 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.features.codes import CODE_BITS
-from fcslam.features.dense import CELL_PX, Logits, Probabilities, find_peaks, sample_codes
+from fcslam.features.dense import CELL_PX, Logits, Probabilities, find_peaks, sample_codes, sample_logits
 from fcslam.records import CODE_BYTES, NAME, Codes, frozen
 
 NETWORK_FORMAT: Final = "1"
@@ -52,6 +52,14 @@ class ImageFeatures(Keypoints):
 
     descriptors: Codes
     """Shape (K, 32)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FloatFeatures(Keypoints):
+    """Keypoints that are described by numbers, compared by Euclidean distance."""
+
+    descriptors: NDArray[np.float32]
+    """Shape (K, D)."""
 
 
 NO_FEATURES = ImageFeatures(
@@ -120,18 +128,31 @@ class OnnxDetector:
 
     def detect(self, image: GreyImage) -> ImageFeatures:
         """Features of an image of any size, ranked by keypoint probability."""
+        found, logits = self._find(image)
+        codes = sample_codes(logits, found.keypoints_px)
+        return ImageFeatures(found.keypoints_px, found.scores, frozen(codes, np.uint8))
+
+    def detect_floats(self, image: GreyImage) -> FloatFeatures:
+        """The same keypoints with the logits of their bits, scaled to unit length: beside ``detect`` it shows what
+        is lost by the bits."""
+        found, logits = self._find(image)
+        sampled = sample_logits(logits, found.keypoints_px)
+        lengths = np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+        return FloatFeatures(found.keypoints_px, found.scores, frozen(sampled / lengths, np.float32))
+
+    def infer(self, image: GreyImage) -> tuple[Probabilities, Logits]:
+        """What the network says: a probability for every pixel (H, W), logits of the cells that cover the image."""
         height, width = image.shape
         if not image.size:
-            return NO_FEATURES
+            return np.empty(image.shape, np.float32), np.zeros((CODE_BITS, 1, 1), np.float32)
         scores, logits = self._run(_padded(image))
-        positions, strengths = find_peaks(
-            scores[:height, :width], self._config.least_score, self._config.nms_px, self._config.most_features
-        )
-        return ImageFeatures(
-            frozen(positions, np.float32),
-            frozen(strengths, np.float32),
-            frozen(sample_codes(logits, positions), np.uint8),
-        )
+        return scores[:height, :width], logits
+
+    def _find(self, image: GreyImage) -> tuple[Keypoints, Logits]:
+        config = self._config
+        scores, logits = self.infer(image)
+        positions, strengths = find_peaks(scores, config.least_score, config.nms_px, config.most_features)
+        return Keypoints(frozen(positions, np.float32), frozen(strengths, np.float32)), logits
 
     def _run(self, image: GreyImage) -> tuple[Probabilities, Logits]:
         grey = (image.astype(np.float32) / np.float32(255.0))[None, None]

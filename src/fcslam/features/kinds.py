@@ -14,6 +14,8 @@ class ContenderKind(StrEnum):
     """Detectors that can be compared."""
 
     ONNX = "onnx"
+    LOGITS = "logits"
+    """The same network, compared before its logits become bits."""
     ORB = "orb"
     SIFT = "sift"
     FAST = "fast"

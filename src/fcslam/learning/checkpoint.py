@@ -28,6 +28,10 @@ class Checkpoint:
     tensors: dict[str, Tensor]
     """Everything by name: network, average, optimiser."""
 
+    def part(self, prefix: str) -> dict[str, Tensor]:
+        """The tensors whose names begin with ``prefix``, by what follows it."""
+        return {name.removeprefix(prefix): each for name, each in self.tensors.items() if name.startswith(prefix)}
+
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Write beside the last checkpoint, then take its place.

@@ -92,7 +92,7 @@ class LightBody(nn.Module):
         around = _twice(self.to_sixteenth(eighth))[..., : eighth.shape[-2], : eighth.shape[-1]]
         joint = self.joint(eighth + around)
         context = _twice(self.context_quarter(quarter) + _twice(self.context_eighth(joint)))
-        points = F.pixel_shuffle(self.point_head(half + context), 2)
+        points = smoothed(F.pixel_shuffle(self.point_head(half + context), 2))
         points = points + self.refine(torch.cat((image, points), dim=1))
         return Maps(points.squeeze(1), self.code_head(joint))
 
@@ -148,6 +148,12 @@ def sample_codes(code_logits: Tensor, points_px: Tensor) -> Tensor:
     grid = (2.0 * points_px + 1.0) / size - 1.0
     sampled = F.grid_sample(code_logits, grid.unsqueeze(1), mode="bilinear", padding_mode="border", align_corners=False)
     return sampled.squeeze(2).transpose(1, 2)
+
+
+def smoothed(maps: Tensor) -> Tensor:
+    """Maps (B, 1, H, W) without what alternates from pixel to pixel: it would tell even pixels from odd ones."""
+    binomial = maps.new_tensor([0.25, 0.5, 0.25])
+    return F.conv2d(F.pad(maps, (1, 1, 1, 1), mode="replicate"), torch.outer(binomial, binomial)[None, None])
 
 
 def _convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:

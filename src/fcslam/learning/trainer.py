@@ -30,6 +30,8 @@ VALIDATION_VIEW: Final = (320, 240)
 VALIDATION_SEED: Final = 2026
 CHECKPOINT_FILE: Final = "checkpoint.npz"
 PROGRESS_FILE: Final = "progress.csv"
+NETWORK, AVERAGE, OPTIMISER = "network/", "average/", "optimiser/"
+"""How names of tensors in a checkpoint begin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,23 +152,20 @@ class Run:
             raise TrainingError(f"{path}: does not fit this network ({error})") from error
 
     def _load(self, checkpoint: Checkpoint) -> None:
-        def part(prefix: str) -> dict[str, Tensor]:
-            return {k.removeprefix(prefix): v for k, v in checkpoint.tensors.items() if k.startswith(prefix)}
-
-        self.network.load_state_dict(part("network/"))
-        self.average.load_state_dict(part("average/"))
+        self.network.load_state_dict(checkpoint.part(NETWORK))
+        self.average.load_state_dict(checkpoint.part(AVERAGE))
         state: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in part("optimiser/").items():
+        for name, tensor in checkpoint.part(OPTIMISER).items():
             index, key = name.split("/")
             state.setdefault(int(index), {})[key] = tensor
         self.optimiser.load_state_dict({"state": state, "param_groups": self.optimiser.state_dict()["param_groups"]})
         self.step = checkpoint.step
 
     def _save(self) -> None:
-        tensors = {f"network/{name}": value for name, value in self.network.state_dict().items()}
-        tensors |= {f"average/{name}": value for name, value in self.average.state_dict().items()}
+        tensors = {f"{NETWORK}{name}": value for name, value in self.network.state_dict().items()}
+        tensors |= {f"{AVERAGE}{name}": value for name, value in self.average.state_dict().items()}
         for index, entries in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser/{index}/{name}": value for name, value in entries.items()}
+            tensors |= {f"{OPTIMISER}{index}/{name}": value for name, value in entries.items()}
         settings = self.settings.model_dump(mode="json")
         write_checkpoint(self.folder / CHECKPOINT_FILE, Checkpoint(self.stage, self.step, settings, tensors))
         self._saved = time.monotonic()
@@ -182,6 +181,22 @@ class Run:
                 rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in figures.items())
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error}); make room and run the command again") from error
+
+
+def trained_network(path: Path) -> KeypointNetwork:
+    """The averaged network of a checkpoint, which is what a run hands over, ready to be used.
+
+    Raises:
+        TrainingError: the file is no checkpoint, or of another network than this version has.
+    """
+    checkpoint = read_checkpoint(path)
+    try:
+        network = KeypointNetwork(checkpoint.settings["encoder"])
+        network.load_state_dict(checkpoint.part(AVERAGE))
+    except (KeyError, RuntimeError) as error:
+        raise TrainingError(f"{path}: does not fit this network ({error})") from error
+    network.eval()
+    return network
 
 
 def validation_pairs(held_out: Sequence[Example]) -> list[Pair]:

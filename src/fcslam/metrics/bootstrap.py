@@ -1,12 +1,16 @@
 """How far a mean over few samples can be trusted."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.records import FloatArray
 
 DRAWS = 2000
+FEW_DRAWS = 300
+"""For what takes longer than a mean."""
 
 
 class Interval(NamedTuple):
@@ -28,3 +32,17 @@ def mean_interval(values: FloatArray, rng: np.random.Generator) -> Interval:
     means = known[rng.integers(len(known), size=(DRAWS, len(known)))].mean(axis=1)
     low, high = np.quantile(means, (0.025, 0.975))
     return Interval(float(known.mean()), float(low), float(high))
+
+
+def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator) -> Interval:
+    """The same for any measure of some of ``count`` samples, which is given their numbers; the first value is of all.
+
+    Draws for which the measure is NaN are left out.
+    """
+    whole = measure(np.arange(count))
+    drawn = np.array([measure(rng.integers(count, size=count)) for _ in range(FEW_DRAWS if count else 0)])
+    known = drawn[np.isfinite(drawn)]
+    if not len(known):
+        return Interval(whole, np.nan, np.nan)
+    low, high = np.quantile(known, (0.025, 0.975))
+    return Interval(whole, float(low), float(high))

@@ -1,164 +1,274 @@
-"""Inverted index: which stored places share words with a new one, and how alike they are."""
+"""The place index: which stored places are like a new one, in words that follow the places as they arrive."""
 
-from collections.abc import Container
-from typing import Generic, NamedTuple, TypeVar
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Self
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from fcslam.places.similarity import BagOfWords
-from fcslam.places.vocabulary import Vocabulary
-from fcslam.records import Codes, FloatArray, Scalar
+from fcslam.features.codes import CODE_WORDS, CodeWords, code_words
+from fcslam.places.kmeans_tree import TreeShape
+from fcslam.places.likeness import Found, Likeness, PlaceId
+from fcslam.places.postings import Postings
+from fcslam.places.scoring import TINY, score_matches, score_words
+from fcslam.places.similarity import BagOfWords, similarity
+from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
+from fcslam.records import Codes, FloatArray
 
-PlaceId = TypeVar("PlaceId")
-
-_BLOCK = 16
-_FIRST_BLOCKS = 256
-
-
-class Found(NamedTuple, Generic[PlaceId]):
-    """A stored place that shares words with the query."""
-
-    id: PlaceId
-    similarity: float
-    """L1 score in [0, 1]."""
-
-
-class _Blocks(NamedTuple):
-    """Postings as compiled code sees them: every word has a chain of blocks of (place row, value)."""
-
-    newest: NDArray[np.int64]
-    """Shape (word_count,): the block of each word that is being filled, -1 for none."""
-    older: NDArray[np.int64]
-    """Shape (B,): the block before it of the same word, -1 for none."""
-    sizes: NDArray[np.int64]
-    """Shape (B,): entries in the block."""
-    rows: NDArray[np.int32]
-    """Shape (B, _BLOCK)."""
-    values: FloatArray
-    """Shape (B, _BLOCK)."""
+_MOST_LEVELS = 16
+"""Of a tree whose leaves split: no limit in practice."""
+_MERGED_SHARE = 4
+"""A merged word is at most so much smaller than one that splits, so that it does not split again at once."""
+_ROWS_KEPT = 2
+"""Rows for every stored place at most: those of forgotten ones are closed up then."""
+_NO_CODES = np.empty((0, CODE_WORDS), np.uint64)
 
 
-class _Postings:
-    """For every word the places that have it. Blocks, because a query is bound by memory: it reads them in a row."""
+@dataclass(frozen=True, slots=True)
+class IndexState(Generic[PlaceId]):
+    """All that an index is; postings follow from it."""
 
-    def __init__(self, word_count: int) -> None:
-        self.blocks = _Blocks(
-            np.full(word_count, -1, np.int64),
-            np.empty(_FIRST_BLOCKS, np.int64),
-            np.empty(_FIRST_BLOCKS, np.int64),
-            np.empty((_FIRST_BLOCKS, _BLOCK), np.int32),
-            np.empty((_FIRST_BLOCKS, _BLOCK)),
-        )
-        self._used = 0
-
-    def append(self, row: int, bag: BagOfWords) -> None:
-        """Add a place; its cost does not depend on how many there are."""
-        needed = self._used + len(bag.words)
-        if needed > len(self.blocks.older):
-            newest, older, sizes, rows, values = self.blocks
-            longer = 2 * needed
-            self.blocks = _Blocks(
-                newest, _longer(older, longer), _longer(sizes, longer), _longer(rows, longer), _longer(values, longer)
-            )
-        self._used = _append(self.blocks, self._used, row, bag.words, bag.values)
+    config: VocabularyConfig
+    descriptor_version: str
+    training: Training | None
+    places_seen: int
+    tree: TreeState
+    ids: Sequence[PlaceId]
+    counts: NDArray[np.int32]
+    """Shape (P,): descriptors of each place."""
+    codes: CodeWords
+    """Shape (D, 4), place by place."""
+    leaves: NDArray[np.int32]
+    """Shape (D,): vertices of ``tree``."""
 
 
-def _longer(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
-    """``array`` with room for ``length`` rows."""
-    longer = np.empty((length, *array.shape[1:]), array.dtype)
-    longer[: len(array)] = array
-    return longer
+class PlaceIndex(Generic[PlaceId]):
+    """Places by the words they contain, and the vocabulary that follows them.
 
-
-class InvertedIndex(Generic[PlaceId]):
-    """Places by the words they contain. It keeps their descriptors, so that a new vocabulary can describe them again.
-
-    idf is the vocabulary's own, so a stored place never changes until the vocabulary does.
+    The strategies differ in when the tree is grown again and whether words split; all else is the same. Places are
+    counted in the order of arrival, from 0, as in Algorithm 1 of FC-SLAM.
     """
 
-    def __init__(self, vocabulary: Vocabulary) -> None:
-        self._descriptors: dict[PlaceId, Codes] = {}
+    def __init__(self, config: VocabularyConfig, rng: np.random.Generator, descriptor_version: str = "") -> None:
+        self._config = config
+        self._descriptor_version = descriptor_version
+        self._vocabulary = Vocabulary(_shape(config), int(rng.integers(0, 2**63)))
+        self._postings = Postings(vertices=1)
         self._ids: list[PlaceId] = []
-        self._vocabulary = vocabulary
-        self._postings = _Postings(vocabulary.word_count)
+        """By row; what stood there once stays after the place was forgotten, until rows are closed up."""
+        self._row_of: dict[PlaceId, int] = {}
+        self._places_seen = 0
+        self._training: Training | None = None
 
     def __len__(self) -> int:
-        return len(self._ids)
+        return len(self._row_of)
+
+    def __contains__(self, place: PlaceId) -> bool:
+        return place in self._row_of
 
     @property
-    def vocabulary(self) -> Vocabulary:
-        """The vocabulary that describes the places at present."""
-        return self._vocabulary
+    def word_count(self) -> int:
+        """Words of the vocabulary; 0 before the first training."""
+        return self._vocabulary.word_count if self._training else 0
+
+    @property
+    def version(self) -> int:
+        """Counts the changes of the vocabulary; 0 before the first training."""
+        return self._vocabulary.version
+
+    @property
+    def training(self) -> Training | None:
+        """What the tree was grown from; None before."""
+        return self._training
 
     def add(self, place: PlaceId, descriptors: Codes) -> None:
-        """Store a place with its descriptors (N, 32).
+        """Store a place with its descriptors (N, 32): Algorithm 1, lines 3-11.
 
         Raises:
             ValueError: the place is stored already, or the descriptors are malformed.
         """
-        if place in self._descriptors:
+        if place in self._row_of:
             raise ValueError(f"place {place} is in the index already")
-        self._postings.append(len(self._ids), self._vocabulary.bag(descriptors))
-        self._descriptors[place] = descriptors
+        codes = code_words(descriptors)
+        leaves = self._vocabulary.leaves(codes)
+        self._row_of[place] = self._postings.add(codes, leaves)
         self._ids.append(place)
-
-    def describe_again(self, vocabulary: Vocabulary) -> None:
-        """Put every stored place into the words of another vocabulary."""
-        self._vocabulary = vocabulary
-        self._postings = _Postings(vocabulary.word_count)
-        for row, place in enumerate(self._ids):
-            self._postings.append(row, vocabulary.bag(self._descriptors[place]))
+        i = self._places_seen
+        self._places_seen += 1
+        if self._is_due(i):
+            self._train_on_newest()
+        elif self._training and self._config.strategy is Strategy.INCREMENTAL:
+            self._split(self._overfull(*np.unique(leaves, return_counts=True)))
 
     def query(self, descriptors: Codes, top_k: int, exclude: Container[PlaceId] = frozenset()) -> list[Found[PlaceId]]:
-        """The ``top_k`` stored places most similar to these descriptors (N, 32), the most similar first.
+        """The ``top_k`` stored places most similar to these descriptors (N, 32): the best of ``compare``."""
+        return self.compare(descriptors).best(top_k, lambda place: place not in exclude)
 
-        Places without a common word are neither touched nor returned; of equals the one stored first comes first.
+    def compare(self, descriptors: Codes) -> Likeness[PlaceId]:
+        """How alike all stored places are to these descriptors (N, 32); nothing before the first training."""
+        codes = code_words(descriptors)
+        entries, row_count, count = self._postings.entries, self._postings.row_count, len(self)
+        if not self._training or not count:
+            return Likeness()
+        if self._config.scoring is Scoring.MATCHES:
+            beam, near_bits = self._config.beam, self._config.near_bits
+            rows, scores = score_matches(entries, self._vocabulary.tree, row_count, count, codes, beam, near_bits)
+        else:
+            leaves, weights = self._weigh(codes)
+            rows, scores = score_words(entries, row_count, count, leaves, weights)
+        return Likeness(self._ids, rows, scores)
+
+    def similarity(self, a: Codes, b: Codes) -> float:
+        """Eq. (4) on [0, 1] of two places, each (N, 32), in the present words; 0 before the first training."""
+        if not self._training:
+            return 0.0
+        return similarity(self.bag(a), self.bag(b))
+
+    def bag(self, descriptors: Codes) -> BagOfWords:
+        """The place with these descriptors (N, 32) in the present words, weighted as stored places are."""
+        leaves, weights = self._weigh(code_words(descriptors))
+        words = self._vocabulary.words[leaves]
+        order = np.argsort(words)
+        return BagOfWords(words[order], weights[order], self.version)
+
+    def forget(self, place: PlaceId) -> None:
+        """Take a place out.
+
+        Raises:
+            KeyError: it is not stored.
         """
-        bag = self._vocabulary.bag(descriptors)
-        rows, scores = _score(self._postings.blocks, bag.words, bag.values, len(self._ids))
-        found: list[Found[PlaceId]] = []
-        for position in np.lexsort((rows, -scores)):
-            if len(found) >= top_k:
-                break
-            place = self._ids[rows[position]]
-            if place not in exclude:
-                found.append(Found(place, float(scores[position])))
-        return found
+        leaves = self._postings.forget(self._row_of.pop(place))
+        if self._training and self._config.strategy is Strategy.INCREMENTAL:
+            self._merge(leaves)
+        if self._postings.row_count > _ROWS_KEPT * (len(self) + 1):
+            self._describe_again(self._postings.gather(self._rows()))
+
+    def train(self, places: Sequence[Codes]) -> None:
+        """Grow the tree now from the descriptors of these places, each (N, 32), which need not be stored."""
+        self._train(np.concatenate([_NO_CODES, *map(code_words, places)]), len(places))
+
+    def state(self) -> IndexState[PlaceId]:
+        """All that the index is."""
+        rows = self._rows()
+        tree, number_of = self._vocabulary.state()
+        leaves = np.concatenate([np.empty(0, np.int32), *map(self._postings.leaves, rows.tolist())])
+        return IndexState(
+            self._config, self._descriptor_version, self._training, self._places_seen, tree, list(self._row_of),
+            self._postings.entries.counts[rows], self._postings.gather(rows), number_of[leaves],
+        )  # fmt: skip
+
+    @classmethod
+    def restored(cls, state: IndexState[PlaceId]) -> Self:
+        """The index that had this state; it goes on as that one."""
+        index = cls(state.config, np.random.default_rng(0), state.descriptor_version)
+        index._training, index._places_seen = state.training, state.places_seen
+        index._vocabulary = Vocabulary.restored(_shape(state.config), state.tree)
+        index._postings = Postings(index._vocabulary.vertex_count)
+        index._postings.add_all(state.codes, state.leaves, state.counts)
+        index._ids = list(state.ids)
+        index._row_of = {place: row for row, place in enumerate(index._ids)}
+        return index
+
+    def _is_due(self, i: int) -> bool:
+        """Algorithm 1, line 4: whether the tree is grown when place i has come."""
+        since = i - self._config.train_batch - 1
+        match self._config.strategy:
+            case Strategy.REBUILD:
+                return since >= 0
+            case Strategy.WINDOWED:
+                return since >= 0 and since % self._config.rebuild_every == 0
+            case _:
+                return since >= 0 and self._training is None
+
+    def _train_on_newest(self) -> None:
+        """Lines 5-9, whose two cases are one window here: D_max(0, i - C + 1) ... D_i."""
+        rows = self._rows()[-self._config.capacity :]
+        self._train(self._postings.gather(rows), len(rows))
+
+    def _train(self, codes: CodeWords, places: int) -> None:
+        """Line 11: V_t, and all stored places in its words."""
+        stored = self._postings.gather(self._rows())
+        self._vocabulary.train(codes)
+        self._training = Training(places, len(codes), self._descriptor_version)
+        self._describe_again(stored)
+        if self._config.strategy is Strategy.INCREMENTAL:
+            self._split(np.flatnonzero(self._postings.entries.sizes > self._config.leaf_capacity))
+
+    def _describe_again(self, stored: CodeWords) -> None:
+        """Enter all stored places anew, ``stored`` (M, 4) being their codes; rows close up."""
+        counts = self._postings.entries.counts[self._rows()]
+        self._postings = Postings(self._vocabulary.vertex_count)
+        self._postings.add_all(stored, self._vocabulary.leaves(stored), counts)
+        self._ids = list(self._row_of)
+        self._row_of = {place: row for row, place in enumerate(self._ids)}
+
+    def _rows(self) -> NDArray[np.int64]:
+        """Of the stored places, ascending."""
+        return np.fromiter(self._row_of.values(), np.int64, len(self))
+
+    def _overfull(self, leaves: NDArray[np.int32], added: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Those of the leaves that have grown over the limit, or over twice, four times ... the limit.
+
+        A word of equal descriptors cannot be split; it is not tried again with each one more.
+        """
+        capacity = self._config.leaf_capacity
+        after = self._postings.entries.sizes[leaves]
+        limit = capacity * 2.0 ** np.floor(np.log2(np.maximum(after - 1, 1) / capacity))
+        return leaves[(after > capacity) & (after - added <= limit)]
+
+    def _split(self, overfull: NDArray[np.integer[Any]]) -> None:
+        """Split words that hold too many descriptors, and what they split into."""
+        waiting = sorted(overfull.tolist(), key=self._word, reverse=True)
+        while waiting:
+            leaf = waiting.pop()
+            content = self._postings.content((leaf,))
+            targets = self._vocabulary.split(leaf, content.codes)
+            if targets is None:
+                continue
+            self._postings.grow_vertices(self._vocabulary.vertex_count)
+            self._postings.move((leaf,), content, targets)
+            sizes = self._postings.entries.sizes
+            waiting += [child for child in np.unique(targets).tolist() if sizes[child] > self._config.leaf_capacity]
+
+    def _merge(self, leaves: NDArray[np.int32]) -> None:
+        """Merge words that have become nearly empty with their siblings, level by level."""
+        while len(leaves):
+            above = np.unique(self._vocabulary.parents[leaves])
+            nearly_empty = [vertex for vertex in above.tolist() if self._is_nearly_empty(vertex)]
+            for vertex in sorted(nearly_empty, key=lambda v: self._word(self._vocabulary.children(v).start)):
+                children = self._vocabulary.children(vertex)
+                content = self._postings.content(range(children.start, children.stop))
+                targets = np.full(len(content.rows), vertex, np.int32)
+                self._postings.move(range(children.start, children.stop), content, targets)
+                self._vocabulary.merge(vertex)
+            leaves = np.array(nearly_empty, np.int32)
+
+    def _is_nearly_empty(self, vertex: int) -> bool:
+        """Whether the children of a vertex are leaves, and one word can hold all that lies in them."""
+        if vertex < 0:
+            return False
+        children = self._vocabulary.children(vertex)
+        if self._vocabulary.tree.child_count[children].any():
+            return False
+        return bool(self._postings.entries.sizes[children].sum() <= self._config.leaf_capacity // _MERGED_SHARE)
+
+    def _word(self, leaf: int) -> int:
+        """Numbers of words, unlike those of vertices, do not depend on where the tree lies in memory."""
+        return int(self._vocabulary.words[leaf])
+
+    def _weigh(self, codes: CodeWords) -> tuple[NDArray[np.int32], FloatArray]:
+        """Leaves, each once, and tf-idf with an L1 norm of 1. Words that all or no places have tell nothing."""
+        leaves, counts = np.unique(self._vocabulary.leaves(codes), return_counts=True)
+        documents = self._postings.entries.documents[leaves]
+        weights = counts * np.log(max(len(self), 1) / np.maximum(documents, 1))
+        telling = weights > 0.0
+        values: FloatArray = weights[telling] / max(weights.sum(), TINY)
+        return leaves[telling], values
 
 
-@njit(cache=True)
-def _append(blocks: _Blocks, used: int, row: int, words: NDArray[np.int64], values: FloatArray) -> int:
-    """Enter the words of one place and return how many blocks are used then; there must be room for them."""
-    for index in range(words.shape[0]):
-        block = blocks.newest[words[index]]
-        if block < 0 or blocks.sizes[block] == _BLOCK:
-            blocks.older[used], blocks.sizes[used] = block, 0
-            blocks.newest[words[index]] = block = used
-            used += 1
-        blocks.rows[block, blocks.sizes[block]] = row
-        blocks.values[block, blocks.sizes[block]] = values[index]
-        blocks.sizes[block] += 1
-    return used
-
-
-@njit(cache=True)
-def _score(
-    blocks: _Blocks, words: NDArray[np.int64], weights: FloatArray, place_count: int
-) -> tuple[NDArray[np.int64], FloatArray]:
-    """Sum of min(query, place) over the common words, for the places that have one."""
-    scores = np.zeros(place_count)
-    touched = np.empty(place_count, np.int64)
-    count = 0
-    for index in range(words.shape[0]):
-        block = blocks.newest[words[index]]
-        while block >= 0:
-            for entry in range(blocks.sizes[block]):
-                row = blocks.rows[block, entry]
-                if scores[row] == 0.0:
-                    touched[count] = row
-                    count += 1
-                scores[row] += min(weights[index], blocks.values[block, entry])
-            block = blocks.older[block]
-    return touched[:count], scores[touched[:count]]
+def _shape(config: VocabularyConfig) -> TreeShape:
+    """A tree whose leaves split has no other limit than their capacity."""
+    if config.strategy is not Strategy.INCREMENTAL:
+        return config.tree.shape
+    return config.tree.shape._replace(depth=_MOST_LEVELS, smallest_split=config.leaf_capacity + 1)

@@ -1,9 +1,9 @@
-"""A k-means tree over binary codes: growing it and finding the leaf of a code, all compiled.
+"""A k-means tree over binary codes: growing it and finding the leaves near a code, all compiled.
 
 The centres are binary too: each bit is the majority of its cluster.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -23,29 +23,73 @@ class TreeShape(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """V vertices level by level: 0 is the root, the children of a vertex are consecutive."""
+    """V vertices: 0 is the root, the children of a vertex are consecutive."""
 
     centres: CodeWords
     """Shape (V, 4)."""
-    first_child: NDArray[np.int64]
+    first_child: NDArray[np.int32]
     """Shape (V,)."""
-    child_count: NDArray[np.int64]
+    child_count: NDArray[np.int32]
     """Shape (V,): 0 for a leaf."""
-    leaf_number: NDArray[np.int64]
-    """Shape (V,): counts the leaves; -1 elsewhere."""
+
+
+def bare_root() -> Tree:
+    """A tree of one leaf."""
+    return Tree(np.zeros((1, CODE_WORDS), np.uint64), np.zeros(1, np.int32), np.zeros(1, np.int32))
 
 
 @njit(cache=True)
-def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int64]:
-    """Number of the leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
-    leaves = np.empty(codes.shape[0], np.int64)
+def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
+    """The leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
+    leaves = np.empty(codes.shape[0], np.int32)
     for index in range(codes.shape[0]):
         vertex = 0
         while tree.child_count[vertex]:
-            first = tree.first_child[vertex]
-            vertex = first + _nearest(codes[index], tree.centres[first : first + tree.child_count[vertex]])
-        leaves[index] = tree.leaf_number[vertex]
+            vertex = _nearest_child(tree, vertex, codes[index])
+        leaves[index] = vertex
     return leaves
+
+
+@njit(cache=True)
+def near_leaves(tree: Tree, code: CodeWords, beam: int) -> NDArray[np.int32]:
+    """At most ``beam`` leaves whose centres are near ``code`` (4,), the first of them that of ``descend``.
+
+    Level by level the nearest ``beam`` vertices are kept, and always the one that ``descend`` passes.
+    """
+    kept, distances = np.zeros(beam, np.int32), np.zeros(beam, np.int64)
+    next_kept, next_distances = np.empty(beam, np.int32), np.empty(beam, np.int64)
+    count, is_done = 1, False
+    while not is_done:
+        # The first place is for the way of ``descend``, the others are sorted by distance.
+        found = 1
+        next_kept[0] = _nearest_child(tree, kept[0], code) if tree.child_count[kept[0]] else kept[0]
+        is_done = tree.child_count[next_kept[0]] == 0
+        for position in range(count):
+            vertex = kept[position]
+            first, children = tree.first_child[vertex], tree.child_count[vertex]
+            for candidate in range(first, first + children) if children else range(vertex, vertex + 1):
+                if candidate == next_kept[0]:
+                    continue
+                distance = np.int64(hamming(code, tree.centres[candidate])) if children else distances[position]
+                if found == beam and (beam == 1 or distance >= next_distances[found - 1]):
+                    continue
+                found = min(found + 1, beam)
+                place = found - 1
+                while place > 1 and next_distances[place - 1] > distance:
+                    next_kept[place], next_distances[place] = next_kept[place - 1], next_distances[place - 1]
+                    place -= 1
+                next_kept[place], next_distances[place] = candidate, distance
+        for position in range(1, found):
+            is_done &= tree.child_count[next_kept[position]] == 0
+        kept, next_kept, distances, next_distances = next_kept, kept, next_distances, distances
+        count = found
+    return kept[:count]
+
+
+@njit(cache=True)
+def _nearest_child(tree: Tree, vertex: int, code: CodeWords) -> Any:
+    first = tree.first_child[vertex]
+    return first + _nearest(code, tree.centres[first : first + tree.child_count[vertex]])
 
 
 @njit(cache=True)
@@ -53,7 +97,7 @@ def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
     """Split the codes (N, 4) level by level; the codes of one vertex stay together in ``members``."""
     most = 1 + shape.branching * (1 + shape.depth * (codes.shape[0] // shape.smallest_split))
     centres = np.zeros((most, CODE_WORDS), np.uint64)
-    first_child, child_count = np.zeros(most, np.int64), np.zeros(most, np.int64)
+    first_child, child_count = np.zeros(most, np.int32), np.zeros(most, np.int32)
     begin, end, level = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros(most, np.int64)
     members = np.arange(codes.shape[0])
     end[0], used, vertex = codes.shape[0], 1, 0
@@ -61,7 +105,7 @@ def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
     while vertex < used:
         low, high = begin[vertex], end[vertex]
         if level[vertex] < shape.depth and high - low >= shape.smallest_split:
-            found, labels = _k_means(codes[members[low:high]], shape, state)
+            found, labels = k_means(codes[members[low:high]], shape, state)
             if found.shape[0] > 1:
                 first_child[vertex], child_count[vertex] = used, found.shape[0]
                 members[low:high] = members[low:high][np.argsort(labels, kind="mergesort")]
@@ -71,14 +115,15 @@ def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
                 begin[used], begin[used + 1 : used + found.shape[0]] = low, bounds[:-1]
                 used += found.shape[0]
         vertex += 1
-    leaves = child_count[:used] == 0
-    numbers = np.where(leaves, np.cumsum(leaves) - 1, -1)
-    return Tree(centres[:used].copy(), first_child[:used].copy(), child_count[:used].copy(), numbers)
+    return Tree(centres[:used].copy(), first_child[:used].copy(), child_count[:used].copy())
 
 
 @njit(cache=True)
-def _k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tuple[CodeWords, NDArray[np.int64]]:
-    """At most ``shape.branching`` centres, none without members, and the centre nearest to every code."""
+def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tuple[CodeWords, NDArray[np.int64]]:
+    """At most ``shape.branching`` centres, none without members, and the centre nearest to every code.
+
+    ``state``: shape (1,), of the random numbers; it moves on.
+    """
     centres = _seed_centres(codes, shape.branching, state)
     labels = np.full(codes.shape[0], -1, np.int64)
     for _ in range(shape.iterations):

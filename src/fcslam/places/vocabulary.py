@@ -1,113 +1,214 @@
-"""Visual vocabulary: a k-means tree over binary descriptors, and the vocabulary that grows with the places.
+"""Visual vocabulary: a k-means tree over binary descriptors that can go on growing where descriptors arrive.
 
-The centres are binary too: each bit is the majority of its cluster. A word is a leaf; finding it takes
-branching x depth comparisons.
+A word is a leaf; finding it takes branching x depth comparisons. Leaves may split and merge, all other centres stay as
+they are: then every other descriptor's word stays as well. Numbers of words are never given twice.
 """
 
-from collections import deque
-from collections.abc import Collection
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.codes import code_words
-from fcslam.places.kmeans_tree import Tree, TreeShape, descend, grow
-from fcslam.places.similarity import BagOfWords, bag_of_words
-from fcslam.records import CODE_BYTES, Codes, FloatArray, frozen
+from fcslam.features.codes import CodeWords
+from fcslam.places.kmeans_tree import Tree, TreeShape, bare_root, descend, grow, k_means
+from fcslam.places.postings import longer
 
 
-class VocabularyConfig(Settings):
-    """Shape of the k-means tree."""
+class Strategy(StrEnum):
+    """When the vocabulary changes."""
 
-    branching: int = Field(default=16, ge=2, le=64, description="children of a tree vertex")
-    depth: int = Field(default=3, ge=1, le=8, description="levels below the root; at most branching ** depth words")
+    STATIC = "static"
+    REBUILD = "rebuild"
+    WINDOWED = "windowed"
+    INCREMENTAL = "incremental"
+
+
+class Scoring(StrEnum):
+    """What a query counts."""
+
+    WORDS = "words"
+    MATCHES = "matches"
+
+
+class TreeConfig(Settings):
+    """Shape of the k-means tree where it is trained."""
+
+    branching: int = Field(default=8, ge=2, le=64, description="children of a tree vertex")
+    depth: int = Field(default=4, ge=1, le=8, description="levels below the root; at most branching ** depth words")
     smallest_split: int = Field(default=20, ge=2, description="a cluster of fewer descriptors stays one word")
     iterations: int = Field(default=8, ge=1, le=100, description="rounds of k-means per cluster, at most")
 
+    @property
+    def shape(self) -> TreeShape:
+        """As compiled code has it."""
+        return TreeShape(self.branching, self.depth, self.smallest_split, self.iterations)
+
+
+class VocabularyConfig(Settings):
+    """The vocabulary of places, and how it follows them. ``rebuild`` is Algorithm 1 to the letter."""
+
+    strategy: Strategy = Field(
+        default=Strategy.INCREMENTAL,
+        description="static: trained once; rebuild: at every place; windowed: at every rebuild_every-th; incremental: "
+        "words split as they fill",
+    )
+    train_batch: int = Field(default=20, ge=0, description="Algorithm 1's L: places before the first training")
+    capacity: int = Field(default=300, ge=1, description="Algorithm 1's C: the newest places that are trained on")
+    rebuild_every: int = Field(default=20, ge=1, description="windowed: places between two trainings")
+    tree: TreeConfig = Field(default=TreeConfig(), description="shape of the tree where it is trained")
+    leaf_capacity: int = Field(default=64, ge=2, description="incremental: a word of more descriptors splits")
+    scoring: Scoring = Field(
+        default=Scoring.MATCHES,
+        description="words: eq. (4) on [0, 1]; matches: words propose descriptors, their bits decide",
+    )
+    beam: int = Field(default=4, ge=1, le=64, description="matches: words looked through for a descriptor")
+    near_bits: int = Field(default=56, ge=0, le=256, description="matches: descriptors of no more differing bits match")
+
 
 @dataclass(frozen=True, slots=True)
-class Vocabulary:
-    """A tree and how much each of its words tells."""
+class Training:
+    """What a vocabulary was trained on."""
 
-    tree: Tree
-    """Its leaves are the words."""
-    idf: FloatArray
-    """Shape (word_count,): ln(N / N_w) over the N places it was trained on, N_w of which have the word."""
+    places: int
+    descriptors: int
+    descriptor_version: str
+    """Of the detector; empty if not told."""
+
+
+class TreeState(NamedTuple):
+    """A tree whose vertices are numbered level by level, so that the numbers of children say where they are."""
+
+    seed: int
     version: int
-    """Words of different versions must not be compared."""
+    words_given: int
+    centres: CodeWords
+    """Shape (V, 4)."""
+    child_count: NDArray[np.int32]
+    """Shape (V,)."""
+    words: NDArray[np.int64]
+    """Shape (V,)."""
+
+
+class Vocabulary:
+    """The living tree. Leaves are numbered as vertices while they live, as words for ever."""
+
+    def __init__(self, shape: TreeShape, seed: int) -> None:
+        self._shape, self._seed = shape, seed
+        self.tree = bare_root()
+        self.words = np.zeros(1, np.int64)
+        """Shape (V,): the number of each leaf's word, -1 for other vertices."""
+        self.parents = np.full(1, -1, np.int32)
+        """Shape (V,): the vertex above; -1 for the root."""
+        self.vertex_count = 1
+        self.version = 0
+        """Counts the changes: words of different versions must not be compared."""
+        self._words_given = 1
+        self._free: dict[int, list[int]] = {}
+        """First vertices of families that merged, by their size."""
 
     @property
     def word_count(self) -> int:
         """Number of words."""
-        return len(self.idf)
+        return int((self.words >= 0).sum())
 
-    def words(self, descriptors: Codes) -> NDArray[np.int64]:
-        """The word of every descriptor (N, 32), shape (N,); of equally near children the first is taken."""
-        words: NDArray[np.int64] = descend(self.tree, code_words(descriptors))
-        return words
+    def train(self, codes: CodeWords) -> None:
+        """Grow a new tree from codes (N, 4)."""
+        self.version += 1
+        self.tree = grow(codes, self._shape, self._state(self.version)[0])
+        self.vertex_count = len(self.tree.centres)
+        leaves = np.flatnonzero(self.tree.child_count == 0)
+        self.words = np.full(self.vertex_count, -1, np.int64)
+        self.words[leaves] = self._words_given + np.arange(len(leaves))
+        self._words_given += len(leaves)
+        self.parents = _parents(self.tree.child_count)
+        self._free.clear()
 
-    def bag(self, descriptors: Codes) -> BagOfWords:
-        """The place with these descriptors (N, 32) as weighted words."""
-        return bag_of_words(self.words(descriptors), self.idf, self.version)
+    def state(self) -> tuple[TreeState, NDArray[np.int32]]:
+        """The tree without gaps, and the new number of every vertex (V,)."""
+        order = np.zeros(1, np.int64)
+        level = order
+        while len(level):
+            below = [np.arange(family.start, family.stop) for family in map(self.children, level.tolist())]
+            level = np.concatenate([np.empty(0, np.int64), *below])
+            order = np.concatenate([order, level])
+        number_of = np.full(self.vertex_count, -1, np.int32)
+        number_of[order] = np.arange(len(order))
+        centres, child_count = self.tree.centres[order], self.tree.child_count[order]
+        tree = TreeState(self._seed, self.version, self._words_given, centres, child_count, self.words[order])
+        return tree, number_of
 
+    @classmethod
+    def restored(cls, shape: TreeShape, state: TreeState) -> Self:
+        """The vocabulary that had this state."""
+        vocabulary = cls(shape, state.seed)
+        counts = state.child_count
+        first_child = np.where(counts > 0, 1 + np.cumsum(counts) - counts, 0).astype(np.int32)
+        vocabulary.tree, vocabulary.words = Tree(state.centres, first_child, counts), state.words
+        vocabulary.version, vocabulary._words_given = state.version, state.words_given
+        vocabulary.vertex_count = len(counts)
+        vocabulary.parents = _parents(counts)
+        return vocabulary
 
-def train(
-    places: Collection[Codes], config: VocabularyConfig, rng: np.random.Generator, version: int = 0
-) -> Vocabulary:
-    """A vocabulary of the descriptors of ``places``, each (N, 32); it has one word if there are none."""
-    codes = code_words(np.concatenate([np.empty((0, CODE_BYTES), np.uint8), *places]))
-    shape = TreeShape(config.branching, config.depth, config.smallest_split, config.iterations)
-    tree = grow(codes, shape, rng.integers(0, 2**63, dtype=np.uint64))
-    for array in tree:
-        array.setflags(write=False)
-    documents = np.zeros(int((tree.child_count == 0).sum()))
-    for place in places:
-        documents[np.unique(descend(tree, code_words(place)))] += 1.0
-    idf = np.log(max(len(places), 1) / np.maximum(documents, 1.0))
-    return Vocabulary(tree, frozen(idf), version)
+    def leaves(self, codes: CodeWords) -> NDArray[np.int32]:
+        """The vertex of the leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
+        leaves: NDArray[np.int32] = descend(self.tree, codes)
+        return leaves
 
+    def split(self, leaf: int, codes: CodeWords) -> NDArray[np.int32] | None:
+        """Split a leaf by the codes (N, 4) that lie in it; returns the new leaf of each, None if all are equal.
 
-class DynamicVocabularyConfig(Settings):
-    """When the vocabulary is trained again. ``rebuild_every`` = 1 is Algorithm 1 to the letter."""
-
-    train_batch: int = Field(default=20, ge=0, description="Algorithm 1's L: places before the first training")
-    capacity: int = Field(default=300, ge=1, description="Algorithm 1's C: the newest places that are trained on")
-    rebuild_every: int = Field(default=20, ge=1, description="places between two trainings")
-    tree: VocabularyConfig = Field(default=VocabularyConfig(), description="shape of the tree")
-
-
-class DynamicVocabulary:
-    """Algorithm 1 of FC-SLAM (lines 1-11, 19): a vocabulary trained again on the newest places as they arrive.
-
-    Places are counted over all robots in the order of arrival, from 0.
-    """
-
-    def __init__(self, config: DynamicVocabularyConfig, rng: np.random.Generator) -> None:
-        self._config = config
-        self._rng = rng
-        self._window: deque[Codes] = deque(maxlen=config.capacity)
-        self._places_seen = 0
-        self._vocabulary: Vocabulary | None = None
-
-    @property
-    def vocabulary(self) -> Vocabulary | None:
-        """V_t; None before the first training. Its version counts the trainings from 1."""
-        return self._vocabulary
-
-    def add(self, descriptors: Codes) -> bool:
-        """Receive the descriptors (N, 32) of the next place; True if the vocabulary was trained again.
-
-        The paper's frame i is the place; its two cases of lines 5-9 are one window here.
+        The same word splits the same codes in the same way, whatever else has happened.
         """
-        L, n = self._config.train_batch, self._config.rebuild_every
-        i = self._places_seen
-        self._places_seen += 1
-        self._window.append(descriptors)  # lines 3, 6, 8: D = {D_max(0, i - C + 1) ... D_i}
-        if i <= L or (i - L - 1) % n:  # line 4; n = 1 in the paper
-            return False
-        version = self._vocabulary.version + 1 if self._vocabulary else 1
-        self._vocabulary = train(self._window, self._config.tree, self._rng, version)  # lines 6, 8, 11
-        return True
+        centres, labels = k_means(codes, self._shape, self._state(int(self.words[leaf])))
+        if len(centres) < 2:
+            return None
+        first = self._family(len(centres))
+        family = slice(first, first + len(centres))
+        self.tree.centres[family], self.tree.child_count[family], self.parents[family] = centres, 0, leaf
+        self.words[family] = self._words_given + np.arange(len(centres))
+        self._words_given += len(centres)
+        self.tree.first_child[leaf], self.tree.child_count[leaf], self.words[leaf] = first, len(centres), -1
+        self.version += 1
+        leaves: NDArray[np.int32] = (first + labels).astype(np.int32)
+        return leaves
+
+    def merge(self, parent: int) -> None:
+        """Make a vertex whose children are leaves one new word."""
+        children = self.children(parent)
+        self._free.setdefault(children.stop - children.start, []).append(children.start)
+        self.words[children] = -1
+        self.tree.child_count[parent], self.words[parent] = 0, self._words_given
+        self._words_given += 1
+        self.version += 1
+
+    def children(self, vertex: int) -> slice:
+        """Of a vertex, in arrays of vertices."""
+        first = int(self.tree.first_child[vertex])
+        return slice(first, first + int(self.tree.child_count[vertex]))
+
+    def _family(self, size: int) -> int:
+        """The first of so many vertices in a row that are free."""
+        if self._free.get(size):
+            return self._free[size].pop()
+        first = self.vertex_count
+        self.vertex_count += size
+        if self.vertex_count > len(self.words):
+            length = max(self.vertex_count, int(1.25 * len(self.words)))
+            centres, first_child, child_count = self.tree
+            self.tree = Tree(longer(centres, length), longer(first_child, length), longer(child_count, length))
+            self.words, self.parents = longer(self.words, length), longer(self.parents, length)
+            self.words[first:] = -1
+        return first
+
+    def _state(self, number: int) -> NDArray[np.uint64]:
+        """Random numbers of their own for each training and each word."""
+        return np.random.SeedSequence((self._seed, number)).generate_state(1, np.uint64).astype(np.uint64)
+
+
+def _parents(child_count: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The vertex above each one of a tree that is numbered level by level."""
+    return np.concatenate([[-1], np.repeat(np.arange(len(child_count)), child_count)]).astype(np.int32)

@@ -1,0 +1,156 @@
+"""`fcslam evaluate places`: how well places are found again, by folders of images or recordings with their truth."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from fcslam.evaluation.places import SetResult
+    from fcslam.metrics.bootstrap import Interval
+    from fcslam.places.vocabulary import Strategy
+
+
+def places(
+    sets: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SETS...",
+            help="Folders of images with their truth (dataset.csv, loop_pairs.txt, associations.txt or matches.csv), "
+            "or recordings of a LiDAR.",
+        ),
+    ],
+    *,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the table, the curves and the similarity matrices.")
+    ],
+    features: Annotated[
+        str,
+        typer.Option(
+            help="Of images: orb, onnx (the network that comes with fcslam), an .onnx file, or a folder of extracted "
+            "features, <name of the set>/..., as fcslam extract writes them."
+        ),
+    ] = "orb",
+    strategy: Annotated[
+        list[str] | None,
+        typer.Option(help="Of the vocabulary: static, rebuild, windowed, incremental; if not said, all but rebuild."),
+    ] = None,
+    train_on: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of other images, to train a fixed vocabulary on; may be given several times."),
+    ] = None,
+    label: Annotated[
+        list[str] | None, typer.Option(help="Of sets with labels only this one; may be given several times.")
+    ] = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Also check by geometry the places that look most alike.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the vocabularies and the bootstrap.")] = 1,
+) -> None:
+    """Recall, precision and mismatches of place recognition: each strategy of the vocabulary beside brute force."""
+    from rich.console import Console
+
+    from fcslam.evaluation.place_figures import curves_figure, save
+    from fcslam.evaluation.places import write_results
+
+    strategies = _strategies(strategy or ("static", "windowed", "incremental"))
+    results = _evaluate(sets, features, label or (), train_on or (), strategies, seed, verify=verify)
+    write_results(output, results)
+    save(curves_figure(results), output / "precision_recall.png")
+    _show(Console(), results, output)
+
+
+def _evaluate(
+    sets: "Sequence[Path]",
+    features: str,
+    labels: "Sequence[str]",
+    train_on: "Sequence[Path]",
+    strategies: "Sequence[Strategy]",
+    seed: int,
+    *,
+    verify: bool,
+) -> "list[SetResult]":
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from fcslam.evaluation.place_checks import PairChecker
+    from fcslam.evaluation.place_features import choose_features, describe_sets, describe_training
+    from fcslam.evaluation.place_scoring import choose_scorers
+    from fcslam.evaluation.places import evaluate_set
+    from fcslam.places.vocabulary import VocabularyConfig
+
+    chosen = choose_features(features)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("describing", total=None)
+        training = describe_training(train_on, chosen, lambda: bar.advance(task))
+        described = describe_sets(sets, labels, chosen, lambda: bar.advance(task))
+        scorers = choose_scorers(strategies, VocabularyConfig(), training, seed)
+        task = bar.add_task("comparing", total=len(scorers) * len(described))
+        return [
+            evaluate_set(each, scorers, PairChecker(each) if verify else None, seed, lambda: bar.advance(task))
+            for each in described
+        ]
+
+
+def _strategies(names: "Sequence[str]") -> "list[Strategy]":
+    from fcslam.places.vocabulary import Strategy
+
+    known = [strategy.value for strategy in Strategy]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise typer.BadParameter(f"'{unknown[0]}' is not one of {', '.join(known)}", param_hint="--strategy")
+    return [Strategy(name) for name in dict.fromkeys(names)]
+
+
+def _show(console: "Console", results: "Sequence[SetResult]", output: Path) -> None:
+    for result in results:
+        for question in result.place_set.questions:
+            console.print(_table(result, question))
+    lines = (
+        "In brackets: 95 % intervals by bootstrap over queries. Recall at k: of the queries that have a match. AP and "
+        "recall at 100 % precision: each query answers with its most similar place, or not at all.",
+        "Mismatch: no match is more similar than the most similar wrong place. Relative significance: by how much "
+        "it is more similar, as a share of its similarity.",
+        f"Similarity matrices, curves and all intervals: {output}",
+    )
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _table(result: "SetResult", question: str) -> "Table":
+    from rich.table import Table
+
+    scores = [score for score in result.scores if score.question == question]
+    table = Table(title=f"{result.place_set.name}, {question}: {scores[0].queries} queries", title_justify="left")
+    headings = ("", "recall at 1", "at 5", "at 10", "AP", "recall at 100 %", "mismatch rate", "relative significance")
+    for heading in headings:
+        table.add_column(heading)
+    for score in scores:
+        name = f"{score.scorer}, verified" if score.is_verified else score.scorer
+        value = score.measures
+        table.add_row(
+            name,
+            _interval(value["recall_at_1"]),
+            _share(value["recall_at_5"].mean),
+            _share(value["recall_at_10"].mean),
+            _interval(value["average_precision"]),
+            _share(value["recall_at_full_precision"].mean),
+            _interval(value["mismatch_rate"]),
+            _share(value["relative_significance"].mean),
+        )
+    return table
+
+
+def _share(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.3f}"
+
+
+def _interval(value: "Interval") -> str:
+    return "" if math.isnan(value.mean) else f"{value.mean:.3f} [{value.low:.2f}, {value.high:.2f}]"

@@ -1,0 +1,136 @@
+"""A place index as a file: numpy's ``.npz``, not compressed, nothing in it that could run.
+
+Written are the tree, the places and their descriptors; postings follow from them. Numbers of words, the state of chance
+and what the tree was trained on are kept, so an index that was read goes on exactly as the one that was written.
+"""
+
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.config import parse
+from fcslam.errors import InputError, OutputError
+from fcslam.features.codes import CODE_WORDS
+from fcslam.places.index import IndexState, PlaceIndex
+from fcslam.places.likeness import PlaceId
+from fcslam.places.vocabulary import Training, TreeState, VocabularyConfig
+
+FORMAT = "fcslam place index 1"
+
+_SHAPES: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+    "centres": (np.dtype("<u8"), (CODE_WORDS,)),
+    "child_count": (np.dtype("<i4"), ()),
+    "words": (np.dtype("<i8"), ()),
+    "codes": (np.dtype("<u8"), (CODE_WORDS,)),
+    "counts": (np.dtype("<i4"), ()),
+    "leaves": (np.dtype("<i4"), ()),
+    "about": (np.dtype("u1"), ()),
+}
+
+
+def save_index(index: PlaceIndex[Any], path: Path) -> None:
+    """Write an index; what was there is replaced at the end. Identifiers are what JSON can tell: text, numbers, tuples.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    state = index.state()
+    tree = state.tree
+    about = {
+        "format": FORMAT,
+        "config": state.config.model_dump(mode="json"),
+        "descriptor_version": state.descriptor_version,
+        "training": asdict(state.training) if state.training else None,
+        "places_seen": state.places_seen,
+        "seed": tree.seed,
+        "version": tree.version,
+        "words_given": tree.words_given,
+        "ids": state.ids,
+    }
+    arrays: dict[str, NDArray[Any]] = {
+        "centres": tree.centres, "child_count": tree.child_count, "words": tree.words, "codes": state.codes,
+        "counts": state.counts, "leaves": state.leaves, "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
+    }  # fmt: skip
+    portable = {name: np.asarray(array, _SHAPES[name][0]) for name, array in arrays.items()}
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            np.savez(file, allow_pickle=False, **portable)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
+
+
+def load_index(path: Path, place_id: Callable[[Any], PlaceId], descriptor_version: str = "") -> PlaceIndex[PlaceId]:
+    """Read an index.
+
+    Args:
+        path: of the file.
+        place_id: an identifier from what JSON makes of it: text, a number, a list.
+        descriptor_version: of the descriptors that it will be asked about; empty if whatever it has will do.
+
+    Raises:
+        InputError: the file cannot be read, is damaged, or holds descriptors of another version.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in _SHAPES}
+        about = json.loads(arrays.pop("about").tobytes())
+        state = _state(arrays, about, place_id)
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, InputError) as error:
+        raise InputError(f"{path}: no place index that can be read ({_one_line(error)}); make it anew") from error
+    if descriptor_version not in ("", state.descriptor_version):
+        raise InputError(
+            f"{path}: descriptors of {state.descriptor_version or 'an unnamed detector'} cannot be compared with those "
+            f"of {descriptor_version}; make the index anew"
+        )
+    return PlaceIndex.restored(state)
+
+
+def _state(
+    arrays: dict[str, NDArray[Any]], about: dict[str, Any], place_id: Callable[[Any], PlaceId]
+) -> IndexState[PlaceId]:
+    """What was read, checked: compiled code trusts it.
+
+    Raises:
+        ValueError, KeyError, TypeError, InputError: it is not what was written.
+    """
+    if about["format"] != FORMAT:
+        raise ValueError(f"its format is {about['format']!r}, not {FORMAT!r}")
+    for name, array in arrays.items():
+        dtype, row = _SHAPES[name]
+        if array.dtype != dtype or array.ndim == 0 or array.shape[1:] != row:
+            raise ValueError(f"{name} are {array.shape} {array.dtype}")
+    child_count, words, counts, leaves = (arrays[name] for name in ("child_count", "words", "counts", "leaves"))
+    vertices = len(child_count)
+    after = 1 + np.cumsum(child_count)
+    is_tree = vertices and child_count.min() >= 0 and after[-1] == vertices and (after > np.arange(vertices)).all()
+    if not is_tree or not len(arrays["centres"]) == len(words) == vertices:
+        raise ValueError("the tree does not hold together")
+    ids = [place_id(value) for value in about["ids"]]
+    if len(ids) != len(set(ids)) or len(ids) != len(counts) or (counts < 0).any():
+        raise ValueError("places and their sizes do not fit")
+    if not len(leaves) == len(arrays["codes"]) == counts.sum(dtype=np.int64):
+        raise ValueError("places and descriptors do not fit")
+    if len(leaves) and (leaves.min() < 0 or leaves.max() >= vertices or child_count[leaves].any()):
+        raise ValueError("descriptors lie in no word")
+    numbers = [int(about[name]) for name in ("seed", "version", "words_given", "places_seen")]
+    if min(numbers) < 0 or words.max() >= numbers[2] or ((words >= 0) != (child_count == 0)).any():
+        raise ValueError("numbers of words do not fit")
+    tree = TreeState(numbers[0], numbers[1], numbers[2], arrays["centres"], child_count, words)
+    training = Training(**about["training"]) if about["training"] is not None else None
+    config = parse(VocabularyConfig, about["config"], "config")
+    version = str(about["descriptor_version"])
+    return IndexState(config, version, training, numbers[3], tree, ids, counts, arrays["codes"], leaves)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
