@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError, TrainingError  # noqa: E402
 from fcslam.learning.checkpoint import Checkpoint, write_checkpoint  # noqa: E402
+from fcslam.learning.descent import learning_rate  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import Teacher, fuse  # noqa: E402
 from fcslam.learning.monitor import alarms, validate  # noqa: E402
@@ -18,7 +19,7 @@ from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.objective import negatives, shift_grid, teacher_bits  # noqa: E402
 from fcslam.learning.pairs import Example  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.trainer import CHECKPOINT_FILE, Pace, Run, learning_rate, trained_network, validation_pairs  # noqa: E402
+from fcslam.learning.trainer import CHECKPOINT_FILE, Pace, Run, trained_network, validation_pairs  # noqa: E402
 
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64, points=32)
 PACE = Pace(validate_every=100, checkpoint_every_s=0.0, log_every=1)

@@ -7,7 +7,7 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import config, demo, evaluate, extract, simulate, train
+from fcslam.cli import config, demo, evaluate, extract, federate, simulate, train
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.errors import FcslamError
@@ -41,6 +41,11 @@ app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo
 app.command("train", epilog="Example: fcslam train photos --output detector, fcslam train photos -o try --quick")(
     train.train
 )
+app.command(
+    "federate",
+    epilog="Example: fcslam federate --local robot1 robot2 robot3 --output fleet --public photos, "
+    "fcslam federate --local robot1 robot2 --output try --quick",
+)(federate.federate)
 app.add_typer(config.app, name="config")
 app.add_typer(evaluate.app, name="evaluate")
 

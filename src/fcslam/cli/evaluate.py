@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.evaluate_federated import federated
 from fcslam.cli.evaluate_fleet import fleet, percent
 from fcslam.cli.evaluate_homography import homography
 from fcslam.cli.evaluate_places import places
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, help="Measure run folders against references, and detectors.")
 app.command(epilog="Example: fcslam evaluate fleet fleet/run --truth fleet")(fleet)
+app.command(epilog="Example: fcslam evaluate federated robot1 robot2 robot3 --output study")(federated)
 app.command(epilog="Example: fcslam evaluate homography hpatches --detector onnx --detector orb --figures figures")(
     homography
 )

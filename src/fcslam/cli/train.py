@@ -40,14 +40,14 @@ def train(
     from rich.console import Console
 
     settings = _settings(config, quick, {"encoder": encoder, "steps": steps, "seed": seed})
-    _need_torch()
+    need_torch()
     from fcslam.learning.deliver import deliver
     from fcslam.learning.stages import train_detector
 
     console = Console(stderr=True)
     began = time.perf_counter()
     with _progress(console) as watch:
-        network, found = train_detector(images, output, settings, _pace(device, quick), teacher, watch)
+        network, found = train_detector(images, output, settings, pace_on(device, quick), teacher, watch)
     files = deliver(network, output, settings, found, teacher)
     for file in files:
         typer.echo(str(file))
@@ -67,17 +67,19 @@ def _settings(config: Path | None, quick: bool, given: dict[str, Any]) -> "Train
     return parse(TrainingSettings, base.model_dump() | changes, "the command line")
 
 
-def _need_torch() -> None:
+def need_torch(*others: str, extra: str = "train") -> None:
+    """Raise TrainingError if a library of training, or one of ``others``, is missing."""
     from importlib.util import find_spec
 
     from fcslam.errors import TrainingError
 
-    missing = [name for name in ("torch", "onnx", "onnxruntime") if find_spec(name) is None]
+    missing = [name for name in ("torch", "onnx", "onnxruntime", *others) if find_spec(name) is None]
     if missing:
-        raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[train]'")
+        raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
 
 
-def _pace(device: str, quick: bool) -> Any:
+def pace_on(device: str, quick: bool) -> Any:
+    """How to train on a device; raises TrainingError if it cannot be used."""
     import os
 
     import torch

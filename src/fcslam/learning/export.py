@@ -123,7 +123,7 @@ class _Calibration:
 
 
 def _left_in_float(graph: Any) -> list[str]:
-    """Names of the convolutions that no other one comes after, and of those with few inputs or a fixed kernel."""
+    """Names of the convolutions that no other one comes after, of those with few inputs, and of those nobody trains."""
     inputs = {array.name: array.dims[1] for array in graph.graph.initializer if len(array.dims) == 4}
     consumers: dict[str, list[Any]] = {}
     for node in graph.graph.node:
@@ -136,6 +136,7 @@ def _left_in_float(graph: Any) -> list[str]:
         )
 
     convolutions = [node for node in graph.graph.node if node.op_type == "Conv"]
+    # A kernel that is fixed, and no weight, is a constant in the graph and not among the initialisers.
     return [node.name for node in convolutions if not leads_on(node) or inputs.get(node.input[1], 0) < FEWEST_INPUTS]
 
 

@@ -85,8 +85,8 @@ def train_detector(
     start: dict[str, Tensor] | None = None
     detector: Callable[[GreyImage], Response] | None = None
     if teacher is None:
-        first = _train_on_shapes(folder / "shapes", settings, pace, watch)
-        start, detector = first.state_dict(), _as_detector(first, torch.device(pace.device))
+        first = train_on_shapes(folder / "shapes", settings, pace, watch)
+        start, detector = first.state_dict(), as_detector(first, torch.device(pace.device))
     images = gather(files, folder / "labels", settings, detector, teacher, watch)
     run = Run(settings, "joint", _made(folder / "joint"), pace, start)
     return run.train(images.train, images.held_out, _bits(images.train, settings.seed), partial(watch, "joint")), images
@@ -153,7 +153,13 @@ def _labels(
     return labels
 
 
-def _train_on_shapes(folder: Path, settings: TrainingSettings, pace: Pace, watch: Watch) -> KeypointNetwork:
+def train_on_shapes(folder: Path, settings: TrainingSettings, pace: Pace, watch: Watch) -> KeypointNetwork:
+    """A detector of corners of synthetic shapes, whose codes mean nothing yet; resumes in ``folder``.
+
+    Raises:
+        TrainingError: ``folder`` holds another run.
+        OutputError: something cannot be written.
+    """
     shapes = settings.model_copy(update={"steps": settings.shape_steps, "loss": SHAPE_LOSSES})
     run = Run(shapes, "shapes", _made(folder), pace)
     return run.train(Shapes(0, SHAPE_COUNT), Shapes(1, HELD_OUT_SHAPES), watch=partial(watch, "shapes"))
@@ -168,7 +174,9 @@ def _bits(examples: Sequence[Example], seed: int) -> TeacherBits | None:
     return teacher_bits(torch.from_numpy(np.concatenate(some).astype(np.float32)), seed)
 
 
-def _as_detector(network: KeypointNetwork, device: torch.device) -> Callable[[GreyImage], Response]:
+def as_detector(network: KeypointNetwork, device: torch.device) -> Callable[[GreyImage], Response]:
+    """A network as what labels images, on its device."""
+
     @torch.inference_mode()
     def detector(image: GreyImage) -> Response:
         height, width = (side // CELL_PX * CELL_PX for side in image.shape)

@@ -17,18 +17,14 @@ from torch import Tensor
 from fcslam.errors import OutputError, TrainingError
 from fcslam.learning.batches import Batch, stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from fcslam.learning.descent import descend, learning_rate, new_optimiser
 from fcslam.learning.monitor import alarms, validate
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.objective import TeacherBits, grid_shift, objective
+from fcslam.learning.objective import TeacherBits
 from fcslam.learning.pairs import Example, Pair, draw_pair
 from fcslam.learning.settings import TrainingSettings
 
 AVERAGE_DECAY: Final = 0.999
-WARM_UP_STEPS: Final = 300
-LAST_RATE: Final = 1e-5
-DECAY_SHARE: Final = 0.3
-CLIP_NORM: Final = 1.0
-WEIGHT_DECAY: Final = 1e-4
 VALIDATION_PAIRS: Final = 24
 VALIDATION_VIEW: Final = (320, 240)
 VALIDATION_SEED: Final = 2026
@@ -79,7 +75,7 @@ class Run:
         self.average = KeypointNetwork(settings.encoder).to(self.device)
         self.average.load_state_dict(self.network.state_dict())
         self.average.eval()
-        self.optimiser = torch.optim.AdamW(self.network.parameters(), weight_decay=WEIGHT_DECAY)
+        self.optimiser = new_optimiser(self.network)
         self.step = 0
         self._saved = time.monotonic()
 
@@ -128,21 +124,10 @@ class Run:
 
     def _step(self, step: int, batch: Batch, bits: TeacherBits | None) -> dict[str, Tensor]:
         self.network.train()
-        for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate(self.settings, step)
-        progress = step / self.settings.steps
-        with torch.autocast(self.device.type, torch.bfloat16):
-            maps = self.network(batch.images.contiguous(memory_format=torch.channels_last))
-        shift = grid_shift(self.settings.encoder, self.settings.seed, step)
-        total, parts = objective(maps, batch, self.settings.loss, progress, shift, bits)
-        if not torch.isfinite(total):
-            raise TrainingError(f"{self.folder}: training diverged at step {step}; lower the learning rate")
-        self.optimiser.zero_grad(set_to_none=True)
-        total.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP_NORM)
-        self.optimiser.step()
+        rate = learning_rate(self.settings, step)
+        parts = descend(self.network, self.optimiser, batch, self.settings, step, rate, bits)
         self._average(step)
-        return {name: part.detach() for name, part in parts.items()}
+        return parts
 
     @torch.no_grad()
     def _average(self, step: int) -> None:
@@ -212,17 +197,6 @@ def trained_network(path: Path) -> KeypointNetwork:
         raise TrainingError(f"{path}: does not fit this network ({error})") from error
     network.eval()
     return network
-
-
-def learning_rate(settings: TrainingSettings, step: int) -> float:
-    """Linear warm-up, a plateau, and a straight way down over the last part.
-
-    On the plateau it does not depend on how many steps there will be, so a run may be made longer.
-    """
-    warm = min(WARM_UP_STEPS, settings.steps // 10)
-    rise = (step + 1) / max(warm, 1)
-    fall = (settings.steps - step) / (DECAY_SHARE * settings.steps)
-    return max(settings.learning_rate * min(rise, fall, 1.0), LAST_RATE)
 
 
 def validation_pairs(held_out: Sequence[Example]) -> list[Pair]:

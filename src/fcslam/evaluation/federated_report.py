@@ -1,0 +1,91 @@
+"""What a study of federated training found: gaps to central training, with intervals, and the robot worst off."""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.errors import OutputError
+from fcslam.evaluation.federated import MEASURES, Findings
+from fcslam.evaluation.federated_arms import CENTRAL, LOCAL
+from fcslam.metrics.bootstrap import Interval, mean_interval
+from fcslam.records import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ArmReport:
+    """One arm by one measure."""
+
+    arm: str
+    measure: str
+    mean: float
+    gap: Interval
+    """Central minus this arm on the same pairs, means over seeds first: the paired bootstrap interval."""
+    closed: float
+    """(arm - local) / (central - local); NaN where central is not clearly better than local."""
+    worst_robot: str
+    worst_gap: float
+    """Central minus this arm on that robot's pairs."""
+    seeds: tuple[float, ...]
+    """The mean of each seed."""
+
+
+def report(findings: Findings, seed: int = 1) -> list[ArmReport]:
+    """Every arm by every measure."""
+    return [
+        _report(findings, arm, index, np.random.default_rng(seed))
+        for index in range(len(MEASURES))
+        for arm in findings.measured
+    ]
+
+
+def write_report(reports: list[ArmReport], path: Path) -> None:
+    """As a CSV file.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            rows = csv.writer(file, lineterminator="\n")
+            rows.writerow(
+                ("measure", "arm", "mean", "gap", "low", "high", "closed", "worst_robot", "worst_gap", "seeds")
+            )
+            for each in reports:
+                numbers = (each.mean, *each.gap, each.closed)
+                seeds = " ".join(f"{mean:.4f}" for mean in each.seeds)
+                cells = [f"{number:.4f}" for number in numbers]
+                rows.writerow((each.measure, each.arm, *cells, each.worst_robot, f"{each.worst_gap:.4f}", seeds))
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error})") from error
+
+
+def _report(findings: Findings, arm: str, index: int, rng: np.random.Generator) -> ArmReport:
+    values = _by_pair(findings.measured, arm, index)
+    central, local = (_by_pair(findings.measured, name, index) for name in (CENTRAL, LOCAL))
+    gain = mean_interval(central - local, rng)
+    owners = np.array(findings.owners)
+    gaps = [float(np.nanmean((central - values)[owners == robot])) for robot in range(len(findings.robots))]
+    worst = int(np.argmax(gaps))
+    closed = float(np.nanmean(values - local)) / gain.mean if gain.low > 0.0 else np.nan
+    return ArmReport(
+        arm=arm,
+        measure=MEASURES[index],
+        mean=float(np.nanmean(values)),
+        gap=mean_interval(central - values, rng),
+        closed=closed,
+        worst_robot=findings.robots[worst],
+        worst_gap=gaps[worst],
+        seeds=tuple(float(np.nanmean(each[..., index])) for each in findings.measured[arm]),
+    )
+
+
+def _by_pair(measured: Mapping[str, FloatArray], arm: str, index: int) -> FloatArray:
+    """One measure of every pair, mean over seeds and networks, shape (pairs,); NaN where it is not known."""
+    values = measured[arm][..., index]
+    known = np.isfinite(values)
+    counts = known.sum(axis=(0, 1))
+    sums = np.where(known, values, 0.0).sum(axis=(0, 1))
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)

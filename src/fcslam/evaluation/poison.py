@@ -1,0 +1,46 @@
+"""Robots that mean harm, for studies and tests of how well a fleet bears them."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fcslam.federated.robot import Learned, Learner
+from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.weights import Weights, moved, trained_names, update_vector
+
+Poison = Literal["flipped", "scaled", "random", "nan"]
+SCALE = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Poisoned:
+    """Trains like another robot, and spoils its update before it leaves."""
+
+    learner: Learner
+    poison: Poison
+
+    @property
+    def name(self) -> str:
+        """As the other robot."""
+        return self.learner.name
+
+    def learn(self, weights: Weights, round_number: int, settings: FederatedSettings) -> Learned:
+        """As in ``Learner``."""
+        learned = self.learner.learn(weights, round_number, settings)
+        names = trained_names(weights, frozen_statistics=True)
+        update = update_vector(learned.weights, weights, names)
+        match self.poison:
+            case "flipped":
+                update = -update
+            case "scaled":
+                update = SCALE * update
+            case "random":
+                update = np.random.default_rng([settings.training.seed, round_number]).permutation(update)
+            case "nan":
+                update = np.full_like(update, np.nan)
+        return Learned(moved(weights, update, names), learned.losses)
+
+    def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+        """As in ``Learner``."""
+        return self.learner.judge(weights, settings)

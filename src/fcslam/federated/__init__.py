@@ -1,0 +1,1 @@
+"""Federated training: robots train the detector on their own images, and only weights leave them."""

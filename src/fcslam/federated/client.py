@@ -1,0 +1,49 @@
+"""Flower's side of a robot: a ``ClientApp`` around whoever learns."""
+
+from collections.abc import Callable
+
+from fcslam.errors import FcslamError
+from fcslam.federated.flower import ClientApp, Context, Error, Message
+from fcslam.federated.letters import answer, read_order, write_arrays
+from fcslam.federated.robot import Learner
+
+CANNOT = 1000
+"""Code of an error that the robot explains; Flower's own are below."""
+
+Handler = Callable[[Message, Learner], Message]
+
+
+def client_app(learner_of: Callable[[Context], Learner]) -> ClientApp:
+    """The app of a robot that a Flower context stands for. What a robot cannot do it answers with a reason."""
+    app = ClientApp()
+
+    def handled(handler: Handler) -> Callable[[Message, Context], Message]:
+        def handle(message: Message, context: Context) -> Message:
+            try:
+                return handler(message, learner_of(context))
+            except FcslamError as error:
+                return Message(Error(CANNOT, " ".join(str(error).split())), reply_to=message)
+
+        return handle
+
+    app.query()(handled(_present))
+    app.train()(handled(_train))
+    app.evaluate()(handled(_evaluate))
+    return app
+
+
+def _present(message: Message, learner: Learner) -> Message:
+    return Message(answer(learner.name, "", {}), reply_to=message)
+
+
+def _train(message: Message, learner: Learner) -> Message:
+    order = read_order(message.content)
+    learned = learner.learn(order.weights, order.round_number, order.settings)
+    arrays = write_arrays(learned.weights)
+    return Message(answer(learner.name, order.version, learned.losses, arrays), reply_to=message)
+
+
+def _evaluate(message: Message, learner: Learner) -> Message:
+    order = read_order(message.content)
+    figures = learner.judge(order.weights, order.settings)
+    return Message(answer(learner.name, order.version, figures), reply_to=message)

@@ -1,0 +1,115 @@
+"""What a federated run hands over: the released detector as ONNX files, its card, and a picture of the rounds."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from fcslam.config import dump
+from fcslam.errors import OutputError, TrainingError
+from fcslam.features.detector import GreyImage
+from fcslam.federated.history import LOSS, ROUNDS_FILE, Row
+from fcslam.federated.memory import State
+from fcslam.federated.network import network_of
+from fcslam.federated.settings import FederatedSettings
+from fcslam.learning.export import export, quantise, version_of
+
+DETECTOR, INT8, CARD, PICTURE = "detector.onnx", "detector-int8.onnx", "card.md", "rounds.png"
+FIGURES: Final = {
+    "repeatability": "keypoints found again within 3 px",
+    "mma_3px": "matches within 3 px, by bits",
+}
+SHOWN_LOSSES: Final = ("detector", "contrastive", "triplet")
+MEGABYTE: Final = 1e6
+
+
+def deliver(
+    state: State, folder: Path, settings: FederatedSettings, calibration: Sequence[GreyImage], judged_on: str
+) -> list[Path]:
+    """Write all four files; returns their paths.
+
+    Args:
+        state: whose best weights are delivered.
+        folder: of the run, with its table of rounds.
+        settings: of the run.
+        calibration: images that give int8 its ranges.
+        judged_on: what the figures are of, in words.
+
+    Raises:
+        OutputError: one cannot be written.
+        TrainingError: the table of rounds is broken.
+    """
+    network = network_of(state.best, settings.training.encoder)
+    export(network, folder / DETECTOR)
+    quantise(folder / DETECTOR, folder / INT8, calibration)
+    rows = _rows(folder / ROUNDS_FILE)
+    try:
+        draw_rounds(rows, folder / PICTURE)
+        (folder / CARD).write_text(_card(version_of(network), state, settings, rows, judged_on), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error}); make room and run the command again") from error
+    return [folder / name for name in (DETECTOR, INT8, PICTURE, CARD)]
+
+
+def draw_rounds(rows: Sequence[Row], path: Path) -> None:
+    """Three panels over the rounds: losses, figures with the released ones marked, and megabytes so far."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    losses, shares, traffic = figure.subplots(1, 3)
+    rounds = [int(row["round"]) for row in rows]
+    for name in SHOWN_LOSSES:
+        losses.plot(rounds, _column(rows, LOSS + name), label=name)
+    for name in FIGURES:
+        shares.plot(rounds, _column(rows, name), label=name.replace("_", " "))
+    for number, row in zip(rounds, rows, strict=True):
+        if row["released"] == "1":
+            shares.axvline(number, color="0.8", linewidth=0.8, zorder=0)
+    for name, label in (("bytes_down", "to the robots"), ("bytes_up", "from the robots")):
+        sent = _column(rows, name)
+        traffic.plot(rounds, [sum(sent[: index + 1]) / MEGABYTE for index in range(len(sent))], label=label)
+    shares.set_ylim(0.0, 1.0)
+    titles = ("losses, mean of the robots", "on held-out images; grey: released", "weights sent so far [MB]")
+    for panel, title in zip((losses, shares, traffic), titles, strict=True):
+        panel.set_title(title)
+        panel.set_xlabel("round")
+        panel.grid(alpha=0.3)
+        panel.legend(frameon=False)
+    figure.savefig(path, dpi=120)
+
+
+def _rows(path: Path) -> list[Row]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except (OSError, csv.Error) as error:
+        raise TrainingError(f"{path}: is no table of rounds ({error})") from error
+
+
+def _column(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:
+    return [float(row.get(name) or "nan") for row in rows]
+
+
+def _card(version: str, state: State, settings: FederatedSettings, rows: Sequence[Row], judged_on: str) -> str:
+    asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.asked.items()))
+    best = next((row for row in rows if int(row["round"]) == state.best_round), {})
+    sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))
+    private = f"epsilon {rows[-1]['epsilon']} at delta {settings.privacy.delta:g}" if rows else "nothing was sent"
+    lines = [
+        f"# Detector {version}",
+        "",
+        f"Trained by {len(state.asked)} robots together, in {state.rounds_done} rounds; this is round "
+        f"{state.best_round}. How often each was asked: {asked or 'never'}.",
+        "",
+        f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB. Privacy of all that a robot has seen: "
+        f"{private}.",
+        "",
+        f"| {judged_on} | |",
+        "|---|---|",
+        *(f"| {text} | {float(best[name]):.3f} |" for name, text in FIGURES.items() if best.get(name)),
+        "",
+        "Settings:",
+        "",
+        *(f"    {line}" for line in dump(settings).splitlines()),
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,235 @@
+"""Start Flower's daemons for a fleet on several machines, with our apps in them."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Final
+
+from fcslam.errors import OutputError, TrainingError
+from fcslam.federated.deployed import STATUS_FILE, read_status, task_text
+from fcslam.federated.flower import QUIET
+from fcslam.federated.task import Task
+
+LINK: Final = "fleet"
+START_S: Final = 60.0
+LOG_FILE: Final = "flower.log"
+
+_APP: Final = """[build-system]
+requires = ["hatchling"]
+build-backend = "hatchling.build"
+
+[project]
+name = "fcslam-fleet"
+version = "0.1.0"
+description = "Federated training of fcslam's detector"
+license = { file = "LICENSE" }
+dependencies = ["flwr>=1.41.0,<2.0"]
+
+[tool.flwr.app]
+publisher = "fcslam"
+fab-format-version = 1
+flwr-version-target = "1.41.0"
+
+[tool.flwr.app.components]
+serverapp = "fcslam_fleet.apps:server"
+clientapp = "fcslam_fleet.apps:robot"
+
+[tool.flwr.app.config]
+task = %s
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Certificates:
+    """PEM files of one machine."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+    def options(self) -> list[str]:
+        """For Flower's daemons."""
+        files = ("--ssl-ca-certfile", self.ca), ("--ssl-certfile", self.certificate), ("--ssl-keyfile", self.key)
+        return [word for option, file in files for word in (option, str(file.resolve()))]
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where the server listens."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.port}"
+
+
+def serve(
+    task: Task,
+    device: str,
+    address: Address,
+    certificates: Certificates | None,
+    robot_keys: Sequence[Path],
+    say: Callable[[], None],
+) -> None:
+    """Start a SuperLink, let robots with these public keys join, train, and stop it.
+
+    Args:
+        task: what is asked.
+        device: what the server judges on.
+        address: to listen on.
+        certificates: None for a network that nobody else is on: neither encrypted nor authenticated.
+        robot_keys: public keys of the robots that may join.
+        say: called about every second, to look at the run folder.
+
+    Raises:
+        TrainingError: Flower does not start, or the training failed; the message says why.
+        OutputError: the run folder cannot be written.
+    """
+    _made(task.output)
+    (task.output / STATUS_FILE).unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as place, (task.output / LOG_FILE).open("ab") as log:
+        home = Path(place)
+        environment = _environment(home / "home")
+        _write_app(home, task_text(task, device), address, certificates)
+        security = ["--insecure"] if certificates is None else [*certificates.options(), "--enable-supernode-auth"]
+        where = ["--host", address.host, "--port", str(address.port)]
+        with _daemon(["flower-superlink", *security, *where], environment, log) as link:
+            _wait_for(address, link)
+            for key in robot_keys:
+                _flwr(["supernode", "register", str(key.resolve()), LINK], environment)
+            with _daemon(["flwr", "run", str(home / "app"), LINK, "--stream"], environment, log) as run:
+                while run.poll() is None and read_status(task.output)[0] not in ("done", "failed"):
+                    say()
+                    time.sleep(1.0)
+                    if link.poll() is not None:
+                        raise TrainingError(f"Flower's SuperLink ended; see {task.output / LOG_FILE}")
+        say()
+    state, text = read_status(task.output)
+    if state != "done":
+        raise TrainingError(text or f"Flower's run ended; see {task.output / LOG_FILE}")
+
+
+def join(
+    address: Address,
+    robot: Mapping[str, str],
+    certificates: Certificates | None,
+    private_key: Path | None,
+    log_file: Path,
+) -> int:
+    """Be a robot's SuperNode until interrupted; returns its exit code.
+
+    Args:
+        address: of the server.
+        robot: its configuration, see ``deployed``.
+        certificates: of this machine, as Flower's processes on it talk over TLS as well; None as in ``serve``.
+        private_key: of a key pair whose public half the server has.
+        log_file: for what Flower says.
+    """
+    security = ["--insecure"]
+    if certificates is not None:
+        security = ["--root-certificates", str(certificates.ca.resolve()), *certificates.options()]
+    if private_key is not None:
+        security += ["--auth-supernode-private-key", str(private_key.resolve())]
+    config = " ".join(f"{name}={json.dumps(value)}" for name, value in robot.items())
+    where = ["--superlink", str(address), "--host", "127.0.0.1", "--port", str(free_port()), "--node-config", config]
+    _made(log_file.parent)
+    with (
+        tempfile.TemporaryDirectory() as home,
+        log_file.open("ab") as log,
+        _daemon(["flower-supernode", *security, *where], _environment(Path(home)), log) as node,
+    ):
+        return node.wait()
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _write_app(home: Path, task: str, address: Address, certificates: Certificates | None) -> None:
+    package = home / "app" / "fcslam_fleet"
+    package.mkdir(parents=True)
+    (home / "home").mkdir()
+    (home / "app" / "pyproject.toml").write_text(_APP % json.dumps(task), encoding="utf-8")
+    (home / "app" / "LICENSE").write_text("Apache-2.0\n", encoding="utf-8")
+    (package / "__init__.py").write_text('"""fcslam\'s apps, which are installed on every machine."""\n')
+    # Flower looks for assignments in the text.
+    apps = "from fcslam.federated import deployed\n\nrobot = deployed.robot\nserver = deployed.server\n"
+    (package / "apps.py").write_text(apps, encoding="utf-8")
+    trust = (
+        "insecure = true"
+        if certificates is None
+        else f"root-certificates = {json.dumps(str(certificates.ca.resolve()))}"
+    )
+    connection = f'[superlink]\ndefault = "{LINK}"\n[superlink.{LINK}]\naddress = "{address}"\n{trust}\n'
+    (home / "home" / "config.toml").write_text(connection, encoding="utf-8")
+
+
+def _wait_for(address: Address, link: "subprocess.Popen[bytes]") -> None:
+    end = time.monotonic() + START_S
+    while time.monotonic() < end and link.poll() is None:
+        with contextlib.suppress(OSError), socket.create_connection((address.host, address.port), timeout=1.0):
+            return
+        time.sleep(0.2)
+    raise TrainingError(
+        f"{address}: Flower's SuperLink does not listen there; is the port free, do certificate and key fit?"
+    )
+
+
+def _flwr(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
+    command = [*_program("flwr"), *arguments]
+    done = subprocess.run(command, env=dict(environment), capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        said = " ".join((done.stdout + done.stderr).split())
+        raise TrainingError(f"flwr {' '.join(arguments[:2])} {arguments[2]}: {said[-300:]}")
+
+
+def _environment(home: Path) -> dict[str, str]:
+    """For Flower's daemons: they start one another by name, whether or not this Python's commands are on the path."""
+    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)))
+    return {**os.environ, **QUIET, "FLWR_HOME": str(home), "PATH": path}
+
+
+def _program(name: str) -> list[str]:
+    """Flower's command that belongs to this very Python."""
+    beside = Path(sys.executable).with_name(name)
+    if not beside.is_file():
+        raise TrainingError(f"{name}: is not installed beside {sys.executable}; pip install 'fcslam[federated]'")
+    return [str(beside)]
+
+
+@contextlib.contextmanager
+def _daemon(
+    command: Sequence[str], environment: Mapping[str, str], log: IO[bytes]
+) -> "Iterator[subprocess.Popen[bytes]]":
+    """A process in a session of its own, which ends with the block and takes its children with it."""
+    process = subprocess.Popen(
+        [*_program(command[0]), *command[1:]], env=dict(environment), stdout=log, stderr=log, start_new_session=True
+    )
+    try:
+        yield process
+    finally:
+        for number in (signal.SIGINT, signal.SIGKILL):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10.0)
+
+
+def _made(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be used as the output folder ({error})") from error

@@ -1,0 +1,94 @@
+"""What server and robots write to each other, as Flower's records: writer and reader side by side."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.errors import TrainingError
+from fcslam.federated.flower import Array, ArrayRecord, ConfigRecord, MetricRecord, RecordDict
+from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.weights import Weights
+
+ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"
+WEIGHT = "num-examples"
+"""Flower's name for how much an update weighs."""
+LONGEST_NAME = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What a robot is asked."""
+
+    weights: Weights
+    version: str
+    """Of the weights."""
+    round_number: int
+    settings: FederatedSettings
+
+
+def order_config(version: str, round_number: int, settings: FederatedSettings) -> ConfigRecord:
+    """What goes with the weights to every robot."""
+    return ConfigRecord({"version": version, "round": round_number, "settings": settings.model_dump_json()})
+
+
+def read_order(content: RecordDict) -> Order:
+    """An order as a robot gets it.
+
+    Raises:
+        TrainingError: it is none.
+        ConfigError: its settings are of another version of fcslam.
+    """
+    try:
+        config = content[CONFIG]
+        settings = FederatedSettings.model_validate_json(config["settings"])
+        return Order(read_arrays(content[ARRAYS]), str(config["version"]), int(config["round"]), settings)
+    except (KeyError, TypeError, ValueError) as error:
+        raise TrainingError(f"the server's order cannot be read ({error}); are both of one version?") from error
+
+
+def write_arrays(weights: Weights) -> ArrayRecord:
+    """Weights as a record."""
+    return ArrayRecord({name: Array(np.asarray(array, order="C")) for name, array in weights.items()})
+
+
+def read_arrays(record: ArrayRecord) -> dict[str, NDArray[np.float32]]:
+    """Weights of a record, as they are: neither names nor shapes nor numbers are checked.
+
+    Raises:
+        ValueError: an array is not one of numbers.
+    """
+    return {str(name): array.numpy() for name, array in record.items()}
+
+
+def size_of(record: ArrayRecord) -> int:
+    """Bytes of its arrays."""
+    return sum(len(array.data) for array in record.values())
+
+
+def answer(robot: str, version: str, figures: Mapping[str, float], arrays: ArrayRecord | None = None) -> RecordDict:
+    """A robot's answer to an order that came with weights of this version."""
+    records = {CONFIG: ConfigRecord({"robot": robot, "version": version}), METRICS: MetricRecord(dict(figures))}
+    return RecordDict(records if arrays is None else records | {ARRAYS: arrays})
+
+
+def signature(content: RecordDict) -> tuple[str, str]:
+    """Who answers, and which version it was asked about.
+
+    Raises:
+        ValueError: the answer does not say.
+    """
+    try:
+        config = content[CONFIG]
+        robot, version = config["robot"], config["version"]
+    except (KeyError, TypeError) as error:
+        raise ValueError("an answer without a name") from error
+    if not (isinstance(robot, str) and 0 < len(robot) <= LONGEST_NAME and robot.isprintable()):
+        raise ValueError("an answer without a usable name")
+    return robot, str(version)
+
+
+def figures_of(content: RecordDict) -> dict[str, float]:
+    """The numbers of an answer."""
+    return {str(name): float(value) for name, value in content[METRICS].items() if isinstance(value, int | float)}

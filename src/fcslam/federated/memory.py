@@ -1,0 +1,102 @@
+"""Where federated training stands, as a checkpoint."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fcslam.errors import TrainingError
+from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.weights import Weights, malformed
+from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+
+CHECKPOINT_FILE: Final = "checkpoint.npz"
+STAGE: Final = "federated"
+MAY_CHANGE: Final = frozenset({"rounds", "deadline_s", "minimum_robots"})
+"""Settings that a run may go on with other values of."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """After a round."""
+
+    rounds_done: int
+    weights: Weights
+    """What the next round begins from."""
+    best: Weights
+    """The released ones."""
+    best_score: float
+    best_round: int
+    """The round they are of; 0 is the start."""
+    memory: Mapping[str, NDArray[Any]]
+    """The strategy's."""
+    asked: Mapping[str, int]
+    """How often each robot was: at most so many updates have left it."""
+    origin: str
+    """Version of the weights that everything began from."""
+
+
+def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
+    """Write beside the last state, then take its place.
+
+    Raises:
+        OutputError: it cannot be written; the last one stays.
+    """
+    numbers = {
+        "best_score": state.best_score,
+        "best_round": state.best_round,
+        "asked": dict(state.asked),
+        "origin": state.origin,
+    }
+    tensors = {
+        f"{group}/{name}": torch.from_numpy(np.asarray(array, order="C"))
+        for group, arrays in (("weights", state.weights), ("best", state.best), ("memory", state.memory))
+        for name, array in arrays.items()
+    }
+    header = {"settings": settings.model_dump(mode="json"), **numbers}
+    write_checkpoint(path, Checkpoint(STAGE, state.rounds_done, header, tensors))
+
+
+def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: str) -> State | None:
+    """The state in a file; None if there is no file. ``start`` are this run's first weights, ``origin`` names them.
+
+    Raises:
+        TrainingError: the file is no such state, or that of a run with other settings or another network.
+    """
+    if not path.exists():
+        return None
+    checkpoint = read_checkpoint(path)
+    groups: dict[str, dict[str, NDArray[Any]]] = {"weights": {}, "best": {}, "memory": {}}
+    try:
+        for key, tensor in checkpoint.tensors.items():
+            group, _, name = key.partition("/")
+            groups[group][name] = tensor.numpy()
+        header = checkpoint.settings
+        fixed = {name: value for name, value in header["settings"].items() if name not in MAY_CHANGE}
+        state = State(
+            checkpoint.step,
+            groups["weights"],
+            groups["best"],
+            float(header["best_score"]),
+            int(header["best_round"]),
+            groups["memory"],
+            {str(robot): int(rounds) for robot, rounds in header["asked"].items()},
+            str(header["origin"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise TrainingError(f"{path}: is no checkpoint of federated training ({error}); take it away") from error
+    wanted = {name: value for name, value in settings.model_dump(mode="json").items() if name not in MAY_CHANGE}
+    if checkpoint.stage != STAGE or fixed != wanted:
+        raise TrainingError(f"{path}: is of a run with other settings; give them again, or another --output")
+    reason = malformed(state.weights, start)
+    if reason is not None:
+        raise TrainingError(f"{path}: does not fit this network ({reason})")
+    if state.origin != origin:
+        raise TrainingError(
+            f"{path}: is of a run that began from {state.origin}, not from {origin}; give another --output"
+        )
+    return state

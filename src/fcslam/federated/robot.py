@@ -1,0 +1,118 @@
+"""What a robot does in a round: train from the global weights on its own images, or judge weights on some of them."""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fcslam.federated.network import network_of, weights_of
+from fcslam.federated.privacy import privatised
+from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.weights import Weights, trained_names
+from fcslam.learning.images import find_images
+from fcslam.learning.leg import Leg, train_leg
+from fcslam.learning.monitor import validate
+from fcslam.learning.stages import Images, as_detector, gather
+from fcslam.learning.trainer import Status, validation_pairs
+
+NoiseSource = Callable[[int], np.random.Generator]
+"""Gives the generator of a round's noise: of the system's entropy where robots are real, seeded where they are not."""
+
+
+class Learned(NamedTuple):
+    """A robot's answer."""
+
+    weights: dict[str, NDArray[np.float32]]
+    losses: dict[str, float]
+    """Means over the steps."""
+
+
+class Learner(Protocol):
+    """Whoever takes part in federated training."""
+
+    @property
+    def name(self) -> str:
+        """What the robot is called, in the whole fleet."""
+
+    def learn(self, weights: Weights, round_number: int, settings: FederatedSettings) -> Learned:
+        """Train for a round; rounds count from 0."""
+
+    def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+        """Figures of weights, by name."""
+
+
+@dataclass(slots=True)
+class RobotLearner:
+    """A robot with images of its own in ``folder``. Labels of them are kept in ``cache``, and nothing else."""
+
+    name: str
+    folder: Path
+    cache: Path
+    noise: NoiseSource
+    device: str = "cpu"
+    watch: Callable[[str, int], None] = lambda _robot, _steps: None
+    """Is told its name and how many steps of a round are done."""
+    gathered: Images | None = None
+    """Its images with their labels, once they are read."""
+
+    def learn(self, weights: Weights, round_number: int, settings: FederatedSettings) -> Learned:
+        """As in ``Learner``; the result depends on the arguments, the images, their labels, and the noise.
+
+        Raises:
+            TrainingError: there are too few usable images, the weights are of another network, or training diverged.
+        """
+        frozen = settings.normalisation == "frozen"
+        network = network_of(weights, settings.training.encoder)
+        examples = self._examples(weights, settings).train
+        leg = Leg(
+            first=round_number * settings.local_steps,
+            steps=settings.local_steps,
+            pull=settings.proximal if settings.strategy == "fedprox" else 0.0,
+            frozen_statistics=frozen,
+        )
+        own = settings.of_robots().model_copy(update={"seed": own_seed(self.name, settings.training.seed)})
+        network, losses = train_leg(
+            network.state_dict(), examples, own, leg, torch.device(self.device), partial(self.watch, self.name)
+        )
+        trained = weights_of(network)
+        names = trained_names(weights, frozen)
+        return Learned(privatised(trained, weights, names, settings.privacy, self.noise(round_number)), losses)
+
+    def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+        """As in ``Learner``, on pairs of images that were held out."""
+        network = network_of(weights, settings.training.encoder).to(self.device)
+        held_out = self._examples(weights, settings).held_out
+        return validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
+
+    def _examples(self, weights: Weights, settings: FederatedSettings) -> Images:
+        """The images, labelled by the first weights that ever came here, and by no later ones."""
+        if self.gathered is None:
+            device = torch.device(self.device)
+            labeller = as_detector(network_of(weights, settings.training.encoder).to(device), device)
+            self.gathered = gather(find_images([self.folder]), self.cache, settings.training, labeller, None, _silent)
+        return self.gathered
+
+
+def own_seed(robot: str, seed: int) -> int:
+    """A robot's own seed, so that no two draw the same views."""
+    return int(np.random.default_rng([seed, zlib.crc32(robot.encode())]).integers(2**31))
+
+
+def seeded_noise(robot: str, seed: int) -> NoiseSource:
+    """Noise that can be repeated: for robots in one process, whose privacy is a rehearsal."""
+    return lambda round_number: np.random.default_rng([own_seed(robot, seed), round_number])
+
+
+def secret_noise(_round_number: int) -> np.random.Generator:
+    """Noise that nobody can repeat."""
+    return np.random.default_rng()
+
+
+def _silent(_stage: str, _status: Status) -> None:
+    pass

@@ -1,0 +1,44 @@
+"""Which robot is behind which of Flower's nodes: their numbers are drawn anew whenever a robot joins, names stay."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from fcslam.federated.flower import Grid, Message, MessageType, RecordDict
+from fcslam.federated.letters import signature
+
+
+class Roster:
+    """Asks every node once for its name."""
+
+    def __init__(self, grid: Grid, deadline_s: float) -> None:
+        self._grid, self._deadline_s = grid, deadline_s
+        self._names: dict[int, str] = {}
+
+    def present(self) -> dict[str, int]:
+        """Nodes by the names of the robots that are there now, in the names' order; of two with one name, the first."""
+        nodes = sorted(self._grid.get_node_ids())
+        self._meet([node for node in nodes if node not in self._names])
+        found: dict[str, int] = {}
+        for name, node in sorted((self._names[node], node) for node in nodes if node in self._names):
+            found.setdefault(name, node)
+        return found
+
+    def _meet(self, nodes: Sequence[int]) -> None:
+        if not nodes:
+            return
+        questions = [Message(RecordDict({}), node, MessageType.QUERY) for node in nodes]
+        for reply in self._grid.send_and_receive(questions, timeout=self._deadline_s):
+            if reply.has_error():
+                continue
+            try:
+                self._names[reply.metadata.src_node_id], _ = signature(reply.content)
+            except ValueError:
+                continue
+
+
+def choose(names: Iterable[str], share: float, fewest: int, rng: np.random.Generator) -> list[str]:
+    """Some of the robots, in the order of their names: a share of them, and no fewer than ``fewest`` if there are."""
+    everyone = sorted(names)
+    count = min(max(int(np.ceil(share * len(everyone))), fewest), len(everyone))
+    return [everyone[index] for index in sorted(rng.choice(len(everyone), count, replace=False))]

@@ -1,0 +1,79 @@
+"""A federated run from its start to what it hands over, whatever carries the messages."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fcslam.config import dump
+from fcslam.errors import OutputError
+from fcslam.federated.delivery import DETECTOR, deliver
+from fcslam.federated.flower import Grid
+from fcslam.federated.history import RoundReport
+from fcslam.federated.network import network_of, version_maker
+from fcslam.federated.rounds import Outside, Server
+from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.start import calibration_images, first_weights, judge_by, public_images
+from fcslam.federated.weights import Weights
+from fcslam.learning.export import export
+from fcslam.learning.stages import Watch
+from fcslam.learning.trainer import Pace
+
+CONFIG_FILE: Final = "config.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is asked of the server."""
+
+    output: Path
+    settings: FederatedSettings
+    start: Path | None = None
+    """A checkpoint to begin from; None for synthetic shapes."""
+    public: Sequence[Path] = ()
+    """Folders of images that the server may look at."""
+
+
+@dataclass(frozen=True, slots=True)
+class Watches:
+    """Who is told what."""
+
+    stage: Watch = lambda _stage, _status: None
+    steps: Callable[[str, int], None] = lambda _robot, _steps: None
+    rounds: Callable[[RoundReport], None] = lambda _report: None
+
+
+def run_task(
+    task: Task, pace: Pace, watches: Watches, grid: Grid, wait: Callable[[str], None] | None = None
+) -> list[Path]:
+    """Run or resume; returns the files that were made. ``wait`` is as in ``Outside``.
+
+    Raises:
+        TrainingError: something given is unusable, no robot can train, or the output is another run's.
+        OutputError: something cannot be written.
+    """
+    images = public_images(task.public)
+    _write_config(task, task.output / CONFIG_FILE)
+    start = first_weights(task.start, task.output, task.settings, pace, watches.stage)
+    encoder = task.settings.training.encoder
+
+    def watch(report: RoundReport, best: Weights) -> None:
+        if report.released:
+            export(network_of(best, encoder), task.output / DETECTOR)
+        watches.rounds(report)
+
+    outside = Outside(version_maker(encoder), judge_by(images, encoder, pace.device), watch, wait)
+    state = Server(task.settings, start, task.output, outside).run(grid)
+    _write_config(task, task.output / CONFIG_FILE, again=True)
+    judged_on = "on pairs of public images" if images else "on pairs of images held out by the robots, their median"
+    return deliver(state, task.output, task.settings, calibration_images(images), judged_on)
+
+
+def _write_config(task: Task, path: Path, again: bool = False) -> None:
+    """At the start, unless an earlier run's is there, and at the end."""
+    try:
+        task.output.mkdir(parents=True, exist_ok=True)
+        if again or not path.exists():
+            path.write_text(dump(task.settings), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{task.output}: cannot be used as the output folder ({error})") from error

@@ -1,0 +1,52 @@
+"""Weights as they travel: float32 arrays by name, in one order."""
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+Weights = Mapping[str, NDArray[np.float32]]
+FloatVector = NDArray[np.float64]
+
+STATISTICS = ("running_mean", "running_var")
+"""How the names of batch normalisation's statistics end."""
+
+
+def trained_names(weights: Weights, frozen_statistics: bool) -> list[str]:
+    """Names of the arrays that training changes."""
+    return [name for name in weights if not (frozen_statistics and name.endswith(STATISTICS))]
+
+
+def update_vector(new: Weights, old: Weights, names: Collection[str]) -> FloatVector:
+    """All differences of the arrays of these names, one after another, shape (N,)."""
+    parts = [(new[name].astype(np.float64) - old[name]).ravel() for name in names]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def moved(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str, NDArray[np.float32]]:
+    """``old`` with ``update`` (N,) added to the arrays of these names."""
+    arrays = {name: array.copy() for name, array in old.items()}
+    begin = 0
+    for name in names:
+        size = old[name].size
+        step = update[begin : begin + size].reshape(old[name].shape)
+        arrays[name] = (old[name] + step).astype(np.float32)
+        begin += size
+    return arrays
+
+
+def malformed(new: Weights, old: Weights) -> str | None:
+    """Why ``new`` cannot be weights of the network that ``old`` are of, in words; None if it can."""
+    if new.keys() != old.keys():
+        odd = sorted(new.keys() ^ old.keys())
+        return f"other arrays than asked for ({odd[0]}{', ...' if len(odd) > 1 else ''})"
+    for name, array in old.items():
+        if new[name].shape != array.shape:
+            return f"{name} has shape {new[name].shape}, not {array.shape}"
+        if new[name].dtype != np.float32:
+            return f"{name} is {new[name].dtype}, not float32"
+        if not np.isfinite(new[name]).all():
+            return f"{name} holds numbers that are not finite"
+        if name.endswith("running_var") and (new[name] < 0.0).any():
+            return f"{name} holds negative variances"
+    return None

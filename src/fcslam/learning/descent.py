@@ -1,0 +1,82 @@
+"""One step of training: forward, losses, backward, update."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from fcslam.errors import TrainingError
+from fcslam.learning.batches import Batch
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.objective import TeacherBits, grid_shift, objective
+from fcslam.learning.settings import TrainingSettings
+
+CLIP_NORM: Final = 1.0
+WEIGHT_DECAY: Final = 1e-4
+WARM_UP_STEPS: Final = 300
+LAST_RATE: Final = 1e-5
+DECAY_SHARE: Final = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Pull:
+    """A spring back to given weights: strength / 2 times the squared distance is added to what is minimised."""
+
+    strength: float
+    weights: Mapping[str, Tensor]
+    """By the parameters' names."""
+
+    def energy(self, network: KeypointNetwork) -> Tensor:
+        """What is added now."""
+        terms = [(value - self.weights[name]).square().sum() for name, value in network.named_parameters()]
+        return 0.5 * self.strength * torch.stack(terms).sum()
+
+
+def new_optimiser(network: KeypointNetwork) -> torch.optim.Optimizer:
+    """An optimiser without a memory yet; ``descend`` sets its rate."""
+    return torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
+
+
+def descend(
+    network: KeypointNetwork,
+    optimiser: torch.optim.Optimizer,
+    batch: Batch,
+    settings: TrainingSettings,
+    step: int,
+    rate: float,
+    bits: TeacherBits | None = None,
+    pull: Pull | None = None,
+) -> dict[str, Tensor]:
+    """One step in place, with batch, network and optimiser on one device; returns the losses by name.
+
+    Raises:
+        TrainingError: the losses are no longer finite; nothing was changed in this step.
+    """
+    for group in optimiser.param_groups:
+        group["lr"] = rate
+    with torch.autocast(batch.images.device.type, torch.bfloat16):
+        maps = network(batch.images.contiguous(memory_format=torch.channels_last))
+    shift = grid_shift(settings.encoder, settings.seed, step)
+    total, parts = objective(maps, batch, settings.loss, step / settings.steps, shift, bits)
+    if pull is not None:
+        total = total + pull.energy(network)
+    if not torch.isfinite(total):
+        raise TrainingError(f"training diverged at step {step}; lower the learning rate")
+    optimiser.zero_grad(set_to_none=True)
+    total.backward()
+    torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)
+    optimiser.step()
+    return {name: part.detach() for name, part in parts.items()}
+
+
+def learning_rate(settings: TrainingSettings, step: int) -> float:
+    """Linear warm-up, a plateau, and a straight way down over the last part.
+
+    On the plateau it does not depend on how many steps there will be, so a run may be made longer.
+    """
+    warm = min(WARM_UP_STEPS, settings.steps // 10)
+    rise = (step + 1) / max(warm, 1)
+    fall = (settings.steps - step) / (DECAY_SHARE * settings.steps)
+    return max(settings.learning_rate * min(rise, fall, 1.0), LAST_RATE)

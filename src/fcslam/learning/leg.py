@@ -1,0 +1,89 @@
+"""A leg of a training run that another machine began: some steps from given weights, and back go the new ones."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from fcslam.errors import TrainingError
+from fcslam.learning.batches import stream
+from fcslam.learning.descent import Pull, descend, learning_rate, new_optimiser
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.pairs import Example
+from fcslam.learning.settings import Encoder, TrainingSettings
+
+RAMP_STEPS: Final = 10
+"""An optimiser that knows no gradients yet steps by their signs alone; its rate rises over so many steps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """Which steps of the whole run, and how."""
+
+    first: int
+    steps: int
+    pull: float = 0.0
+    """Strength of a spring to the weights at the start."""
+    frozen_statistics: bool = False
+    """Whether batch normalisation uses the means and variances it came with, and leaves them as they are."""
+
+
+def train_leg(
+    start: Mapping[str, Tensor],
+    examples: Sequence[Example],
+    settings: TrainingSettings,
+    leg: Leg,
+    device: torch.device,
+    watch: Callable[[int], None] = lambda _steps: None,
+) -> tuple[KeypointNetwork, dict[str, float]]:
+    """Train from ``start`` (a network's state) with an optimiser of its own; the network and its mean losses.
+
+    The result depends on the arguments alone. ``settings.steps`` are those of the whole run: the rate falls towards
+    its end. ``watch`` is told how many steps are done.
+
+    Raises:
+        TrainingError: ``start`` does not fit the network, or training diverged.
+    """
+    network = network_with(settings.encoder, start).to(device, memory_format=torch.channels_last)
+    network.train()
+    if leg.frozen_statistics:
+        freeze_statistics(network)
+    pull = None
+    if leg.pull > 0.0:
+        pull = Pull(leg.pull, {name: value.detach().clone() for name, value in network.named_parameters()})
+    optimiser = new_optimiser(network)
+    sums: dict[str, float] = {}
+    ends = settings.model_copy(update={"steps": leg.first + leg.steps})
+    for step, batch in stream(examples, ends, leg.first, ahead=2, threads=1):
+        done = step - leg.first + 1
+        rate = learning_rate(settings, step) * min(done / RAMP_STEPS, 1.0)
+        parts = descend(network, optimiser, batch.to(device), settings, step, rate, pull=pull)
+        for name, part in parts.items():
+            sums[name] = sums.get(name, 0.0) + float(part)
+        watch(done)
+    network.eval()
+    return network, {name: total / leg.steps for name, total in sums.items()}
+
+
+def network_with(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:
+    """A network in this state, in evaluation mode.
+
+    Raises:
+        TrainingError: the state is of another network.
+    """
+    network = KeypointNetwork(encoder)
+    try:
+        network.load_state_dict(dict(state))
+    except RuntimeError as error:
+        raise TrainingError(f"the weights are not those of a {encoder} network ({error})") from error
+    network.eval()
+    return network
+
+
+def freeze_statistics(network: nn.Module) -> None:
+    """Let batch normalisation neither look at the batch nor learn from it; its scale and shift stay trainable."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.eval()

@@ -1,0 +1,125 @@
+"""`fcslam federate`: a whole run of real robots, its resuming, and what bad input is answered."""
+
+import csv
+
+import cv2
+import pytest
+import yaml
+from learning.textures import textured
+
+from fcslam.cli import BAD_INPUT, main
+
+pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+pytest.importorskip("onnx", reason="needs fcslam[federated]")
+
+TINY = {
+    "rounds": 2,
+    "local_steps": 2,
+    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def brief():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fcslam.learning.trainer.VALIDATION_PAIRS", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """Three robots: two with images, one without."""
+    made = tmp_path_factory.mktemp("fleet")
+    for robot, seeds in (("one", (1, 2, 3)), ("two", (4, 5)), ("bare", ())):
+        (made / robot).mkdir()
+        for seed in seeds:
+            cv2.imwrite(str(made / robot / f"{seed}.png"), textured(seed))
+    (made / "public").mkdir()
+    cv2.imwrite(str(made / "public" / "9.png"), textured(9))
+    (made / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    return made
+
+
+def federate(fleet, output, *more, robots=("one", "two", "bare")):
+    folders = [str(fleet / robot) for robot in robots]
+    settings = ["--config", str(fleet / "tiny.yaml"), "--device", "cpu"]
+    return main(["federate", "--local", *folders, "--output", str(output), *settings, *more])
+
+
+@pytest.fixture(scope="module")
+def run(fleet, tmp_path_factory):
+    output = tmp_path_factory.mktemp("run") / "fleet"
+    assert federate(fleet, output, "--public", str(fleet / "public")) == 0
+    return output
+
+
+def rows_of(folder):
+    with (folder / "rounds.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_folder_holds_everything(run, fleet):
+    for name in ("config.yaml", "rounds.csv", "checkpoint.npz", "rounds.png", "card.md"):
+        assert (run / name).stat().st_size > 100
+    rows = rows_of(run)
+    assert [row["robots"] for row in rows] == ["one | two"] * 2
+    assert all("bare" in row["left_out"] and "holds no image" in row["left_out"] for row in rows)
+    assert all(int(row["bytes_up"]) == 2 * int(row["bytes_down"]) / 3 > 1e6 for row in rows)
+    assert yaml.safe_load((run / "config.yaml").read_text())["rounds"] == 2
+
+
+def test_the_delivered_detectors_run(run, fleet, tmp_path):
+    for name in ("detector.onnx", "detector-int8.onnx"):
+        arguments = ["extract", str(fleet / "one"), "--output", str(tmp_path / name), "--detector", "onnx"]
+        assert main([*arguments, "--weights", str(run / name)]) == 0
+        assert len(list((tmp_path / name).rglob("*.npz"))) == 3
+
+
+def test_labels_are_all_that_is_kept_of_images(run):
+    suffixes = {file.suffix for file in run.rglob("*") if file.is_file()}
+    assert suffixes <= {".yaml", ".csv", ".npz", ".onnx", ".png", ".md"}
+    assert {file.name for file in run.rglob("*.png")} == {"rounds.png"}
+
+
+def test_the_same_command_with_more_rounds_goes_on(fleet, tmp_path, capsys):
+    assert federate(fleet, tmp_path / "run", "--rounds", "1", robots=("one", "two")) == 0
+    assert federate(fleet, tmp_path / "run", "--rounds", "2", robots=("one", "two")) == 0
+    assert "round 1/2" not in capsys.readouterr().err.partition("round 2/2")[2]
+    assert [row["round"] for row in rows_of(tmp_path / "run")] == ["1", "2"]
+    begun = tmp_path / "begun"
+    assert federate(fleet, begun, "--start", str(tmp_path / "run" / "checkpoint.npz"), robots=("one", "two")) == 0
+    assert not (begun / "shapes").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["federate", "--local", "{fleet}/one", "{fleet}/one", "-o", "{out}"], "two folders are called one"),
+        (["federate", "--local", "{fleet}/nobody", "-o", "{out}"], "nobody: is no folder"),
+        (["federate", "{fleet}/one", "-o", "{out}"], "--local"),
+        (["federate", "--local", "{fleet}/one", "-o", "{out}", "--strategy", "best"], "strategy"),
+        (["federate", "--local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
+        (["federate", "--local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"], "cannot be used as the output folder"),
+        (["federate", "--local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"], "is no checkpoint"),
+        (["federate", "--local", "-o", "{out}"], "--local needs a folder"),
+        (["federate", "--local", "--serve", "a:1", "-o", "{out}"], "say where the robots are"),
+        (["federate", "--serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is no HOST:PORT"),
+        (["federate", "--serve", "a:1", "{fleet}/one", "-o", "{out}", "--insecure"], "robots bring their own images"),
+        (["federate", "--serve", "a:1", "-o", "{out}"], "give --ca"),
+        (["federate", "--serve", "a:1", "-o", "{out}", "--ca", "{fleet}/no.crt"], "no.crt: is no file"),
+        (["federate", "--serve", "a:1", "-o", "{out}", "--insecure", "--ca", "{fleet}/tiny.yaml"], "leave out one"),
+        (["federate", "--join", "a:1", "-o", "{out}", "--insecure"], "--join needs one folder"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
+    given = [word.format(fleet=fleet, out=tmp_path / "out") for word in arguments]
+    assert main(given) == BAD_INPUT
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert words in said[0]
+
+
+def test_a_fleet_without_images_is_said(fleet, tmp_path, capsys):
+    assert federate(fleet, tmp_path / "run", robots=("bare",)) == BAD_INPUT
+    assert "no round can be completed: bare: " in capsys.readouterr().err

@@ -1,0 +1,159 @@
+"""The study of federated training: it compares like with like, resumes, and its arithmetic is right."""
+
+import cv2
+import numpy as np
+import pytest
+from learning.textures import textured
+
+torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+
+from federated.fakes import Fake  # noqa: E402
+
+from fcslam.errors import EvaluationError  # noqa: E402
+from fcslam.evaluation.federated import (  # noqa: E402
+    MEASURES,
+    Findings,
+    Study,
+    StudySettings,
+    held_out_pairs,
+    measure_pair,
+    run_study,
+)
+from fcslam.evaluation.federated_report import report  # noqa: E402
+from fcslam.evaluation.poison import Poisoned  # noqa: E402
+from fcslam.federated.settings import FederatedSettings  # noqa: E402
+from fcslam.learning.images import find_images  # noqa: E402
+from fcslam.learning.network import KeypointNetwork  # noqa: E402
+from fcslam.learning.trainer import Pace  # noqa: E402
+
+TINY = {
+    "federated": {
+        "rounds": 2,
+        "local_steps": 2,
+        "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
+    },
+    "arms": {"averaged": {}, "bad": {"settings": {"strategy": "fedmedian"}, "poison": "nan"}},
+    "seeds": 2,
+    "pairs": 4,
+}
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch):
+    monkeypatch.setattr("fcslam.learning.trainer.VALIDATION_PAIRS", 1)
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory):
+    made = tmp_path_factory.mktemp("robots")
+    for number, robot in enumerate(("north", "south")):
+        (made / robot).mkdir()
+        for seed in range(12):
+            cv2.imwrite(str(made / robot / f"{seed}.png"), textured(100 * number + seed, 160, 128))
+    return {robot: made / robot for robot in ("north", "south")}
+
+
+def study(robots, folder, watch=lambda *_: None, **changes):
+    return Study(robots, folder, StudySettings.model_validate(TINY | changes), Pace(), watch)
+
+
+def test_an_interrupted_study_ends_as_if_it_had_not_been(robots, tmp_path):
+    whole = run_study(study(robots, tmp_path / "whole"))
+
+    def stop(name, done, _of):
+        if name == "averaged, seed 2" and done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study(robots, tmp_path / "torn", stop))
+    told = []
+    torn = run_study(study(robots, tmp_path / "torn", lambda name, done, _of: told.append((name, done))))
+    assert ("averaged, seed 2", 2) in told
+    assert not [name for name, _ in told if name.startswith("central") or name == "averaged, seed 1"]
+    assert {name: values.shape for name, values in whole.measured.items()} == {
+        "central": (2, 1, 4, 3), "local": (2, 2, 4, 3), "averaged": (2, 1, 4, 3), "bad": (2, 1, 4, 3),
+    }  # fmt: skip
+    assert whole.owners == (0, 0, 1, 1)
+    for name, values in whole.measured.items():
+        assert np.array_equal(values, torn.measured[name], equal_nan=True)
+    assert run_study(study(robots, tmp_path / "torn", lambda *_: pytest.fail("all is done"))).robots == (
+        "north",
+        "south",
+    )
+    with pytest.raises(EvaluationError, match="another study"):
+        run_study(study(robots, tmp_path / "torn", seeds=3))
+
+
+def test_every_network_sees_as_many_samples(robots, tmp_path):
+    steps = {}
+
+    def watch(name, done, of):
+        steps[name] = of
+
+    run_study(study(robots, tmp_path, watch, seeds=1))
+    assert steps["central, seed 1"] == steps["local-north, seed 1"] == steps["local-south, seed 1"] == 2 * 2 * 2
+    assert steps["averaged, seed 1"] == 2
+
+
+def test_an_arm_may_not_take_the_name_of_another(robots, tmp_path):
+    with pytest.raises(EvaluationError, match="central"):
+        run_study(study(robots, tmp_path, arms={"central": {}}))
+
+
+def test_a_network_matches_a_view_with_itself(robots, tmp_path):
+    torch.manual_seed(1)
+    network = KeypointNetwork("light").eval()
+    network.body.code_head[-1].bias.data.zero_()  # or all its codes are alike
+    (pair,) = held_out_pairs("north", find_images([robots["north"]])[:1], study(robots, tmp_path, pairs=2))
+    same = type(pair)((pair.views[0], pair.views[0]), pair.valid, pair.taught_valid, pair.taught, np.eye(3))
+    correct, accuracy, again = measure_pair(network, same, torch.device("cpu"))
+    assert (correct, again) == (1.0, 1.0)
+    assert accuracy > 0.95
+
+
+def findings(central, federated, local):
+    """One seed, one measure's worth of pairs repeated for all measures; two robots own half of the pairs each."""
+    count = len(central)
+    owners = tuple(int(index >= count // 2) for index in range(count))
+
+    def stacked(*networks):
+        return np.stack([np.repeat(np.asarray(each, float)[:, None], len(MEASURES), axis=1) for each in networks])[None]
+
+    measured = {"central": stacked(central), "local": stacked(*local), "federated": stacked(federated)}
+    return Findings(("north", "south"), owners, measured)
+
+
+def test_gaps_are_paired_and_the_worst_robot_is_named():
+    rng = np.random.default_rng(1)
+    hard = rng.random(400)
+    lost = np.where(np.arange(400) < 200, 0.0, 0.04)
+    found = findings(hard, hard - lost, [hard - 0.1, hard - 0.3])
+    rows = {row.arm: row for row in report(found) if row.measure == MEASURES[0]}
+    assert rows["central"].gap == (0.0, 0.0, 0.0)
+    assert rows["federated"].gap.mean == pytest.approx(0.02)
+    assert 0.017 < rows["federated"].gap.low < 0.02 < rows["federated"].gap.high < 0.023
+    assert (rows["federated"].worst_robot, rows["federated"].worst_gap) == ("south", pytest.approx(0.04))
+    assert rows["federated"].closed == pytest.approx((0.2 - 0.02) / 0.2)
+    assert rows["local"].mean == pytest.approx(hard.mean() - 0.2)
+    assert rows["local"].closed == pytest.approx(0.0)
+
+
+def test_nothing_is_closed_where_central_is_no_better():
+    rng = np.random.default_rng(2)
+    central = rng.random(50)
+    rows = report(findings(central, central, [central + 0.01 * rng.normal(size=50)]))
+    assert all(np.isnan(row.closed) for row in rows)
+
+
+@pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
+def test_poison_is_what_it_says(poison):
+    before = {"weight": np.zeros(6, np.float32)}
+    bad = Poisoned(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
+    sent = bad.learn(before, 0, FederatedSettings()).weights["weight"]
+    expected = {"flipped": -np.arange(6.0), "scaled": 10 * np.arange(6.0), "nan": np.full(6, np.nan)}
+    if poison == "random":
+        assert sorted(sent) == list(range(6))
+        assert list(sent) != list(range(6))
+    else:
+        assert np.array_equal(sent, expected[poison], equal_nan=True)

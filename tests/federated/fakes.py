@@ -1,0 +1,68 @@
+"""Robots that learn nothing but answer what a test wants, and how a server is run with them."""
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fcslam.federated.client import client_app
+from fcslam.federated.grid import InProcessGrid
+from fcslam.federated.robot import Learned
+from fcslam.federated.rounds import Outside, Server
+from fcslam.federated.settings import FederatedSettings
+
+START = {
+    "a.weight": np.arange(1.0, 7.0, dtype=np.float32).reshape(2, 3),
+    "a.running_var": np.ones(2, np.float32),
+    "b.weight": np.full((), 0.5, np.float32),
+}
+
+
+def version(weights):
+    digest = hashlib.sha256()
+    for name, array in sorted(weights.items()):
+        digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:12]
+
+
+def shifted(weights, by):
+    return {name: (array + np.float32(by)).astype(np.float32) for name, array in weights.items()}
+
+
+@dataclass
+class Fake:
+    """Adds ``by`` to all weights; ``answer`` replaces that."""
+
+    name: str
+    by: float = 0.1
+    answer: object = None
+    figures: dict = field(default_factory=lambda: {"repeatability": 0.5, "mma_3px": 0.5})
+    asked: list = field(default_factory=list)
+
+    def learn(self, weights, round_number, _settings):
+        self.asked.append(round_number)
+        new = self.answer(weights, round_number) if self.answer else shifted(weights, self.by)
+        return Learned(new, {"detector": self.by})
+
+    def judge(self, _weights, _settings):
+        return self.figures
+
+
+def grid_of(robots, **extra):
+    return InProcessGrid(client_app(lambda context: robots[context.node_config["partition-id"]]), len(robots), **extra)
+
+
+def settings(**given):
+    return FederatedSettings.model_validate({"rounds": 2, "local_steps": 1, "screening": LENIENT} | given)
+
+
+LENIENT = {"largest_change": None, "longest": None, "least_agreement": None}
+
+
+def run(robots, folder, chosen=None, grid=None, start=START, **outside):
+    reports = []
+    outside = {"version": version, "judge": lambda _weights: {"repeatability": 0.5, "mma_3px": 0.5}} | outside
+    server = Server(
+        chosen or settings(), start, folder, Outside(watch=lambda report, _best: reports.append(report), **outside)
+    )
+    return server.run(grid or grid_of(robots)), reports

@@ -1,0 +1,130 @@
+"""A robot's part: real training from given weights on its own images, and nothing of these in what it sends."""
+
+import cv2
+import numpy as np
+import pytest
+from learning.textures import textured
+
+torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
+
+from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.federated.network import network_of, version_maker, weights_of  # noqa: E402
+from fcslam.federated.robot import RobotLearner, own_seed, secret_noise, seeded_noise  # noqa: E402
+from fcslam.federated.settings import FederatedSettings  # noqa: E402
+from fcslam.federated.weights import trained_names, update_vector  # noqa: E402
+from fcslam.learning.leg import network_with  # noqa: E402
+from fcslam.learning.network import KeypointNetwork  # noqa: E402
+
+TINY = {"rounds": 2, "local_steps": 2, "training": {"pairs": 1, "side_px": 64, "points": 32, "label_copies": 1}}
+
+
+def settings(**given):
+    return FederatedSettings.model_validate(TINY | given)
+
+
+@pytest.fixture(scope="module")
+def start():
+    torch.manual_seed(3)
+    return weights_of(KeypointNetwork("light"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("images")
+    for seed in range(3):
+        cv2.imwrite(str(made / f"{seed}.png"), textured(seed))
+    return made
+
+
+def robot(folder, cache, name="rover"):
+    return RobotLearner(name, folder, cache, seeded_noise(name, 1))
+
+
+def same(first, second):
+    return all(np.array_equal(first[name], second[name]) for name in first)
+
+
+def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
+    whole = robot(folder, tmp_path / "labels").learn(start, 0, settings())
+    kept = {name: array.copy() for name, array in start.items()}
+    again = robot(folder, tmp_path / "labels").learn(start, 0, settings())
+    assert same(whole.weights, again.weights)
+    assert same(kept, start)
+    other = robot(folder, tmp_path / "labels", "other").learn(start, 0, settings())
+    later = robot(folder, tmp_path / "labels").learn(start, 1, settings())
+    assert not same(whole.weights, other.weights)
+    assert not same(whole.weights, later.weights)
+    assert whole.weights.keys() == start.keys()
+    assert {array.dtype for array in whole.weights.values()} == {np.dtype(np.float32)}
+
+
+def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
+    first = robot(folder, tmp_path)
+    first.learn(start, 0, settings())
+    labels = {file: file.read_bytes() for file in tmp_path.rglob("*.npz")}
+    assert len(labels) == 3
+    moved = {name: array * np.float32(1.1) for name, array in start.items()}
+    fresh = robot(folder, tmp_path)
+    assert same(first.learn(moved, 1, settings()).weights, fresh.learn(moved, 1, settings()).weights)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*.npz")} == labels
+
+
+def test_the_pull_holds_updates_back(folder, start, tmp_path):
+    def length(**given):
+        learned = robot(folder, tmp_path).learn(start, 0, settings(local_steps=12, rounds=1, **given))
+        return np.linalg.norm(update_vector(learned.weights, start, trained_names(start, frozen_statistics=True)))
+
+    free, held = length(), length(strategy="fedprox", proximal=1000.0)
+    assert 0.0 < held < free
+
+
+def test_frozen_statistics_stay_and_averaged_ones_move(folder, start, tmp_path):
+    statistics = [name for name in start if name not in trained_names(start, frozen_statistics=True)]
+    assert statistics
+    for normalisation, stay in (("frozen", True), ("averaged", False)):
+        learned = robot(folder, tmp_path).learn(start, 0, settings(normalisation=normalisation))
+        assert all(np.array_equal(learned.weights[name], start[name]) for name in statistics) is stay
+
+
+def test_noise_is_added_before_anything_leaves(folder, start, tmp_path):
+    chosen = settings(normalisation="frozen", privacy={"clip_norm": 0.5, "noise_multiplier": 0.2})
+    learned = robot(folder, tmp_path).learn(start, 0, chosen)
+    update = update_vector(learned.weights, start, trained_names(start, frozen_statistics=True))
+    assert update.std() == pytest.approx(0.1, rel=0.02)
+
+
+def test_secret_noise_never_repeats_and_seeded_noise_does():
+    assert secret_noise(0).random() != secret_noise(0).random()
+    assert seeded_noise("a", 1)(0).random() == seeded_noise("a", 1)(0).random()
+    assert len({own_seed(name, seed) for name in "abc" for seed in (1, 2)}) == 6
+
+
+@pytest.mark.parametrize("content", ["none", "one", "broken"])
+def test_too_few_images_are_said(content, start, tmp_path):
+    images = tmp_path / "images"
+    images.mkdir()
+    if content == "one":
+        cv2.imwrite(str(images / "1.png"), textured(1))
+    if content == "broken":
+        for index in range(5):
+            (images / f"{index}.png").write_bytes(b"no image")
+    with pytest.raises(TrainingError, match=r"images: holds no image|only . of . image files can be trained on"):
+        robot(images, tmp_path / "labels").learn(start, 0, settings())
+
+
+def test_weights_of_another_network_are_refused(folder, start, tmp_path):
+    chosen = settings(training={"encoder": "vgg"} | TINY["training"])
+    with pytest.raises(TrainingError, match="no weights of a vgg network"):
+        robot(folder, tmp_path).learn(start, 0, chosen)
+    with pytest.raises(TrainingError, match="not those of a light network"):
+        network_with("light", {})
+
+
+def test_weights_become_the_same_network_again(start):
+    torch.manual_seed(5)
+    image = torch.rand(1, 1, 64, 64)
+    network = KeypointNetwork("light").eval()
+    again = network_of(weights_of(network), "light")
+    assert torch.equal(network(image).code_logits, again(image).code_logits)
+    version = version_maker("light")
+    assert version(weights_of(network)) == version(weights_of(again)) != version(start)

@@ -1,0 +1,108 @@
+"""Which updates are refused: poison of every kind is, and honest robots that differ are not."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fcslam.federated.screening import agreement, screen
+from fcslam.federated.settings import ScreeningSettings
+from fcslam.federated.weights import malformed, moved, trained_names, update_vector
+
+RNG = np.random.default_rng(4)
+BEFORE = {
+    "convolution.weight": RNG.normal(size=(400, 300)).astype(np.float32),
+    "norm.running_mean": np.zeros(20, np.float32),
+    "norm.running_var": np.ones(20, np.float32),
+}
+COMMON = RNG.normal(size=BEFORE["convolution.weight"].shape)
+
+
+def honest(seed, share=0.4):
+    """A robot that shares a part of its direction with the others, and has one of its own."""
+    own = np.random.default_rng(seed).normal(size=COMMON.shape)
+    step = share * COMMON + np.sqrt(1 - share**2) * own
+    return BEFORE | {"convolution.weight": (BEFORE["convolution.weight"] + 0.02 * step).astype(np.float32)}
+
+
+def poisoned(kind):
+    good = honest(99)["convolution.weight"] - BEFORE["convolution.weight"]
+    update = {
+        "flipped": -good,
+        "scaled": 30.0 * good,
+        "random": np.random.default_rng(7).normal(size=good.shape) * good.std(),
+        "huge": np.random.default_rng(7).normal(size=good.shape) * 1e3,
+        "nan": np.where(good > 0, np.nan, good),
+        "zero": np.zeros_like(good),
+    }[kind]
+    return BEFORE | {"convolution.weight": (BEFORE["convolution.weight"] + update).astype(np.float32)}
+
+
+@pytest.mark.parametrize("kind", ["flipped", "scaled", "random", "huge", "nan", "zero"])
+def test_one_poisoned_robot_of_five_is_refused_and_no_other(kind):
+    answers = {f"robot{seed}": honest(seed) for seed in range(4)} | {"bad": poisoned(kind)}
+    refused = screen(answers, BEFORE, ScreeningSettings())
+    assert set(refused) == {"bad"}
+    assert refused["bad"]
+
+
+@pytest.mark.parametrize("kind", ["flipped", "random", "scaled"])
+def test_poison_does_not_hide_behind_honest_statistics(kind):
+    """These may be longer than all else by far, and alike, for all robots see other things than what the start saw."""
+
+    def in_daylight(weights):
+        return weights | {
+            "norm.running_mean": np.full(20, 40.0, np.float32),
+            "norm.running_var": np.full(20, 50.0, np.float32),
+        }
+
+    start = BEFORE | {"norm.running_mean": np.full(20, 90.0, np.float32)}
+    answers = {f"robot{seed}": in_daylight(honest(seed)) for seed in range(4)} | {"bad": in_daylight(poisoned(kind))}
+    assert set(screen(answers, start, ScreeningSettings())) == {"bad"}
+
+
+def test_statistics_may_lie_on_all_sides_but_not_far_away():
+    def lit(seed, by):
+        return honest(seed) | {"norm.running_mean": np.full(20, by, np.float32)}
+
+    answers = {f"robot{seed}": lit(seed, by) for seed, by in enumerate([0.1, -0.1, 0.12, -0.12])}
+    assert screen(answers, BEFORE, ScreeningSettings()) == {}
+    assert set(screen(answers | {"bad": lit(9, 5.0)}, BEFORE, ScreeningSettings())) == {"bad"}
+
+
+@pytest.mark.parametrize("kind", ["huge", "nan"])
+@pytest.mark.parametrize("others", [0, 1, 2])
+def test_even_few_robots_are_safe_from_what_nobody_could_mean(kind, others):
+    answers = {f"robot{seed}": honest(seed) for seed in range(others)} | {"bad": poisoned(kind)}
+    assert set(screen(answers, BEFORE, ScreeningSettings())) == {"bad"}
+
+
+def test_two_that_disagree_are_not_judged():
+    answers = {"a": honest(1), "b": poisoned("flipped")}
+    assert screen(answers, BEFORE, ScreeningSettings()) == {}
+
+
+def test_bounds_that_are_off_let_everything_finite_pass():
+    off = ScreeningSettings(largest_change=None, longest=None, least_agreement=None)
+    answers = {kind: poisoned(kind) for kind in ("flipped", "scaled", "random", "huge")}
+    assert screen(answers, BEFORE, off) == {}
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_an_update_taken_apart_and_added_again_is_the_same(seed, frozen):
+    rng = np.random.default_rng(seed)
+    after = {name: (array + rng.random(array.shape)).astype(np.float32) for name, array in BEFORE.items()}
+    names = trained_names(BEFORE, frozen)
+    back = moved(BEFORE, update_vector(after, BEFORE, names), names)
+    for name, array in BEFORE.items():
+        assert back[name] == pytest.approx(after[name] if name in names else array, abs=1e-6)
+    assert malformed(after, BEFORE) is None
+    assert ("norm.running_var" in names) is not frozen
+
+
+def test_agreement_is_a_cosine():
+    x = np.array([3.0, 4.0])
+    assert agreement(x, [x, 2 * x, 100 * x]) == pytest.approx(1.0)
+    assert agreement(x, [-x]) == pytest.approx(-1.0)
+    assert agreement(x, [np.array([-4.0, 3.0])]) == pytest.approx(0.0)
+    assert agreement(x, [np.zeros(2)]) == 0.0

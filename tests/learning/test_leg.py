@@ -1,0 +1,79 @@
+"""A leg of a run: it starts where it is told, leaves alone what is frozen, and is pulled back as hard as asked."""
+
+import pytest
+from learning.textures import textured
+
+torch = pytest.importorskip("torch", reason="needs fcslam[train]")
+
+from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.learning.descent import Pull  # noqa: E402
+from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
+from fcslam.learning.labels import fuse  # noqa: E402
+from fcslam.learning.leg import Leg, network_with, train_leg  # noqa: E402
+from fcslam.learning.network import KeypointNetwork  # noqa: E402
+from fcslam.learning.pairs import Example  # noqa: E402
+from fcslam.learning.settings import TrainingSettings  # noqa: E402
+
+SMALL = TrainingSettings(steps=40, pairs=1, side_px=64, points=32)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def examples():
+    images = [textured(seed) for seed in range(2)]
+    points = [peaks(harris(image), 4, 200) for image in images]
+    return [Example(image, fuse(each, each)) for image, each in zip(images, points, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def start():
+    torch.manual_seed(1)
+    return KeypointNetwork("light").state_dict()
+
+
+def test_a_leg_does_its_steps_and_says_so(examples, start):
+    done = []
+    before = {name: tensor.clone() for name, tensor in start.items()}
+    network, losses = train_leg(start, examples, SMALL, Leg(first=5, steps=3), CPU, done.append)
+    assert done == [1, 2, 3]
+    assert not network.training
+    assert {"detector", "contrastive", "triplet"} <= losses.keys()
+    assert all(torch.equal(start[name], before[name]) for name in start)
+    assert any(not torch.equal(start[name], tensor) for name, tensor in network.state_dict().items())
+
+
+def test_a_leg_learns(examples, start):
+    longer = SMALL.model_copy(update={"pairs": 2})
+    _, first = train_leg(start, examples, longer, Leg(first=0, steps=5), CPU)
+    network, _ = train_leg(start, examples, longer, Leg(first=0, steps=30), CPU)
+    _, last = train_leg(network.state_dict(), examples, longer, Leg(first=30, steps=5), CPU)
+    assert last["detector"] < 0.9 * first["detector"]
+
+
+def test_frozen_statistics_are_not_touched_while_their_scales_are_trained(examples, start):
+    network, _ = train_leg(start, examples, SMALL, Leg(0, 2, frozen_statistics=True), CPU)
+    changed = {name for name, tensor in network.state_dict().items() if not torch.equal(tensor, start[name])}
+    assert not [name for name in changed if "running" in name]
+    norms = {name.removesuffix("running_var") for name in start if name.endswith("running_var")}
+    assert all(f"{norm}weight" in changed for norm in norms)
+
+
+def test_the_pull_is_half_its_strength_times_the_squared_distance(start):
+    network = network_with("light", start)
+    weights = {name: value.detach().clone() for name, value in network.named_parameters()}
+    pull = Pull(3.0, weights)
+    assert pull.energy(network).item() == 0.0
+    count = 0
+    with torch.no_grad():
+        for value in network.parameters():
+            value.add_(0.5)
+            count += value.numel()
+    assert pull.energy(network).item() == pytest.approx(0.5 * 3.0 * 0.25 * count, rel=1e-5)
+    pull.energy(network).backward()
+    assert all(torch.allclose(value.grad, torch.full_like(value, 1.5)) for value in network.parameters())
+
+
+def test_weights_that_make_training_diverge_are_said(examples, start):
+    broken = start | {"body.code_head.1.bias": torch.full_like(start["body.code_head.1.bias"], torch.nan)}
+    with pytest.raises(TrainingError, match="diverged at step 7"):
+        train_leg(broken, examples, SMALL, Leg(7, 1), CPU)
