@@ -12,6 +12,7 @@ from small_fleet import feed, fingerprint, in_order, map_of
 from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
+from fcslam.places.matcher import MatcherConfig
 from fcslam.records import ClosureStatus, ConstraintKind, Correction, KeyscanId, Place, Veto
 from fcslam.wire.packets import decode, encode
 
@@ -398,3 +399,30 @@ def test_every_beginning_of_a_recording_has_a_result(scripted):
         for robot in result.robots:
             assert len(robot.keyscans) == len(robot.T_map_base) > 0
             assert robot.keyscans[-1].id == KeyscanId(robot.robot, len(robot.keyscans) - 1)
+
+
+def rounds(count):
+    """Two robots that drive round the same block, one after the other, ``count`` times each; a place every 4 m."""
+    way = rectangle(60 * count + 1)
+    return [*stream("a", way, start_s=0.0), *stream("b", way, start_s=LATER)]
+
+
+def places_kept(fleet):
+    (matcher,) = fleet._matchers.values()
+    return {robot: [k for k in range(0, 301, 4) if KeyscanId(robot, k) in matcher] for robot in ("a", "b")}
+
+
+def test_of_many_places_of_one_robot_at_one_spot_the_oldest_are_forgotten():
+    settings = MatcherConfig(most_nearby=2, nearby_m=1.0)
+    fleet = feed(Fleet(FleetConfig(matcher=settings), 0), rounds(5))
+    last_two = list(range(184, 301, 4))  # the fourth round's first place is where the fifth one ended
+    assert places_kept(fleet) == {"a": last_two, "b": last_two}
+    everything = feed(Fleet(FleetConfig(), 0), rounds(5))
+    assert places_kept(everything) == {robot: list(range(0, 301, 4)) for robot in ("a", "b")}
+    assert fingerprint(fleet.finalize()) == fingerprint(everything.finalize())
+
+
+def test_places_forgotten_by_age_take_nobodys_room():
+    settings = MatcherConfig(most_places=10, most_nearby=2, nearby_m=1.0)
+    fleet = feed(Fleet(FleetConfig(matcher=settings), 0), rounds(5))
+    assert places_kept(fleet) == {"a": [], "b": list(range(264, 301, 4))}

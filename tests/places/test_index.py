@@ -215,14 +215,21 @@ def test_poor_places_are_stored_and_harm_nothing(strategy, scoring, codes):
 
 
 @BOTH
-def test_thousands_of_identical_places_are_one_to_any_query(scoring):
-    place = random_places(np.random.default_rng(3), 1)[0]
+def test_ten_thousand_identical_places_are_one_to_any_query(scoring):
+    place = random_places(np.random.default_rng(3), 1)[0][:5]
     index = PlaceIndex[int](config(Strategy.INCREMENTAL, scoring), np.random.default_rng(0))
-    for number in range(3000):
+    for number in range(10_000):
         index.add(number, place)
+    assert len(index) == 10_000
+    assert index.word_count == len(np.unique(place, axis=0))  # equal descriptors are one word, however many
     found = index.query(place, top_k=5)
     expected = [(number, 1.0) for number in range(5)] if scoring is Scoring.MATCHES else []  # idf 0 tells nothing
     assert [(f.id, round(f.similarity, 9)) for f in found] == expected
+    if scoring is Scoring.MATCHES:
+        other = random_places(np.random.default_rng(4), 1)[0]
+        index.add(10_000, other)
+        assert index.query(place, top_k=1)[0].id == 0
+        assert [(f.id, round(f.similarity, 9)) for f in index.query(other, top_k=1)] == [(10_000, 1.0)]
 
 
 @EVERY

@@ -5,9 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fcslam.config import parse
+from fcslam.errors import ConfigError
 from fcslam.features.codes import code_words
 from fcslam.places.kmeans_tree import TreeShape, bare_root, descend, grow, near_leaves
-from fcslam.places.vocabulary import Vocabulary
+from fcslam.places.vocabulary import Vocabulary, VocabularyConfig
 
 SMALL = TreeShape(branching=4, depth=3, smallest_split=8, iterations=8)
 
@@ -144,3 +146,12 @@ def test_splits_and_merges_keep_a_tree_and_all_other_words(seed, choices):
     restored = Vocabulary.restored(SMALL, tree)
     np.testing.assert_array_equal(number_of[vocabulary.leaves(codes)], restored.leaves(codes))
     assert restored.word_count == vocabulary.word_count
+
+
+@pytest.mark.parametrize(
+    ("tree", "said"),
+    [({"branching": 1}, "tree.branching: .*greater than or equal to 2"), ({"depth": 0}, "tree.depth: .*equal to 1")],
+)
+def test_a_tree_that_cannot_branch_is_refused_in_one_line(tree, said):
+    with pytest.raises(ConfigError, match=f"^my.yaml: {said}.*$"):
+        parse(VocabularyConfig, {"tree": tree}, "my.yaml")

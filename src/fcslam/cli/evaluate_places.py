@@ -51,6 +51,14 @@ def places(
     verify: Annotated[
         bool, typer.Option("--verify", help="Also check by geometry the places that look most alike.")
     ] = False,
+    sequence: Annotated[
+        bool,
+        typer.Option(
+            "--sequence",
+            help="Of sets that are one stream also: similarities as shares of the previous place's, and what "
+            "consecutive places agree on.",
+        ),
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the vocabularies and the bootstrap.")] = 1,
 ) -> None:
     """Recall, precision and mismatches of place recognition: each strategy of the vocabulary beside brute force."""
@@ -60,7 +68,7 @@ def places(
     from fcslam.evaluation.places import write_results
 
     strategies = _strategies(strategy or ("static", "windowed", "incremental"))
-    results = _evaluate(sets, features, label or (), train_on or (), strategies, seed, verify=verify)
+    results = _evaluate(sets, features, label or (), train_on or (), strategies, seed, verify=verify, sequence=sequence)
     write_results(output, results)
     save(curves_figure(results), output / "precision_recall.png")
     _show(Console(), results, output)
@@ -75,6 +83,7 @@ def _evaluate(
     seed: int,
     *,
     verify: bool,
+    sequence: bool,
 ) -> "list[SetResult]":
     from rich.console import Console
     from rich.progress import Progress
@@ -82,6 +91,7 @@ def _evaluate(
     from fcslam.evaluation.place_checks import PairChecker
     from fcslam.evaluation.place_features import choose_features, describe_sets, describe_training
     from fcslam.evaluation.place_scoring import choose_scorers
+    from fcslam.evaluation.place_sequences import in_sequence, plain
     from fcslam.evaluation.places import evaluate_set
     from fcslam.places.vocabulary import VocabularyConfig
 
@@ -93,8 +103,11 @@ def _evaluate(
         described = describe_sets(sets, labels, chosen, lambda: bar.advance(task))
         scorers = choose_scorers(strategies, VocabularyConfig(), training, seed)
         task = bar.add_task("comparing", total=len(scorers) * len(described))
+        variants = in_sequence if sequence else plain
         return [
-            evaluate_set(each, scorers, PairChecker(each) if verify else None, seed, lambda: bar.advance(task))
+            evaluate_set(
+                each, scorers, PairChecker(each) if verify else None, seed, lambda: bar.advance(task), variants
+            )
             for each in described
         ]
 

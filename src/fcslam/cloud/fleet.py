@@ -23,6 +23,7 @@ from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
+from fcslam.places.thinning import crowded_out
 from fcslam.records import (
     Channel,
     ClosureStatus,
@@ -193,11 +194,23 @@ class Fleet:
             for other in dict.fromkeys(entry.closure.i.robot for entry in waiting):
                 self._judge_pair(other, place.id.robot)
             self._places.setdefault((words, place.id.robot), []).append(place.id)
+            self._thin(words, place.id.robot)
         # A robot alone needs no estimate before the end.
         if len(self._store.robots) > 1 and self._graph.is_due(self._config.solve_every):
             self._optimize()
         if self._doubted and len(self._ledger) >= self._patience:
             self._reconsider()
+
+    def _thin(self, words: _Words, robot: str) -> None:
+        """Forget a robot's oldest place where it has very many."""
+        settings, matcher = self._config.matcher, self._matchers[words]
+        if len(self._places[words, robot]) <= settings.most_nearby:
+            return
+        ids = self._places[words, robot] = [i for i in self._places[words, robot] if i in matcher]
+        positions = np.array([self._graph.pose(i)[:2] for i in ids])
+        crowded = crowded_out(positions, settings.nearby_m, settings.most_nearby)
+        if crowded is not None:
+            matcher.forget(ids.pop(crowded))
 
     def _matcher(self, words: _Words) -> PlaceMatcher:
         if words not in self._matchers:

@@ -17,6 +17,7 @@ from fcslam.features.codes import mutual_matches
 from fcslam.metrics.retrieval import PairTruth
 from fcslam.places.hypotheses import HypothesisConfig, propose
 from fcslam.places.motions import MotionConfig
+from fcslam.places.sequence import long_before
 from fcslam.records import Channel, FloatArray, Keyscan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
@@ -51,7 +52,7 @@ def describe_recording(recording: Path) -> DescribedSet:
 
     apart_m = np.linalg.norm(poses[:, None, :2] - poses[:, :2], axis=2)
     seen = np.array([stamps[place.id] for place in places])
-    admitted = (seen[:, None] - seen >= REVISIT_S) & np.tri(len(places), k=-1, dtype=np.bool_)
+    admitted = long_before(seen, REVISIT_S)
     truth = PairTruth(admitted & (apart_m <= SAME_M), admitted & (apart_m > OTHER_M))
     names = tuple(Path(source.name, str(place.id.number)) for place in places)
     features = [PlaceFeatures(place.keypoints, place.descriptors) for place in places]

@@ -28,6 +28,7 @@ from fcslam.errors import EvaluationError
 from fcslam.evaluation.tum_sequence import read_sequence
 from fcslam.evaluation.view_overlap import view_overlap
 from fcslam.metrics.retrieval import Pairs, PairTruth
+from fcslam.places.sequence import long_before
 
 LABELLED: Final = "dataset.csv"
 SAME_CLIP_FRAMES: Final = 4
@@ -136,8 +137,7 @@ def _read_tour(folder: Path) -> PlaceSet:
     matches[later, earlier] = True
     for i, j in zip(earlier, later, strict=True):
         near[max(0, j - NEAR_PAIR) : j + NEAR_PAIR + 1, max(0, i - NEAR_PAIR) : i + NEAR_PAIR + 1] = True
-    index = np.arange(count)
-    admitted = index[:, None] - index >= TOUR_GAP
+    admitted = long_before(np.arange(count), TOUR_GAP)
     paths = tuple(images[number] for number in numbers)
     return _stream(folder, paths, admitted, "loops", PairTruth(matches, ~near))
 
@@ -145,7 +145,7 @@ def _read_tour(folder: Path) -> PlaceSet:
 def _read_sequence(folder: Path) -> PlaceSet:
     sequence = read_sequence(folder)
     overlap = view_overlap(sequence.depths_m, sequence.T_world_camera, sequence.camera)
-    admitted = np.asarray(sequence.stamps[:, None] - sequence.stamps >= SEQUENCE_GAP_S)
+    admitted = long_before(sequence.stamps, SEQUENCE_GAP_S)
     truth = PairTruth(overlap > SAME_OVERLAP, overlap < OTHER_OVERLAP)
     return _stream(folder, sequence.images, admitted, "overlap", truth)
 

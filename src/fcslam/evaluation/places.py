@@ -1,7 +1,7 @@
 """Place recognition: how well each way to compare places finds the same one again, before and after geometry."""
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -11,6 +11,7 @@ import numpy as np
 from fcslam.errors import OutputError
 from fcslam.evaluation.place_checks import PairChecker
 from fcslam.evaluation.place_scoring import DescribedSet, Scorer
+from fcslam.evaluation.place_sequences import plain
 from fcslam.evaluation.place_sets import PlaceSet
 from fcslam.metrics.bootstrap import Interval, mean_interval, measure_interval
 from fcslam.metrics.retrieval import (
@@ -65,28 +66,35 @@ def evaluate_set(
     checker: PairChecker | None,
     seed: int,
     watch: Callable[[], None] = lambda: None,
+    variants: Callable[[DescribedSet, Scorer], Mapping[str, FloatArray]] = plain,
 ) -> SetResult:
-    """Every scorer on every question; with a ``checker`` also after geometry. ``watch`` is called after each scorer."""
+    """Every scorer on every question; with a ``checker`` also after geometry. ``watch`` is called after each scorer.
+
+    ``variants``: what is made of a scorer's similarities; the name of each follows the scorer's.
+    """
     similarities: dict[str, FloatArray] = {}
     verified: dict[str, FloatArray] = {}
     scores: list[Score] = []
-    for name, scorer in scorers.items():
-        similarities[name] = scorer(described)
-        stages = [(similarities[name], False)]
-        if checker is not None:
-            verified[name] = checker.verified(similarities[name])
-            stages.append((verified[name], True))
-        for question, truth in described.place_set.questions.items():
-            for similarity, is_verified in stages:
-                measures, answers = measure(similarity, truth, np.random.default_rng(seed))
-                scores.append(
-                    Score(
-                        described.place_set.name, question, name, is_verified, int(truth.answerable.sum()), measures,
-                        answers.curve(),
-                    )
-                )  # fmt: skip
+    for scorer_name, scorer in scorers.items():
+        for variant, similarity in variants(described, scorer).items():
+            name = f"{scorer_name} {variant}".rstrip()
+            similarities[name] = similarity
+            stages = [(similarity, False)]
+            if checker is not None:
+                verified[name] = checker.verified(similarity)
+                stages.append((verified[name], True))
+            scores += _scores(described.place_set, name, stages, seed)
         watch()
     return SetResult(described.place_set, similarities, verified, tuple(scores))
+
+
+def _scores(place_set: PlaceSet, name: str, stages: Sequence[tuple[FloatArray, bool]], seed: int) -> Iterator[Score]:
+    """Every question, before and after geometry."""
+    for question, truth in place_set.questions.items():
+        for similarity, is_verified in stages:
+            measures, answers = measure(similarity, truth, np.random.default_rng(seed))
+            asked = int(truth.answerable.sum())
+            yield Score(place_set.name, question, name, is_verified, asked, measures, answers.curve())
 
 
 def measure(similarity: FloatArray, truth: PairTruth, rng: np.random.Generator) -> tuple[dict[str, Interval], Answers]:

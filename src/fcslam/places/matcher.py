@@ -31,6 +31,10 @@ class MatcherConfig(Settings):
     most_places: int = Field(
         default=100_000, gt=0, description="places kept of one channel; of more the oldest are forgotten"
     )
+    most_nearby: int = Field(
+        default=1000, gt=0, description="places kept of one robot and channel this close; of more the oldest goes"
+    )
+    nearby_m: float = Field(default=2.0, gt=0.0, description="how close that is, in the robot's map")
     doubts: int = Field(
         default=2, ge=0, description="places of robots in the same map that are compared wherever the map puts them"
     )
@@ -73,6 +77,9 @@ class PlaceMatcher:
     def __len__(self) -> int:
         return len(self._places)
 
+    def __contains__(self, place: KeyscanId) -> bool:
+        return place in self._places
+
     def match(
         self, place: Place, predicted: Mapping[KeyscanId, FloatArray], strangers: Callable[[KeyscanId], bool]
     ) -> list[PlaceMatch]:
@@ -99,15 +106,22 @@ class PlaceMatcher:
         self._backlog.clear()
         return self._index.compare(place.descriptors)
 
+    def forget(self, place: KeyscanId) -> None:
+        """Never compare this place again.
+
+        Raises:
+            KeyError: it is not stored.
+        """
+        del self._places[place]
+        if place in self._index:
+            self._index.forget(place)
+        else:
+            self._backlog = [stored for stored in self._backlog if stored.id != place]
+
     def _forget_oldest(self) -> None:
         """Bounds the memory: a fleet that goes on for ever keeps its newest places."""
         while len(self._places) > self._config.most_places:
-            oldest = next(iter(self._places))
-            if oldest in self._index:
-                self._index.forget(oldest)
-            else:
-                self._backlog = [stored for stored in self._backlog if stored.id != oldest]
-            del self._places[oldest]
+            self.forget(next(iter(self._places)))
 
     def _candidates(self, likeness: Likeness[KeyscanId], strangers: Callable[[KeyscanId], bool]) -> list[KeyscanId]:
         """Every stranger's place while there are few, else those that are most alike."""
