@@ -202,15 +202,14 @@ class Fleet:
             self._reconsider()
 
     def _thin(self, words: _Words, robot: str) -> None:
-        """Forget a robot's oldest place where it has very many."""
+        """Forget a robot's oldest places where it has very many."""
         settings, matcher = self._config.matcher, self._matchers[words]
         if len(self._places[words, robot]) <= settings.most_nearby:
             return
         ids = self._places[words, robot] = [i for i in self._places[words, robot] if i in matcher]
         positions = np.array([self._graph.pose(i)[:2] for i in ids])
-        crowded = crowded_out(positions, settings.nearby_m, settings.most_nearby)
-        if crowded is not None:
-            matcher.forget(ids.pop(crowded))
+        for row in reversed(crowded_out(positions, settings.nearby_m, settings.most_nearby)):
+            matcher.forget(ids.pop(row))
 
     def _matcher(self, words: _Words) -> PlaceMatcher:
         if words not in self._matchers:

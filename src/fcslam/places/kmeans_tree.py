@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from fcslam.features.codes import CODE_BITS, CODE_WORDS, CodeWords, hamming
 
+_READ_CHILDREN = 8
+"""Of a vertex: as many as most have."""
+
 
 class TreeShape(NamedTuple):
     """Limits of a tree's growth."""
@@ -51,39 +54,61 @@ def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
 
 
 @njit(cache=True)
-def near_leaves(tree: Tree, code: CodeWords, beam: int) -> NDArray[np.int32]:
-    """At most ``beam`` leaves whose centres are near ``code`` (4,), the first of them that of ``descend``.
+def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
+    """At most ``beam`` leaves whose centres are near each code (K, 4), the first of them that of ``descend``.
 
-    Level by level the nearest ``beam`` vertices are kept, and always the one that ``descend`` passes.
+    Level by level the nearest ``beam`` vertices are kept, and always the one that ``descend`` passes. All codes go down
+    abreast: what the next level needs is read for all of them at once, so that cache misses overlap.
+
+    Returns:
+        Shape (K, beam), -1 after the last one.
     """
-    kept, distances = np.zeros(beam, np.int32), np.zeros(beam, np.int64)
-    next_kept, next_distances = np.empty(beam, np.int32), np.empty(beam, np.int64)
-    count, is_done = 1, False
-    while not is_done:
-        # The first place is for the way of ``descend``, the others are sorted by distance.
-        found = 1
-        next_kept[0] = _nearest_child(tree, kept[0], code) if tree.child_count[kept[0]] else kept[0]
-        is_done = tree.child_count[next_kept[0]] == 0
-        for position in range(count):
-            vertex = kept[position]
-            first, children = tree.first_child[vertex], tree.child_count[vertex]
-            for candidate in range(first, first + children) if children else range(vertex, vertex + 1):
-                if candidate == next_kept[0]:
-                    continue
-                distance = np.int64(hamming(code, tree.centres[candidate])) if children else distances[position]
-                if found == beam and (beam == 1 or distance >= next_distances[found - 1]):
-                    continue
-                found = min(found + 1, beam)
-                place = found - 1
-                while place > 1 and next_distances[place - 1] > distance:
-                    next_kept[place], next_distances[place] = next_kept[place - 1], next_distances[place - 1]
-                    place -= 1
-                next_kept[place], next_distances[place] = candidate, distance
-        for position in range(1, found):
-            is_done &= tree.child_count[next_kept[position]] == 0
-        kept, next_kept, distances, next_distances = next_kept, kept, next_distances, distances
-        count = found
-    return kept[:count]
+    kept, distances = np.full((codes.shape[0], beam), -1, np.int32), np.zeros((codes.shape[0], beam), np.int64)
+    kept[:, 0] = 0
+    while _read_children(tree, kept):
+        for k in range(codes.shape[0]):
+            _go_down(tree, codes[k], kept[k], distances[k])
+    return kept
+
+
+@njit(cache=True)
+def _read_children(tree: Tree, kept: NDArray[np.int32]) -> bool:
+    """Bring the centres of the children of these vertices into the cache; tells whether there are any."""
+    first, count = np.empty(kept.size, np.int32), 0
+    for vertex in kept.flat:
+        if vertex >= 0 and tree.child_count[vertex]:
+            first[count] = tree.first_child[vertex]
+            count += 1
+    read = np.uint64(0)
+    for child in first[:count]:
+        for other in range(child, min(child + _READ_CHILDREN, tree.centres.shape[0]), 2):  # two to a line of the cache
+            read |= tree.centres[other, 0]
+    return bool(read >= np.uint64(0)) if count else False
+
+
+@njit(cache=True)
+def _go_down(tree: Tree, code: CodeWords, kept: NDArray[np.int32], distances: NDArray[np.int64]) -> None:
+    """From the vertices kept (-1 after the last) to the nearest of their children; leaves stay."""
+    above, reached = kept.copy(), distances.copy()
+    kept[0] = _nearest_child(tree, above[0], code) if tree.child_count[above[0]] else above[0]
+    found = 1  # the first place is for the way of ``descend``, the others are sorted by distance
+    for position in range(above.shape[0]):
+        vertex = above[position]
+        if vertex < 0:
+            break
+        first, children = tree.first_child[vertex], tree.child_count[vertex]
+        for candidate in range(first, first + children) if children else range(vertex, vertex + 1):
+            if candidate == kept[0]:
+                continue
+            distance = np.int64(hamming(code, tree.centres[candidate])) if children else reached[position]
+            if found == kept.shape[0] and (found == 1 or distance >= distances[found - 1]):
+                continue
+            found = min(found + 1, kept.shape[0])
+            place = found - 1
+            while place > 1 and distances[place - 1] > distance:
+                kept[place], distances[place] = kept[place - 1], distances[place - 1]
+                place -= 1
+            kept[place], distances[place] = candidate, distance
 
 
 @njit(cache=True)

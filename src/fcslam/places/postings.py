@@ -101,7 +101,7 @@ class Postings:
         self.entries.starts[rows] = self.descriptor_count + np.cumsum(counts) - counts
         self.entries.counts[rows], self.entries.log_documents[: rows.stop] = counts, 0.0
         self.row_count, self.descriptor_count = rows.stop, self.descriptor_count + len(codes)
-        _enter_all(self.entries, first_row, len(counts), codes, leaves)
+        _enter_all(self.entries, np.argsort(leaves, kind="stable"), first_row, codes, leaves)
 
     def forget(self, row: int) -> NDArray[np.int32]:
         """Take a place out; returns the leaves that it was in."""
@@ -201,12 +201,20 @@ def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int3
 
 
 @njit(cache=True)
-def _enter_all(entries: Entries, first_row: int, count: int, codes: CodeWords, leaves: NDArray[np.int32]) -> None:
-    k = 0
-    for row in range(first_row, first_row + count):
-        for index in range(entries.counts[row]):
-            _append(entries, leaves[k], row, index, codes[k])
-            k += 1
+def _enter_all(
+    entries: Entries, order: NDArray[np.int64], first_row: int, codes: CodeWords, leaves: NDArray[np.int32]
+) -> None:
+    """``order``: of the leaves, so that each is filled at once, in the order of places."""
+    begin = entries.starts[first_row] if order.shape[0] else 0
+    row_of = np.empty(order.shape[0], np.int32)
+    row = first_row
+    for k in range(order.shape[0]):
+        while begin + k >= entries.starts[row] + entries.counts[row]:
+            row += 1
+        row_of[k] = row
+    for k in order:
+        row = row_of[k]
+        _append(entries, leaves[k], row, begin + k - entries.starts[row], codes[k])
     for leaf in range(entries.newest.shape[0]):
         if entries.sizes[leaf]:
             _shift(entries, leaf, np.log(entries.documents[leaf]), -1)

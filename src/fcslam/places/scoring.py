@@ -11,6 +11,8 @@ from fcslam.places.kmeans_tree import Tree, near_leaves
 from fcslam.places.postings import BLOCK, Entries, block_size
 from fcslam.records import FloatArray
 
+_ABREAST = 32
+"""Codes of a query whose words are read together: so many that cache misses overlap, so few that all stays there."""
 TINY = 1e-300
 """In the place of a sum that may be zero."""
 
@@ -76,12 +78,10 @@ def score_matches(
     scores, nearest = np.zeros(row_count), np.full(row_count, near_bits + 1, np.int32)
     touched, here = np.empty(row_count, np.int32), np.empty(row_count, np.int32)
     total, whole = 0, 0.0
-    leaves = np.full((codes.shape[0], beam), -1, np.int32)
+    leaves = near_leaves(tree, codes, beam)
     for k in range(codes.shape[0]):
-        near = near_leaves(tree, codes[k], beam)
-        leaves[k, : near.shape[0]] = near
-    _fetch(entries, leaves.ravel())
-    for k in range(codes.shape[0]):
+        if k % _ABREAST == 0:
+            _fetch(entries, leaves[k : k + _ABREAST].ravel())
         found = 0
         for leaf in leaves[k]:
             if leaf < 0:

@@ -1,12 +1,13 @@
-"""Which place may be forgotten where a robot has stored very many."""
+"""Which places may be forgotten where a robot has stored very many."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.records import FloatArray
 
 
-def crowded_out(positions_m: FloatArray, radius_m: float, most: int) -> int | None:
-    """The oldest place within ``radius_m`` of the newest one if they are more than ``most`` together, itself included.
+def crowded_out(positions_m: FloatArray, radius_m: float, most: int) -> NDArray[np.int64]:
+    """All but the newest ``most`` places within ``radius_m`` of the newest one, which is one of them.
 
     Asked after every new place, no disc of half the radius ever holds more than ``most``: as long as places stay where
     they are, memory is bounded by the area that a robot drives in and not by how long it drives.
@@ -17,10 +18,10 @@ def crowded_out(positions_m: FloatArray, radius_m: float, most: int) -> int | No
         most: 1 or more, so that the newest always stays.
 
     Returns:
-        A row of ``positions_m``, None if there is room.
+        Rows of ``positions_m``; none if there is room.
     """
     if len(positions_m) <= most:
-        return None
+        return np.empty(0, np.int64)
     offsets = positions_m - positions_m[-1]
     near = np.flatnonzero(np.hypot(offsets[:, 0], offsets[:, 1]) <= radius_m)
-    return int(near[0]) if len(near) > most else None
+    return near[:-most]

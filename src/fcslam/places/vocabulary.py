@@ -129,11 +129,11 @@ class Vocabulary:
 
     def state(self) -> tuple[TreeState, NDArray[np.int32]]:
         """The tree without gaps, and the new number of every vertex (V,)."""
-        order = np.zeros(1, np.int64)
-        level = order
+        order = level = np.zeros(1, np.int64)
         while len(level):
-            below = [np.arange(family.start, family.stop) for family in map(self.children, level.tolist())]
-            level = np.concatenate([np.empty(0, np.int64), *below])
+            counts = self.tree.child_count[level]
+            before = np.cumsum(counts) - counts
+            level = np.repeat(self.tree.first_child[level] - before, counts) + np.arange(counts.sum())
             order = np.concatenate([order, level])
         number_of = np.full(self.vertex_count, -1, np.int32)
         number_of[order] = np.arange(len(order))

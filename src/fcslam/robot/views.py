@@ -25,7 +25,7 @@ class ViewsConfig(Settings):
     every_rad: float = Field(default=0.5, gt=0.0, description="or turn: half of what a camera sees is new [rad]")
     fewest_keypoints: int = Field(default=20, ge=1, description="an image of a bare wall is no place")
     ceiling_m: float = Field(default=3.0, gt=0.0, description="keypoints above this lie on no wall [m]")
-    detector: DetectorKind = Field(default=DetectorKind.ONNX, description="what describes images: onnx (a network), orb")
+    detector: DetectorKind = Field(default=DetectorKind.ONNX, description="what describes images: a network or orb")
     orb: OrbConfig = Field(default=OrbConfig(), description="settings of detector orb")
     onnx: OnnxConfig = Field(default=OnnxConfig(), description="settings of detector onnx")
 
