@@ -165,7 +165,7 @@ class PlaceIndex(Generic[PlaceId]):
         index._training, index._places_seen = state.training, state.places_seen
         index._vocabulary = Vocabulary.restored(_shape(state.config), state.tree)
         index._postings = Postings(index._vocabulary.vertex_count)
-        index._postings.add_all(state.codes, state.leaves, state.counts)
+        index._postings.fill(state.codes, state.leaves, state.counts)
         index._ids = list(state.ids)
         index._row_of = {place: row for row, place in enumerate(index._ids)}
         return index
@@ -199,7 +199,7 @@ class PlaceIndex(Generic[PlaceId]):
         """Enter all stored places anew, ``stored`` (M, 4) being their codes; rows close up."""
         counts = self._postings.entries.counts[self._rows()]
         self._postings = Postings(self._vocabulary.vertex_count)
-        self._postings.add_all(stored, self._vocabulary.leaves(stored), counts)
+        self._postings.fill(stored, self._vocabulary.leaves(stored), counts)
         self._ids = list(self._row_of)
         self._row_of = {place: row for row, place in enumerate(self._ids)}
 

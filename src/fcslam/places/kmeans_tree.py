@@ -44,13 +44,12 @@ def bare_root() -> Tree:
 @njit(cache=True)
 def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
     """The leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
-    leaves = np.empty(codes.shape[0], np.int32)
-    for index in range(codes.shape[0]):
-        vertex = 0
-        while tree.child_count[vertex]:
-            vertex = _nearest_child(tree, vertex, codes[index])
-        leaves[index] = vertex
-    return leaves
+    reached = np.zeros(codes.shape[0], np.int32)
+    while _read_children(tree, reached):
+        for index in range(codes.shape[0]):
+            if tree.child_count[reached[index]]:
+                reached[index] = _nearest_child(tree, reached[index], codes[index])
+    return reached
 
 
 @njit(cache=True)

@@ -93,15 +93,21 @@ class Postings:
         _enter(entries, row, codes, leaves)
         return row
 
-    def add_all(self, codes: CodeWords, leaves: NDArray[np.int32], counts: NDArray[np.int32]) -> None:
-        """Enter many places at once: codes (M, 4) and leaves (M,) place by place, ``counts`` of each."""
-        first_row = self.row_count
-        self._make_room(blocks=len(codes) // BLOCK + len(np.unique(leaves)), rows=len(counts), descriptors=len(codes))
-        rows = slice(first_row, first_row + len(counts))
-        self.entries.starts[rows] = self.descriptor_count + np.cumsum(counts) - counts
-        self.entries.counts[rows], self.entries.log_documents[: rows.stop] = counts, 0.0
-        self.row_count, self.descriptor_count = rows.stop, self.descriptor_count + len(codes)
-        _enter_all(self.entries, np.argsort(leaves, kind="stable"), first_row, codes, leaves)
+    def fill(self, codes: CodeWords, leaves: NDArray[np.int32], counts: NDArray[np.int32]) -> None:
+        """Enter many places where there are none: codes (M, 4), leaves (M,) place by place, ``counts`` of each."""
+        sizes = np.bincount(leaves, minlength=len(self.entries.newest))
+        blocks = -(-sizes // BLOCK)
+        ends = np.cumsum(blocks)
+        self._make_room(blocks=int(ends[-1]), rows=len(counts), descriptors=len(codes))
+        self.row_count, self.descriptor_count = len(counts), len(codes)
+        entries = self.entries
+        entries.sizes[: len(sizes)], entries.free[1] = sizes, ends[-1]
+        entries.newest[: len(sizes)] = np.where(sizes, ends - 1, -1)
+        entries.older[: ends[-1]] = np.arange(-1, ends[-1] - 1)
+        entries.older[(ends - blocks)[sizes > 0]] = -1
+        entries.counts[: len(counts)], entries.leaves[: len(codes)] = counts, leaves
+        entries.starts[: len(counts)] = np.cumsum(counts) - counts
+        _fill(entries, len(counts), codes, (ends - blocks) * BLOCK)
 
     def forget(self, row: int) -> NDArray[np.int32]:
         """Take a place out; returns the leaves that it was in."""
@@ -201,23 +207,27 @@ def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int3
 
 
 @njit(cache=True)
-def _enter_all(
-    entries: Entries, order: NDArray[np.int64], first_row: int, codes: CodeWords, leaves: NDArray[np.int32]
-) -> None:
-    """``order``: of the leaves, so that each is filled at once, in the order of places."""
-    begin = entries.starts[first_row] if order.shape[0] else 0
-    row_of = np.empty(order.shape[0], np.int32)
-    row = first_row
-    for k in range(order.shape[0]):
-        while begin + k >= entries.starts[row] + entries.counts[row]:
-            row += 1
-        row_of[k] = row
-    for k in order:
-        row = row_of[k]
-        _append(entries, leaves[k], row, begin + k - entries.starts[row], codes[k])
-    for leaf in range(entries.newest.shape[0]):
-        if entries.sizes[leaf]:
-            _shift(entries, leaf, np.log(entries.documents[leaf]), -1)
+def _fill(entries: Entries, places: int, codes: CodeWords, first: NDArray[np.int64]) -> None:
+    """``first`` (V,): where in the blocks, entry by entry, each leaf's descriptors begin; it moves on."""
+    rows, indices = entries.rows.reshape(-1), entries.indices.reshape(-1)
+    stored = entries.codes.reshape(-1, CODE_WORDS)
+    latest = np.full(first.shape[0], -1, np.int32)
+    k = 0
+    for row in range(places):
+        for index in range(entries.counts[row]):
+            leaf = entries.leaves[k]
+            target = first[leaf]
+            first[leaf] += 1
+            rows[target], indices[target] = row, index
+            for word in range(CODE_WORDS):
+                stored[target, word] = codes[k, word]
+            entries.documents[leaf] += latest[leaf] != row
+            latest[leaf] = row
+            k += 1
+    log_documents = np.log(np.maximum(entries.documents, 1))
+    for row in range(places):
+        begin = entries.starts[row]
+        entries.log_documents[row] = log_documents[entries.leaves[begin : begin + entries.counts[row]]].sum()
 
 
 @njit(cache=True)
