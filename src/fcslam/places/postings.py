@@ -333,7 +333,9 @@ def _gather(entries: Entries, begins: NDArray[np.int64], codes: CodeWords) -> No
             for place in range(filled):
                 row = entries.rows[block, place]
                 if begins[row] >= 0:
-                    codes[begins[row] + entries.indices[block, place]] = entries.codes[block, place]
+                    target = begins[row] + entries.indices[block, place]
+                    for word in range(CODE_WORDS):
+                        codes[target, word] = entries.codes[block, place, word]
             block, filled = entries.older[block], BLOCK
 
 
