@@ -4,7 +4,7 @@
 
 The scenes of `benchmarks/homography.py` have 25 pairs, too few for a difference of two hundredths. Here 250 images, 84
 or 83 each of an office corridor, a desk and the floors 11 to 15 of a tower, none of them trained on, and of each two
-copies under a random homography, light, blur and noise, drawn as training draws them. So the truth is exact and the kind
+copies under a random homography, light, blur and noise, drawn as training draws them. The truth is exact and the kind
 of change is one that training knew; the images it did not. At 640 x 480, matching as there; 95 % intervals by bootstrap
 over pairs, those of differences paired. NAME-logits: the same keypoints compared by the cosine of their 256 logits.
 """
