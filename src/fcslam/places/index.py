@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from fcslam.features.codes import CODE_WORDS, CodeWords, code_words
 from fcslam.places.kmeans_tree import TreeShape
 from fcslam.places.likeness import Found, Likeness, PlaceId
-from fcslam.places.postings import Postings
-from fcslam.places.scoring import TINY, score_matches, score_words
+from fcslam.places.postings import GROWTH, Postings
+from fcslam.places.scoring import TINY, blank_tally, score_matches, score_words
 from fcslam.places.similarity import BagOfWords, similarity
 from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
 from fcslam.records import Codes, FloatArray
@@ -54,7 +54,8 @@ class PlaceIndex(Generic[PlaceId]):
         self._config = config
         self._descriptor_version = descriptor_version
         self._vocabulary = Vocabulary(_shape(config), int(rng.integers(0, 2**63)))
-        self._postings = Postings(vertices=1)
+        self._postings = self._no_postings()
+        self._tally = blank_tally(0)
         self._ids: list[PlaceId] = []
         """By row; what stood there once stays after the place was forgotten, until rows are closed up."""
         self._row_of: dict[PlaceId, int] = {}
@@ -99,7 +100,7 @@ class PlaceIndex(Generic[PlaceId]):
         if self._is_due(i):
             self._train_on_newest()
         elif self._training and self._config.strategy is Strategy.INCREMENTAL:
-            self._split(self._overfull(*np.unique(leaves, return_counts=True)))
+            self._split(self._overfull(leaves))
 
     def query(self, descriptors: Codes, top_k: int, exclude: Container[PlaceId] = frozenset()) -> list[Found[PlaceId]]:
         """The ``top_k`` stored places most similar to these descriptors (N, 32): the best of ``compare``."""
@@ -108,15 +109,17 @@ class PlaceIndex(Generic[PlaceId]):
     def compare(self, descriptors: Codes) -> Likeness[PlaceId]:
         """How alike all stored places are to these descriptors (N, 32); nothing before the first training."""
         codes = code_words(descriptors)
-        entries, row_count, count = self._postings.entries, self._postings.row_count, len(self)
+        entries, count = self._postings.entries, len(self)
         if not self._training or not count:
             return Likeness()
+        if self._postings.row_count > len(self._tally.scores):
+            self._tally = blank_tally(int(GROWTH * self._postings.row_count))
         if self._config.scoring is Scoring.MATCHES:
             beam, near_bits = self._config.beam, self._config.near_bits
-            rows, scores = score_matches(entries, self._vocabulary.tree, row_count, count, codes, beam, near_bits)
+            rows, scores = score_matches(entries, self._vocabulary.tree, self._tally, count, codes, beam, near_bits)
         else:
             leaves, weights = self._weigh(codes)
-            rows, scores = score_words(entries, row_count, count, leaves, weights)
+            rows, scores = score_words(entries, self._tally, count, leaves, weights)
         return Likeness(self._ids, rows, scores)
 
     def similarity(self, a: Codes, b: Codes) -> float:
@@ -164,7 +167,7 @@ class PlaceIndex(Generic[PlaceId]):
         index = cls(state.config, np.random.default_rng(0), state.descriptor_version)
         index._training, index._places_seen = state.training, state.places_seen
         index._vocabulary = Vocabulary.restored(_shape(state.config), state.tree)
-        index._postings = Postings(index._vocabulary.vertex_count)
+        index._postings = index._no_postings()
         index._postings.fill(state.codes, state.leaves, state.counts)
         index._ids = list(state.ids)
         index._row_of = {place: row for row, place in enumerate(index._ids)}
@@ -198,24 +201,29 @@ class PlaceIndex(Generic[PlaceId]):
     def _describe_again(self, stored: CodeWords) -> None:
         """Enter all stored places anew, ``stored`` (M, 4) being their codes; rows close up."""
         counts = self._postings.entries.counts[self._rows()]
-        self._postings = Postings(self._vocabulary.vertex_count)
+        self._postings = self._no_postings()
         self._postings.fill(stored, self._vocabulary.leaves(stored), counts)
         self._ids = list(self._row_of)
         self._row_of = {place: row for row, place in enumerate(self._ids)}
+
+    def _no_postings(self) -> Postings:
+        """For the leaves of the present tree."""
+        return Postings(self._vocabulary.vertex_count, has_norms=self._config.scoring is Scoring.WORDS)
 
     def _rows(self) -> NDArray[np.int64]:
         """Of the stored places, ascending."""
         return np.fromiter(self._row_of.values(), np.int64, len(self))
 
-    def _overfull(self, leaves: NDArray[np.int32], added: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Those of the leaves that have grown over the limit, or over twice, four times ... the limit.
+    def _overfull(self, entered: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Leaves that have grown over the limit, or over twice, four times ... the limit, by what was just entered.
 
         A word of equal descriptors cannot be split; it is not tried again with each one more.
         """
-        capacity = self._config.leaf_capacity
-        after = self._postings.entries.sizes[leaves]
-        limit = capacity * 2.0 ** np.floor(np.log2(np.maximum(after - 1, 1) / capacity))
-        return leaves[(after > capacity) & (after - added <= limit)]
+        capacity, sizes = self._config.leaf_capacity, self._postings.entries.sizes
+        leaves, added = np.unique(entered[sizes[entered] > capacity], return_counts=True)
+        after = sizes[leaves]
+        limit = capacity * 2.0 ** np.floor(np.log2((after - 1) / capacity))
+        return leaves[after - added <= limit]
 
     def _split(self, overfull: NDArray[np.integer[Any]]) -> None:
         """Split words that hold too many descriptors, and what they split into."""

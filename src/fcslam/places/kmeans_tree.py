@@ -9,10 +9,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fcslam.features.codes import CODE_BITS, CODE_WORDS, CodeWords, hamming
+from fcslam.features.codes import CODE_BITS, CODE_WORDS, CodeWords, popcount
 
-_READ_CHILDREN = 8
-"""Of a vertex: as many as most have."""
+_MOST_PLANES = 32
+"""Counters of a bit: more codes than 2 ** 32 are in no cluster."""
 
 
 class TreeShape(NamedTuple):
@@ -30,15 +30,23 @@ class Tree(NamedTuple):
 
     centres: CodeWords
     """Shape (V, 4)."""
-    first_child: NDArray[np.int32]
-    """Shape (V,)."""
-    child_count: NDArray[np.int32]
-    """Shape (V,): 0 for a leaf."""
+    families: NDArray[np.int32]
+    """Shape (V, 2), side by side since whoever needs one needs the other: the first child, and how many there are."""
+
+    @property
+    def first_child(self) -> NDArray[np.int32]:
+        """Shape (V,)."""
+        return self.families[:, 0]
+
+    @property
+    def child_count(self) -> NDArray[np.int32]:
+        """Shape (V,): 0 for a leaf."""
+        return self.families[:, 1]
 
 
 def bare_root() -> Tree:
     """A tree of one leaf."""
-    return Tree(np.zeros((1, CODE_WORDS), np.uint64), np.zeros(1, np.int32), np.zeros(1, np.int32))
+    return Tree(np.zeros((1, CODE_WORDS), np.uint64), np.zeros((1, 2), np.int32))
 
 
 @njit(cache=True)
@@ -46,9 +54,10 @@ def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
     """The leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
     reached = np.zeros(codes.shape[0], np.int32)
     while _read_children(tree, reached):
-        for index in range(codes.shape[0]):
-            if tree.child_count[reached[index]]:
-                reached[index] = _nearest_child(tree, reached[index], codes[index])
+        for k in range(codes.shape[0]):
+            first, children = tree.families[reached[k], 0], tree.families[reached[k], 1]
+            if children:
+                reached[k] = _nearest(codes, k, tree.centres, first, first + children)
     return reached
 
 
@@ -62,58 +71,66 @@ def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
     Returns:
         Shape (K, beam), -1 after the last one.
     """
-    kept, distances = np.full((codes.shape[0], beam), -1, np.int32), np.zeros((codes.shape[0], beam), np.int64)
+    kept, distances = np.full((codes.shape[0], beam), -1, np.int32), np.zeros((codes.shape[0], beam), np.int32)
+    above, reached = np.empty(beam, np.int32), np.empty(beam, np.int32)
     kept[:, 0] = 0
-    while _read_children(tree, kept):
+    while _read_children(tree, kept.reshape(-1)):
         for k in range(codes.shape[0]):
-            _go_down(tree, codes[k], kept[k], distances[k])
+            for position in range(beam):
+                above[position], reached[position] = kept[k, position], distances[k, position]
+            _go_down(tree, codes, k, above, reached, kept, distances)
     return kept
 
 
 @njit(cache=True)
 def _read_children(tree: Tree, kept: NDArray[np.int32]) -> bool:
     """Bring the centres of the children of these vertices into the cache; tells whether there are any."""
-    first, count = np.empty(kept.size, np.int32), 0
-    for vertex in kept.flat:
-        if vertex >= 0 and tree.child_count[vertex]:
-            first[count] = tree.first_child[vertex]
+    parents, count = np.empty(kept.size, np.int32), 0
+    for vertex in kept:
+        if vertex >= 0 and tree.families[vertex, 1]:
+            parents[count] = vertex
             count += 1
     read = np.uint64(0)
-    for child in first[:count]:
-        for other in range(child, min(child + _READ_CHILDREN, tree.centres.shape[0]), 2):  # two to a line of the cache
-            read |= tree.centres[other, 0]
+    for vertex in parents[:count]:
+        first, last = tree.families[vertex, 0], tree.families[vertex, 0] + tree.families[vertex, 1] - 1
+        for child in range(first, last, 2):  # two to a line of the cache
+            read |= tree.centres[child, 0]
+        read |= tree.centres[last, CODE_WORDS - 1]
     return bool(read >= np.uint64(0)) if count else False
 
 
 @njit(cache=True)
-def _go_down(tree: Tree, code: CodeWords, kept: NDArray[np.int32], distances: NDArray[np.int64]) -> None:
-    """From the vertices kept (-1 after the last) to the nearest of their children; leaves stay."""
-    above, reached = kept.copy(), distances.copy()
-    kept[0] = _nearest_child(tree, above[0], code) if tree.child_count[above[0]] else above[0]
-    found = 1  # the first place is for the way of ``descend``, the others are sorted by distance
-    for position in range(above.shape[0]):
+def _go_down(
+    tree: Tree,
+    codes: CodeWords,
+    k: int,
+    above: NDArray[np.int32],
+    reached: NDArray[np.int32],
+    kept: NDArray[np.int32],
+    distances: NDArray[np.int32],
+) -> None:
+    """From the vertices above (-1 after the last), which code k reached, to the nearest of their children; leaves stay.
+
+    The children of the first vertex come first and may take the first place, which is for the way of ``descend``; the
+    children of others stay behind it, sorted by distance.
+    """
+    found, beam = 0, above.shape[0]
+    for position in range(beam):
         vertex = above[position]
         if vertex < 0:
             break
-        first, children = tree.first_child[vertex], tree.child_count[vertex]
+        first, children = tree.families[vertex, 0], tree.families[vertex, 1]
         for candidate in range(first, first + children) if children else range(vertex, vertex + 1):
-            if candidate == kept[0]:
+            distance = _distance(codes, k, tree.centres, candidate) if children else reached[position]
+            if found < beam:
+                found += 1
+            elif distance >= distances[k, beam - 1]:
                 continue
-            distance = np.int64(hamming(code, tree.centres[candidate])) if children else reached[position]
-            if found == kept.shape[0] and (found == 1 or distance >= distances[found - 1]):
-                continue
-            found = min(found + 1, kept.shape[0])
-            place = found - 1
-            while place > 1 and distances[place - 1] > distance:
-                kept[place], distances[place] = kept[place - 1], distances[place - 1]
+            place, foremost = found - 1, min(position, 1)
+            while place > foremost and distances[k, place - 1] > distance:
+                kept[k, place], distances[k, place] = kept[k, place - 1], distances[k, place - 1]
                 place -= 1
-            kept[place], distances[place] = candidate, distance
-
-
-@njit(cache=True)
-def _nearest_child(tree: Tree, vertex: int, code: CodeWords) -> Any:
-    first = tree.first_child[vertex]
-    return first + _nearest(code, tree.centres[first : first + tree.child_count[vertex]])
+            kept[k, place], distances[k, place] = candidate, distance
 
 
 @njit(cache=True)
@@ -121,7 +138,7 @@ def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
     """Split the codes (N, 4) level by level; the codes of one vertex stay together in ``members``."""
     most = 1 + shape.branching * (1 + shape.depth * (codes.shape[0] // shape.smallest_split))
     centres = np.zeros((most, CODE_WORDS), np.uint64)
-    first_child, child_count = np.zeros(most, np.int32), np.zeros(most, np.int32)
+    families = np.zeros((most, 2), np.int32)
     begin, end, level = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros(most, np.int64)
     members = np.arange(codes.shape[0])
     end[0], used, vertex = codes.shape[0], 1, 0
@@ -131,7 +148,7 @@ def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
         if level[vertex] < shape.depth and high - low >= shape.smallest_split:
             found, labels = k_means(codes[members[low:high]], shape, state)
             if found.shape[0] > 1:
-                first_child[vertex], child_count[vertex] = used, found.shape[0]
+                families[vertex, 0], families[vertex, 1] = used, found.shape[0]
                 members[low:high] = members[low:high][np.argsort(labels, kind="mergesort")]
                 bounds = low + np.cumsum(np.bincount(labels, minlength=found.shape[0]))
                 children = slice(used, used + found.shape[0])
@@ -139,7 +156,7 @@ def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
                 begin[used], begin[used + 1 : used + found.shape[0]] = low, bounds[:-1]
                 used += found.shape[0]
         vertex += 1
-    return Tree(centres[:used].copy(), first_child[:used].copy(), child_count[:used].copy())
+    return Tree(centres[:used].copy(), families[:used].copy())
 
 
 @njit(cache=True)
@@ -161,22 +178,31 @@ def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tu
 
 
 @njit(cache=True)
-def _nearest(code: CodeWords, centres: CodeWords) -> int:
-    best, best_distance = 0, np.uint64(CODE_BITS + 1)
-    for index in range(centres.shape[0]):
-        distance = hamming(code, centres[index])
+def _distance(codes: CodeWords, k: int, centres: CodeWords, vertex: int) -> Any:
+    """Bits between code k and a centre, by their numbers: to cut out rows would cost more than to compare them."""
+    bits = popcount(codes[k, 0] ^ centres[vertex, 0]) + popcount(codes[k, 1] ^ centres[vertex, 1])
+    bits += popcount(codes[k, 2] ^ centres[vertex, 2]) + popcount(codes[k, 3] ^ centres[vertex, 3])
+    return np.int32(bits)
+
+
+@njit(cache=True)
+def _nearest(codes: CodeWords, k: int, centres: CodeWords, first: int, end: int) -> Any:
+    """The number, from ``first`` to before ``end``, of the centre nearest to code k."""
+    best, best_distance = first, np.int32(CODE_BITS + 1)
+    for candidate in range(first, end):
+        distance = _distance(codes, k, centres, candidate)
         if distance < best_distance:
-            best, best_distance = index, distance
+            best, best_distance = candidate, distance
     return best
 
 
 @njit(cache=True)
 def _assign(codes: CodeWords, centres: CodeWords, labels: NDArray[np.int64]) -> int:
     changed = 0
-    for index in range(codes.shape[0]):
-        label = _nearest(codes[index], centres)
-        changed += label != labels[index]
-        labels[index] = label
+    for k in range(codes.shape[0]):
+        label = _nearest(codes, k, centres, 0, centres.shape[0])
+        changed += label != labels[k]
+        labels[k] = label
     return changed
 
 
@@ -189,7 +215,7 @@ def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -
     count = 1
     while count < branching:
         for index in range(codes.shape[0]):
-            nearest[index] = min(nearest[index], np.int64(hamming(codes[index], centres[count - 1])))
+            nearest[index] = min(nearest[index], np.int64(_distance(codes, index, centres, count - 1)))
         reach = np.cumsum(nearest * nearest)
         if reach[-1] == 0:
             break
@@ -200,20 +226,31 @@ def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -
 
 @njit(cache=True)
 def _majorities(codes: CodeWords, labels: NDArray[np.int64], count: int) -> CodeWords:
-    """The majority of every bit in every cluster; a tie, as in a cluster without members, is 0."""
-    ones = np.zeros((count, CODE_BITS), np.int32)
-    sizes = np.bincount(labels, minlength=count)
-    for index in range(codes.shape[0]):
-        target = ones[labels[index]]
+    """The majority of every bit in every cluster; a tie, as in a cluster without members, is 0.
+
+    The ones of 64 bits are counted at once: plane p holds bit p of each of the 64 counts.
+    """
+    planes = np.zeros((count, CODE_WORDS, _MOST_PLANES), np.uint64)
+    for k in range(codes.shape[0]):
         for word in range(CODE_WORDS):
-            bits = codes[index, word]
-            for bit in range(64):
-                target[word * 64 + bit] += np.int32((bits >> np.uint64(bit)) & np.uint64(1))
+            plane, carry = 0, codes[k, word]
+            while carry:
+                kept = planes[labels[k], word, plane]
+                planes[labels[k], word, plane] = kept ^ carry
+                carry &= kept
+                plane += 1
+    half = np.bincount(labels, minlength=count) // 2
     centres = np.zeros((count, CODE_WORDS), np.uint64)
     for label in range(count):
-        for bit in range(CODE_BITS):
-            if 2 * ones[label, bit] > sizes[label]:
-                centres[label, bit // 64] |= np.uint64(1) << np.uint64(bit % 64)
+        for word in range(CODE_WORDS):
+            equal = ~np.uint64(0)  # counts whose higher bits are those of half the cluster
+            for plane in range(_MOST_PLANES - 1, -1, -1):
+                ones = planes[label, word, plane]
+                if (half[label] >> plane) & 1:
+                    equal &= ones
+                else:
+                    centres[label, word] |= equal & ones
+                    equal &= ~ones
     return centres
 
 

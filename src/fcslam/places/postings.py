@@ -1,7 +1,7 @@
 """Where every stored descriptor is: by word, in blocks that a query reads in a row, and by place.
 
 The codes themselves lie in the blocks, word by word: a query compares some hundred codes of one word, and codes that
-lie place by place would cost a cache miss each.
+lie place by place would cost a cache miss each. For the same reason a block holds all that is known of its entries.
 """
 
 from collections.abc import Sequence
@@ -20,24 +20,27 @@ BLOCK = 8
 GROWTH = 1.06
 """Of arrays that run out of room."""
 
+ROWS = 2 * CODE_WORDS * BLOCK
+"""Where in the numbers of a block it is told whose descriptors they are, for each entry."""
+OLDER = ROWS + BLOCK
+"""The number of the block before it in its chain, -1 for none."""
+_INDICES = OLDER + 2
+"""Which ones of their places they are, for each entry."""
+_BLOCK_WORDS = (_INDICES + BLOCK) // 2
+
 
 class Entries(NamedTuple):
     """Postings as compiled code sees them. Words go by the number of their leaf in the tree, places by row."""
 
-    newest: NDArray[np.int32]
-    """Shape (V,): the block of each leaf that is being filled, -1 for none. All others of its chain are full."""
-    sizes: NDArray[np.int32]
-    """Shape (V,): descriptors of the leaf."""
+    heads: NDArray[np.int32]
+    """Shape (V, 2): the block of each leaf that is being filled, -1 for none, and the descriptors of the leaf. All other
+    blocks of its chain are full."""
     documents: NDArray[np.int32]
-    """Shape (V,): places that have one."""
-    older: NDArray[np.int32]
-    """Shape (B,): the block before it in its chain, -1 for none."""
-    rows: NDArray[np.int32]
-    """Shape (B, BLOCK): whose descriptor it is."""
-    indices: NDArray[np.int32]
-    """Shape (B, BLOCK): which one of that place."""
-    codes: CodeWords
-    """Shape (B, BLOCK, 4)."""
+    """Shape (V,): places that have a descriptor in the leaf."""
+    blocks: NDArray[np.uint64]
+    """Shape (B, _BLOCK_WORDS): first the codes, entry by entry."""
+    numbers: NDArray[np.int32]
+    """Shape (B, 2 * _BLOCK_WORDS), the same memory: ``ROWS``, ``OLDER``, ``_INDICES``."""
     free: NDArray[np.int64]
     """Shape (2,): the first of the chain of unused blocks, -1 for none; from where on no block was ever used."""
     starts: NDArray[np.int64]
@@ -47,7 +50,13 @@ class Entries(NamedTuple):
     leaves: NDArray[np.int32]
     """Shape (D,): the leaf of every descriptor, place by place."""
     log_documents: FloatArray
-    """Shape (R,): sum of ln(documents) over a place's descriptors. Its L1 norm is n ln(N) minus this, whatever N is."""
+    """Shape (R,): sum of ln(documents) over a place's descriptors. Its L1 norm is n ln(N) minus this, whatever N is.
+    Shape (0,) where nobody asks for norms."""
+
+    @property
+    def sizes(self) -> NDArray[np.int32]:
+        """Shape (V,): descriptors of each leaf."""
+        return self.heads[:, 1]
 
 
 class Content(NamedTuple):
@@ -64,15 +73,14 @@ class Content(NamedTuple):
 class Postings:
     """Entries with room for more."""
 
-    def __init__(self, vertices: int) -> None:
+    def __init__(self, vertices: int, has_norms: bool) -> None:
+        """``has_norms``: whether the L1 norms of the places are kept up, which every place that comes changes."""
+        self._has_norms = has_norms
         self.entries = Entries(
-            np.full(vertices, -1, np.int32),
+            _heads(vertices),
             np.zeros(vertices, np.int32),
-            np.zeros(vertices, np.int32),
-            np.empty(0, np.int32),
-            np.empty((0, BLOCK), np.int32),
-            np.empty((0, BLOCK), np.int32),
-            np.empty((0, BLOCK, CODE_WORDS), np.uint64),
+            np.empty((0, _BLOCK_WORDS), np.uint64),
+            np.empty((0, 2 * _BLOCK_WORDS), np.int32),
             np.array([-1, 0]),
             np.empty(0, np.int64),
             np.empty(0, np.int32),
@@ -88,23 +96,23 @@ class Postings:
         row, begin = self.row_count, self.descriptor_count
         self._make_room(blocks=len(codes), rows=1, descriptors=len(codes))
         entries = self.entries
-        entries.starts[row], entries.counts[row], entries.log_documents[row] = begin, len(codes), 0.0
+        entries.starts[row], entries.counts[row] = begin, len(codes)
         self.row_count, self.descriptor_count = row + 1, begin + len(codes)
         _enter(entries, row, codes, leaves)
         return row
 
     def fill(self, codes: CodeWords, leaves: NDArray[np.int32], counts: NDArray[np.int32]) -> None:
         """Enter many places where there are none: codes (M, 4), leaves (M,) place by place, ``counts`` of each."""
-        sizes = np.bincount(leaves, minlength=len(self.entries.newest))
+        sizes = np.bincount(leaves, minlength=len(self.entries.heads))
         blocks = -(-sizes // BLOCK)
         ends = np.cumsum(blocks)
         self._make_room(blocks=int(ends[-1]), rows=len(counts), descriptors=len(codes))
         self.row_count, self.descriptor_count = len(counts), len(codes)
         entries = self.entries
-        entries.sizes[: len(sizes)], entries.free[1] = sizes, ends[-1]
-        entries.newest[: len(sizes)] = np.where(sizes, ends - 1, -1)
-        entries.older[: ends[-1]] = np.arange(-1, ends[-1] - 1)
-        entries.older[(ends - blocks)[sizes > 0]] = -1
+        entries.heads[:, 0], entries.heads[:, 1] = np.where(sizes, ends - 1, -1), sizes
+        entries.free[1] = ends[-1]
+        entries.numbers[: ends[-1], OLDER] = np.arange(-1, ends[-1] - 1)
+        entries.numbers[(ends - blocks)[sizes > 0], OLDER] = -1
         entries.counts[: len(counts)], entries.leaves[: len(codes)] = counts, leaves
         entries.starts[: len(counts)] = np.cumsum(counts) - counts
         _fill(entries, len(counts), codes, (ends - blocks) * BLOCK)
@@ -139,12 +147,12 @@ class Postings:
     def grow_vertices(self, vertices: int) -> None:
         """Make room for so many vertices of the tree."""
         entries = self.entries
-        if vertices > len(entries.newest):
-            length = max(vertices, int(GROWTH * len(entries.newest)))
-            before = len(entries.newest)
-            newest, sizes, documents = (longer(array, length) for array in entries[:3])
-            newest[before:], sizes[before:], documents[before:] = -1, 0, 0
-            self.entries = entries._replace(newest=newest, sizes=sizes, documents=documents)
+        before = len(entries.heads)
+        if vertices > before:
+            length = max(vertices, int(GROWTH * before))
+            heads, documents = longer(entries.heads, length), longer(entries.documents, length)
+            heads[before:], documents[before:] = _heads(length - before), 0
+            self.entries = entries._replace(heads=heads, documents=documents)
 
     def gather(self, rows: NDArray[np.int64]) -> CodeWords:
         """Codes (M, 4) of these places, in ascending order of rows, place by place."""
@@ -158,18 +166,14 @@ class Postings:
     def _make_room(self, blocks: int, rows: int = 0, descriptors: int = 0) -> None:
         entries = self.entries
         block_count = int(entries.free[1]) + blocks
-        if block_count > len(entries.older):
-            length = max(block_count, int(GROWTH * len(entries.older)))
-            entries = entries._replace(
-                older=longer(entries.older, length), rows=longer(entries.rows, length),
-                indices=longer(entries.indices, length), codes=longer(entries.codes, length),
-            )  # fmt: skip
+        if block_count > len(entries.blocks):
+            grown = longer(entries.blocks, max(block_count, int(GROWTH * len(entries.blocks))))
+            entries = entries._replace(blocks=grown, numbers=grown.view(np.int32))
         if self.row_count + rows > len(entries.starts):
             length = max(self.row_count + rows, int(GROWTH * len(entries.starts)), 64)
-            entries = entries._replace(
-                starts=longer(entries.starts, length), counts=longer(entries.counts, length),
-                log_documents=longer(entries.log_documents, length),
-            )  # fmt: skip
+            norms = longer(entries.log_documents, length) if self._has_norms else entries.log_documents
+            starts, counts = longer(entries.starts, length), longer(entries.counts, length)
+            entries = entries._replace(starts=starts, counts=counts, log_documents=norms)
         if self.descriptor_count + descriptors > len(entries.leaves):
             length = max(self.descriptor_count + descriptors, int(GROWTH * len(entries.leaves)))
             entries = entries._replace(leaves=longer(entries.leaves, length))
@@ -188,66 +192,75 @@ def longer(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
     return array
 
 
+def _heads(vertices: int) -> NDArray[np.int32]:
+    """Of leaves that hold nothing."""
+    return np.tile(np.array([-1, 0], np.int32), (vertices, 1))
+
+
 @njit(cache=True)
-def block_size(entries: Entries, leaf: int) -> Any:
-    """Entries in the newest block of a leaf that is not empty."""
-    return (entries.sizes[leaf] - 1) % BLOCK + 1
+def newest_block(entries: Entries, leaf: int) -> tuple[int, int]:
+    """The block of a leaf that is being filled, -1 for none, and how many entries are in it."""
+    return entries.heads[leaf, 0], (entries.heads[leaf, 1] - 1) % BLOCK + 1
 
 
 @njit(cache=True)
 def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int32]) -> None:
     """A new place's descriptors, and what it changes in the norms of others."""
+    norms = entries.log_documents
     for index in range(codes.shape[0]):
         leaf = leaves[index]
-        if _append(entries, leaf, row, index, codes[index]):
+        if _append(entries, leaf, row, index, codes, index):
             before = entries.documents[leaf] - 1
             if before:
                 _shift(entries, leaf, np.log((before + 1) / before), row)
-        entries.log_documents[row] += np.log(entries.documents[leaf])
+    if len(norms):
+        norms[row] = np.log(entries.documents[leaves]).sum()
 
 
 @njit(cache=True)
 def _fill(entries: Entries, places: int, codes: CodeWords, first: NDArray[np.int64]) -> None:
     """``first`` (V,): where in the blocks, entry by entry, each leaf's descriptors begin; it moves on."""
-    rows, indices = entries.rows.reshape(-1), entries.indices.reshape(-1)
-    stored = entries.codes.reshape(-1, CODE_WORDS)
     latest = np.full(first.shape[0], -1, np.int32)
     k = 0
     for row in range(places):
         for index in range(entries.counts[row]):
             leaf = entries.leaves[k]
-            target = first[leaf]
+            _put(entries, first[leaf] // BLOCK, first[leaf] % BLOCK, row, index, codes, k)
             first[leaf] += 1
-            rows[target], indices[target] = row, index
-            for word in range(CODE_WORDS):
-                stored[target, word] = codes[k, word]
             entries.documents[leaf] += latest[leaf] != row
             latest[leaf] = row
             k += 1
-    log_documents = np.log(np.maximum(entries.documents, 1))
-    for row in range(places):
-        begin = entries.starts[row]
-        entries.log_documents[row] = log_documents[entries.leaves[begin : begin + entries.counts[row]]].sum()
+    if len(entries.log_documents):
+        log_documents = np.log(np.maximum(entries.documents, 1))
+        for row in range(places):
+            begin = entries.starts[row]
+            entries.log_documents[row] = log_documents[entries.leaves[begin : begin + entries.counts[row]]].sum()
 
 
 @njit(cache=True)
-def _append(entries: Entries, leaf: int, row: int, index: int, code: CodeWords) -> Any:
+def _put(entries: Entries, block: int, place: int, row: int, index: int, codes: CodeWords, k: int) -> None:
+    """Write an entry: descriptor ``index`` of a row, whose code is number k of these."""
+    entries.numbers[block, ROWS + place], entries.numbers[block, _INDICES + place] = row, index
+    for word in range(CODE_WORDS):
+        entries.blocks[block, CODE_WORDS * place + word] = codes[k, word]
+
+
+@njit(cache=True)
+def _append(entries: Entries, leaf: int, row: int, index: int, codes: CodeWords, k: int) -> Any:
     """Tells whether the place is new in the leaf: its descriptors come one after the other."""
-    place = entries.sizes[leaf] % BLOCK
-    block = entries.newest[leaf]
-    is_new = block < 0 or entries.rows[block, block_size(entries, leaf) - 1] != row
-    if place == 0:
-        block = entries.free[0]
+    block, filled = newest_block(entries, leaf)
+    is_new = block < 0 or entries.numbers[block, ROWS + filled - 1] != row
+    if block < 0 or filled == BLOCK:
+        older, block, filled = block, entries.free[0], 0
         if block >= 0:
-            entries.free[0] = entries.older[block]
+            entries.free[0] = entries.numbers[block, OLDER]
         else:
             block = entries.free[1]
             entries.free[1] += 1
-        entries.older[block] = entries.newest[leaf]
-        entries.newest[leaf] = block
-    entries.rows[block, place], entries.indices[block, place] = row, index
-    entries.codes[block, place] = code
-    entries.sizes[leaf] += 1
+        entries.numbers[block, OLDER] = older
+        entries.heads[leaf, 0] = block
+    _put(entries, block, filled, row, index, codes, k)
+    entries.heads[leaf, 1] += 1
     entries.documents[leaf] += is_new
     entries.leaves[entries.starts[row] + index] = leaf
     return is_new
@@ -256,26 +269,27 @@ def _append(entries: Entries, leaf: int, row: int, index: int, code: CodeWords) 
 @njit(cache=True)
 def _shift(entries: Entries, leaf: int, change: float, but: int) -> None:
     """Add to the ``log_documents`` of every descriptor in a leaf but those of one place."""
-    block, filled = entries.newest[leaf], block_size(entries, leaf)
+    if not len(entries.log_documents):
+        return
+    block, filled = newest_block(entries, leaf)
     while block >= 0:
-        for place in range(filled):
-            row = entries.rows[block, place]
+        for row in entries.numbers[block, ROWS : ROWS + filled]:
             if row != but:
                 entries.log_documents[row] += change
-        block, filled = entries.older[block], BLOCK
+        block, filled = entries.numbers[block, OLDER], BLOCK
 
 
 @njit(cache=True)
 def _remove(entries: Entries, leaves: NDArray[np.int32], row: int) -> None:
     """From the end to the beginning: the last entry, which fills each gap, is one that stays."""
     for leaf in leaves:
-        block, place = entries.newest[leaf], block_size(entries, leaf)
+        block, filled = newest_block(entries, leaf)
         while block >= 0:
-            older = entries.older[block]
-            for k in range(place - 1, -1, -1):
-                if entries.rows[block, k] == row:
-                    _drop(entries, leaf, block, k)
-            block, place = older, BLOCK
+            older = entries.numbers[block, OLDER]
+            for place in range(filled - 1, -1, -1):
+                if entries.numbers[block, ROWS + place] == row:
+                    _drop(entries, leaf, block, place)
+            block, filled = older, BLOCK
         entries.documents[leaf] -= 1
         left = entries.documents[leaf]
         if left:
@@ -284,13 +298,14 @@ def _remove(entries: Entries, leaves: NDArray[np.int32], row: int) -> None:
 
 @njit(cache=True)
 def _drop(entries: Entries, leaf: int, block: int, place: int) -> None:
-    last, end = entries.newest[leaf], block_size(entries, leaf) - 1
-    entries.rows[block, place], entries.indices[block, place] = entries.rows[last, end], entries.indices[last, end]
-    entries.codes[block, place] = entries.codes[last, end]
-    entries.sizes[leaf] -= 1
-    if end == 0:
-        entries.newest[leaf] = entries.older[last]
-        entries.older[last] = entries.free[0]
+    last, filled = newest_block(entries, leaf)
+    row, index = entries.numbers[last, ROWS + filled - 1], entries.numbers[last, _INDICES + filled - 1]
+    code = entries.blocks[last : last + 1, CODE_WORDS * (filled - 1) : CODE_WORDS * filled]
+    _put(entries, block, place, row, index, code, 0)
+    entries.heads[leaf, 1] -= 1
+    if filled == 1:
+        entries.heads[leaf, 0] = entries.numbers[last, OLDER]
+        entries.numbers[last, OLDER] = entries.free[0]
         entries.free[0] = last
 
 
@@ -298,13 +313,15 @@ def _drop(entries: Entries, leaf: int, block: int, place: int) -> None:
 def _read(entries: Entries, leaves: NDArray[np.int32], content: Content) -> None:
     count = 0
     for leaf in leaves:
-        block, filled = entries.newest[leaf], block_size(entries, leaf)
+        block, filled = newest_block(entries, leaf)
         while block >= 0:
             for place in range(filled):
-                content.rows[count], content.indices[count] = entries.rows[block, place], entries.indices[block, place]
-                content.codes[count] = entries.codes[block, place]
+                content.rows[count] = entries.numbers[block, ROWS + place]
+                content.indices[count] = entries.numbers[block, _INDICES + place]
+                for word in range(CODE_WORDS):
+                    content.codes[count, word] = entries.blocks[block, CODE_WORDS * place + word]
                 count += 1
-            block, filled = entries.older[block], BLOCK
+            block, filled = entries.numbers[block, OLDER], BLOCK
 
 
 @njit(cache=True)
@@ -316,35 +333,35 @@ def _move(
     receiving: NDArray[np.int32],
 ) -> None:
     for leaf in leaves:
-        if entries.sizes[leaf]:
+        if entries.heads[leaf, 1]:
             _shift(entries, leaf, -np.log(entries.documents[leaf]), -1)
         _clear(entries, leaf)
     for k in range(targets.shape[0]):
-        _append(entries, targets[k], content.rows[k], content.indices[k], content.codes[k])
+        _append(entries, targets[k], content.rows[k], content.indices[k], content.codes, k)
     for leaf in receiving:
         _shift(entries, leaf, np.log(entries.documents[leaf]), -1)
 
 
 @njit(cache=True)
 def _gather(entries: Entries, begins: NDArray[np.int64], codes: CodeWords) -> None:
-    for leaf in range(entries.newest.shape[0]):
-        block, filled = entries.newest[leaf], block_size(entries, leaf)
+    for leaf in range(entries.heads.shape[0]):
+        block, filled = newest_block(entries, leaf)
         while block >= 0:
             for place in range(filled):
-                row = entries.rows[block, place]
-                if begins[row] >= 0:
-                    target = begins[row] + entries.indices[block, place]
+                begin = begins[entries.numbers[block, ROWS + place]]
+                if begin >= 0:
+                    target = begin + entries.numbers[block, _INDICES + place]
                     for word in range(CODE_WORDS):
-                        codes[target, word] = entries.codes[block, place, word]
-            block, filled = entries.older[block], BLOCK
+                        codes[target, word] = entries.blocks[block, CODE_WORDS * place + word]
+            block, filled = entries.numbers[block, OLDER], BLOCK
 
 
 @njit(cache=True)
 def _clear(entries: Entries, leaf: int) -> None:
-    block = entries.newest[leaf]
+    block = entries.heads[leaf, 0]
     while block >= 0:
-        older = entries.older[block]
-        entries.older[block] = entries.free[0]
+        older = entries.numbers[block, OLDER]
+        entries.numbers[block, OLDER] = entries.free[0]
         entries.free[0] = block
         block = older
-    entries.newest[leaf], entries.sizes[leaf], entries.documents[leaf] = -1, 0, 0
+    entries.heads[leaf, 0], entries.heads[leaf, 1], entries.documents[leaf] = -1, 0, 0

@@ -1,51 +1,71 @@
 """How alike a query and stored places are, without touching a place that has nothing in common with it; compiled."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fcslam.features.codes import CodeWords, hamming
+from fcslam.features.codes import CodeWords, popcount
 from fcslam.places.kmeans_tree import Tree, near_leaves
-from fcslam.places.postings import BLOCK, Entries, block_size
+from fcslam.places.postings import BLOCK, OLDER, ROWS, Entries, newest_block
 from fcslam.records import FloatArray
 
 _ABREAST = 32
 """Codes of a query whose words are read together: so many that cache misses overlap, so few that all stays there."""
+_LINE = 8
+"""Words to a line of the cache."""
 TINY = 1e-300
 """In the place of a sum that may be zero."""
 
 
+class Tally(NamedTuple):
+    """What is known of every row while a query is answered: zeros between queries, since to clear what was touched costs
+    less than as many zeros as there are places."""
+
+    scores: FloatArray
+    """Shape (R,)."""
+    marks: NDArray[np.int32]
+    """Shape (R,): of the word or code that is looked at."""
+    touched: NDArray[np.int32]
+    """Shape (R,): rows that have a score, in the order in which they were met."""
+    here: NDArray[np.int32]
+    """Shape (R,): rows that have a mark."""
+
+
+def blank_tally(rows: int) -> Tally:
+    """For so many rows."""
+    return Tally(np.zeros(rows), np.zeros(rows, np.int32), np.empty(rows, np.int32), np.empty(rows, np.int32))
+
+
 @njit(cache=True)
 def score_words(
-    entries: Entries, row_count: int, place_count: int, leaves: NDArray[np.int32], weights: FloatArray
+    entries: Entries, tally: Tally, place_count: int, leaves: NDArray[np.int32], weights: FloatArray
 ) -> tuple[NDArray[np.int32], FloatArray]:
     """Sum of min(query, place) over the common words: rows that have one, and their scores.
 
     Args:
-        entries: the stored places.
-        row_count: rows in use, forgotten places included.
+        entries: the stored places, with their norms.
+        tally: blank, for all rows; it is left so.
         place_count: N of the inverse document frequencies.
         leaves: shape (K,), the query's words, each once.
         weights: shape (K,), tf-idf of the query, L1 norm 1.
     """
-    scores, counts = np.zeros(row_count), np.zeros(row_count, np.int32)
-    touched, here = np.empty(row_count, np.int32), np.empty(row_count, np.int32)
+    scores, counts, touched, here = tally
     total = 0
     for k in range(leaves.shape[0]):
         leaf, found = leaves[k], 0
         if entries.documents[leaf] == 0:
             continue
         idf = np.log(place_count / entries.documents[leaf])
-        block, filled = entries.newest[leaf], block_size(entries, leaf)
+        block, filled = newest_block(entries, leaf)
         while block >= 0:
-            for row in entries.rows[block, :filled]:
+            for row in entries.numbers[block, ROWS : ROWS + filled]:
                 if counts[row] == 0:
                     here[found] = row
                     found += 1
                 counts[row] += 1
-            block, filled = entries.older[block], BLOCK
+            block, filled = entries.numbers[block, OLDER], BLOCK
         for row in here[:found]:
             if scores[row] == 0.0:
                 touched[total] = row
@@ -53,12 +73,12 @@ def score_words(
             norm = entries.counts[row] * np.log(place_count) - entries.log_documents[row]
             scores[row] += min(weights[k], counts[row] * idf / norm)
             counts[row] = 0
-    return touched[:total], scores[touched[:total]]
+    return _taken(tally, total)
 
 
 @njit(cache=True)
 def score_matches(
-    entries: Entries, tree: Tree, row_count: int, place_count: int, codes: CodeWords, beam: int, near_bits: int
+    entries: Entries, tree: Tree, tally: Tally, place_count: int, codes: CodeWords, beam: int, near_bits: int
 ) -> tuple[NDArray[np.int32], FloatArray]:
     """Share of the query's descriptors that a place has, too, in [0, 1]; a place is wholly like itself.
 
@@ -69,14 +89,14 @@ def score_matches(
     Args:
         entries: the stored places.
         tree: the words.
-        row_count: rows in use, forgotten places included.
+        tally: blank, for all rows; it is left so.
         place_count: N, the places that are stored.
         codes: shape (K, 4), of the query.
         beam: words that are looked through for each code.
         near_bits: codes that differ in no more bits are of the same thing.
     """
-    scores, nearest = np.zeros(row_count), np.full(row_count, near_bits + 1, np.int32)
-    touched, here = np.empty(row_count, np.int32), np.empty(row_count, np.int32)
+    scores, closeness, touched, here = tally  # closeness: bits that are missing to one more than near_bits
+    gives = 1.0 - ((near_bits + 1.0 - np.arange(near_bits + 2)) / (near_bits + 1.0)) ** 2
     total, whole = 0, 0.0
     leaves = near_leaves(tree, codes, beam)
     for k in range(codes.shape[0]):
@@ -86,50 +106,69 @@ def score_matches(
         for leaf in leaves[k]:
             if leaf < 0:
                 break
-            block, filled = entries.newest[leaf], block_size(entries, leaf)
+            block, filled = newest_block(entries, leaf)
             while block >= 0:
                 for place in range(filled):
-                    distance = np.int32(hamming(codes[k], entries.codes[block, place]))
-                    if distance <= near_bits:
-                        row = entries.rows[block, place]
-                        if nearest[row] > near_bits:
+                    close = near_bits + 1 - _distance(codes, k, entries.blocks, block, place)
+                    if close > 0:
+                        row = entries.numbers[block, ROWS + place]
+                        if closeness[row] == 0:
                             here[found] = row
                             found += 1
-                        nearest[row] = min(nearest[row], distance)
-                block, filled = entries.older[block], BLOCK
+                        closeness[row] = max(closeness[row], close)
+                block, filled = entries.numbers[block, OLDER], BLOCK
         everywhere = 0.0
         for row in here[:found]:
-            everywhere += 1.0 - (nearest[row] / (near_bits + 1.0)) ** 2
+            everywhere += gives[closeness[row]]
         weight = np.log((place_count + 1) / max(everywhere, 1.0))
         whole += weight
         for row in here[:found]:
             if scores[row] == 0.0:
                 touched[total] = row
                 total += 1
-            scores[row] += weight * (1.0 - (nearest[row] / (near_bits + 1.0)) ** 2)
-            nearest[row] = near_bits + 1
-    return touched[:total], scores[touched[:total]] / max(whole, TINY)
+            scores[row] += weight * gives[closeness[row]]
+            closeness[row] = 0
+    rows, shares = _taken(tally, total)
+    return rows, shares / max(whole, TINY)
+
+
+@njit(cache=True)
+def _taken(tally: Tally, total: int) -> tuple[NDArray[np.int32], FloatArray]:
+    """The rows that were touched and their scores, which are cleared."""
+    rows = tally.touched[:total].copy()
+    scores = tally.scores[rows]
+    tally.scores[rows] = 0.0
+    return rows, scores
+
+
+@njit(cache=True)
+def _distance(codes: CodeWords, k: int, blocks: NDArray[np.uint64], block: int, place: int) -> Any:
+    """Bits between code k and the code of an entry."""
+    bits = popcount(codes[k, 0] ^ blocks[block, 4 * place]) + popcount(codes[k, 1] ^ blocks[block, 4 * place + 1])
+    bits += popcount(codes[k, 2] ^ blocks[block, 4 * place + 2]) + popcount(codes[k, 3] ^ blocks[block, 4 * place + 3])
+    return np.int32(bits)
 
 
 @njit(cache=True)
 def _fetch(entries: Entries, leaves: NDArray[np.int32]) -> Any:
-    """Bring the codes of these leaves (-1 for none) into the cache.
+    """Bring the blocks of these leaves (-1 for none) into the cache.
 
     A chain is read block after block, each a cache miss in a large index. Read abreast, the chains' misses overlap.
     """
     blocks = np.empty(leaves.shape[0], np.int32)
     count, read = 0, np.uint64(0)
     for leaf in leaves:
-        if leaf >= 0 and entries.newest[leaf] >= 0:
-            blocks[count] = entries.newest[leaf]
+        if leaf >= 0 and entries.heads[leaf, 0] >= 0:
+            blocks[count] = entries.heads[leaf, 0]
             count += 1
     while count:
         left = 0
         for block in blocks[:count]:
-            read ^= entries.codes[block, 0, 0] ^ entries.codes[block, BLOCK // 4, 0]
-            read ^= entries.codes[block, BLOCK // 2, 0] ^ entries.codes[block, 3 * BLOCK // 4, 0]
-            if entries.older[block] >= 0:
-                blocks[left] = entries.older[block]
+            for word in range(0, ROWS // 2, _LINE):
+                read ^= entries.blocks[block, word]
+            older = entries.numbers[block, OLDER]
+            if older >= 0:
+                blocks[left] = older
                 left += 1
         count = left
     return read  # what is computed is not left out by the compiler if it is returned

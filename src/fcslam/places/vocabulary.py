@@ -147,7 +147,8 @@ class Vocabulary:
         vocabulary = cls(shape, state.seed)
         counts = state.child_count
         first_child = np.where(counts > 0, 1 + np.cumsum(counts) - counts, 0).astype(np.int32)
-        vocabulary.tree, vocabulary.words = Tree(state.centres, first_child, counts), state.words
+        vocabulary.tree = Tree(state.centres, np.column_stack((first_child, counts)))
+        vocabulary.words = state.words
         vocabulary.version, vocabulary._words_given = state.version, state.words_given
         vocabulary.vertex_count = len(counts)
         vocabulary.parents = _parents(counts)
@@ -168,10 +169,10 @@ class Vocabulary:
             return None
         first = self._family(len(centres))
         family = slice(first, first + len(centres))
-        self.tree.centres[family], self.tree.child_count[family], self.parents[family] = centres, 0, leaf
+        self.tree.centres[family], self.tree.families[family], self.parents[family] = centres, 0, leaf
         self.words[family] = self._words_given + np.arange(len(centres))
         self._words_given += len(centres)
-        self.tree.first_child[leaf], self.tree.child_count[leaf], self.words[leaf] = first, len(centres), -1
+        self.tree.families[leaf], self.words[leaf] = (first, len(centres)), -1
         self.version += 1
         leaves: NDArray[np.int32] = (first + labels).astype(np.int32)
         return leaves
@@ -181,14 +182,14 @@ class Vocabulary:
         children = self.children(parent)
         self._free.setdefault(children.stop - children.start, []).append(children.start)
         self.words[children] = -1
-        self.tree.child_count[parent], self.words[parent] = 0, self._words_given
+        self.tree.families[parent], self.words[parent] = 0, self._words_given
         self._words_given += 1
         self.version += 1
 
     def children(self, vertex: int) -> slice:
         """Of a vertex, in arrays of vertices."""
-        first = int(self.tree.first_child[vertex])
-        return slice(first, first + int(self.tree.child_count[vertex]))
+        first, count = self.tree.families[vertex].tolist()
+        return slice(first, first + count)
 
     def _family(self, size: int) -> int:
         """The first of so many vertices in a row that are free."""
@@ -198,8 +199,7 @@ class Vocabulary:
         self.vertex_count += size
         if self.vertex_count > len(self.words):
             length = max(self.vertex_count, int(GROWTH * len(self.words)))
-            centres, first_child, child_count = self.tree
-            self.tree = Tree(longer(centres, length), longer(first_child, length), longer(child_count, length))
+            self.tree = Tree(longer(self.tree.centres, length), longer(self.tree.families, length))
             self.words, self.parents = longer(self.words, length), longer(self.parents, length)
             self.words[first:] = -1
         return first
