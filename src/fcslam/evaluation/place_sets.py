@@ -9,6 +9,9 @@ A folder says by what lies in it how it is read:
   images of it at both ends are ignored, all others are different.
 - ``associations.txt`` and ``groundtruth.txt``: a TUM RGB-D sequence (Sturm et al. 2012), online. A match is an overlap
   of the views by depth and pose of more than 0.5, different is less than 0.1.
+- ``simulation.yaml``: a fleet that ``fcslam simulate`` recorded with cameras. Each robot's images, a metre or half a
+  radian apart, ask for those of the robots before it; overlap is that of the walls that the LiDARs met in the cameras'
+  views, and the limits are those of TUM's sequences.
 - ``matches.csv`` (query, gallery, relation) with folders ``queries`` and ``gallery``: relation is ``match`` or
   ``ignored``; what is not listed is different.
 
@@ -25,12 +28,14 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import EvaluationError
+from fcslam.evaluation.fleet_views import read_fleet_views
 from fcslam.evaluation.tum_sequence import read_sequence
 from fcslam.evaluation.view_overlap import view_overlap
 from fcslam.metrics.retrieval import Pairs, PairTruth
 from fcslam.places.sequence import long_before
 
 LABELLED: Final = "dataset.csv"
+FLEET: Final = "simulation.yaml"
 SAME_CLIP_FRAMES: Final = 4
 OTHER_CLIP_FRAMES: Final = 12
 NEAR_PAIR: Final = 8
@@ -65,11 +70,13 @@ def read_place_set(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
 
     Raises:
         EvaluationError: there is no set of a known kind, its files do not fit together, or nothing has those labels.
+        SourceError: a robot's recording cannot be read.
     """
     readers: dict[str, Callable[[], PlaceSet]] = {
         LABELLED: lambda: _read_tower(folder, labels),
         "loop_pairs.txt": lambda: _read_tour(folder),
         "associations.txt": lambda: _read_sequence(folder),
+        FLEET: lambda: _read_fleet(folder),
         "matches.csv": lambda: _read_generic(folder),
     }
     kind = next((name for name in readers if (folder / name).is_file()), None)
@@ -148,6 +155,16 @@ def _read_sequence(folder: Path) -> PlaceSet:
     admitted = long_before(sequence.stamps, SEQUENCE_GAP_S)
     truth = PairTruth(overlap > SAME_OVERLAP, overlap < OTHER_OVERLAP)
     return _stream(folder, sequence.images, admitted, "overlap", truth)
+
+
+def _read_fleet(folder: Path) -> PlaceSet:
+    views = read_fleet_views(folder)
+    q, g = np.flatnonzero(views.robots > 0), np.flatnonzero(views.robots < views.robots.max())
+    admitted = views.robots[q][:, None] > views.robots[g]
+    overlap = views.overlap[np.ix_(q, g)]
+    truth = PairTruth(admitted & (overlap > SAME_OVERLAP), admitted & (overlap < OTHER_OVERLAP))
+    queries, gallery = (tuple(views.images[i] for i in rows) for rows in (q, g))
+    return PlaceSet(folder.resolve().name, queries, gallery, admitted, {"overlap": truth})
 
 
 def _read_generic(folder: Path) -> PlaceSet:

@@ -33,8 +33,8 @@ class Entries(NamedTuple):
     """Postings as compiled code sees them. Words go by the number of their leaf in the tree, places by row."""
 
     heads: NDArray[np.int32]
-    """Shape (V, 2): the block of each leaf that is being filled, -1 for none, and the descriptors of the leaf. All other
-    blocks of its chain are full."""
+    """Shape (V, 2): the block of each leaf that is being filled, -1 for none; the leaf's descriptors, which fill all other
+    blocks of its chain."""
     documents: NDArray[np.int32]
     """Shape (V,): places that have a descriptor in the leaf."""
     blocks: NDArray[np.uint64]

@@ -20,8 +20,10 @@ TINY = 1e-300
 
 
 class Tally(NamedTuple):
-    """What is known of every row while a query is answered: zeros between queries, since to clear what was touched costs
-    less than as many zeros as there are places."""
+    """What is known of every row while a query is answered.
+
+    Zeros between queries: to clear what was touched costs less than as many zeros as there are places.
+    """
 
     scores: FloatArray
     """Shape (R,)."""
@@ -73,7 +75,8 @@ def score_words(
             norm = entries.counts[row] * np.log(place_count) - entries.log_documents[row]
             scores[row] += min(weights[k], counts[row] * idf / norm)
             counts[row] = 0
-    return _taken(tally, total)
+    taken: tuple[NDArray[np.int32], FloatArray] = _taken(tally, total)
+    return taken
 
 
 @njit(cache=True)
