@@ -1,6 +1,6 @@
 """Place recognition: the fleet's index beside brute force and a fixed tree of other images, as DBoW users have it.
 
-    FCSLAM_DATA=/path/to/data python benchmarks/places.py
+    FCSLAM_DATA=/path/to/data python benchmarks/places.py --fleets FLEET ...
 
 500 features on grey images of 400 pixels; each query answers with its most similar place. Trees of other images are
 trained on photographs and street scenes (k=10, L=4). The network learned from other floors of the tower, so it is
@@ -8,10 +8,12 @@ judged on floors 11 to 15 only, and ORB there as well. Places look alike from fl
 one among all, which appearance cannot tell. Verified: the 50 most similar places of each query, ranked by how many
 matches one fundamental matrix explains. rebuild is left out: it would take hours; benchmarks/figure4.py
 has it. In brackets: 95 % by bootstrap over queries. LiDAR: places of one robot against those at least 60 s older, 1 m
-or less away by its own corrected poses; different is more than 10 m away.
+or less away by its own corrected poses; different is more than 10 m away. FLEET: folders that `fcslam simulate` recorded,
+places of each robot against those of the robots before it, by how much their views overlap; without --fleets left out.
 """
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import common
 
@@ -34,6 +36,7 @@ SEED = 1
 def main() -> None:
     parser = common.options(__doc__ or "")
     parser.add_argument("--features", nargs="+", default=["orb", "onnx"], help="orb, onnx, .onnx files, folders")
+    parser.add_argument("--fleets", nargs="*", type=Path, default=[], help="recorded by fcslam simulate")
     parser.add_argument("--no-lidar", action="store_true", help="images only")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
@@ -42,7 +45,7 @@ def main() -> None:
     for name in chosen.features:
         features = choose_features(name)
         training = describe_training([images / folder for folder in TRAINING], features)
-        sets = describe_sets([images / CORRIDOR, images / DESK], (), features)
+        sets = describe_sets([images / CORRIDOR, images / DESK, *chosen.fleets], (), features)
         unseen = describe_sets([images / TOWER], UNSEEN_FLOORS, features)
         results = _evaluate([*sets, *unseen], training)
         _tell(report, features.name, results, "floors 11 to 15")

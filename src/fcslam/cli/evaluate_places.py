@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.place_options import Features, Label, Sets, TrainOn
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -18,36 +20,18 @@ if TYPE_CHECKING:
 
 
 def places(
-    sets: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SETS...",
-            help="Folders of images with their truth (dataset.csv, loop_pairs.txt, associations.txt or matches.csv), "
-            "or recordings of a LiDAR.",
-        ),
-    ],
+    sets: Sets,
     *,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for the table, the curves and the similarity matrices.")
     ],
-    features: Annotated[
-        str,
-        typer.Option(
-            help="Of images: orb, onnx (the network that comes with fcslam), an .onnx file, or a folder of extracted "
-            "features, <name of the set>/..., as fcslam extract writes them."
-        ),
-    ] = "orb",
+    features: Features = "orb",
     strategy: Annotated[
         list[str] | None,
         typer.Option(help="Of the vocabulary: static, rebuild, windowed, incremental; if not said, all but rebuild."),
     ] = None,
-    train_on: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of other images, to train a fixed vocabulary on; may be given several times."),
-    ] = None,
-    label: Annotated[
-        list[str] | None, typer.Option(help="Of sets with labels only this one; may be given several times.")
-    ] = None,
+    train_on: TrainOn = None,
+    label: Label = None,
     verify: Annotated[
         bool, typer.Option("--verify", help="Also check by geometry the places that look most alike.")
     ] = False,

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.place_options import Features, Label, Sets, TrainOn
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -15,30 +17,20 @@ if TYPE_CHECKING:
 
 
 def vocabulary(
-    sets: Annotated[
-        list[Path],
-        typer.Argument(metavar="SETS...", help="As of fcslam evaluate places; their places arrive in this order."),
-    ],
+    sets: Sets,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and its table.")],
-    features: Annotated[
-        str, typer.Option(help="Of images: orb, onnx, an .onnx file, or a folder of extracted features.")
-    ] = "orb",
+    features: Features = "orb",
     first: Annotated[
         list[Path] | None,
         typer.Option(help="Folder of images that arrive before; may be given several times."),
     ] = None,
-    train_on: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of other images, to train a fixed vocabulary on; may be given several times."),
-    ] = None,
-    label: Annotated[
-        list[str] | None, typer.Option(help="Of sets with labels only this one; may be given several times.")
-    ] = None,
+    train_on: TrainOn = None,
+    label: Label = None,
     groups: Annotated[int, typer.Option(min=1, help="Targets, each with another view and 8 wrong places.")] = 120,
     seed: Annotated[int, typer.Option(min=0, help="Of groups, vocabularies and the bootstrap.")] = 1,
 ) -> None:
-    """Significance, mismatches and words of every strategy as places arrive 40 at a time."""
+    """Significance, mismatches and words of every strategy as places arrive 40 at a time, set after set."""
     import numpy as np
     from rich.console import Console
     from rich.progress import Progress

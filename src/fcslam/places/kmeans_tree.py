@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fcslam.features.codes import CODE_BITS, CODE_WORDS, CodeWords, popcount
+from fcslam.places.prefetch import prefetch
 
 _MOST_PLANES = 32
 """Counters of a bit: more codes than 2 ** 32 are in no cluster."""
@@ -53,7 +54,7 @@ def bare_root() -> Tree:
 def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
     """The leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
     reached = np.zeros(codes.shape[0], np.int32)
-    while _read_children(tree, reached):
+    while _announce_children(tree, reached):
         for k in range(codes.shape[0]):
             first, children = tree.families[reached[k], 0], tree.families[reached[k], 1]
             if children:
@@ -74,7 +75,7 @@ def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
     kept, distances = np.full((codes.shape[0], beam), -1, np.int32), np.zeros((codes.shape[0], beam), np.int32)
     above, reached = np.empty(beam, np.int32), np.empty(beam, np.int32)
     kept[:, 0] = 0
-    while _read_children(tree, kept.reshape(-1)):
+    while _announce_children(tree, kept.reshape(-1)):
         for k in range(codes.shape[0]):
             for position in range(beam):
                 above[position], reached[position] = kept[k, position], distances[k, position]
@@ -83,20 +84,17 @@ def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
 
 
 @njit(cache=True)
-def _read_children(tree: Tree, kept: NDArray[np.int32]) -> bool:
-    """Bring the centres of the children of these vertices into the cache; tells whether there are any."""
-    parents, count = np.empty(kept.size, np.int32), 0
+def _announce_children(tree: Tree, kept: NDArray[np.int32]) -> int:
+    """Announce the centres of the children of these vertices, -1 for none; tells how many of the vertices have any."""
+    parents = 0
     for vertex in kept:
-        if vertex >= 0 and tree.families[vertex, 1]:
-            parents[count] = vertex
-            count += 1
-    read = np.uint64(0)
-    for vertex in parents[:count]:
-        first, last = tree.families[vertex, 0], tree.families[vertex, 0] + tree.families[vertex, 1] - 1
-        for child in range(first, last, 2):  # two to a line of the cache
-            read |= tree.centres[child, 0]
-        read |= tree.centres[last, CODE_WORDS - 1]
-    return bool(read >= np.uint64(0)) if count else False
+        first, children = tree.families[vertex, 0], tree.families[vertex, 1]
+        if vertex >= 0 and children:
+            parents += 1
+            for child in range(first, first + children - 1, 2):  # two to a line of the cache
+                prefetch(tree.centres, child, 0)
+            prefetch(tree.centres, first + children - 1, CODE_WORDS - 1)
+    return parents
 
 
 @njit(cache=True)

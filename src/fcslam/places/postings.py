@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fcslam.features.codes import CODE_WORDS, CodeWords
+from fcslam.places.prefetch import prefetch
 from fcslam.records import FloatArray, Scalar
 
 BLOCK = 8
@@ -27,14 +28,16 @@ OLDER = ROWS + BLOCK
 _INDICES = OLDER + 2
 """Which ones of their places they are, for each entry."""
 _BLOCK_WORDS = (_INDICES + BLOCK) // 2
+_LINE = 16
+"""Numbers to a line of the cache."""
 
 
 class Entries(NamedTuple):
     """Postings as compiled code sees them. Words go by the number of their leaf in the tree, places by row."""
 
     heads: NDArray[np.int32]
-    """Shape (V, 2): the block of each leaf that is being filled, -1 for none; the leaf's descriptors, which fill all other
-    blocks of its chain."""
+    """Shape (V, 2): the block of each leaf that is being filled, -1 for none, all others of its chain being full; how
+    many descriptors the leaf has."""
     documents: NDArray[np.int32]
     """Shape (V,): places that have a descriptor in the leaf."""
     blocks: NDArray[np.uint64]
@@ -204,8 +207,21 @@ def newest_block(entries: Entries, leaf: int) -> tuple[int, int]:
 
 
 @njit(cache=True)
+def announce_block(entries: Entries, block: int) -> None:
+    """Announce what a query reads of a block, which begins anywhere in a line."""
+    for number in range(0, OLDER, _LINE):
+        prefetch(entries.numbers, block, number)
+    prefetch(entries.numbers, block, OLDER)
+
+
+@njit(cache=True)
 def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int32]) -> None:
     """A new place's descriptors, and what it changes in the norms of others."""
+    for leaf in leaves:
+        prefetch(entries.heads, leaf, 0)
+    for leaf in leaves:
+        if entries.heads[leaf, 0] >= 0:
+            announce_block(entries, entries.heads[leaf, 0])
     norms = entries.log_documents
     for index in range(codes.shape[0]):
         leaf = leaves[index]

@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 
 from fcslam.features.codes import CodeWords, popcount
 from fcslam.places.kmeans_tree import Tree, near_leaves
-from fcslam.places.postings import BLOCK, OLDER, ROWS, Entries, newest_block
+from fcslam.places.postings import BLOCK, OLDER, ROWS, Entries, announce_block, newest_block
+from fcslam.places.prefetch import prefetch
 from fcslam.records import FloatArray
 
 _ABREAST = 32
 """Codes of a query whose words are read together: so many that cache misses overlap, so few that all stays there."""
-_LINE = 8
-"""Words to a line of the cache."""
 TINY = 1e-300
 """In the place of a sum that may be zero."""
 
@@ -104,7 +103,7 @@ def score_matches(
     leaves = near_leaves(tree, codes, beam)
     for k in range(codes.shape[0]):
         if k % _ABREAST == 0:
-            _fetch(entries, leaves[k : k + _ABREAST].ravel())
+            _announce(entries, leaves[k : k + _ABREAST].ravel())
         found = 0
         for leaf in leaves[k]:
             if leaf < 0:
@@ -153,25 +152,26 @@ def _distance(codes: CodeWords, k: int, blocks: NDArray[np.uint64], block: int, 
 
 
 @njit(cache=True)
-def _fetch(entries: Entries, leaves: NDArray[np.int32]) -> Any:
-    """Bring the blocks of these leaves (-1 for none) into the cache.
+def _announce(entries: Entries, leaves: NDArray[np.int32]) -> None:
+    """Announce the blocks of these leaves, -1 for none.
 
-    A chain is read block after block, each a cache miss in a large index. Read abreast, the chains' misses overlap.
+    A chain is read block after block, each a cache miss in a large index. Abreast, the misses of all chains overlap.
     """
-    blocks = np.empty(leaves.shape[0], np.int32)
-    count, read = 0, np.uint64(0)
+    for leaf in leaves:
+        if leaf >= 0:
+            prefetch(entries.heads, leaf, 0)
+    blocks, count = np.empty(leaves.shape[0], np.int32), 0
     for leaf in leaves:
         if leaf >= 0 and entries.heads[leaf, 0] >= 0:
             blocks[count] = entries.heads[leaf, 0]
             count += 1
     while count:
+        for block in blocks[:count]:
+            announce_block(entries, block)
         left = 0
         for block in blocks[:count]:
-            for word in range(0, ROWS // 2, _LINE):
-                read ^= entries.blocks[block, word]
             older = entries.numbers[block, OLDER]
             if older >= 0:
                 blocks[left] = older
                 left += 1
         count = left
-    return read  # what is computed is not left out by the compiler if it is returned
