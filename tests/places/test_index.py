@@ -115,6 +115,8 @@ def test_queries_find_what_comparing_with_every_place_finds(strategy, scoring, s
         assert [score for _, score in found] == sorted((score for _, score in found), reverse=True)
         for top_k in (1, 3, 20):
             assert index.query(query, top_k) == found[:top_k]
+        assert not index._tally.scores.any()  # blank for the next query
+        assert not index._tally.marks.any()
 
 
 @EVERY

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fcslam.config import parse
 from fcslam.errors import ConfigError
 from fcslam.features.codes import code_words
-from fcslam.places.kmeans_tree import TreeShape, bare_root, descend, grow, near_leaves
+from fcslam.places.kmeans_tree import TreeShape, _majorities, bare_root, descend, grow, near_leaves
 from fcslam.places.vocabulary import Vocabulary, VocabularyConfig
 
 SMALL = TreeShape(branching=4, depth=3, smallest_split=8, iterations=8)
@@ -93,6 +93,17 @@ def test_clear_clusters_become_words_and_centres_are_bit_majorities():
         bits = np.unpackbits(codes[leaves == leaf].view(np.uint8), axis=1)
         majority = (2 * bits.sum(axis=0) > len(bits)).astype(np.uint8)
         np.testing.assert_array_equal(np.unpackbits(tree.centres[leaf].view(np.uint8)), majority)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**16), count=st.integers(1, 90), clusters=st.integers(1, 5))
+def test_majorities_of_bits_are_those_of_counting_them(seed, count, clusters):
+    rng = np.random.default_rng(seed)
+    bits = rng.random((count, 256)) < rng.random(256)
+    labels = rng.integers(0, clusters, count)
+    found = _majorities(code_words(np.packbits(bits, axis=1)), labels, clusters)
+    expected = [2 * bits[labels == label].sum(axis=0) > (labels == label).sum() for label in range(clusters)]
+    np.testing.assert_array_equal(np.unpackbits(found.view(np.uint8), axis=1), expected)
 
 
 def test_limits_of_the_shape_hold():
