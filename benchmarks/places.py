@@ -9,7 +9,8 @@ one among all, which appearance cannot tell. Verified: the 50 most similar place
 matches one fundamental matrix explains. rebuild is left out: it would take hours; benchmarks/figure4.py
 has it. In brackets: 95 % by bootstrap over queries. LiDAR: places of one robot against those at least 60 s older, 1 m
 or less away by its own corrected poses; different is more than 10 m away. FLEET: folders that `fcslam simulate`
-recorded, places of each robot against those of robots before it, by how much their views overlap; without --fleets left out.
+recorded, places of each robot against those of robots before it, by how much their views overlap; left out if none is
+given.
 """
 
 from collections.abc import Iterator, Sequence
