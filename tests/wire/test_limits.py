@@ -4,7 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from wire.examples import ACKNOWLEDGEMENT, CLOSURE, CORRECTION, EXAMPLES, HELLO, KEYSCAN, LIDAR_PLACE, RELEASE, packet, same
+from wire.examples import (
+    ACKNOWLEDGEMENT,
+    CLOSURE,
+    CORRECTION,
+    EXAMPLES,
+    HELLO,
+    KEYSCAN,
+    LIDAR_PLACE,
+    RELEASE,
+    packet,
+    same,
+)
 
 from fcslam.errors import PacketError
 from fcslam.records import Channel, KeyscanId

@@ -21,7 +21,7 @@ from fcslam.federated.task import Task
 from fcslam.federated.tls import Address, Certificates, check_own, check_server
 
 LINK: Final = "fleet"
-START_S: Final = 60.0
+START_S: Final = 180.0
 LOG_FILE: Final = "flower.log"
 LOOPBACK: Final = "127.0.0.1"
 PR_SET_PDEATHSIG: Final = 1
