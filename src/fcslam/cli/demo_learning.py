@@ -55,7 +55,7 @@ def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console
 
     given = {"rounds": ROUNDS, "local_steps": STEPS, "normalisation": "frozen", "training": TRAINING | {"seed": seed}}
     settings = parse(FederatedSettings, given, "the demo")
-    homes = [_own_images(source, folder / "robots_images" / source.name) for source in sources]
+    homes = [_own_images(source, folder / "images" / source.name) for source in sources]
     released = False
 
     def tell(report: RoundReport) -> None:
