@@ -30,6 +30,7 @@ from fcslam.records import (
     Constraint,
     ConstraintKind,
     Correction,
+    DetectorFile,
     FloatArray,
     Keyscan,
     KeyscanId,
@@ -37,7 +38,7 @@ from fcslam.records import (
     Veto,
     frozen,
 )
-from fcslam.wire.messages import Acknowledgement, Hello, Packet
+from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
 from fcslam.wire.packets import decode, encode
 
 
@@ -89,6 +90,8 @@ class Fleet:
         """Whether evidence has turned against a join."""
         self._patience = 0
         """Closures up to which doubts wait: the same doubts soon again would be dispelled again."""
+        self._releases: dict[Channel, DetectorFile] = {}
+        """The newest detectors."""
         self._version = 0
         self._disturbed = False
         """Whether something but a packet left its mark on the graph."""
@@ -132,6 +135,10 @@ class Fleet:
         if any(entry.closure.status is not ClosureStatus.CANDIDATE for entry in vetoed):
             self._disturbed = True
             self._reconsider()
+
+    def announce(self, file: DetectorFile) -> None:
+        """From now on robots that describe this channel are told of this detector, until they have taken it."""
+        self._releases[file.channel] = file
 
     def closure_counts(self) -> dict[str, int]:
         """Closures so far by kind, for progress displays."""
@@ -180,7 +187,7 @@ class Fleet:
             case Place() as place:
                 self._store.add_place(place)
                 self._add_place(place)  # place recognition and map fusion
-            case Correction() | Acknowledgement():
+            case Correction() | Acknowledgement() | Release():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
 
     def _add_place(self, place: Place) -> None:
@@ -189,7 +196,7 @@ class Fleet:
             words = place.channel, place.detector_version
             matcher = self._matcher(words)
             matches = matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
-            entries = [self._ledger.add(match) for match in matches]
+            entries = [self._ledger.add(match) for match in matches if not self._ledger.confirms(match)]
             waiting = [entry for entry in entries if not self._is_vetoed(entry) and self._accept_or_wait(entry)]
             for other in dict.fromkeys(entry.closure.i.robot for entry in waiting):
                 self._judge_pair(other, place.id.robot)
@@ -323,11 +330,21 @@ class Fleet:
         return fusion
 
     def _replies(self, packet: Packet) -> list[bytes]:
-        """Acknowledgement and, after a place, where the robot's odometry lies in the map."""
+        """Acknowledgement; after a place, where the robot's odometry lies in the map; newer detectors."""
         robot, epoch = packet.robot, packet.epoch
-        bodies: list[Acknowledgement | Correction] = [Acknowledgement(robot, epoch, packet.sequence)]
+        bodies: list[Acknowledgement | Correction | Release] = [Acknowledgement(robot, epoch, packet.sequence)]
         if isinstance(packet.body, Place) and self._graph.keyscan_count(robot):
             index = next(k for k, robots in enumerate(self._maps) if robot in robots)
             bodies.append(Correction(robot, self._version, index, frozen(self._graph.T_map_odom(robot))))
+        if isinstance(packet.body, Hello | Place):
+            bodies += self._newer_detectors(robot)
         first = self._store.number_replies(robot, len(bodies))
         return [encode(Packet(robot, epoch, first + k, packet.time, body)) for k, body in enumerate(bodies)]
+
+    def _newer_detectors(self, robot: str) -> list[Release]:
+        """Of the channels that the robot has."""
+        versions = self._store.detector_versions(robot)
+        newer = [
+            file for channel, file in self._releases.items() if versions.get(channel, file.version) != file.version
+        ]
+        return [Release(robot, file) for file in newer]

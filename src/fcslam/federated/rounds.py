@@ -255,7 +255,7 @@ def _read(replies: Any, robots: Mapping[int, str], version: str) -> Answers:
             answers.left_out[robot] = f"an answer that cannot be read ({error})"
     for robot in robots.values():
         if robot not in answers.weights and robot not in answers.left_out:
-            answers.left_out[robot] = "no answer before the deadline"
+            answers.left_out[robot] = "no answer: gone, or later than the deadline"
     return answers
 
 
