@@ -31,6 +31,7 @@ class Arm(Settings):
 
     settings: dict[str, Any] = Field(default_factory=dict, description="federated settings that differ")
     poison: Poison | None = Field(default=None, description="what the last robot does to its updates")
+    seeds: int | None = Field(default=None, ge=1, description="so many of the study's seeds; null for all")
 
     def federated(self, common: FederatedSettings, seed: int) -> FederatedSettings:
         """The settings of this arm.
@@ -71,10 +72,10 @@ def train_locally(ground: Ground) -> list[KeypointNetwork]:
 
 def train_together(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]:
     """One network, by federated training in one process; the one after the last round."""
-    settings = arm.federated(ground.settings, ground.seed)
+    settings, place = arm.federated(ground.settings, ground.seed), ground.folder / name
     learners: list[Learner] = [
         RobotLearner(
-            robot, Path(robot), Path(robot), seeded_noise(robot, ground.seed), ground.pace.device, gathered=own
+            robot, Path(robot), place / robot, seeded_noise(robot, ground.seed), ground.pace.device, gathered=own
         )
         for robot, own in ground.images.items()
     ]
@@ -90,7 +91,7 @@ def train_together(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]
         judge=lambda _weights: {},
         watch=lambda report, _best: ground.watch(name, report.round_number, settings.rounds),
     )
-    server = Server(settings, ground.start, ground.folder / name, outside)
+    server = Server(settings, ground.start, place, outside)
     state = server.run(InProcessGrid(client_app(learner_of), len(learners)))
     return [network_of(state.weights, settings.training.encoder)]
 
