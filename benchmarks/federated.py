@@ -16,14 +16,22 @@ poison, minus the arm.
 
 import json
 import sys
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import common
+import numpy as np
+from matplotlib.figure import Figure
 
 from fcslam.evaluation.federated import Findings, Study, StudySettings, run_study
+from fcslam.evaluation.federated_report import ArmReport
+from fcslam.evaluation.federated_report import report as summarise
+from fcslam.federated.privacy import epsilon
+from fcslam.federated.settings import PrivacySettings
 from fcslam.learning.trainer import Pace
+from fcslam.metrics.bootstrap import Interval
 
 VISION = {"tower": "ie_tower/floor22", "town": "camvid/0016E5", "photos": "coco_subset/train2017"}
 SIMULATED = {"day": "robot_1", "lamp-off": "robot_2"}
@@ -48,6 +56,14 @@ NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3}
 KEPT = {"compatible-3": 3.0, "compatible-30": 30.0}
 """Strengths of the pull to the codes of the start."""
 CLIP_NORM = 3.0
+START_ARM = "start"
+
+TITLES = {"homography_3px": "Homographies right to 3 px, %", "mma_3px": "MMA at 3 px, %"}
+GAPS = {"arm": "s", "seeds": "d", "mean": ".1f", "gap": "s", "closed": ".2f", "worst robot": "s", "each seed": "s"}
+LOST = {"homography, %": ".1f", "lost": "s", "MMA, %": ".1f", "lost ": "s"}
+LOSSES = {"arm": "s"} | LOST
+PRIVATE = {"arm": "s", "noise": "g", "epsilon": ".3g"} | LOST
+KEEPING = {"arm": "s", "strength": "g", "new and new, MMA, %": ".1f", "old and new, MMA, %": ".1f"}
 SEEDS, PAIRS, IMAGES = 3, 500, 64
 FEW: dict[str, Any] = {"seeds": 1}
 """What is beside the point gets one seed."""
@@ -83,7 +99,16 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     prepare(vision, folder)
     findings = study(vision, folder)
-    print(findings)
+    report = common.Report(__file__, __doc__ or "", chosen)
+    report.say(setting(findings, folder))
+    rows = {(each.measure, each.arm): each for each in summarise(findings)}
+    for measure, title in TITLES.items():
+        report.table(title, GAPS, [gap_row(rows[measure, arm]) for arm in findings.measured if arm in compared()])
+    report.table("One of five robots poisoned", LOSSES, poison_rows(findings))
+    report.table("Noise for privacy", PRIVATE, private_rows(findings))
+    report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(findings))
+    report.picture("Gap to central training by arm, and what noise costs", draw(findings))
+    report.write()
 
 
 def prepare(vision: Path, folder: Path) -> None:
@@ -111,6 +136,96 @@ def study(vision: Path, folder: Path) -> Findings:
             print(f"{datetime.now(UTC):%H:%M:%S} {name}: {of}", flush=True)
 
     return run_study(Study(robots, folder / "study", settings, Pace(), watch))
+
+
+def compared() -> list[str]:
+    """Arms without poison and noise."""
+    return [START_ARM, "central", "local", "averaged", "frozen", *KEPT]
+
+
+def setting(findings: Findings, folder: Path) -> str:
+    """What was done, in words."""
+    files = sorted((folder / "study").glob("seed*/measured/*.npz"), key=lambda file: file.stat().st_mtime)
+    hours = (files[-1].stat().st_mtime - (folder / "start.yaml").stat().st_mtime) / 3600
+    labelled = {name: len(list((folder / "study" / "labels" / place).rglob("*.npz"))) for name, place in places()}
+    images = ", ".join(f"{name} {count}" for name, count in labelled.items())
+    steps = FEDERATED["rounds"] * FEDERATED["local_steps"] * len(labelled)
+    return (
+        f"Images trained on: {images}; of {IMAGES} files each a quarter is tested on. {FEDERATED['rounds']} rounds of "
+        f"{FEDERATED['local_steps']} steps of {TRAINING['pairs']} pairs a robot; central and local {steps} steps. "
+        f"{len(findings.owners)} pairs, {SEEDS} seeds where not said otherwise. From the first file to the "
+        f"last figure {hours:.1f} hours, interruptions included, on one core that others used as well."
+    )
+
+
+def places() -> list[tuple[str, str]]:
+    """The robots, and how their labels' folders are called."""
+    return [(name, Path(place).name) for name, place in VISION.items()] + list(SIMULATED.items())
+
+
+def gap_row(row: ArmReport) -> tuple[object, ...]:
+    worst = f"{row.worst_robot} {100 * row.worst_gap:.1f}"
+    seeds = " ".join(f"{100 * mean:.1f}" for mean in row.seeds)
+    return row.arm, len(row.seeds), 100 * row.mean, points(row.gap), row.closed, worst, seeds
+
+
+def points(interval: Interval) -> str:
+    """A share's interval in points."""
+    return f"{100 * interval.mean:.1f} [{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
+
+
+def poison_rows(findings: Findings) -> Iterator[tuple[object, ...]]:
+    lost = {(each.measure, each.arm): each for each in summarise(findings, against="averaged")}
+    for arm in arms():
+        if arms()[arm].get("poison"):
+            rows = [lost[measure, arm] for measure in TITLES]
+            yield arm, *(cell for row in rows for cell in (100 * row.mean, points(row.gap)))
+
+
+def private_rows(findings: Findings) -> Iterator[tuple[object, ...]]:
+    lost = {(each.measure, each.arm): each for each in summarise(findings, against="frozen")}
+    for arm, noise in {"frozen": 0.0, **NOISE}.items():
+        rows = [lost[measure, arm] for measure in TITLES]
+        yield arm, noise, promised(noise), *(cell for row in rows for cell in (100 * row.mean, points(row.gap)))
+
+
+def promised(noise: float) -> float:
+    """Epsilon after all rounds."""
+    return epsilon(noise, FEDERATED["rounds"], PrivacySettings().delta)
+
+
+def kept_rows(findings: Findings) -> Iterator[tuple[object, ...]]:
+    rows = {(each.measure, each.arm): each for each in summarise(findings, against=START_ARM)}
+    for arm in (START_ARM, "central", "averaged", *KEPT):
+        new, across = rows["mma_3px", arm], rows["mma_3px_former", arm]
+        yield arm, KEPT.get(arm, 0.0), 100 * new.seeds[0], 100 * across.seeds[0]
+
+
+def draw(findings: Findings) -> Figure:
+    """Gaps with intervals by arm, and accuracy against epsilon."""
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    rows = {(each.measure, each.arm): each for each in summarise(findings)}
+    names = [arm for arm in findings.measured if arm not in ("central", START_ARM)]
+    for offset, (measure, title) in zip((-0.15, 0.15), TITLES.items(), strict=True):
+        gaps = np.array([rows[measure, arm].gap for arm in names]) * 100
+        at, spread = np.arange(len(names)) + offset, np.abs(gaps[:, 1:].T - gaps[:, 0])
+        left.errorbar(gaps[:, 0], at, xerr=spread, fmt="o", capsize=2, label=title)
+        noisy = [(promised(noise), 100 * rows[measure, arm].mean) for arm, noise in NOISE.items()]
+        line = right.plot(*zip(*noisy, strict=True), "o-", label=title)[0]
+        right.axhline(100 * rows[measure, "frozen"].mean, color=line.get_color(), linestyle="--", linewidth=1)
+    left.axvline(0.0, color="black", linewidth=1)
+    left.axvline(2.0, color="grey", linewidth=1, linestyle=":")
+    left.set_yticks(range(len(names)), names)
+    left.invert_yaxis()
+    left.set_xlabel("points below central training, 95 %")
+    right.set_xscale("log")
+    right.set_xlabel("epsilon; dashed: without noise")
+    right.set_ylabel("%")
+    for panel in (left, right):
+        panel.grid(alpha=0.3)
+        panel.legend(frameon=False)
+    return figure
 
 
 if __name__ == "__main__":

@@ -65,9 +65,13 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(robots, tmp_path):
     assert ("averaged, seed 2", 2) in told
     assert not [name for name, _ in told if name.startswith("central") or name == "averaged, seed 1"]
     assert {name: values.shape for name, values in whole.measured.items()} == {
-        "central": (2, 1, 4, 4), "local": (2, 2, 4, 4), "averaged": (2, 1, 4, 4), "bad": (2, 1, 4, 4),
+        "start": (1, 1, 4, 4), "central": (2, 1, 4, 4), "local": (2, 2, 4, 4),
+        "averaged": (2, 1, 4, 4), "bad": (2, 1, 4, 4),
     }  # fmt: skip
     assert whole.owners == (0, 0, 1, 1)
+    start = whole.measured["start"]
+    assert np.array_equal(start[..., 1], start[..., 3])  # it is the former network itself
+    assert not np.array_equal(start, whole.measured["central"][:1], equal_nan=True)
     for name, values in whole.measured.items():
         assert np.array_equal(values, torn.measured[name], equal_nan=True)
     assert run_study(study(robots, tmp_path / "torn", lambda *_: pytest.fail("all is done"))).robots == (
@@ -84,7 +88,9 @@ def test_arms_and_seeds_may_be_added_to_a_study(robots, tmp_path):
     told = []
     arms = {"frozen": {"settings": {"normalisation": "frozen"}, "seeds": 1}}
     found = run_study(study(robots, tmp_path, lambda name, *_: told.append(name), seeds=2, arms=arms))
-    assert {name: len(values) for name, values in found.measured.items()} == {"central": 2, "local": 2, "frozen": 1}
+    assert {name: len(values) for name, values in found.measured.items()} == {
+        "start": 1, "central": 2, "local": 2, "frozen": 1,
+    }  # fmt: skip
     assert "frozen, seed 1" in told
     assert "central, seed 1" not in told
     with pytest.raises(EvaluationError, match="another study"):
@@ -120,9 +126,10 @@ def test_every_network_sees_as_many_samples(robots, tmp_path):
     assert steps["averaged, seed 1"] == 2
 
 
-def test_an_arm_may_not_take_the_name_of_another(robots, tmp_path):
-    with pytest.raises(EvaluationError, match="central"):
-        run_study(study(robots, tmp_path, arms={"central": {}}))
+@pytest.mark.parametrize("name", ["start", "central", "local-north", "a/b"])
+def test_an_arm_may_not_take_the_name_of_another(name, robots, tmp_path):
+    with pytest.raises(EvaluationError, match=name):
+        run_study(study(robots, tmp_path, arms={name: {}}))
 
 
 def test_a_network_matches_a_view_with_itself(robots):

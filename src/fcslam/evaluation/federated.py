@@ -17,7 +17,16 @@ from pydantic import Field
 
 from fcslam.config import Settings, dump, load
 from fcslam.errors import EvaluationError, OutputError
-from fcslam.evaluation.federated_arms import CENTRAL, LOCAL, Arm, Ground, train_central, train_locally, train_together
+from fcslam.evaluation.federated_arms import (
+    CENTRAL,
+    LOCAL,
+    START,
+    Arm,
+    Ground,
+    train_central,
+    train_locally,
+    train_together,
+)
 from fcslam.evaluation.federated_pairs import MEASURES, Described, described, held_out_pairs, measure_pair
 from fcslam.federated.network import network_of
 from fcslam.federated.settings import FederatedSettings
@@ -83,14 +92,14 @@ def run_study(study: Study) -> Findings:
         OutputError: something cannot be written.
     """
     for name in study.settings.arms:
-        if name in (CENTRAL, LOCAL, "shapes", "labels") or not name.replace("-", "").isalnum():
+        if name.split("-")[0] in (START, CENTRAL, LOCAL) or not name.replace("-", "").isalnum():
             raise EvaluationError(f"{name}: an arm of a study needs another name")
     _claim(study)
     share = -(-study.settings.pairs // len(study.robots))
     pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
     owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
     most, arms = study.settings.seeds, study.settings.arms
-    seeds = {CENTRAL: most, LOCAL: most} | {name: min(arm.seeds or most, most) for name, arm in arms.items()}
+    seeds = {START: 1, CENTRAL: most, LOCAL: most} | {name: min(arm.seeds or most, most) for name, arm in arms.items()}
     common: Common | None = None
     measured: dict[str, FloatArray] = {}
     for name, count in seeds.items():
@@ -108,6 +117,8 @@ def run_study(study: Study) -> Findings:
 
 
 def _trained(ground: Ground, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:
+    if name == START:
+        return [network_of(ground.start, ground.settings.training.encoder)]
     if name == CENTRAL:
         return train_central(ground)
     return train_locally(ground) if name == LOCAL else train_together(ground, name, arms[name])

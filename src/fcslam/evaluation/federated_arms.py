@@ -22,6 +22,8 @@ from fcslam.learning.pairs import Example
 from fcslam.learning.stages import Images
 from fcslam.learning.trainer import Pace, Run, Status
 
+START: Final = "start"
+"""What all begin from, as it is."""
 CENTRAL: Final = "central"
 LOCAL: Final = "local"
 
