@@ -19,19 +19,21 @@ import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import common
 import numpy as np
 from matplotlib.figure import Figure
 
-from fcslam.evaluation.federated import Findings, Study, StudySettings, run_study
-from fcslam.evaluation.federated_report import ArmReport
-from fcslam.evaluation.federated_report import report as summarise
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.settings import PrivacySettings
-from fcslam.learning.trainer import Pace
 from fcslam.metrics.bootstrap import Interval
+
+if TYPE_CHECKING:
+    from fcslam.evaluation.federated import Findings
+    from fcslam.evaluation.federated_report import ArmReport
+
+    Rows = dict[tuple[str, str], ArmReport]
 
 VISION = {"tower": "ie_tower/floor22", "town": "camvid/0016E5", "photos": "coco_subset/train2017"}
 SIMULATED = {"day": "robot_1", "lamp-off": "robot_2"}
@@ -56,8 +58,6 @@ NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3}
 KEPT = {"compatible-3": 3.0, "compatible-30": 30.0}
 """Strengths of the pull to the codes of the start."""
 CLIP_NORM = 3.0
-START_ARM = "start"
-
 TITLES = {"homography_3px": "Homographies right to 3 px, %", "mma_3px": "MMA at 3 px, %"}
 GAPS = {"arm": "s", "seeds": "d", "mean": ".1f", "gap": "s", "closed": ".2f", "worst robot": "s", "each seed": "s"}
 LOST = {"homography, %": ".1f", "lost": "s", "MMA, %": ".1f", "lost ": "s"}
@@ -65,6 +65,8 @@ LOSSES = {"arm": "s"} | LOST
 PRIVATE = {"arm": "s", "noise": "g", "epsilon": ".3g"} | LOST
 KEEPING = {"arm": "s", "strength": "g", "new and new, MMA, %": ".1f", "old and new, MMA, %": ".1f"}
 SEEDS, PAIRS, IMAGES = 3, 500, 64
+COMPARED = ("start", "central", "local", "averaged", "frozen", *KEPT)
+"""Arms without poison and noise."""
 FEW: dict[str, Any] = {"seeds": 1}
 """What is beside the point gets one seed."""
 
@@ -101,13 +103,13 @@ def main() -> None:
     findings = study(vision, folder)
     report = common.Report(__file__, __doc__ or "", chosen)
     report.say(setting(findings, folder))
-    rows = {(each.measure, each.arm): each for each in summarise(findings)}
+    below = compare(findings)
     for measure, title in TITLES.items():
-        report.table(title, GAPS, [gap_row(rows[measure, arm]) for arm in findings.measured if arm in compared()])
-    report.table("One of five robots poisoned", LOSSES, poison_rows(findings))
-    report.table("Noise for privacy", PRIVATE, private_rows(findings))
-    report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(findings))
-    report.picture("Gap to central training by arm, and what noise costs", draw(findings))
+        report.table(title, GAPS, [gap_row(below["central"][measure, arm]) for arm in COMPARED])
+    report.table("One of five robots poisoned", LOSSES, poison_rows(below["averaged"]))
+    report.table("Noise for privacy", PRIVATE, private_rows(below["frozen"]))
+    report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(below["central"]))
+    report.picture("Gap to central training by arm, and what noise costs", draw(below["central"]))
     report.write()
 
 
@@ -120,9 +122,12 @@ def prepare(vision: Path, folder: Path) -> None:
         common.run_fcslam("train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start")
 
 
-def study(vision: Path, folder: Path) -> Findings:
+def study(vision: Path, folder: Path) -> "Findings":
     """Train and measure whatever is missing."""
     import torch
+
+    from fcslam.evaluation.federated import Study, StudySettings, run_study
+    from fcslam.learning.trainer import Pace
 
     torch.set_num_threads(1)
     robots = {name: vision / place for name, place in VISION.items()}
@@ -138,12 +143,15 @@ def study(vision: Path, folder: Path) -> Findings:
     return run_study(Study(robots, folder / "study", settings, Pace(), watch))
 
 
-def compared() -> list[str]:
-    """Arms without poison and noise."""
-    return [START_ARM, "central", "local", "averaged", "frozen", *KEPT]
+def compare(findings: "Findings") -> "dict[str, Rows]":
+    """Every arm by every measure, compared to each of three."""
+    from fcslam.evaluation.federated_report import report
+
+    references = ("central", "averaged", "frozen")
+    return {name: {(row.measure, row.arm): row for row in report(findings, against=name)} for name in references}
 
 
-def setting(findings: Findings, folder: Path) -> str:
+def setting(findings: "Findings", folder: Path) -> str:
     """What was done, in words."""
     files = sorted((folder / "study").glob("seed*/measured/*.npz"), key=lambda file: file.stat().st_mtime)
     hours = (files[-1].stat().st_mtime - (folder / "start.yaml").stat().st_mtime) / 3600
@@ -163,7 +171,7 @@ def places() -> list[tuple[str, str]]:
     return [(name, Path(place).name) for name, place in VISION.items()] + list(SIMULATED.items())
 
 
-def gap_row(row: ArmReport) -> tuple[object, ...]:
+def gap_row(row: "ArmReport") -> tuple[object, ...]:
     worst = f"{row.worst_robot} {100 * row.worst_gap:.1f}"
     seeds = " ".join(f"{100 * mean:.1f}" for mean in row.seeds)
     return row.arm, len(row.seeds), 100 * row.mean, points(row.gap), row.closed, worst, seeds
@@ -174,19 +182,20 @@ def points(interval: Interval) -> str:
     return f"{100 * interval.mean:.1f} [{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
 
 
-def poison_rows(findings: Findings) -> Iterator[tuple[object, ...]]:
-    lost = {(each.measure, each.arm): each for each in summarise(findings, against="averaged")}
-    for arm in arms():
-        if arms()[arm].get("poison"):
-            rows = [lost[measure, arm] for measure in TITLES]
-            yield arm, *(cell for row in rows for cell in (100 * row.mean, points(row.gap)))
+def poison_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
+    for arm, what in arms().items():
+        if "poison" in what:
+            yield arm, *lost(rows, arm)
 
 
-def private_rows(findings: Findings) -> Iterator[tuple[object, ...]]:
-    lost = {(each.measure, each.arm): each for each in summarise(findings, against="frozen")}
+def private_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
     for arm, noise in {"frozen": 0.0, **NOISE}.items():
-        rows = [lost[measure, arm] for measure in TITLES]
-        yield arm, noise, promised(noise), *(cell for row in rows for cell in (100 * row.mean, points(row.gap)))
+        yield arm, noise, promised(noise), *lost(rows, arm)
+
+
+def lost(rows: "Rows", arm: str) -> list[object]:
+    """Both measures of an arm, and how far they are below the one it is compared to."""
+    return [cell for row in (rows[measure, arm] for measure in TITLES) for cell in (100 * row.mean, points(row.gap))]
 
 
 def promised(noise: float) -> float:
@@ -194,19 +203,17 @@ def promised(noise: float) -> float:
     return epsilon(noise, FEDERATED["rounds"], PrivacySettings().delta)
 
 
-def kept_rows(findings: Findings) -> Iterator[tuple[object, ...]]:
-    rows = {(each.measure, each.arm): each for each in summarise(findings, against=START_ARM)}
-    for arm in (START_ARM, "central", "averaged", *KEPT):
+def kept_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
+    for arm in ("start", "central", "averaged", *KEPT):
         new, across = rows["mma_3px", arm], rows["mma_3px_former", arm]
         yield arm, KEPT.get(arm, 0.0), 100 * new.seeds[0], 100 * across.seeds[0]
 
 
-def draw(findings: Findings) -> Figure:
+def draw(rows: "Rows") -> Figure:
     """Gaps with intervals by arm, and accuracy against epsilon."""
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
-    rows = {(each.measure, each.arm): each for each in summarise(findings)}
-    names = [arm for arm in findings.measured if arm not in ("central", START_ARM)]
+    names = ["local", *arms()]
     for offset, (measure, title) in zip((-0.15, 0.15), TITLES.items(), strict=True):
         gaps = np.array([rows[measure, arm].gap for arm in names]) * 100
         at, spread = np.arange(len(names)) + offset, np.abs(gaps[:, 1:].T - gaps[:, 0])
