@@ -44,9 +44,11 @@ START = {"shape_steps": 400, "steps": 1000, "label_copies": 4, "pairs": 4, "side
 
 TRAINING = {"label_copies": 4, "pairs": 2, "side_px": 128, "points": 160, "learning_rate": 1e-3}
 FEDERATED = {"rounds": 5, "local_steps": 20, "training": TRAINING}
+LONGER = 20
+"""Rounds of another study, of one seed; central and local steps in proportion."""
 TRUSTING = {"screening": {"largest_change": None, "longest": None, "least_agreement": None}}
-POISONS = ("scaled", "flipped", "random")
-WORST_POISON = "scaled"
+POISONS = ("reversed", "flipped", "scaled", "random")
+WORST_POISON = "reversed"
 ROBUST: dict[str, dict[str, Any]] = {
     "screened": {},
     "median": {"strategy": "fedmedian", **TRUSTING},
@@ -100,16 +102,20 @@ def main() -> None:
     vision = common.recordings(*VISION.values(), PUBLIC, kind="vision")
     folder.mkdir(parents=True, exist_ok=True)
     prepare(vision, folder)
-    findings = study(vision, folder)
+    findings = study(vision, folder / "study", FEDERATED, arms(), SEEDS)
+    longer = study(vision, folder / "longer", FEDERATED | {"rounds": LONGER}, {"averaged": {}}, 1)
+    below = compare(findings, "central")
     report = common.Report(__file__, __doc__ or "", chosen)
     report.say(setting(findings, folder))
-    below = compare(findings)
     for measure, title in TITLES.items():
-        report.table(title, GAPS, [gap_row(below["central"][measure, arm]) for arm in COMPARED])
-    report.table("One of five robots poisoned", LOSSES, poison_rows(below["averaged"]))
-    report.table("Noise for privacy", PRIVATE, private_rows(below["frozen"]))
-    report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(below["central"]))
-    report.picture("Gap to central training by arm, and what noise costs", draw(below["central"]))
+        report.table(title, GAPS, [gap_row(below[measure, arm]) for arm in COMPARED])
+    for measure, title in TITLES.items():
+        rows = compare(longer, "central")
+        report.table(f"{LONGER} rounds: {title}", GAPS, [gap_row(rows[measure, arm]) for arm in longer.measured])
+    report.table("One of five robots poisoned", LOSSES, poison_rows(compare(findings, "averaged")))
+    report.table("Noise for privacy", PRIVATE, private_rows(compare(findings, "frozen")))
+    report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(below))
+    report.picture("Gap to central training by arm, and what noise costs", draw(below))
     report.write()
 
 
@@ -122,8 +128,8 @@ def prepare(vision: Path, folder: Path) -> None:
         common.run_fcslam("train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start")
 
 
-def study(vision: Path, folder: Path) -> "Findings":
-    """Train and measure whatever is missing."""
+def study(vision: Path, folder: Path, federated: dict[str, Any], others: dict[str, Any], seeds: int) -> "Findings":
+    """Train and measure whatever is missing; simulated robots and start are in the folder above."""
     import torch
 
     from fcslam.evaluation.federated import Study, StudySettings, run_study
@@ -131,24 +137,23 @@ def study(vision: Path, folder: Path) -> "Findings":
 
     torch.set_num_threads(1)
     robots = {name: vision / place for name, place in VISION.items()}
-    robots |= {name: folder / "fleet" / robot for name, robot in SIMULATED.items()}
-    content = {"federated": FEDERATED, "arms": arms(), "seeds": SEEDS, "pairs": PAIRS, "images": IMAGES}
-    content["start"] = folder / "start" / "joint" / "checkpoint.npz"
+    robots |= {name: folder.parent / "fleet" / robot for name, robot in SIMULATED.items()}
+    content = {"federated": federated, "arms": others, "seeds": seeds, "pairs": PAIRS, "images": IMAGES}
+    content["start"] = folder.parent / "start" / "joint" / "checkpoint.npz"
     settings = StudySettings.model_validate(content)
 
     def watch(name: str, done: int, of: int) -> None:
         if done == of:
             print(f"{datetime.now(UTC):%H:%M:%S} {name}: {of}", flush=True)
 
-    return run_study(Study(robots, folder / "study", settings, Pace(), watch))
+    return run_study(Study(robots, folder, settings, Pace(), watch))
 
 
-def compare(findings: "Findings") -> "dict[str, Rows]":
-    """Every arm by every measure, compared to each of three."""
+def compare(findings: "Findings", against: str) -> "Rows":
+    """Every arm by every measure, compared to one."""
     from fcslam.evaluation.federated_report import report
 
-    references = ("central", "averaged", "frozen")
-    return {name: {(row.measure, row.arm): row for row in report(findings, against=name)} for name in references}
+    return {(row.measure, row.arm): row for row in report(findings, against=against)}
 
 
 def setting(findings: "Findings", folder: Path) -> str:

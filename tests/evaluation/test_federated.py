@@ -199,12 +199,17 @@ def test_nothing_is_closed_where_central_is_no_better():
     assert all(np.isnan(row.closed) for row in rows)
 
 
-@pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
+@pytest.mark.parametrize("poison", ["flipped", "scaled", "reversed", "random", "nan"])
 def test_poison_is_what_it_says(poison):
     before = {"weight": np.zeros(6, np.float32)}
     bad = Poisoned(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
     sent = bad.learn(before, 0, FederatedSettings()).weights["weight"]
-    expected = {"flipped": -np.arange(6.0), "scaled": 10 * np.arange(6.0), "nan": np.full(6, np.nan)}
+    expected = {
+        "flipped": -np.arange(6.0),
+        "scaled": 10 * np.arange(6.0),
+        "reversed": -10 * np.arange(6.0),
+        "nan": np.full(6, np.nan),
+    }
     if poison == "random":
         assert sorted(sent) == list(range(6))
         assert list(sent) != list(range(6))
