@@ -65,7 +65,7 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(robots, tmp_path):
     assert ("averaged, seed 2", 2) in told
     assert not [name for name, _ in told if name.startswith("central") or name == "averaged, seed 1"]
     assert {name: values.shape for name, values in whole.measured.items()} == {
-        "start": (1, 1, 4, 4), "central": (2, 1, 4, 4), "local": (2, 2, 4, 4),
+        "start": (1, 1, 4, 4), "central": (2, 1, 4, 4), "local": (2, 2, 4, 4), "alone": (2, 2, 4, 4),
         "averaged": (2, 1, 4, 4), "bad": (2, 1, 4, 4),
     }  # fmt: skip
     assert whole.owners == (0, 0, 1, 1)
@@ -89,7 +89,7 @@ def test_arms_and_seeds_may_be_added_to_a_study(robots, tmp_path):
     arms = {"frozen": {"settings": {"normalisation": "frozen"}, "seeds": 1}}
     found = run_study(study(robots, tmp_path, lambda name, *_: told.append(name), seeds=2, arms=arms))
     assert {name: len(values) for name, values in found.measured.items()} == {
-        "start": 1, "central": 2, "local": 2, "frozen": 1,
+        "start": 1, "central": 2, "local": 2, "alone": 2, "frozen": 1,
     }  # fmt: skip
     assert "frozen, seed 1" in told
     assert "central, seed 1" not in told
@@ -123,10 +123,11 @@ def test_every_network_sees_as_many_samples(robots, tmp_path):
 
     run_study(study(robots, tmp_path, watch, seeds=1))
     assert steps["central, seed 1"] == steps["local-north, seed 1"] == steps["local-south, seed 1"] == 2 * 2 * 2
+    assert steps["alone-north, seed 1"] == 2 * 2
     assert steps["averaged, seed 1"] == 2
 
 
-@pytest.mark.parametrize("name", ["start", "central", "local-north", "a/b"])
+@pytest.mark.parametrize("name", ["start", "central", "local-north", "alone", "a/b"])
 def test_an_arm_may_not_take_the_name_of_another(name, robots, tmp_path):
     with pytest.raises(EvaluationError, match=name):
         run_study(study(robots, tmp_path, arms={name: {}}))

@@ -18,6 +18,7 @@ from pydantic import Field
 from fcslam.config import Settings, dump, load
 from fcslam.errors import EvaluationError, OutputError
 from fcslam.evaluation.federated_arms import (
+    ALONE,
     CENTRAL,
     LOCAL,
     START,
@@ -79,8 +80,9 @@ class Findings:
     owners: tuple[int, ...]
     """For each pair the number of the robot whose image it is."""
     measured: Mapping[str, FloatArray]
-    """By arm: shape (seeds, networks, pairs, measures). ``local`` has a network for each robot, all others have one; a
-    pair is shown to one of its networks only, the others have NaN there. An arm may have fewer seeds than central."""
+    """By arm: shape (seeds, networks, pairs, measures). ``local`` and ``alone`` have a network for each robot, all the
+    others one; a pair is shown to one of them only, the rest have NaN there. An arm may have fewer seeds than central.
+    """
 
 
 def run_study(study: Study) -> Findings:
@@ -92,14 +94,15 @@ def run_study(study: Study) -> Findings:
         OutputError: something cannot be written.
     """
     for name in study.settings.arms:
-        if name.split("-")[0] in (START, CENTRAL, LOCAL) or not name.replace("-", "").isalnum():
+        if name.split("-")[0] in (START, CENTRAL, LOCAL, ALONE) or not name.replace("-", "").isalnum():
             raise EvaluationError(f"{name}: an arm of a study needs another name")
     _claim(study)
     share = -(-study.settings.pairs // len(study.robots))
     pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
     owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
     most, arms = study.settings.seeds, study.settings.arms
-    seeds = {START: 1, CENTRAL: most, LOCAL: most} | {name: min(arm.seeds or most, most) for name, arm in arms.items()}
+    seeds = {START: 1, CENTRAL: most, LOCAL: most, ALONE: most}
+    seeds |= {name: min(arm.seeds or most, most) for name, arm in arms.items()}
     common: Common | None = None
     measured: dict[str, FloatArray] = {}
     for name, count in seeds.items():
@@ -121,7 +124,7 @@ def _trained(ground: Ground, name: str, arms: Mapping[str, Arm]) -> list[Keypoin
         return [network_of(ground.start, ground.settings.training.encoder)]
     if name == CENTRAL:
         return train_central(ground)
-    return train_locally(ground) if name == LOCAL else train_together(ground, name, arms[name])
+    return train_together(ground, name, arms[name]) if name in arms else train_locally(ground, name)
 
 
 def _claim(study: Study) -> None:

@@ -26,6 +26,8 @@ START: Final = "start"
 """What all begin from, as it is."""
 CENTRAL: Final = "central"
 LOCAL: Final = "local"
+ALONE: Final = "alone"
+"""Local training that is no longer than a robot's in a fleet."""
 
 
 class Arm(Settings):
@@ -64,12 +66,13 @@ class Ground:
 def train_central(ground: Ground) -> list[KeypointNetwork]:
     """One network, on all images in one place."""
     everything = [example for images in ground.images.values() for example in images.train]
-    return [_train_alone(ground, CENTRAL, everything)]
+    return [_train_alone(ground, CENTRAL, everything, len(ground.images))]
 
 
-def train_locally(ground: Ground) -> list[KeypointNetwork]:
-    """A network for each robot, on its images alone, with as many samples as all of them saw together."""
-    return [_train_alone(ground, f"{LOCAL}-{robot}", images.train) for robot, images in ground.images.items()]
+def train_locally(ground: Ground, name: str) -> list[KeypointNetwork]:
+    """A network for each robot, on its images alone: with as many samples as all of them saw together, or its share."""
+    shares = len(ground.images) if name == LOCAL else 1
+    return [_train_alone(ground, f"{name}-{robot}", images.train, shares) for robot, images in ground.images.items()]
 
 
 def train_together(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]:
@@ -98,10 +101,10 @@ def train_together(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]
     return [network_of(state.weights, settings.training.encoder)]
 
 
-def _train_alone(ground: Ground, name: str, examples: list[Example]) -> KeypointNetwork:
-    """By the central trainer; robots times the steps of a robot."""
+def _train_alone(ground: Ground, name: str, examples: list[Example], shares: int) -> KeypointNetwork:
+    """By the central trainer; ``shares`` times the steps of a robot."""
     training = ground.settings.of_robots()
-    steps = training.steps * len(ground.images)
+    steps = training.steps * shares
     training = training.model_copy(update={"steps": steps, "seed": ground.seed})
     state = network_of(ground.start, training.encoder).state_dict()
     folder = ground.folder / name
