@@ -11,15 +11,8 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 from federated.fakes import Fake  # noqa: E402
 
 from fcslam.errors import EvaluationError  # noqa: E402
-from fcslam.evaluation.federated import (  # noqa: E402
-    MEASURES,
-    Findings,
-    Study,
-    StudySettings,
-    held_out_pairs,
-    measure_pair,
-    run_study,
-)
+from fcslam.evaluation.federated import Findings, Study, StudySettings, run_study  # noqa: E402
+from fcslam.evaluation.federated_pairs import MEASURES, Described, described, held_out_pairs, measure_pair  # noqa: E402
 from fcslam.evaluation.federated_report import report  # noqa: E402
 from fcslam.evaluation.poison import Poisoned  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
@@ -72,17 +65,54 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(robots, tmp_path):
     assert ("averaged, seed 2", 2) in told
     assert not [name for name, _ in told if name.startswith("central") or name == "averaged, seed 1"]
     assert {name: values.shape for name, values in whole.measured.items()} == {
-        "central": (2, 1, 4, 3), "local": (2, 2, 4, 3), "averaged": (2, 1, 4, 3), "bad": (2, 1, 4, 3),
+        "start": (1, 1, 4, 4), "central": (2, 1, 4, 4), "local": (2, 2, 4, 4), "alone": (2, 2, 4, 4),
+        "averaged": (2, 1, 4, 4), "bad": (2, 1, 4, 4),
     }  # fmt: skip
     assert whole.owners == (0, 0, 1, 1)
+    start = whole.measured["start"]
+    assert np.array_equal(start[..., 1], start[..., 3])  # it is the former network itself
+    assert not np.array_equal(start, whole.measured["central"][:1], equal_nan=True)
     for name, values in whole.measured.items():
         assert np.array_equal(values, torn.measured[name], equal_nan=True)
     assert run_study(study(robots, tmp_path / "torn", lambda *_: pytest.fail("all is done"))).robots == (
         "north",
         "south",
     )
+    for changed in ({"pairs": 6}, {"arms": {"averaged": {"poison": "nan"}}}):
+        with pytest.raises(EvaluationError, match="another study"):
+            run_study(study(robots, tmp_path / "torn", **changed))
+
+
+def test_arms_and_seeds_may_be_added_to_a_study(robots, tmp_path):
+    run_study(study(robots, tmp_path, seeds=1, arms={"averaged": {}}))
+    told = []
+    arms = {"frozen": {"settings": {"normalisation": "frozen"}, "seeds": 1}}
+    found = run_study(study(robots, tmp_path, lambda name, *_: told.append(name), seeds=2, arms=arms))
+    assert {name: len(values) for name, values in found.measured.items()} == {
+        "start": 1, "central": 2, "local": 2, "alone": 2, "frozen": 1,
+    }  # fmt: skip
+    assert "frozen, seed 1" in told
+    assert "central, seed 1" not in told
     with pytest.raises(EvaluationError, match="another study"):
-        run_study(study(robots, tmp_path / "torn", seeds=3))
+        run_study(study(robots, tmp_path, seeds=2, arms={"averaged": {"seeds": 1}}))
+
+
+def test_robots_own_networks_share_the_pairs_out(robots, tmp_path):
+    local = run_study(study(robots, tmp_path, arms={"averaged": {}})).measured["local"]
+    shown = np.isfinite(local[..., 0])
+    assert (shown.sum(axis=1) == 1).all()
+    assert (shown.sum(axis=0) == 1).all()  # over two seeds each of both networks sees each pair once
+
+
+def test_all_begin_from_the_start_that_is_named(robots, tmp_path):
+    run_study(study(robots, tmp_path / "first", seeds=1))
+    start = tmp_path / "first" / "shapes" / "checkpoint.npz"
+    seen = set()
+    settings = study(robots, tmp_path / "second", lambda name, *_: seen.add(name), seeds=1, start=start)
+    again = run_study(settings)
+    assert "shapes" not in seen
+    first = run_study(study(robots, tmp_path / "first", seeds=1))
+    assert all(np.array_equal(first.measured[name], again.measured[name], equal_nan=True) for name in first.measured)
 
 
 def test_every_network_sees_as_many_samples(robots, tmp_path):
@@ -93,23 +123,31 @@ def test_every_network_sees_as_many_samples(robots, tmp_path):
 
     run_study(study(robots, tmp_path, watch, seeds=1))
     assert steps["central, seed 1"] == steps["local-north, seed 1"] == steps["local-south, seed 1"] == 2 * 2 * 2
+    assert steps["alone-north, seed 1"] == 2 * 2
     assert steps["averaged, seed 1"] == 2
 
 
-def test_an_arm_may_not_take_the_name_of_another(robots, tmp_path):
-    with pytest.raises(EvaluationError, match="central"):
-        run_study(study(robots, tmp_path, arms={"central": {}}))
+@pytest.mark.parametrize("name", ["start", "central", "local-north", "alone", "a/b"])
+def test_an_arm_may_not_take_the_name_of_another(name, robots, tmp_path):
+    with pytest.raises(EvaluationError, match=name):
+        run_study(study(robots, tmp_path, arms={name: {}}))
 
 
-def test_a_network_matches_a_view_with_itself(robots, tmp_path):
+def test_a_network_matches_a_view_with_itself(robots):
     torch.manual_seed(1)
     network = KeypointNetwork("light").eval()
     network.body.code_head[-1].bias.data.zero_()  # or all its codes are alike
-    (pair,) = held_out_pairs("north", find_images([robots["north"]])[:1], study(robots, tmp_path, pairs=2))
+    (pair,) = held_out_pairs("north", find_images([robots["north"]])[:1], 1)
     same = type(pair)((pair.views[0], pair.views[0]), pair.valid, pair.taught_valid, pair.taught, np.eye(3))
-    correct, accuracy, again = measure_pair(network, same, torch.device("cpu"))
+    device = torch.device("cpu")
+    own = described(network, pair.views[0], device)
+    correct, accuracy, again, former = measure_pair(network, same, own, device)
     assert (correct, again) == (1.0, 1.0)
     assert accuracy > 0.95
+    assert former == accuracy
+    assert measure_pair(network, same, Described(own.points, np.bitwise_not(own.codes)), device)[3] < 0.2
+    nothing = Described(np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
+    assert measure_pair(network, same, nothing, device)[3] == 0.0
 
 
 def findings(central, federated, local):
@@ -122,6 +160,22 @@ def findings(central, federated, local):
 
     measured = {"central": stacked(central), "local": stacked(*local), "federated": stacked(federated)}
     return Findings(("north", "south"), owners, measured)
+
+
+def test_an_arm_of_fewer_seeds_is_compared_with_those():
+    rng = np.random.default_rng(3)
+    central = rng.random(60)
+    whole = findings(central, central - 0.1, [central - 0.2, central - 0.2])
+    later = findings(central + 0.5, central, [central - 0.2, central - 0.2]).measured
+    measured = {name: np.concatenate((whole.measured[name], later[name])) for name in ("central", "local")}
+    measured |= {"federated": whole.measured["federated"], "poor": whole.measured["federated"] - 0.03}
+    found = Findings(whole.robots, whole.owners, measured)
+    rows = {row.arm: row for row in report(found) if row.measure == MEASURES[0]}
+    assert rows["federated"].gap.mean == pytest.approx(0.1)
+    assert rows["federated"].closed == pytest.approx(0.5)
+    assert rows["local"].gap.mean == pytest.approx(0.45)
+    against = {row.arm: row for row in report(found, against="federated") if row.measure == MEASURES[0]}
+    assert against["poor"].gap == pytest.approx((0.03, 0.03, 0.03))
 
 
 def test_gaps_are_paired_and_the_worst_robot_is_named():
@@ -146,12 +200,17 @@ def test_nothing_is_closed_where_central_is_no_better():
     assert all(np.isnan(row.closed) for row in rows)
 
 
-@pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
+@pytest.mark.parametrize("poison", ["flipped", "scaled", "reversed", "random", "nan"])
 def test_poison_is_what_it_says(poison):
     before = {"weight": np.zeros(6, np.float32)}
     bad = Poisoned(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
     sent = bad.learn(before, 0, FederatedSettings()).weights["weight"]
-    expected = {"flipped": -np.arange(6.0), "scaled": 10 * np.arange(6.0), "nan": np.full(6, np.nan)}
+    expected = {
+        "flipped": -np.arange(6.0),
+        "scaled": 10 * np.arange(6.0),
+        "reversed": -10 * np.arange(6.0),
+        "nan": np.full(6, np.nan),
+    }
     if poison == "random":
         assert sorted(sent) == list(range(6))
         assert list(sent) != list(range(6))

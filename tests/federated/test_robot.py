@@ -78,6 +78,28 @@ def test_the_pull_holds_updates_back(folder, start, tmp_path):
     assert 0.0 < held < free
 
 
+def test_codes_are_kept_to_those_of_the_run_s_first_weights(folder, start, tmp_path):
+    chosen = settings(compatible=100.0)
+    torch.manual_seed(4)
+    moved = weights_of(KeypointNetwork("light"))
+    first = robot(folder, tmp_path / "a")
+    assert "former" in first.learn(start, 0, chosen).losses
+    assert "former" not in robot(folder, tmp_path / "b").learn(start, 0, settings()).losses
+    later = first.learn(moved, 1, chosen).weights
+    restarted = robot(folder, tmp_path / "a")
+    assert same(restarted.learn(moved, 1, chosen).weights, later)
+    (tmp_path / "a" / "former.npz").unlink()
+    assert not same(restarted.learn(moved, 1, chosen).weights, later)
+    restarted.learn(start, 0, chosen)
+    assert same(restarted.learn(moved, 1, chosen).weights, later)
+
+
+def test_a_robot_that_cannot_keep_the_first_weights_says_so(folder, start, tmp_path):
+    (tmp_path / "former.npz").mkdir()
+    with pytest.raises(TrainingError, match=r"former.npz: the first weights cannot be kept"):
+        robot(folder, tmp_path).learn(start, 0, settings(compatible=1.0))
+
+
 def test_frozen_statistics_stay_and_averaged_ones_move(folder, start, tmp_path):
     statistics = [name for name in start if name not in trained_names(start, frozen_statistics=True)]
     assert statistics

@@ -1,12 +1,15 @@
 """A leg of a run: it starts where it is told, leaves alone what is frozen, and is pulled back as hard as asked."""
 
+from dataclasses import replace
+
 import pytest
 from learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import TrainingError  # noqa: E402
-from fcslam.learning.descent import Pull  # noqa: E402
+from fcslam.learning.batches import draw_batch  # noqa: E402
+from fcslam.learning.descent import Former, Pull  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import fuse  # noqa: E402
 from fcslam.learning.leg import Leg, network_with, train_leg  # noqa: E402
@@ -71,6 +74,47 @@ def test_the_pull_is_half_its_strength_times_the_squared_distance(start):
     assert pull.energy(network).item() == pytest.approx(0.5 * 3.0 * 0.25 * count, rel=1e-5)
     pull.energy(network).backward()
     assert all(torch.allclose(value.grad, torch.full_like(value, 1.5)) for value in network.parameters())
+
+
+def bits(network):
+    image = torch.from_numpy(textured(5)).float()[None, None, :128, :128] / 255.0
+    with torch.inference_mode():
+        return network(image).code_logits >= 0
+
+
+def test_a_network_is_not_pulled_away_from_its_own_codes(examples, start):
+    network = network_with("light", start)
+    batch = draw_batch(examples, SMALL, 0)
+    with torch.autocast("cpu", torch.bfloat16):
+        maps = network(batch.images.contiguous(memory_format=torch.channels_last))
+    logits = maps.code_logits.float().detach().requires_grad_()
+    loss = Former(1.0, network).loss(maps._replace(code_logits=logits), batch)
+    loss.backward()
+    assert logits.grad.abs().max() < 1e-6
+    flipped = Former(1.0, network).loss(maps._replace(code_logits=-logits), batch)
+    assert flipped > loss
+    nothing = replace(batch, valid=torch.zeros_like(batch.valid))
+    assert Former(1.0, network).loss(maps._replace(code_logits=-logits), nothing) == 0.0
+
+
+def test_codes_are_kept_to_those_of_a_former_network(examples, start):
+    torch.manual_seed(2)
+    former = KeypointNetwork("light").state_dict()
+    wanted = bits(network_with("light", former))
+
+    def agreement(leg, state):
+        network, losses = train_leg(start, examples, SMALL, leg, CPU, former=state)
+        assert ("former" in losses) is (state is not None and leg.compatible > 0.0)
+        return float((bits(network) == wanted).float().mean())
+
+    free = agreement(Leg(0, 30), None)
+    assert agreement(Leg(0, 30), former) == free
+    assert agreement(Leg(0, 30, compatible=100.0), former) > free + 0.1
+
+
+def test_a_former_network_of_another_kind_is_refused(examples, start):
+    with pytest.raises(TrainingError, match="not those of a light network"):
+        train_leg(start, examples, SMALL, Leg(0, 1, compatible=1.0), CPU, former={})
 
 
 def test_weights_that_make_training_diverge_are_said(examples, start):

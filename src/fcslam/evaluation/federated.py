@@ -1,7 +1,8 @@
 """Is training together as good as training in one place? Central, federated and local-only training, compared.
 
 All begin from the same weights, and every network that is compared saw the same number of samples. Each is measured on
-the same pairs of views of images that nobody trained on. Whatever is finished is kept, so a study can be interrupted.
+the same pairs of views of images that nobody trained on; robots' own networks share them out. Whatever is finished is
+kept, so a study can be interrupted. What is compared first, central, local and the first arm, is trained first.
 """
 
 import zlib
@@ -14,35 +15,33 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from fcslam.config import Settings, dump
+from fcslam.config import Settings, dump, load
 from fcslam.errors import EvaluationError, OutputError
-from fcslam.evaluation.federated_arms import CENTRAL, LOCAL, Arm, Ground, train_central, train_locally, train_together
-from fcslam.features.codes import mutual_matches
-from fcslam.federated.network import network_of, weights_of
-from fcslam.federated.settings import FederatedSettings
-from fcslam.learning.arrays import read_arrays, write_arrays
-from fcslam.learning.images import ImageFile, find_images, is_usable, read_image
-from fcslam.learning.labels import Labels
-from fcslam.learning.monitor import MOST_POINTS, detect
-from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.pairs import Example, Pair, draw_pair
-from fcslam.learning.stages import Images, as_detector, gather, train_on_shapes
-from fcslam.learning.trainer import Pace, Status
-from fcslam.metrics.homography import (
-    corner_error,
-    estimate_homography,
-    inverse,
-    match_errors,
-    matching_accuracy,
+from fcslam.evaluation.federated_arms import (
+    ALONE,
+    CENTRAL,
+    LOCAL,
+    START,
+    Arm,
+    Ground,
+    train_central,
+    train_locally,
+    train_together,
 )
-from fcslam.metrics.repeatability import in_common_view, repeatability
+from fcslam.evaluation.federated_pairs import MEASURES, Described, described, held_out_pairs, measure_pair
+from fcslam.federated.network import network_of
+from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.start import first_weights
+from fcslam.federated.weights import Weights
+from fcslam.learning.arrays import read_arrays, write_arrays
+from fcslam.learning.images import ImageFile, find_images
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.pairs import Pair
+from fcslam.learning.stages import Images, as_detector, gather
+from fcslam.learning.trainer import Pace, Status
 from fcslam.records import FloatArray
 
-MEASURES: Final = ("homography_3px", "mma_3px", "repeatability")
-WITHIN_PX: Final = 3.0
-VIEW: Final = (320, 240)
-PAIR_SEED: Final = 414
-TEST_SHARE: Final = 0.15
+TEST_SHARE: Final = 0.25
 """Images of each robot that nobody trains on, chosen by their names, with those that training validates on."""
 STUDY_FILE: Final = "study.yaml"
 
@@ -51,8 +50,11 @@ class StudySettings(Settings):
     """A study."""
 
     federated: FederatedSettings = Field(default_factory=FederatedSettings, description="of every arm")
+    start: Path | None = Field(
+        default=None, description="checkpoint that all begin from; without one a detector of synthetic shapes"
+    )
     arms: dict[str, Arm] = Field(default_factory=lambda: {"federated": Arm()}, description="by name")
-    seeds: int = Field(default=3, ge=1, description="each trains everything anew")
+    seeds: int = Field(default=3, ge=1, description="each trains anew, from the same start")
     pairs: int = Field(default=500, ge=1, description="pairs of views, shared out among the robots' held-out images")
     images: int = Field(default=400, ge=4, description="at most so many image files of a robot")
 
@@ -78,7 +80,9 @@ class Findings:
     owners: tuple[int, ...]
     """For each pair the number of the robot whose image it is."""
     measured: Mapping[str, FloatArray]
-    """By arm: shape (seeds, networks, pairs, measures). ``local`` has a network for each robot, all others have one."""
+    """By arm: shape (seeds, networks, pairs, measures). ``local`` and ``alone`` have a network for each robot, all the
+    others one; a pair is shown to one of them only, the rest have NaN there. An arm may have fewer seeds than central.
+    """
 
 
 def run_study(study: Study) -> Findings:
@@ -90,64 +94,90 @@ def run_study(study: Study) -> Findings:
         OutputError: something cannot be written.
     """
     for name in study.settings.arms:
-        if name in (CENTRAL, LOCAL, "shapes", "labels") or not name.replace("-", "").isalnum():
+        if name.split("-")[0] in (START, CENTRAL, LOCAL, ALONE) or not name.replace("-", "").isalnum():
             raise EvaluationError(f"{name}: an arm of a study needs another name")
     _claim(study)
-    pairs = {robot: held_out_pairs(robot, _files(study, robot)[1], study) for robot in study.robots}
-    everything = [pair for own in pairs.values() for pair in own]
-    owners = tuple(index for index, own in enumerate(pairs.values()) for _ in own)
-    measured: dict[str, list[FloatArray]] = {name: [] for name in (CENTRAL, LOCAL, *study.settings.arms)}
-    for seed in range(1, study.settings.seeds + 1):
-        place = study.folder / f"seed{seed}"
-        ground: Ground | None = None
-        for name, rows in measured.items():
-            file = place / "measured" / f"{name}.npz"
+    share = -(-study.settings.pairs // len(study.robots))
+    pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
+    owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
+    most, arms = study.settings.seeds, study.settings.arms
+    seeds = {START: 1, CENTRAL: most, LOCAL: most, ALONE: most}
+    seeds |= {name: min(arm.seeds or most, most) for name, arm in arms.items()}
+    common: Common | None = None
+    measured: dict[str, FloatArray] = {}
+    for name, count in seeds.items():
+        rows = []
+        for seed in range(1, count + 1):
+            file = study.folder / f"seed{seed}" / "measured" / f"{name}.npz"
             if not file.exists():
-                ground = ground or _ground(study, seed, place)
-                networks = _trained(ground, name, study.settings.arms)
-                write_arrays(file, {"measures": np.stack([_measure(each, everything, study) for each in networks])})
+                common = common or _common(study, pairs)
+                ground = _ground(study, common, seed)
+                networks = _trained(ground, name, arms)
+                write_arrays(file, {"measures": _measured(networks, pairs, common, seed, study)})
             rows.append(read_arrays(file)["measures"])
-    return Findings(tuple(study.robots), owners, {name: np.stack(rows) for name, rows in measured.items()})
+        measured[name] = np.stack(rows)
+    return Findings(tuple(study.robots), owners, measured)
 
 
 def _trained(ground: Ground, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:
+    if name == START:
+        return [network_of(ground.start, ground.settings.training.encoder)]
     if name == CENTRAL:
         return train_central(ground)
-    return train_locally(ground) if name == LOCAL else train_together(ground, name, arms[name])
+    return train_together(ground, name, arms[name]) if name in arms else train_locally(ground, name)
 
 
 def _claim(study: Study) -> None:
-    """Make the folder this study's, or see that it is."""
+    """Make the folder this study's, or see that it is; arms and seeds may be added to a study."""
     robots = "".join(f"# {robot}: {folder.resolve()}\n" for robot, folder in study.robots.items())
-    wanted, path = robots + dump(study.settings), study.folder / STUDY_FILE
+    settings, path = study.settings, study.folder / STUDY_FILE
     try:
         study.folder.mkdir(parents=True, exist_ok=True)
-        if not path.exists():
-            path.write_text(wanted, encoding="utf-8")
-        elif path.read_text(encoding="utf-8") != wanted:
-            raise EvaluationError(f"{path}: is of another study; name another folder")
+        if path.exists():
+            before = load(StudySettings, path)
+            known = before.model_copy(update={"arms": before.arms | settings.arms, "seeds": settings.seeds})
+            settings = settings.model_copy(update={"arms": known.arms})
+            changed = any(known.arms[name] != arm for name, arm in before.arms.items())
+            if changed or known != settings or not path.read_text(encoding="utf-8").startswith(robots):
+                raise EvaluationError(f"{path}: is of another study; name another folder")
+        path.write_text(robots + dump(settings), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{study.folder}: cannot be used as the output folder ({error})") from error
 
 
-def _ground(study: Study, seed: int, place: Path) -> Ground:
-    """The start of a seed, and all images labelled by it."""
-    training = study.settings.federated.of_robots().model_copy(update={"seed": seed})
+@dataclass(frozen=True, slots=True)
+class Common:
+    """What all seeds share."""
+
+    start: Weights
+    images: Mapping[str, Images]
+    """By robot, labelled by the start."""
+    former: Sequence[Described]
+    """What the start finds in the first view of each pair."""
+
+
+def _common(study: Study, pairs: Sequence[Pair]) -> Common:
+    training = study.settings.federated.of_robots()
 
     def watch(stage: str, status: Status) -> None:
-        study.watch(f"{stage}, seed {seed}", status.step, status.steps)
+        study.watch(stage, status.step, status.steps)
 
-    start = weights_of(train_on_shapes(place / "shapes", training, study.pace, watch))
+    start = first_weights(study.settings.start, study.folder, study.settings.federated, study.pace, watch)
     device = torch.device(study.pace.device)
-    labeller = as_detector(network_of(start, training.encoder).to(device), device)
+    network = network_of(start, training.encoder).to(device)
     images: dict[str, Images] = {}
     for robot in study.robots:
-        images[robot] = gather(_files(study, robot)[0], place / "labels", training, labeller, None, watch)
+        files = _files(study, robot)[0]
+        images[robot] = gather(files, study.folder / "labels", training, as_detector(network, device), None, watch)
+    return Common(start, images, [described(network, pair.views[0], device) for pair in pairs])
 
+
+def _ground(study: Study, common: Common, seed: int) -> Ground:
     def told(name: str, done: int, of: int) -> None:
         study.watch(f"{name}, seed {seed}", done, of)
 
-    return Ground(study.settings.federated, seed, start, images, place, study.pace, told)
+    folder = study.folder / f"seed{seed}"
+    return Ground(study.settings.federated, seed, common.start, common.images, folder, study.pace, told)
 
 
 def _files(study: Study, robot: str) -> tuple[list[ImageFile], list[ImageFile]]:
@@ -159,42 +189,15 @@ def _files(study: Study, robot: str) -> tuple[list[ImageFile], list[ImageFile]]:
     return [file for file in some if file not in tests], tests
 
 
-def held_out_pairs(robot: str, files: Sequence[ImageFile], study: Study) -> list[Pair]:
-    """Pairs of views of a robot's images, its share of all; always the same.
-
-    Raises:
-        EvaluationError: none of the images is usable.
-    """
-    images = [image for file in files if (image := read_image(file.path)) is not None and is_usable(image)]
-    if not images:
-        raise EvaluationError(f"{study.robots[robot]}: no usable image there is among the {TEST_SHARE:.0%} to test on")
-    unlabelled = Labels(np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
-    pairs = []
-    for index in range(-(-study.settings.pairs // len(study.robots))):
-        rng = np.random.default_rng([PAIR_SEED, zlib.crc32(robot.encode()), index])
-        pairs.append(draw_pair(Example(images[index % len(images)], unlabelled), VIEW, 16, 0, rng))
-    return pairs
-
-
-def _measure(network: KeypointNetwork, pairs: Sequence[Pair], study: Study) -> FloatArray:
-    """Shape (pairs, measures)."""
+def _measured(
+    networks: Sequence[KeypointNetwork], pairs: Sequence[Pair], common: Common, seed: int, study: Study
+) -> FloatArray:
+    """Shape (networks, pairs, measures): several networks take turns, so that all together cost what one does."""
     device = torch.device(study.pace.device)
-    network = network.to(device).eval()
-    rows = []
-    for number, pair in enumerate(pairs, start=1):
-        rows.append(measure_pair(network, pair, device))
-        study.watch("measuring", number, len(pairs))
-    return np.array(rows)
-
-
-def measure_pair(network: KeypointNetwork, pair: Pair, device: torch.device) -> tuple[float, float, float]:
-    """``MEASURES`` of one pair: homography right to 3 px at the corners (0 or 1), MMA at 3 px, repeatability."""
-    images = [torch.from_numpy(view.image)[None, None].to(device) for view in pair.views]
-    (first, first_codes), (second, second_codes) = (detect(network, image) for image in images)
-    here, there = in_common_view(first, pair.homography, VIEW), in_common_view(second, inverse(pair.homography), VIEW)
-    matches = mutual_matches(first_codes[here], second_codes[there]).pairs
-    points = first[here][matches[:, 0]], second[there][matches[:, 1]]
-    error = corner_error(estimate_homography(*points), pair.homography, VIEW)
-    accuracy = matching_accuracy(match_errors(*points, pair.homography), [WITHIN_PX])
-    again = repeatability(first, second, pair.homography, VIEW, MOST_POINTS).repeatability
-    return float(error <= WITHIN_PX), float(accuracy[0]), again
+    ready = [network.to(device).eval() for network in networks]
+    measures = np.full((len(ready), len(pairs), len(MEASURES)), np.nan)
+    for index, pair in enumerate(pairs):
+        turn = (index + seed) % len(ready)
+        measures[turn, index] = measure_pair(ready[turn], pair, common.former[index], device)
+        study.watch("measuring", index + 1, len(pairs))
+    return measures

@@ -22,8 +22,12 @@ from fcslam.learning.pairs import Example
 from fcslam.learning.stages import Images
 from fcslam.learning.trainer import Pace, Run, Status
 
+START: Final = "start"
+"""What all begin from, as it is."""
 CENTRAL: Final = "central"
 LOCAL: Final = "local"
+ALONE: Final = "alone"
+"""Local training that is no longer than a robot's in a fleet."""
 
 
 class Arm(Settings):
@@ -31,6 +35,7 @@ class Arm(Settings):
 
     settings: dict[str, Any] = Field(default_factory=dict, description="federated settings that differ")
     poison: Poison | None = Field(default=None, description="what the last robot does to its updates")
+    seeds: int | None = Field(default=None, ge=1, description="so many of the study's seeds; null for all")
 
     def federated(self, common: FederatedSettings, seed: int) -> FederatedSettings:
         """The settings of this arm.
@@ -61,20 +66,21 @@ class Ground:
 def train_central(ground: Ground) -> list[KeypointNetwork]:
     """One network, on all images in one place."""
     everything = [example for images in ground.images.values() for example in images.train]
-    return [_train_alone(ground, CENTRAL, everything)]
+    return [_train_alone(ground, CENTRAL, everything, len(ground.images))]
 
 
-def train_locally(ground: Ground) -> list[KeypointNetwork]:
-    """A network for each robot, on its images alone, with as many samples as all of them saw together."""
-    return [_train_alone(ground, f"{LOCAL}-{robot}", images.train) for robot, images in ground.images.items()]
+def train_locally(ground: Ground, name: str) -> list[KeypointNetwork]:
+    """A network for each robot, on its images alone: with as many samples as all of them saw together, or its share."""
+    shares = len(ground.images) if name == LOCAL else 1
+    return [_train_alone(ground, f"{name}-{robot}", images.train, shares) for robot, images in ground.images.items()]
 
 
 def train_together(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]:
     """One network, by federated training in one process; the one after the last round."""
-    settings = arm.federated(ground.settings, ground.seed)
+    settings, place = arm.federated(ground.settings, ground.seed), ground.folder / name
     learners: list[Learner] = [
         RobotLearner(
-            robot, Path(robot), Path(robot), seeded_noise(robot, ground.seed), ground.pace.device, gathered=own
+            robot, Path(robot), place / robot, seeded_noise(robot, ground.seed), ground.pace.device, gathered=own
         )
         for robot, own in ground.images.items()
     ]
@@ -90,15 +96,15 @@ def train_together(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]
         judge=lambda _weights: {},
         watch=lambda report, _best: ground.watch(name, report.round_number, settings.rounds),
     )
-    server = Server(settings, ground.start, ground.folder / name, outside)
+    server = Server(settings, ground.start, place, outside)
     state = server.run(InProcessGrid(client_app(learner_of), len(learners)))
     return [network_of(state.weights, settings.training.encoder)]
 
 
-def _train_alone(ground: Ground, name: str, examples: list[Example]) -> KeypointNetwork:
-    """By the central trainer; robots times the steps of a robot."""
+def _train_alone(ground: Ground, name: str, examples: list[Example], shares: int) -> KeypointNetwork:
+    """By the central trainer; ``shares`` times the steps of a robot."""
     training = ground.settings.of_robots()
-    steps = training.steps * len(ground.images)
+    steps = training.steps * shares
     training = training.model_copy(update={"steps": steps, "seed": ground.seed})
     state = network_of(ground.start, training.encoder).state_dict()
     folder = ground.folder / name

@@ -1,15 +1,15 @@
 """What a study of federated training found: gaps to central training, with intervals, and the robot worst off."""
 
 import csv
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from fcslam.errors import OutputError
-from fcslam.evaluation.federated import MEASURES, Findings
+from fcslam.evaluation.federated import Findings
 from fcslam.evaluation.federated_arms import CENTRAL, LOCAL
+from fcslam.evaluation.federated_pairs import MEASURES
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
 
@@ -22,20 +22,21 @@ class ArmReport:
     measure: str
     mean: float
     gap: Interval
-    """Central minus this arm on the same pairs, means over seeds first: the paired bootstrap interval."""
+    """Central, or what else it is compared to, minus this arm on the same pairs and seeds, means over seeds first: the
+    paired bootstrap interval."""
     closed: float
     """(arm - local) / (central - local); NaN where central is not clearly better than local."""
     worst_robot: str
     worst_gap: float
-    """Central minus this arm on that robot's pairs."""
+    """The gap on that robot's pairs."""
     seeds: tuple[float, ...]
     """The mean of each seed."""
 
 
-def report(findings: Findings, seed: int = 1) -> list[ArmReport]:
-    """Every arm by every measure."""
+def report(findings: Findings, seed: int = 1, against: str = CENTRAL) -> list[ArmReport]:
+    """Every arm by every measure, compared to the arm ``against``, which has no fewer seeds than any."""
     return [
-        _report(findings, arm, index, np.random.default_rng(seed))
+        _report(findings, arm, index, against, np.random.default_rng(seed))
         for index in range(len(MEASURES))
         for arm in findings.measured
     ]
@@ -62,19 +63,21 @@ def write_report(reports: list[ArmReport], path: Path) -> None:
         raise OutputError(f"{path}: cannot be written ({error})") from error
 
 
-def _report(findings: Findings, arm: str, index: int, rng: np.random.Generator) -> ArmReport:
-    values = _by_pair(findings.measured, arm, index)
-    central, local = (_by_pair(findings.measured, name, index) for name in (CENTRAL, LOCAL))
+def _report(findings: Findings, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
+    seeds = len(findings.measured[arm])
+    values, reference, central, local = (
+        _by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL, LOCAL)
+    )
     gain = mean_interval(central - local, rng)
     owners = np.array(findings.owners)
-    gaps = [float(np.nanmean((central - values)[owners == robot])) for robot in range(len(findings.robots))]
+    gaps = [float(np.nanmean((reference - values)[owners == robot])) for robot in range(len(findings.robots))]
     worst = int(np.argmax(gaps))
     closed = float(np.nanmean(values - local)) / gain.mean if gain.low > 0.0 else np.nan
     return ArmReport(
         arm=arm,
         measure=MEASURES[index],
         mean=float(np.nanmean(values)),
-        gap=mean_interval(central - values, rng),
+        gap=mean_interval(reference - values, rng),
         closed=closed,
         worst_robot=findings.robots[worst],
         worst_gap=gaps[worst],
@@ -82,9 +85,9 @@ def _report(findings: Findings, arm: str, index: int, rng: np.random.Generator) 
     )
 
 
-def _by_pair(measured: Mapping[str, FloatArray], arm: str, index: int) -> FloatArray:
+def _by_pair(measured: FloatArray, index: int) -> FloatArray:
     """One measure of every pair, mean over seeds and networks, shape (pairs,); NaN where it is not known."""
-    values = measured[arm][..., index]
+    values = measured[..., index]
     known = np.isfinite(values)
     counts = known.sum(axis=(0, 1))
     sums = np.where(known, values, 0.0).sum(axis=(0, 1))

@@ -9,7 +9,7 @@ from fcslam.federated.robot import Learned, Learner
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, moved, trained_names, update_vector
 
-Poison = Literal["flipped", "scaled", "random", "nan"]
+Poison = Literal["flipped", "scaled", "reversed", "random", "nan"]
 SCALE = 10.0
 
 
@@ -35,6 +35,8 @@ class Poisoned:
                 update = -update
             case "scaled":
                 update = SCALE * update
+            case "reversed":
+                update = -SCALE * update
             case "random":
                 update = np.random.default_rng([settings.training.seed, round_number]).permutation(update)
             case "nan":

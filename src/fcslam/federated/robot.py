@@ -5,21 +5,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fcslam.errors import TrainingError
 from fcslam.federated.network import network_of, weights_of
 from fcslam.federated.privacy import privatised
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, trained_names
+from fcslam.learning.arrays import read_arrays, write_arrays
 from fcslam.learning.images import find_images
 from fcslam.learning.leg import Leg, train_leg
 from fcslam.learning.monitor import validate
 from fcslam.learning.stages import Images, as_detector, gather
 from fcslam.learning.trainer import Status, validation_pairs
+
+FORMER_FILE: Final = "former.npz"
 
 NoiseSource = Callable[[int], np.random.Generator]
 """Gives the generator of a round's noise: of the system's entropy where robots are real, seeded where they are not."""
@@ -49,7 +53,11 @@ class Learner(Protocol):
 
 @dataclass(slots=True)
 class RobotLearner:
-    """A robot with images of its own in ``folder``. Labels of them are kept in ``cache``, and nothing else."""
+    """A robot with images of its own in ``folder``.
+
+    What outlives a round is kept in ``cache``: labels of the images, and the weights that codes are to be compatible
+    with, if they are to be.
+    """
 
     name: str
     folder: Path
@@ -65,7 +73,8 @@ class RobotLearner:
         """As in ``Learner``; the result depends on the arguments, the images, their labels, and the noise.
 
         Raises:
-            TrainingError: there are too few usable images, the weights are of another network, or training diverged.
+            TrainingError: there are too few usable images, the weights are of another network, training diverged, or
+                the cache cannot be used.
         """
         frozen = settings.normalisation == "frozen"
         network = network_of(weights, settings.training.encoder)
@@ -74,11 +83,19 @@ class RobotLearner:
             first=round_number * settings.local_steps,
             steps=settings.local_steps,
             pull=settings.proximal if settings.strategy == "fedprox" else 0.0,
+            compatible=settings.compatible,
             frozen_statistics=frozen,
         )
         own = settings.of_robots().model_copy(update={"seed": own_seed(self.name, settings.training.seed)})
+        former = network_of(self._former(weights, round_number), settings.training.encoder) if leg.compatible else None
         network, losses = train_leg(
-            network.state_dict(), examples, own, leg, torch.device(self.device), partial(self.watch, self.name)
+            network.state_dict(),
+            examples,
+            own,
+            leg,
+            torch.device(self.device),
+            partial(self.watch, self.name),
+            None if former is None else former.state_dict(),
         )
         trained = weights_of(network)
         names = trained_names(weights, frozen)
@@ -89,6 +106,16 @@ class RobotLearner:
         network = network_of(weights, settings.training.encoder).to(self.device)
         held_out = self._examples(weights, settings).held_out
         return validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
+
+    def _former(self, weights: Weights, round_number: int) -> Weights:
+        """The weights that the run began from, or the first that came here of a run that had begun before."""
+        path = self.cache / FORMER_FILE
+        try:
+            if round_number == 0 or not path.exists():
+                write_arrays(path, weights)
+            return read_arrays(path)
+        except (OSError, ValueError) as error:
+            raise TrainingError(f"{path}: the first weights cannot be kept there ({error}); make room") from error
 
     def _examples(self, weights: Weights, settings: FederatedSettings) -> Images:
         """The images, labelled by the first weights that ever came here, and by no later ones."""

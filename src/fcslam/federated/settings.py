@@ -44,6 +44,9 @@ class FederatedSettings(Settings):
     minimum_robots: int = Field(default=1, ge=1, description="updates without which a round does not count")
     deadline_s: float = Field(default=3600.0, gt=0.0, description="robots that answer later are left out of a round")
     proximal: float = Field(default=0.01, ge=0.0, description="strength of FedProx's pull to the global weights")
+    compatible: float = Field(
+        default=0.0, ge=0.0, description="how strongly codes are kept to those of the first weights; 0 is not at all"
+    )
     server_rate: float = Field(default=0.003, gt=0.0, description="learning rate of FedAdam")
     trimmed: float = Field(default=0.2, ge=0.0, lt=0.5, description="share that FedTrimmedAvg cuts at either end")
     malicious: int = Field(default=1, ge=0, description="poisoned robots that Krum reckons with")

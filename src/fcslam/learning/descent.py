@@ -9,7 +9,8 @@ from torch import Tensor
 
 from fcslam.errors import TrainingError
 from fcslam.learning.batches import Batch
-from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.losses import distillation_loss
+from fcslam.learning.network import KeypointNetwork, Maps, sample_codes
 from fcslam.learning.objective import TeacherBits, grid_shift, objective
 from fcslam.learning.settings import TrainingSettings
 
@@ -34,6 +35,23 @@ class Pull:
         return 0.5 * self.strength * torch.stack(terms).sum()
 
 
+@dataclass(frozen=True, slots=True)
+class Former:
+    """A former network whose codes are still in use: points should get codes that match those it gives them."""
+
+    strength: float
+    network: KeypointNetwork
+    """In evaluation mode, on the device of the one that is trained."""
+
+    def loss(self, maps: Maps, batch: Batch) -> Tensor:
+        """Cross entropy of the bits at the batch's points against the former network's bits there."""
+        with torch.no_grad(), torch.autocast(batch.images.device.type, torch.bfloat16):
+            before = self.network(batch.images.contiguous(memory_format=torch.channels_last))
+        wanted = torch.sigmoid(2.0 * sample_codes(before.code_logits.float(), batch.points))
+        now = 2.0 * sample_codes(maps.code_logits.float(), batch.points)
+        return distillation_loss(now, wanted, batch.valid.repeat(2, 1))
+
+
 def new_optimiser(network: KeypointNetwork) -> torch.optim.Optimizer:
     """An optimiser without a memory yet; ``descend`` sets its rate."""
     return torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
@@ -48,6 +66,7 @@ def descend(
     rate: float,
     bits: TeacherBits | None = None,
     pull: Pull | None = None,
+    former: Former | None = None,
 ) -> dict[str, Tensor]:
     """One step in place, with batch, network and optimiser on one device; returns the losses by name.
 
@@ -62,6 +81,9 @@ def descend(
     total, parts = objective(maps, batch, settings.loss, step / settings.steps, shift, bits)
     if pull is not None:
         total = total + pull.energy(network)
+    if former is not None:
+        parts["former"] = former.loss(maps, batch)
+        total = total + former.strength * parts["former"]
     if not torch.isfinite(total):
         raise TrainingError(f"training diverged at step {step}; lower the learning rate")
     optimiser.zero_grad(set_to_none=True)

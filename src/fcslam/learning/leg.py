@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from fcslam.errors import TrainingError
 from fcslam.learning.batches import stream
-from fcslam.learning.descent import Pull, descend, learning_rate, new_optimiser
+from fcslam.learning.descent import Former, Pull, descend, learning_rate, new_optimiser
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import Example
 from fcslam.learning.settings import Encoder, TrainingSettings
@@ -26,6 +26,8 @@ class Leg:
     steps: int
     pull: float = 0.0
     """Strength of a spring to the weights at the start."""
+    compatible: float = 0.0
+    """How strongly codes are kept to those of a former network, if there is one."""
     frozen_statistics: bool = False
     """Whether batch normalisation uses the means and variances it came with, and leaves them as they are."""
 
@@ -37,14 +39,16 @@ def train_leg(
     leg: Leg,
     device: torch.device,
     watch: Callable[[int], None] = lambda _steps: None,
+    former: Mapping[str, Tensor] | None = None,
 ) -> tuple[KeypointNetwork, dict[str, float]]:
     """Train from ``start`` (a network's state) with an optimiser of its own; the network and its mean losses.
 
     The result depends on the arguments alone. ``settings.steps`` are those of the whole run: the rate falls towards
-    its end. ``watch`` is told how many steps are done.
+    its end. ``watch`` is told how many steps are done. ``former`` is the state of the network that made codes which are
+    still in use.
 
     Raises:
-        TrainingError: ``start`` does not fit the network, or training diverged.
+        TrainingError: ``start`` or ``former`` does not fit the network, or training diverged.
     """
     network = network_with(settings.encoder, start).to(device, memory_format=torch.channels_last)
     network.train()
@@ -53,13 +57,16 @@ def train_leg(
     pull = None
     if leg.pull > 0.0:
         pull = Pull(leg.pull, {name: value.detach().clone() for name, value in network.named_parameters()})
+    keeper = None
+    if former is not None and leg.compatible > 0.0:
+        keeper = Former(leg.compatible, network_with(settings.encoder, former).to(device))
     optimiser = new_optimiser(network)
     sums: dict[str, float] = {}
     ends = settings.model_copy(update={"steps": leg.first + leg.steps})
     for step, batch in stream(examples, ends, leg.first, ahead=2, threads=1):
         done = step - leg.first + 1
         rate = learning_rate(settings, step) * min(done / RAMP_STEPS, 1.0)
-        parts = descend(network, optimiser, batch.to(device), settings, step, rate, pull=pull)
+        parts = descend(network, optimiser, batch.to(device), settings, step, rate, pull=pull, former=keeper)
         for name, part in parts.items():
             sums[name] = sums.get(name, 0.0) + float(part)
         watch(done)

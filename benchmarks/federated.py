@@ -1,0 +1,243 @@
+"""Federated training against training in one place and against robots that train alone, and against poison and noise.
+
+    FCSLAM_DATA=/path/to/data python benchmarks/federated.py --study FOLDER
+
+Needs `fcslam[federated]` and `fcslam[sim]`. FOLDER holds all that is trained and measured; the same command goes on
+where it was interrupted. Five robots that see different things: a floor of a tower, a drive through a town, photographs
+from the web, and two simulated ones, by day and with lamps off. All begin from one small detector that was trained on
+synthetic shapes and on photographs that no robot has, and is far from what longer training makes of it. Central and
+local training do as many steps as all robots together, 500, a robot of a fleet a fifth of these in every arm, and so
+do robots that train alone. Faster: three times the learning rate; faster-long: in two rounds instead of five. Pairs are
+drawn from images that no network saw; a robot's own network is shown every fifth of them, in turns over the seeds.
+
+Gap: central minus the arm, in points, on the same pairs and seeds, with 95 % by paired bootstrap over pairs. Closed:
+(arm - local) / (central - local), where central - local is clearly above 0. Lost: the same arm or FedAvg without
+poison, minus the arm.
+"""
+
+import json
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import common
+import numpy as np
+from matplotlib.figure import Figure
+
+from fcslam.federated.privacy import epsilon
+from fcslam.federated.settings import PrivacySettings
+from fcslam.metrics.bootstrap import Interval
+
+if TYPE_CHECKING:
+    from fcslam.evaluation.federated import Findings
+    from fcslam.evaluation.federated_report import ArmReport
+
+    Rows = dict[tuple[str, str], ArmReport]
+
+VISION = {"tower": "ie_tower/floor22", "town": "camvid/0016E5", "photos": "coco_subset/train2017"}
+SIMULATED = {"day": "robot_1", "lamp-off": "robot_2"}
+SIMULATION = ("--robots", 2, "--seed", 7, "--path-length", 40, "--lighting", "day", "--lighting", "lamp-off")
+PUBLIC = "sun_hays80"
+"""Photographs that the start is trained on."""
+START = {"shape_steps": 400, "steps": 1000, "label_copies": 4, "pairs": 4, "side_px": 128, "points": 160}
+
+TRAINING = {"label_copies": 4, "pairs": 2, "side_px": 128, "points": 160, "learning_rate": 1e-3}
+FEDERATED = {"rounds": 5, "local_steps": 20, "training": TRAINING}
+FASTER = TRAINING | {"learning_rate": 3e-3}
+"""An average of five updates bears more than one alone."""
+TRUSTING = {"screening": {"largest_change": None, "longest": None, "least_agreement": None}}
+POISONS = ("flipped", "random", "scaled")
+"""Beside the worst one, an update that is sent ten times as long in the wrong direction."""
+ROBUST: dict[str, dict[str, Any]] = {
+    "screened": {},
+    "median": {"strategy": "fedmedian", **TRUSTING},
+    "trimmed": {"strategy": "fedtrimmedavg", **TRUSTING},
+    "krum": {"strategy": "krum", "normalisation": "frozen", **TRUSTING},
+}
+NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3}
+"""Multipliers; noise of more than that is longer than all updates together."""
+KEPT = {"compatible-3": 3.0, "compatible-30": 30.0}
+"""Strengths of the pull to the codes of the start."""
+CLIP_NORM = 3.0
+TITLES = {"homography_3px": "Homographies right to 3 px, %", "mma_3px": "MMA at 3 px, %"}
+GAPS = {"arm": "s", "seeds": "d", "mean": ".1f", "gap": "s", "closed": ".2f", "worst robot": "s", "each seed": "s"}
+LOST = {"homography, %": ".1f", "lost": "s", "MMA, %": ".1f", "lost ": "s"}
+LOSSES = {"arm": "s"} | LOST
+PRIVATE = {"arm": "s", "noise": "g", "epsilon": ".3g"} | LOST
+KEEPING = {"arm": "s", "strength": "g", "new and new, MMA, %": ".1f", "old and new, MMA, %": ".1f"}
+SEEDS, PAIRS, IMAGES = 3, 500, 64
+COMPARED = ("start", "central", "local", "alone", "averaged", "faster", "faster-long", "frozen", *KEPT)
+"""Arms without poison and noise."""
+
+
+def arms() -> dict[str, Any]:
+    """What is trained beside central and local, in the order in which it is."""
+    few: dict[str, Any] = {"seeds": 1}
+    return {
+        "averaged": {},
+        "fedavg-reversed": {"poison": "reversed", "settings": TRUSTING, **few},
+        **{f"{name}-reversed": {"poison": "reversed", "settings": how, **few} for name, how in ROBUST.items()},
+        "frozen": {"settings": {"normalisation": "frozen"}, **few},
+        **{name: {"settings": private(multiplier), **few} for name, multiplier in NOISE.items()},
+        **{name: {"settings": {"compatible": strength}, **few} for name, strength in KEPT.items()},
+        "faster": {"settings": {"training": FASTER}},
+        "faster-long": {"settings": {"training": FASTER, "rounds": 2, "local_steps": 50}, **few},
+        **{f"fedavg-{poison}": {"poison": poison, "settings": TRUSTING, **few} for poison in POISONS},
+    }
+
+
+def private(multiplier: float) -> dict[str, Any]:
+    """Settings with noise; what is mostly noise would be screened out."""
+    privacy = {"clip_norm": CLIP_NORM, "noise_multiplier": multiplier}
+    return {"normalisation": "frozen", "privacy": privacy, **TRUSTING}
+
+
+def main() -> None:
+    parser = common.options(__doc__ or "")
+    parser.add_argument("--study", type=Path, help="folder of the study; the same one resumes")
+    chosen = parser.parse_args()
+    if chosen.study is None:
+        print("skipped: takes an hour or more; name a folder by --study")
+        sys.exit(0)
+    folder: Path = chosen.study
+    vision = common.recordings(*VISION.values(), PUBLIC, kind="vision")
+    folder.mkdir(parents=True, exist_ok=True)
+    prepare(vision, folder)
+    findings = study(vision, folder)
+    below = compare(findings, "central")
+    report = common.Report(__file__, __doc__ or "", chosen)
+    report.say(setting(findings, folder))
+    for measure, title in TITLES.items():
+        report.table(title, GAPS, [gap_row(below[measure, arm]) for arm in COMPARED])
+    report.table("One of five robots poisoned", LOSSES, poison_rows(compare(findings, "averaged")))
+    report.table("Noise for privacy", PRIVATE, private_rows(compare(findings, "frozen")))
+    report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(below))
+    report.picture("Gap to central training by arm, and what noise costs", draw(below))
+    report.write()
+
+
+def prepare(vision: Path, folder: Path) -> None:
+    """The simulated robots and the start, unless they are there."""
+    if not (folder / "fleet" / "simulation.yaml").exists():
+        common.run_fcslam("simulate", "--output", folder / "fleet", *SIMULATION)
+    if not (folder / "start" / "detector.onnx").exists():
+        (folder / "start.yaml").write_text(json.dumps(START), encoding="utf-8")
+        common.run_fcslam("train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start")
+
+
+def study(vision: Path, folder: Path) -> "Findings":
+    """Train and measure whatever is missing."""
+    import torch
+
+    from fcslam.evaluation.federated import Study, StudySettings, run_study
+    from fcslam.learning.trainer import Pace
+
+    torch.set_num_threads(1)
+    robots = {name: vision / place for name, place in VISION.items()}
+    robots |= {name: folder / "fleet" / robot for name, robot in SIMULATED.items()}
+    content = {"federated": FEDERATED, "arms": arms(), "seeds": SEEDS, "pairs": PAIRS, "images": IMAGES}
+    content["start"] = folder / "start" / "joint" / "checkpoint.npz"
+    settings = StudySettings.model_validate(content)
+
+    def watch(name: str, done: int, of: int) -> None:
+        if done == of:
+            print(f"{datetime.now(UTC):%H:%M:%S} {name}: {of}", flush=True)
+
+    return run_study(Study(robots, folder / "study", settings, Pace(), watch))
+
+
+def compare(findings: "Findings", against: str) -> "Rows":
+    """Every arm by every measure, compared to one."""
+    from fcslam.evaluation.federated_report import report
+
+    return {(row.measure, row.arm): row for row in report(findings, against=against)}
+
+
+def setting(findings: "Findings", folder: Path) -> str:
+    """What was done, in words."""
+    files = sorted((folder / "study").glob("seed*/measured/*.npz"), key=lambda file: file.stat().st_mtime)
+    hours = (files[-1].stat().st_mtime - (folder / "start.yaml").stat().st_mtime) / 3600
+    labelled = {name: len(list((folder / "study" / "labels" / place).rglob("*.npz"))) for name, place in places()}
+    images = ", ".join(f"{name} {count}" for name, count in labelled.items())
+    steps = FEDERATED["rounds"] * FEDERATED["local_steps"] * len(labelled)
+    return (
+        f"Images trained on: {images}; of {IMAGES} files each a quarter is tested on. {FEDERATED['rounds']} rounds of "
+        f"{FEDERATED['local_steps']} steps of {TRAINING['pairs']} pairs a robot; central and local {steps} steps. "
+        f"{len(findings.owners)} pairs, {SEEDS} seeds where not said otherwise. From the first file to the "
+        f"last figure {hours:.1f} hours, interruptions included, on one core that others used as well."
+    )
+
+
+def places() -> list[tuple[str, str]]:
+    """The robots, and how their labels' folders are called."""
+    return [(name, Path(place).name) for name, place in VISION.items()] + list(SIMULATED.items())
+
+
+def gap_row(row: "ArmReport") -> tuple[object, ...]:
+    worst = f"{row.worst_robot} {100 * row.worst_gap:.1f}"
+    seeds = " ".join(f"{100 * mean:.1f}" for mean in row.seeds)
+    return row.arm, len(row.seeds), 100 * row.mean, points(row.gap), row.closed, worst, seeds
+
+
+def points(interval: Interval) -> str:
+    """A share's interval in points."""
+    return f"{100 * interval.mean:.1f} [{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
+
+
+def poison_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
+    for arm, what in arms().items():
+        if "poison" in what:
+            yield arm, *lost(rows, arm)
+
+
+def private_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
+    for arm, noise in {"frozen": 0.0, **NOISE}.items():
+        yield arm, noise, promised(noise), *lost(rows, arm)
+
+
+def lost(rows: "Rows", arm: str) -> list[object]:
+    """Both measures of an arm, and how far they are below the one it is compared to."""
+    return [cell for row in (rows[measure, arm] for measure in TITLES) for cell in (100 * row.mean, points(row.gap))]
+
+
+def promised(noise: float) -> float:
+    """Epsilon after all rounds."""
+    return epsilon(noise, FEDERATED["rounds"], PrivacySettings().delta)
+
+
+def kept_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
+    for arm in ("start", "central", "averaged", *KEPT):
+        new, across = rows["mma_3px", arm], rows["mma_3px_former", arm]
+        yield arm, KEPT.get(arm, 0.0), 100 * new.seeds[0], 100 * across.seeds[0]
+
+
+def draw(rows: "Rows") -> Figure:
+    """Gaps with intervals by arm, and accuracy against epsilon."""
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    names = ["local", "alone", *arms()]
+    for offset, (measure, title) in zip((-0.15, 0.15), TITLES.items(), strict=True):
+        gaps = np.array([rows[measure, arm].gap for arm in names]) * 100
+        at, spread = np.arange(len(names)) + offset, np.abs(gaps[:, 1:].T - gaps[:, 0])
+        left.errorbar(gaps[:, 0], at, xerr=spread, fmt="o", capsize=2, label=title)
+        noisy = [(promised(noise), 100 * rows[measure, arm].mean) for arm, noise in NOISE.items()]
+        line = right.plot(*zip(*noisy, strict=True), "o-", label=title)[0]
+        right.axhline(100 * rows[measure, "frozen"].mean, color=line.get_color(), linestyle="--", linewidth=1)
+    left.axvline(0.0, color="black", linewidth=1)
+    left.axvline(2.0, color="grey", linewidth=1, linestyle=":")
+    left.set_yticks(range(len(names)), names)
+    left.invert_yaxis()
+    left.set_xlabel("points below central training, 95 %")
+    right.set_xscale("log")
+    right.set_xlabel("epsilon; dashed: without noise")
+    right.set_ylabel("%")
+    for panel in (left, right):
+        panel.grid(alpha=0.3)
+        panel.legend(frameon=False)
+    return figure
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""What networks of a study of federated training are measured on: pairs of views of images that nobody trained on."""
+
+import zlib
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+import torch
+
+from fcslam.errors import EvaluationError
+from fcslam.features.codes import mutual_matches
+from fcslam.learning.images import ImageFile, is_usable, read_image
+from fcslam.learning.labels import Labels
+from fcslam.learning.monitor import MOST_POINTS, detect
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.pairs import Example, Pair, View, draw_pair
+from fcslam.metrics.homography import corner_error, estimate_homography, inverse, match_errors
+from fcslam.metrics.repeatability import in_common_view, repeatability
+from fcslam.records import Codes, FloatArray
+
+MEASURES: Final = ("homography_3px", "mma_3px", "repeatability", "mma_3px_former")
+WITHIN_PX: Final = 3.0
+VIEW: Final = (320, 240)
+PAIR_SEED: Final = 414
+
+
+class Described(NamedTuple):
+    """What a network finds in a view."""
+
+    points: FloatArray
+    """Shape (N, 2) [px]."""
+    codes: Codes
+    """Shape (N, 32)."""
+
+
+def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[Pair]:
+    """Pairs of views of a robot's images; always the same.
+
+    Raises:
+        EvaluationError: none of the images is usable.
+    """
+    images = [image for file in files if (image := read_image(file.path)) is not None and is_usable(image)]
+    if not images:
+        raise EvaluationError(f"{robot}: no usable image is among the {len(files)} that are held out to test on")
+    unlabelled = Labels(np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
+    pairs = []
+    for index in range(count):
+        rng = np.random.default_rng([PAIR_SEED, zlib.crc32(robot.encode()), index])
+        pairs.append(draw_pair(Example(images[index % len(images)], unlabelled), VIEW, 16, 0, rng))
+    return pairs
+
+
+def described(network: KeypointNetwork, view: View, device: torch.device) -> Described:
+    """What the network, which is on the device, finds."""
+    return Described(*detect(network, torch.from_numpy(view.image)[None, None].to(device)))
+
+
+def measure_pair(
+    network: KeypointNetwork, pair: Pair, former: Described, device: torch.device
+) -> tuple[float, float, float, float]:
+    """``MEASURES`` of one pair: homography right to 3 px at the corners or not, MMA at 3 px, repeatability, former MMA.
+
+    The last is that of the codes which a ``former`` network gave the first view and this one gives the second.
+    Where nothing is matched MMA is 0, or a network that finds nothing would look good.
+    """
+    first, second = (described(network, view, device) for view in pair.views)
+    matched = _matched(first, second, pair)
+    error = corner_error(estimate_homography(*matched), pair.homography, VIEW)
+    again = repeatability(first.points, second.points, pair.homography, VIEW, MOST_POINTS).repeatability
+    return float(error <= WITHIN_PX), _accuracy(matched, pair), again, _accuracy(_matched(former, second, pair), pair)
+
+
+def _matched(first: Described, second: Described, pair: Pair) -> tuple[FloatArray, FloatArray]:
+    """Points (N, 2) of both views whose codes are each other's nearest, among those that both see."""
+    here = in_common_view(first.points, pair.homography, VIEW)
+    there = in_common_view(second.points, inverse(pair.homography), VIEW)
+    matches = mutual_matches(first.codes[here], second.codes[there]).pairs
+    return first.points[here][matches[:, 0]], second.points[there][matches[:, 1]]
+
+
+def _accuracy(matched: tuple[FloatArray, FloatArray], pair: Pair) -> float:
+    right = match_errors(*matched, pair.homography) <= WITHIN_PX
+    return float(right.mean()) if len(right) else 0.0
