@@ -2,9 +2,10 @@
 
     python benchmarks/fuzz.py --packets 1000000
 
-Packets of every kind, the golden ones and random ones up to the limits, are broken in every way below. What is read must
-survive being written and read once more; anything but a packet or a PacketError fails the script, and so do a thousand
-packets that take longer than two minutes. Memory is the resident set, after the first tenth and the largest later.
+Packets of every kind, the golden ones and random ones up to the limits, are broken in every way below. What is read
+must survive being written and read once more. Anything but a packet or a PacketError fails the script, and so do a
+thousand packets that take longer than two minutes. Memory is the resident set, after the first tenth and the largest
+later.
 """
 
 import faulthandler

@@ -13,10 +13,7 @@ MAXIMUM_NUMBER = 2**31 - 1
 """Numbers of keyscans, versions and maps."""
 
 MAXIMUM_BEAMS = 4096
-BYTES_PER_RANGE = 3
-"""The longest varint of a difference between two 16-bit ranges."""
-MAXIMUM_RANGES_BYTES = BYTES_PER_RANGE * MAXIMUM_BEAMS
-"""Length of a keyscan's ranges, both before and after inflating."""
+BYTES_PER_RANGE = 2
 
 MAXIMUM_KEYPOINTS = 2048
 KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
