@@ -89,7 +89,7 @@ def test_what_repeats_is_learnt():
 def test_what_has_no_room_is_not_written():
     coder, data = writer(2)
     for _ in range(100):
-        code_bit(coder, data, 1, 1)
+        code_bit(coder, data, 65535, 0)
     assert written(coder, data) == -1
 
 

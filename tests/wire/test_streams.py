@@ -180,6 +180,11 @@ def test_streams_that_are_cut_off_or_go_on_are_refused(what):
         unpack_any(what, bytes(50 * PLAIN[what] + 1), 50)
 
 
+def test_keypoints_in_steps_of_another_grid_are_refused():
+    with pytest.raises(PacketError, match="in steps of their grid"):
+        unpack_keypoints(b"\x00\x20\x06", 1, 3)
+
+
 def test_keypoints_out_of_order_are_refused():
     with pytest.raises(PacketError, match="ascending"):
         unpack_keypoints(np.array([[1, 0], [0, 0]], "<i2").tobytes(), 2, 2)

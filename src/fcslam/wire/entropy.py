@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 Coder = NDArray[np.int64]
-"""State: [reads, low, high, number read, position, bytes available]."""
+"""State: [reads, low, high, number read or length without zeros at the end, position, bytes available]."""
 Bytes = NDArray[np.uint8]
 Model = NDArray[np.int64]
 """Shape (contexts, 2): probability of a one in 1/65536, and how many bits it was learnt from."""
@@ -115,12 +115,7 @@ def written(coder: Coder, data: Bytes) -> int:
     """End the stream: how many bytes it has, or -1 if it has more than there was room for."""
     if coder[_LOW] > 0:
         _put_byte(coder, data, coder[_HIGH] >> 24)
-    size = coder[_POSITION]
-    if size > coder[_SIZE]:
-        return -1
-    while size > 0 and data[size - 1] == 0:
-        size -= 1
-    return int(size)
+    return int(coder[_NUMBER]) if coder[_NUMBER] <= coder[_SIZE] else -1
 
 
 @njit(cache=True)
@@ -143,3 +138,5 @@ def _put_byte(coder: Coder, data: Bytes, byte: int) -> None:
     if coder[_POSITION] < coder[_SIZE]:
         data[coder[_POSITION]] = byte
     coder[_POSITION] += 1
+    if byte != 0:
+        coder[_NUMBER] = coder[_POSITION]

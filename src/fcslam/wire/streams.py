@@ -78,7 +78,10 @@ def unpack_keypoints(data: bytes, count: int, axes: int) -> KeypointCodes:
         raise PacketError("place: a keypoint is no 16-bit number of steps")
     if not np.array_equal(ascending(codes), np.arange(count)):
         raise PacketError("place: keypoints are not in ascending order")
-    return codes.astype(np.int16)
+    keypoints: KeypointCodes = codes.astype(np.int16)
+    if len(data) < BYTES_PER_AXIS * codes.size and pack_keypoints(keypoints) != data:
+        raise PacketError("place: keypoints are not in steps of their grid")
+    return keypoints
 
 
 def ascending(keypoints: NDArray[Any]) -> NDArray[np.int64]:
