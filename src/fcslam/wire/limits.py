@@ -31,3 +31,7 @@ MINIMUM_INFORMATION = 2.0**-20
 """A standard deviation of 1 km or 1000 rad. Both bounds hold for the diagonal."""
 MINIMUM_CORRELATION_EIGENVALUE = 1e-6
 """Well above the rounding of float32: what is positive definite here stays so."""
+
+MAXIMUM_BATCH_BYTES = 1024 * 1024
+MAXIMUM_BATCH_PACKETS = 1024
+"""Of packets that travel together, their lengths included in the bytes."""
