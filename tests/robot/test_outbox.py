@@ -12,7 +12,8 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from wire.examples import HELLO, KEYSCAN, LIDAR_PLACE, packet
+from robot.fake_cloud import said
+from wire.examples import HELLO, KEYSCAN, LIDAR_PLACE
 
 from fcslam.errors import StateError
 from fcslam.robot.outbox import Outbox
@@ -21,12 +22,6 @@ from fcslam.wire.packets import decode, encode
 
 LIMIT = 10_000_000
 BODIES = [HELLO, KEYSCAN, LIDAR_PLACE]
-
-
-def said(ordinal, body=KEYSCAN):
-    """What a front end gives: it knows no epoch."""
-    body = replace(body, epoch=0) if body is HELLO else body
-    return replace(packet(body), epoch=0, sequence=ordinal)
 
 
 def drain(outbox, packets=MAXIMUM_BATCH_PACKETS):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcslam.records import Constraint, ConstraintKind, Keyscan, LaserScan, SensorRecord
+from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, LaserScan, SensorRecord
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.localization import Localizer
 from fcslam.robot.outbox import Outbox, Waiting
@@ -88,7 +88,7 @@ class Agent:
         self._refused = refused
         self._sleep = sleep
         self._sender = Sender(outbox, transport, rng, clock, self.localizer.correct, self._keep_refused)
-        self._said = self._keyscans = self._left_out = 0
+        self._known = self._said = self._keyscans = self._left_out = 0
 
     def run(self, records: Iterable[SensorRecord], known: int, pace: Pace, watch: AgentWatch) -> None:
         """Map a whole recording and send all of it; ``known`` packets of it were said before, and hurry by.
@@ -98,15 +98,36 @@ class Agent:
             StateError: the outbox cannot be used.
             SourceError: the recording cannot be read.
         """
+        self._known = known
         with self._sending():
             for record in records:
                 if isinstance(record, LaserScan) and self._said >= known:
                     pace.wait(record.stamp)
                 self._say(self._frontend.process(record))
-                self._wait_while(lambda: self._outbox.is_full, known, watch)
-                watch(self._progress(known))
+                self._wait_while(lambda: self._outbox.is_full, watch)
+                watch(self.progress())
             self._say(self._frontend.finish())
-            self._wait_while(lambda: self._outbox.waiting.packets > 0, known, watch)
+            self._wait_while(lambda: self._outbox.waiting.packets > 0, watch)
+
+    def progress(self) -> AgentProgress:
+        """Where the robot is now."""
+        sender = self._sender
+        return AgentProgress(
+            len(self._frontend.scan_poses), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
+            self._left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
+            self._said < self._known,
+        )  # fmt: skip
+
+    def trajectory(self) -> tuple[FloatArray, FloatArray] | None:
+        """Stamps (N,) and poses (N, 3) of ``base`` in the fleet's map at every scan, by the newest correction.
+
+        None: the cloud has not said where the map is.
+        """
+        poses = [self.localizer.T_map_base(pose) for pose in self._frontend.scan_poses]
+        known = [pose for pose in poses if pose is not None]
+        if not known:
+            return None
+        return np.array([pose.stamp for pose in self._frontend.scan_poses]), np.array(known)
 
     def _say(self, packets: list[Packet]) -> None:
         for body in (packet.body for packet in packets):
@@ -117,11 +138,11 @@ class Agent:
             self._left_out += self._outbox.put(packets)
             self._said += len(packets)
 
-    def _wait_while(self, condition: Callable[[], bool], known: int, watch: AgentWatch) -> None:
+    def _wait_while(self, condition: Callable[[], bool], watch: AgentWatch) -> None:
         """Until the sender has changed that."""
         self._require_sender()
         while condition():
-            watch(self._progress(known))
+            watch(self.progress())
             self._sleep(LOOK_EVERY_S)
             self._require_sender()
 
@@ -146,11 +167,3 @@ class Agent:
         stem = f"{len(list(self._refused.glob('*.bin'))):06d}"
         (self._refused / f"{stem}.bin").write_bytes(data)
         (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
-
-    def _progress(self, known: int) -> AgentProgress:
-        sender = self._sender
-        return AgentProgress(
-            len(self._frontend.scan_poses), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
-            self._left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
-            self._said < known,
-        )  # fmt: skip
