@@ -44,7 +44,11 @@ def _explain_traffic(wanted: bool) -> None:
         for field in message.fields:
             table.add_row(field.name, field.type, field.reveals)
         console.print(table)
-    console.print("Nothing else leaves a robot: a message has no other field, and unknown ones are refused.")
+    console.print(
+        "A message has no other field; unknown ones are refused. The network besides sees the robot's address and when "
+        "it sends, and without TLS everything; a token and a random number tell the cloud which robot speaks.",
+        soft_wrap=True,
+    )
     raise typer.Exit
 
 
