@@ -61,7 +61,6 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
         (["--speed", "nan"], "no speed"),
         (["--name", "r+2"], "how a later start of 'r' is called"),
         (["--name", "r/2"], "is no name"),
-        (["--resume"], "nothing to resume"),
         (["--token-file", "nowhere"], "no token can be read"),
         (["--state", "/dev/null/state"], "cannot be made"),
         (["--ca", "nowhere"], "no certificate authority"),

@@ -191,10 +191,10 @@ def test_what_is_resumed_must_be_the_same(outbox, path):
     again.close()
 
 
-def test_there_must_be_something_to_resume(path):
+def test_where_there_is_nothing_to_resume_a_robot_starts(path):
     outbox = Outbox(path, "alice", LIMIT)
-    with pytest.raises(StateError, match="nothing to resume"):
-        outbox.begin("r", resume=True)
+    assert outbox.begin("r", resume=True) == 0
+    assert outbox.epoch == 0
     outbox.close()
 
 

@@ -3,7 +3,7 @@
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -61,7 +61,7 @@ def robot(
     ],
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on with the recording that was interrupted; else the robot starts anew."),
+        typer.Option("--resume", help="Go on with the recording if it was interrupted; else the robot starts anew."),
     ] = False,
     name: Annotated[str | None, typer.Option(help="The robot's name; the file's if not given.")] = None,
     token_file: Annotated[Path | None, typer.Option(help="File with the robot's token.")] = None,
@@ -71,6 +71,12 @@ def robot(
     speed: Annotated[
         str, typer.Option(metavar="FACTOR", help="Play so many times as fast as it was recorded; max: no waiting.")
     ] = "max",
+    budget_kbps: Annotated[
+        float | None,
+        typer.Option(
+            "--budget-kBps", min=0.1, help="Most to send per second of the recording, in kB: places get what is left."
+        ),
+    ] = None,
     outbox_mb: Annotated[
         float, typer.Option(min=0.1, help="Most that waits on disk; at three quarters places are left out.")
     ] = 256.0,
@@ -105,27 +111,37 @@ def robot(
     survey = recording.survey()
     console = Console(stderr=True)
     show_notes(console, survey.notes)
-    with _agent(recording.name, settings, server, state, token, ca, outbox_mb) as (agent, outbox):
-        known = outbox.begin(_fingerprint(recording.name, survey, settings), resume)
+    with _agent(recording.name, settings, server, state, token, ca, outbox_mb, budget_kbps) as (agent, outbox):
+        known = outbox.begin(_fingerprint(recording.name, survey, settings, budget_kbps), resume)
         try:
             with _interruptible(), _progress(console, survey.scan_count) as watch:
                 agent.run(recording.records(), known, pace, watch)
         except KeyboardInterrupt:
             left = outbox.waiting
-            console.print(f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; --resume goes on")
+            console.print(
+                f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; --resume goes on", soft_wrap=True
+            )
             raise
         _report(recording, agent, state, server)
 
 
 @contextmanager
 def _agent(
-    name: str, settings: "RobotConfig", server: str, state: Path, token: str | None, ca: Path | None, outbox_mb: float
+    name: str,
+    settings: "RobotConfig",
+    server: str,
+    state: Path,
+    token: str | None,
+    ca: Path | None,
+    outbox_mb: float,
+    budget_kbps: float | None,
 ) -> "Iterator[tuple[Agent, Outbox]]":
     """The robot, and its outbox in the state folder."""
     import numpy as np
 
     from fcslam.errors import StateError
     from fcslam.robot.agent import Agent
+    from fcslam.robot.budget import Budget
     from fcslam.robot.frontend import RobotFrontend
     from fcslam.robot.outbox import Outbox
     from fcslam.wire.http_transport import HttpTransport
@@ -134,16 +150,15 @@ def _agent(
         state.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StateError(f"{state}: cannot be made ({error.strerror}); give another --state") from error
-    outbox = Outbox(state / "outbox.sqlite", name, int(outbox_mb * 1e6))
-    try:
-        transport = HttpTransport(server, name, outbox.agent, token, ca)
-        frontend = RobotFrontend(name, settings)
-        # Robots must not try again in step, so this is not the mission's seed.
-        rng = np.random.default_rng()
-        yield Agent(frontend, outbox, transport, state / "refused", rng, time.monotonic, time.sleep), outbox
-        transport.close()
-    finally:
-        outbox.close()
+    frontend = RobotFrontend(name, settings)
+    # Robots must not try again in step, so this is not the mission's seed.
+    rng = np.random.default_rng()
+    budget = None if budget_kbps is None else Budget(1e3 * budget_kbps)
+    with (
+        closing(Outbox(state / "outbox.sqlite", name, int(outbox_mb * 1e6))) as outbox,
+        closing(HttpTransport(server, name, outbox.agent, token, ca)) as transport,
+    ):
+        yield Agent(frontend, outbox, transport, state / "refused", rng, time.monotonic, time.sleep, budget), outbox
 
 
 def _settings(config: Path | None) -> "RobotConfig":
@@ -197,14 +212,15 @@ def _token(path: Path | None) -> str | None:
     return token
 
 
-def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig") -> str:
+def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kbps: float | None) -> str:
     """What must be the same for the same packets; digests of the packets find out the rest."""
     import hashlib
 
     import fcslam
     from fcslam.config import dump
 
-    told = (fcslam.__version__, name, survey.scan_count, survey.duration_s, survey.path_length_m, survey.laser)
+    length = survey.scan_count, survey.duration_s, survey.path_length_m
+    told = (fcslam.__version__, name, *length, survey.laser, budget_kbps)
     return hashlib.sha256(f"{told} {dump(settings)}".encode()).hexdigest()
 
 
@@ -272,7 +288,7 @@ def _report(recording: "Source", agent: "Agent", state: Path, server: str) -> No
         highlight=False, soft_wrap=True,
     )  # fmt: skip
     if now.left_out:
-        console.print(f"{now.left_out} places were left out while too much waited", highlight=False)
+        console.print(f"{now.left_out} places were left out: too much waited, or the budget was spent", highlight=False)
     if now.refused:
         console.print(f"{now.refused} packets were refused: {state / 'refused'}", highlight=False, soft_wrap=True)
     trajectory = agent.trajectory()

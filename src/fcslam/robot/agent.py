@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, LaserScan, SensorRecord
+from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.localization import Localizer
 from fcslam.robot.outbox import Outbox, Waiting
@@ -38,7 +39,7 @@ class AgentProgress:
     """Packets that it has."""
     sent_bytes: int
     left_out: int
-    """Places that were not sent as too much waited."""
+    """Places that are not sent: too much waits, or the budget does not allow for them."""
     refused: int
     """Packets that the cloud will never store."""
     map_index: int | None
@@ -80,15 +81,17 @@ class Agent:
     def __init__(
         self, frontend: RobotFrontend, outbox: Outbox, transport: BatchTransport, refused: Path,
         rng: np.random.Generator, clock: Callable[[], float], sleep: Callable[[float], None],
+        budget: Budget | None = None,
     ) -> None:  # fmt: skip
-        """``refused``: folder for packets that the cloud will never store."""
+        """``refused``: folder for packets that the cloud will never store; without a ``budget`` all may be sent."""
         self.localizer = Localizer(clock)
         self._frontend = frontend
         self._outbox = outbox
         self._refused = refused
         self._sleep = sleep
+        self._budget = budget
         self._sender = Sender(outbox, transport, rng, clock, self.localizer.correct, self._keep_refused)
-        self._known = self._said = self._keyscans = self._left_out = 0
+        self._known = self._said = self._keyscans = self._crowded_out = 0
 
     def run(self, records: Iterable[SensorRecord], known: int, pace: Pace, watch: AgentWatch) -> None:
         """Map a whole recording and send all of it; ``known`` packets of it were said before, and hurry by.
@@ -112,9 +115,10 @@ class Agent:
     def progress(self) -> AgentProgress:
         """Where the robot is now."""
         sender = self._sender
+        left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
             len(self._frontend.scan_poses), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
-            self._left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
+            left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
             self._said < self._known,
         )  # fmt: skip
 
@@ -134,9 +138,10 @@ class Agent:
             if isinstance(body, Constraint) and body.kind is ConstraintKind.ODOMETRY:
                 self.localizer.extend(body)
             self._keyscans += isinstance(body, Keyscan)
-        if packets:
-            self._left_out += self._outbox.put(packets)
-            self._said += len(packets)
+        chosen = packets if self._budget is None else self._budget.fit(packets)
+        if chosen:
+            self._crowded_out += self._outbox.put(chosen)
+            self._said += len(chosen)
 
     def _wait_while(self, condition: Callable[[], bool], watch: AgentWatch) -> None:
         """Until the sender has changed that."""

@@ -87,24 +87,22 @@ class Outbox:
     def begin(self, recording: str, resume: bool) -> int:
         """Start a session that reads ``recording`` (a fingerprint of it): a new epoch, or the last one once more.
 
-        Returns how many packets the front end will say again: 0 unless resumed.
+        Returns how many packets the front end will say again: 0 unless there is something to resume.
 
         Raises:
-            StateError: there is nothing to resume, or it was another recording.
+            StateError: it was another recording.
         """
         with self._transaction():
-            last = self._one("SELECT max(epoch), recording FROM sessions")
-            if resume:
-                if last[0] is None:
-                    raise StateError(f"{self._path}: nothing to resume; leave --resume out")
-                if last[1] != recording:
+            last, before = self._one("SELECT max(epoch), recording FROM sessions")
+            if resume and last is not None:
+                if before != recording:
                     raise StateError(
                         f"{self._path}: left by another recording, other settings or another version; "
                         "leave --resume out to start anew"
                     )
-                self.epoch = int(last[0])
+                self.epoch = int(last)
             else:
-                self.epoch = 0 if last[0] is None else int(last[0]) + 1
+                self.epoch = 0 if last is None else int(last) + 1
                 self._database.execute("INSERT INTO sessions VALUES (?, ?, 0, 0)", (self.epoch, recording))
             return int(self._one("SELECT count(*) FROM packets WHERE epoch = ?", self.epoch)[0])
 
