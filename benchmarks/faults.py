@@ -13,6 +13,7 @@ process: accepted closures, pose graph (largest difference of any number), bytes
 """
 
 import asyncio
+import json
 import os
 import resource
 import signal
@@ -61,6 +62,8 @@ class Scenario:
     away: bool = False
     """For OUTAGE_S of the recording nothing gets through."""
     server_kills: int = 0
+    worker_kills: int = 0
+    """The server lives on; only the process in which its fleet lives is killed."""
     robot_kills: int = 0
     disk_full: bool = False
     """The server cannot write for a third of the recording."""
@@ -77,6 +80,7 @@ SCENARIOS = {
     "late and out of order": Scenario(twice=0.5, delay_s=1.0),
     "everything twice": Scenario(twice=1.0),
     "server killed": Scenario(server_kills=4),
+    "worker killed": Scenario(worker_kills=4),
     "robots killed": Scenario(robot_kills=6),
     "all at once": Scenario(lost=0.1, cut=0.05, twice=0.3, delay_s=0.5, server_kills=2, robot_kills=3),
     "disk full": Scenario(disk_full=True),
@@ -226,26 +230,32 @@ async def http_message(reader: asyncio.StreamReader) -> bytes:
 class Process:
     """A command that can be killed and started again."""
 
-    def __init__(self, arguments: Sequence[object], log: Path, again: Sequence[object] = ()) -> None:
+    def __init__(self, arguments: Sequence[object], log: Path) -> None:
         self._arguments = [sys.executable, "-c", common._COMMAND, *map(str, arguments)]
-        self._again = list(map(str, again))
         self.log = log
-        self.starts = 0
+        self.kills = 0
         self.start()
 
     def start(self) -> None:
         environment = {**os.environ, "PYTHONPATH": str(Path(common.fcslam.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-        command = self._arguments + (self._again if self.starts else [])
         with self.log.open("ab") as output:
-            self.process = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
-        self.starts += 1
+            self.process = subprocess.Popen(self._arguments, env=environment, stdout=output, stderr=output)
 
     def kill_and_start(self) -> None:
         """Without a word; one that is done rests."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
+            self.kills += 1
             self.start()
+
+    def kill_children(self) -> None:
+        """What it has started; it is expected to start them again."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text(encoding="ascii")
+        for child in map(int, children.split()):
+            with suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+                self.kills += 1
 
     def ended(self) -> bool:
         """Whether it is done; that it failed ends the script."""
@@ -273,9 +283,9 @@ def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
         proxy = Proxy(scenario, port, rng)
         robots = [robot(log, proxy.port, place, chosen.speed) for log in logs]
         disturb(scenario, server, robots, proxy, duration_s / chosen.speed, OUTAGE_S / chosen.speed, rng)
-        run = finalize(port, place)
+        run = finalize(port)
         proxy.close()
-    kills = server.starts - 1 + sum(robot.starts - 1 for robot in robots)
+    kills = server.kills + sum(robot.kills for robot in robots)
     compared = compare(run, reference)
     elapsed_s = time.perf_counter() - began
     return (
@@ -301,7 +311,7 @@ def cloud(place: Path) -> Iterator[tuple[Process, int]]:
         yield server, port
     finally:
         server.process.send_signal(signal.SIGTERM)
-        server.process.wait(30)
+        server.process.wait(PATIENCE_S)
 
 
 def wait_for(port: int, server: Process) -> None:
@@ -319,8 +329,9 @@ def wait_for(port: int, server: Process) -> None:
 
 def robot(log: Path, port: int, place: Path, speed: float) -> Process:
     state = place / "state" / log.stem
-    arguments = ("robot", log, "--server", f"http://127.0.0.1:{port}", "--state", state, "--speed", speed)
-    return Process(arguments, place / f"{log.stem}.log", again=("--resume",))
+    url = f"http://127.0.0.1:{port}"
+    arguments = ("robot", log, "--server", url, "--state", state, "--speed", speed, "--resume")
+    return Process(arguments, place / f"{log.stem}.log")
 
 
 def disturb(
@@ -334,6 +345,7 @@ def disturb(
     if scenario.disk_full:
         events += [(play_s / 3.0, server.fill_disk), (play_s * 2.0 / 3.0, server.empty_disk)]
     events += [(at, server.kill_and_start) for at in rng.uniform(0.1, 1.1, scenario.server_kills) * play_s]
+    events += [(at, server.kill_children) for at in rng.uniform(0.1, 1.1, scenario.worker_kills) * play_s]
     victims = rng.choice(len(robots), scenario.robot_kills)
     instants = rng.uniform(0.1, 1.0, scenario.robot_kills) * play_s
     events += [(at, robots[victim].kill_and_start) for at, victim in zip(instants, victims, strict=True)]
@@ -382,9 +394,10 @@ def graph_difference(run: Path, reference: Path) -> float:
     return largest
 
 
-def finalize(port: int, place: Path) -> Path:
+def finalize(port: int) -> Path:
     """Ask for the result of all packets, and wait for its run folder."""
-    raise NotImplementedError
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/v1/finalize", data=b"", timeout=PATIENCE_S) as answer:
+        return Path(json.load(answer)["run"])
 
 
 if __name__ == "__main__":

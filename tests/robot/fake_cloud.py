@@ -23,7 +23,9 @@ class FakeCloud:
     stored: dict[tuple[int, int], bytes] = field(default_factory=dict)
     correction: int = -1
     unwanted: set[bytes] = field(default_factory=set)
-    """Contents of packets that it will never store."""
+    """Contents of packets that it will never take."""
+    refused: set[tuple[int, int]] = field(default_factory=set)
+    """Their numbers, which are used up."""
 
     def state(self):
         epochs = {epoch for epoch, _ in self.stored}
@@ -31,16 +33,17 @@ class FakeCloud:
 
     def next(self, epoch):
         sequence = 0
-        while (epoch, sequence) in self.stored:
+        while (epoch, sequence) in self.stored or (epoch, sequence) in self.refused:
             sequence += 1
         return sequence
 
     def send(self, packets, correction):
         for index, data in enumerate(packets):
             sent = decode(data)
-            if content(data) in self.unwanted:
-                return Answer(refusal=Refusal(index, "unwanted"))
             key = sent.epoch, sent.sequence
+            if content(data) in self.unwanted:
+                self.refused.add(key)
+                return Answer(refusal=Refusal(index, "unwanted"))
             assert self.stored.setdefault(key, data) == data, "two packets of one number"
         epoch = decode(packets[0]).epoch if packets else max((e for e, _ in self.stored), default=0)
         answer = []

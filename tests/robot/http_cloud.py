@@ -27,7 +27,7 @@ class HttpCloud:
             return self.canned.popleft()
         if path.endswith("/state"):
             epochs = self.cloud.state().expected
-            return 200, {}, json.dumps({"epochs": epochs, "correction": None, "map": None}).encode()
+            return 200, {}, json.dumps({"next": epochs, "correction": -1, "map": None}).encode()
         answer = self.cloud.send(read_batch(body), int(headers.get(CORRECTION_HEADER, -1)))
         if answer.refusal is not None:
             detail = {"error": answer.refusal.reason, "index": answer.refusal.index}

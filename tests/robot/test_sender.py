@@ -140,7 +140,7 @@ def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
     for _ in range(5):
         robot.step()
     assert robot.refused == [(content(encode(packets[k])), "unwanted") for k in (2, 3)]
-    times = {key: 2000.0 + k for key, k in zip([(0, n) for n in range(4)], (0, 1, 4, 5), strict=True)}
+    times = {(0, k): 2000.0 + k for k in (0, 1, 4, 5)}
     assert {key: decode(data).time for key, data in network.cloud.stored.items()} == times
     assert (robot.sender.confirmed, robot.sender.refusals) == (4, 2)
     assert robot.outbox.waiting == (0, 0)

@@ -189,33 +189,30 @@ class Outbox:
         return count
 
     def drop(self, epoch: int, sequence: int) -> bytes:
-        """Take out a packet that the cloud will never store; those after it close the gap. Returns its bytes."""
+        """Take out a packet that the cloud will never take, but whose number it counts as used. Returns its bytes."""
+        which = "WHERE epoch = ? AND sequence = ?"
         with self._transaction():
-            (data,) = self._one("SELECT data FROM packets WHERE epoch = ? AND sequence = ?", epoch, sequence)
-            self._database.execute(
-                "UPDATE packets SET data = NULL, sequence = NULL WHERE epoch = ? AND sequence = ?", (epoch, sequence)
-            )
-            self._rewrite(epoch, epoch, f"sequence > {sequence:d}", -1)
-            return bytes(data)
+            data = bytes(self._one(f"SELECT data FROM packets {which}", epoch, sequence)[0])
+            self._database.execute(f"UPDATE packets SET data = NULL {which}", (epoch, sequence))
+            self.waiting = Waiting(self.waiting.packets - 1, self.waiting.bytes - len(data))
+        return data
 
     def _move(self, epoch: int, to: int) -> None:
-        self._database.execute("UPDATE sessions SET epoch = ? WHERE epoch = ?", (to, epoch))
-        self._rewrite(epoch, to, "TRUE", 0)
-        if self.epoch == epoch:
-            self.epoch = to
-
-    def _rewrite(self, epoch: int, to: int, which: str, shift: int) -> None:
-        """New numbers for packets that the cloud has not stored."""
+        """Another epoch for a session of which the cloud has nothing."""
         rows = self._database.execute(
-            f"SELECT ordinal, sequence, data FROM packets WHERE epoch = ? AND data IS NOT NULL AND {which}", (epoch,)
+            "SELECT ordinal, sequence, data FROM packets WHERE epoch = ?", (epoch,)
         ).fetchall()
         for ordinal, sequence, data in rows:
-            self._database.execute(
-                "UPDATE packets SET sequence = ?, data = ? WHERE epoch = ? AND ordinal = ?",
-                (sequence + shift, readdress(data, to, sequence + shift), epoch, ordinal),
-            )
+            if data is not None:
+                moved = readdress(data, to, sequence)
+                self._database.execute(
+                    "UPDATE packets SET data = ? WHERE epoch = ? AND ordinal = ?", (moved, epoch, ordinal)
+                )
         self._database.execute("UPDATE packets SET epoch = ? WHERE epoch = ?", (to, epoch))
+        self._database.execute("UPDATE sessions SET epoch = ? WHERE epoch = ?", (to, epoch))
         self.waiting = Waiting(*self._count("data IS NOT NULL"))
+        if self.epoch == epoch:
+            self.epoch = to
 
     def _open(self, robot: str) -> str:
         """Whose file it is is settled first; returns its agent."""

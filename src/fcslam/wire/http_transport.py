@@ -23,7 +23,10 @@ _LATER = frozenset({408, 425, 429, 500, 502, 503, 504, 507})
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """One packet of a batch that the cloud will never store; those before it are stored, those after it are not."""
+    """One packet of a batch that the cloud will never take; its number is used up all the same.
+
+    Those before it are stored, those after it are not.
+    """
 
     index: int
     reason: str
@@ -100,7 +103,7 @@ class HttpTransport:
         response = self._ask("GET", f"robots/{self._robot}/state", accept="application/json")
         self._require(response, 200)
         try:
-            expected = {int(epoch): int(sequence) for epoch, sequence in response.json()["epochs"].items()}
+            expected = {int(epoch): int(sequence) for epoch, sequence in response.json()["next"].items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise CloudError(f"{self._url}: answers, but not as a cloud of fcslam; give its address") from error
         return CloudState(expected)
@@ -155,7 +158,8 @@ class HttpTransport:
             return
         after = response.headers.get("Retry-After", "")
         wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
-        if code in _LATER or (code == 409 and wait_s):  # another agent of this name may be gone soon
+        is_other_agent = code == 409 and "index" not in _detail(response)  # it may be gone soon
+        if code in _LATER or is_other_agent:
             raise UnavailableError(self._reason(response), wait_s)
         raise CloudError(self._reason(response))
 
