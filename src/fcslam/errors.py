@@ -8,8 +8,11 @@ FcslamError
 │   ├── SimulationError   a fleet cannot be simulated
 │   ├── FeatureError      network weights, images or extracted features cannot be used
 │   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
-│   └── EvaluationError   a reference file or a run folder cannot be evaluated
+│   ├── EvaluationError   a reference file or a run folder cannot be evaluated
+│   ├── ServiceError      the cloud service cannot start as it is told to: tokens, certificates, address, folder
+│   └── StoreError        a mission cannot be kept or read: the disk is full, the file is broken or something else
 └── PacketError           bytes received are not a packet that may be trusted
+    └── PacketConflictError   two different packets have one number
 """
 
 
@@ -49,5 +52,22 @@ class EvaluationError(InputError):
     """A reference file or a run folder cannot be evaluated."""
 
 
+class ServiceError(InputError):
+    """The cloud service cannot start as it is told to: tokens, certificates, address or folder do not serve."""
+
+
+class StoreError(InputError):
+    """A mission cannot be kept or read: the disk is full, or the file is broken or no mission."""
+
+
 class PacketError(FcslamError):
     """Bytes received are not a packet that may be trusted; the message says why."""
+
+
+class PacketConflictError(PacketError):
+    """A packet has the number of another one that is stored already."""
+
+    def __init__(self, message: str, index: int) -> None:
+        super().__init__(message)
+        self.index = index
+        """Of the packet among those that were given."""
