@@ -4,7 +4,7 @@ import os
 import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +36,10 @@ class Database:
             for pragma in ("trusted_schema=OFF", "journal_mode=WAL", "synchronous=FULL"):
                 self._connection.execute(f"PRAGMA {pragma}")
         with self.transaction() as connection:
-            found = connection.execute("PRAGMA user_version").fetchone()[0]
-            tables = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]
-            if tables == 0:
-                for statement in filter(str.strip, schema.split(";")):
-                    connection.execute(statement)
-                connection.execute(f"PRAGMA user_version={version}")
-            elif found != version:
-                raise StoreError(f"{path}: version {found} of the file is unknown, this fcslam writes {version}")
+            if not _shape(connection)[1]:
+                _make(connection, schema, version)
+            if _shape(connection) != _expected(schema, version):
+                raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
 
     def close(self) -> None:
         """Let go of the file."""
@@ -86,6 +82,38 @@ class Database:
                 os.link(staging, path)
             finally:
                 staging.unlink(missing_ok=True)
+
+
+def check_file(path: Path, schema: str, version: int) -> None:
+    """Refuse a file from elsewhere that ``Database`` did not make; it is not changed, and nothing in it is run.
+
+    Raises:
+        StoreError: it is broken, or has other tables than those of ``schema``, or anything else.
+    """
+    with told(path), closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found:
+        found.execute("PRAGMA trusted_schema=OFF")
+        if _shape(found) != _expected(schema, version):
+            raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
+        if found.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
+            raise StoreError(f"{path}: broken")
+
+
+def _make(connection: sqlite3.Connection, schema: str, version: int) -> None:
+    for statement in schema.split(";"):
+        connection.execute(statement)
+    connection.execute(f"PRAGMA user_version={version}")
+
+
+def _shape(connection: sqlite3.Connection) -> tuple[int, list[tuple[Any, ...]]]:
+    """Version, and everything that is not data."""
+    parts = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema ORDER BY type, name").fetchall()
+    return connection.execute("PRAGMA user_version").fetchone()[0], parts
+
+
+def _expected(schema: str, version: int) -> tuple[int, list[tuple[Any, ...]]]:
+    with closing(sqlite3.connect(":memory:")) as connection:
+        _make(connection, schema, version)
+        return _shape(connection)
 
 
 @contextmanager

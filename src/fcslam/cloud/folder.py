@@ -41,20 +41,20 @@ class MissionFolder:
         """A run folder that was asked for."""
         return self.path / "runs" / name
 
-    def publish(self, run: Run, number: int) -> None:
+    def publish(self, run: Run) -> None:
         """Make ``run`` the live one; the one before stays for those who are still reading it.
 
         Raises:
             OutputError: it cannot be written.
         """
         snapshots = self.path / "snapshots"
-        write_run(run, snapshots / str(number), force=True)
+        before = int(self.live.resolve().name) if self.live.exists() else 0
+        name = str(before + 1)
+        write_run(run, snapshots / name, force=True)
         link = self.path / ".live.partial"
         link.unlink(missing_ok=True)
-        link.symlink_to(Path("snapshots") / str(number), target_is_directory=True)
-        before = os.readlink(self.live) if self.live.is_symlink() else ""
+        link.symlink_to(Path("snapshots") / name, target_is_directory=True)
         os.replace(link, self.live)
-        kept = {str(number), Path(before).name}
         for old in snapshots.iterdir():
-            if old.name not in kept:
+            if old.name not in (str(before), name):
                 shutil.rmtree(old, ignore_errors=True)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fcslam.cloud.database import Database
+from fcslam.cloud.database import Database, check_file
 from fcslam.errors import PacketConflictError
 from fcslam.records import Channel, Correction, Veto, frozen
 from fcslam.wire.ledger import Ledger, Traffic
@@ -25,7 +25,7 @@ _VERSION = 1
 _SCHEMA = """
 CREATE TABLE packets (
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, sequence INTEGER NOT NULL,
-    received REAL NOT NULL, time REAL NOT NULL, kind TEXT NOT NULL, channel TEXT,
+    received REAL NOT NULL, time REAL NOT NULL, kind TEXT, channel TEXT,
     refusal TEXT, turn INTEGER UNIQUE, data BLOB NOT NULL,
     PRIMARY KEY (robot, epoch, sequence)
 ) STRICT;
@@ -54,7 +54,8 @@ class StoredPacket:
     epoch: int
     sequence: int
     time: float
-    kind: Kind
+    kind: Kind | None
+    """None: it could not be read, and was refused."""
     channel: Channel | None
     """Of a place."""
     data: bytes
@@ -144,7 +145,7 @@ class MissionStore:
         columns = "robot, epoch, sequence, time, kind, channel, data, refusal"
         statement = f"SELECT {columns} FROM packets WHERE turn >= ? ORDER BY turn LIMIT ?"
         return [
-            StoredPacket(robot, epoch, sequence, time, Kind(kind), Channel(channel) if channel else None, data, refusal)
+            StoredPacket(robot, epoch, sequence, time, kind and Kind(kind), channel and Channel(channel), data, refusal)
             for robot, epoch, sequence, time, kind, channel, data, refusal in self._database.rows(
                 statement, (after, limit)
             )
@@ -235,6 +236,10 @@ class MissionStore:
             Finalization(*row) for row in self._database.rows(f"SELECT {columns} FROM finalizations ORDER BY number")
         ]
 
+    def finalization(self, number: int) -> Finalization:
+        """One request, which is there."""
+        return next(asked for asked in self.finalizations() if asked.number == number)
+
     def answer(self, number: int, run: str | None, failure: str | None = None) -> None:
         """What came of a request."""
         with self._database.transaction() as database:
@@ -258,7 +263,7 @@ class MissionStore:
         refused = Traffic()
         for robot, kind, channel, counts, packets, size in self._database.rows(statement):
             if counts:
-                accepted[Label(robot, Kind(kind), Channel(channel) if channel else None)] = Traffic(packets, size)
+                accepted[Label(robot, Kind(kind), channel and Channel(channel))] = Traffic(packets, size)
             else:
                 refused += Traffic(packets, size)
         return Ledger(accepted, refused)
@@ -272,16 +277,23 @@ class MissionStore:
         self._database.export(path)
 
 
+def check_mission(path: Path) -> None:
+    """Refuse a file that is no exported mission.
+
+    Raises:
+        StoreError: it is not what ``MissionStore.export`` writes.
+    """
+    check_file(path, _SCHEMA, _VERSION)
+
+
 def _remember(database: sqlite3.Connection, name: str, value: str) -> None:
     database.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, value))
 
 
 def _insert(database: sqlite3.Connection, packet: StoredPacket, received_s: float) -> bool:
     columns = "robot, epoch, sequence, received, time, kind, channel, refusal, data"
-    row = (
-        packet.robot, packet.epoch, packet.sequence, received_s, packet.time, packet.kind.value,
-        packet.channel.value if packet.channel else None, packet.refusal, packet.data,
-    )  # fmt: skip
+    number = (packet.robot, packet.epoch, packet.sequence)
+    row = (*number, received_s, packet.time, packet.kind, packet.channel, packet.refusal, packet.data)
     statement = f"INSERT INTO packets ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING"
     return database.execute(statement, row).rowcount > 0
 

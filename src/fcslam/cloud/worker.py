@@ -136,7 +136,7 @@ class Worker:
         now = self._clock()
         if self._published == self._turn or self._turn < self._resumed_at or now < self._publish_at:
             return False
-        self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False), self._turn)
+        self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False))
         self._published = self._turn
         self._publish_at = self._clock() + max((self._clock() - now) / LIVE_SHARE, LIVE_EVERY_S)
         self._tell("live", self._turn)
