@@ -9,9 +9,12 @@ FcslamError
 │   ├── FeatureError      network weights, images or extracted features cannot be used
 │   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
 │   ├── EvaluationError   a reference file or a run folder cannot be evaluated
+│   ├── ServiceError      the cloud service cannot start as it is told to: tokens, certificates, address, folder
+│   ├── StoreError        a mission cannot be kept or read: the disk is full, the file is broken or something else
 │   ├── StateError        a robot's state folder cannot be used
 │   └── CloudError        the cloud turns a robot away: its token, its name or what it sends
 ├── PacketError           bytes received are not a packet that may be trusted
+│   └── PacketConflictError   two different packets have one number
 └── UnavailableError      the cloud cannot be reached or is busy: try again
 """
 
@@ -69,5 +72,22 @@ class UnavailableError(FcslamError):
         """The cloud asks not to be asked before; 0: it says nothing."""
 
 
+class ServiceError(InputError):
+    """The cloud service cannot start as it is told to: tokens, certificates, address or folder do not serve."""
+
+
+class StoreError(InputError):
+    """A mission cannot be kept or read: the disk is full, or the file is broken or no mission."""
+
+
 class PacketError(FcslamError):
     """Bytes received are not a packet that may be trusted; the message says why."""
+
+
+class PacketConflictError(PacketError):
+    """A packet has the number of another one that is stored already."""
+
+    def __init__(self, message: str, index: int) -> None:
+        super().__init__(message)
+        self.index = index
+        """Of the packet among those that were given."""
