@@ -3,8 +3,8 @@
     python benchmarks/byte_budget.py
 
 The logs cut into robots as elsewhere (README). Each robot's packets go through `fcslam.robot.budget`, as by `fcslam
-robot --budget-kBps`: hello, keyscans and constraints always travel, places are thinned to their strongest descriptors or
-left out. So a budget below what the chain takes is not kept; what was sent is stated. Errors are over the relations
+robot --budget-kBps`: hello, keyscans and constraints always travel, places are thinned to their strongest descriptors
+or left out. So a budget below what the chain takes is not kept; what was sent is stated. Errors are over the relations
 between different robots, of which those between robots in different maps cannot be used.
 """
 

@@ -368,7 +368,7 @@ def compare(run: Path, reference: Path) -> tuple:
     closures, expected = accepted(run), accepted(reference)
     off = graph_difference(run, reference)
     same_map = (run / "map.pgm").read_bytes() == (reference / "map.pgm").read_bytes()
-    lost, twice = -sum(min(0.0, n) for n in more), sum(max(0.0, n) for n in more)
+    lost, twice = sum(max(0.0, -n) for n in more), sum(max(0.0, n) for n in more)
     passed = closures == expected and off <= 1e-9 and same_map and lost == twice == 0.0
     same = ["yes" if is_same else "NO" for is_same in (closures == expected, same_map, passed)]
     return sum(ours[name] for name in kinds), lost, twice, len(closures), same[0], off, *same[1:]
