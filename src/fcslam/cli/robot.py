@@ -52,6 +52,37 @@ def _explain_traffic(wanted: bool) -> None:
     raise typer.Exit
 
 
+_NETWORK = "Network"
+
+TokenFile = Annotated[Path | None, typer.Option(help="File with the robot's token.", rich_help_panel=_NETWORK)]
+Ca = Annotated[
+    Path | None,
+    typer.Option(
+        help="PEM file of who signed the cloud's certificate; the system's if not given.", rich_help_panel=_NETWORK
+    ),
+]
+BudgetKbps = Annotated[
+    float | None,
+    typer.Option(
+        "--budget-kBps", min=0.1, rich_help_panel=_NETWORK,
+        help="Most to send per second of the recording, in kB: places get what is left.",
+    ),
+]  # fmt: skip
+OutboxMb = Annotated[
+    float,
+    typer.Option(
+        min=0.1, help="Most that waits on disk; at three quarters places are left out.", rich_help_panel=_NETWORK
+    ),
+]
+ExplainTraffic = Annotated[
+    bool,
+    typer.Option(
+        "--explain-traffic", callback=_explain_traffic, is_eager=True, rich_help_panel=_NETWORK,
+        help="List every message, its fields and what they could reveal, and exit.",
+    ),
+]  # fmt: skip
+
+
 def robot(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help="The robot's recording; NAME=LOG names it.")],
     *,
@@ -60,42 +91,24 @@ def robot(
         Path, typer.Option(help="Folder for what the cloud has not confirmed yet; one a robot, kept between starts.")
     ],
     resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Go on with the recording if it was interrupted; else the robot starts anew."),
+        bool, typer.Option("--resume", help="Go on with the recording if it was interrupted; else start anew.")
     ] = False,
     name: Annotated[str | None, typer.Option(help="The robot's name; the file's if not given.")] = None,
-    token_file: Annotated[Path | None, typer.Option(help="File with the robot's token.")] = None,
-    ca: Annotated[
-        Path | None, typer.Option(help="PEM file of who signed the cloud's certificate; the system's if not given.")
-    ] = None,
     speed: Annotated[
         str, typer.Option(metavar="FACTOR", help="Play so many times as fast as it was recorded; max: no waiting.")
     ] = "max",
-    budget_kbps: Annotated[
-        float | None,
-        typer.Option(
-            "--budget-kBps", min=0.1, help="Most to send per second of the recording, in kB: places get what is left."
-        ),
-    ] = None,
-    outbox_mb: Annotated[
-        float, typer.Option(min=0.1, help="Most that waits on disk; at three quarters places are left out.")
-    ] = 256.0,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Configuration file; see `fcslam config dump`.")
     ] = None,
+    token_file: TokenFile = None,
+    ca: Ca = None,
+    budget_kbps: BudgetKbps = None,
+    outbox_mb: OutboxMb = 256.0,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
-    _explain: Annotated[
-        bool,
-        typer.Option(
-            "--explain-traffic",
-            callback=_explain_traffic,
-            is_eager=True,
-            help="List every message, its fields and what they could reveal, and exit.",
-        ),
-    ] = False,
+    _explain: ExplainTraffic = False,
 ) -> None:
     """Be one robot: map a recording, send places and keyscans to the cloud, through outages and restarts."""
     from rich.console import Console

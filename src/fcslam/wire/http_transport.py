@@ -72,7 +72,7 @@ class BatchTransport(Protocol):
 
 
 class HttpTransport:
-    """One connection to one cloud for one robot; see docs/wire.md for paths and status codes."""
+    """One connection to one cloud for one robot; docs/howto-robot.md says what it makes of which answer."""
 
     def __init__(self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None) -> None:
         """``agent`` tells two processes apart that go by one name; ``ca`` is a PEM file, the system's if not given.
