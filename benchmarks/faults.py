@@ -91,7 +91,7 @@ SCENARIOS = {
 UPLINK = ("hello", "keyscan", "constraint", "place")
 COLUMNS = {"scenario": "", "robots": "", "packets": ",.0f", "lost": ".0f", "twice": ".0f", "closures": "",
            "the same": "", "graph off by": ".1e", "map the same": "", "requests": ",.0f", "disturbed": ",.0f",
-           "turned away": ",.0f",            "kills": "", "s": ".0f", "passed": ""}  # fmt: skip
+           "turned away": ",.0f", "kills": "", "s": ".0f", "passed": ""}  # fmt: skip
 
 
 def main() -> None:
