@@ -44,6 +44,11 @@ REVEALS: Mapping[str, str] = MappingProxyType(
         "Correction.version": "how often the cloud's map has changed",
         "Correction.map_index": "whether the robot has met others",
         "Correction.t_map_odom": "where the robot is in the building's map",
+        "Release.channel": "nothing of the robot",
+        "Release.version": "that the fleet has trained",
+        "Release.format": "nothing of the robot",
+        "Release.size": "nothing of the robot",
+        "Release.sha256": "nothing of the robot",
         "Acknowledgement.epoch": "nothing by itself",
         "Acknowledgement.sequence": "how much the cloud has",
     }
