@@ -252,10 +252,10 @@ class Process:
 
     def kill_children(self) -> None:
         """What it has started; it is expected to start them again."""
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text(encoding="ascii")
-        for child in map(int, children.split()):
+        threads = Path(f"/proc/{self.process.pid}/task").glob("*/children")
+        for child in " ".join(path.read_text(encoding="ascii") for path in threads).split():
             with suppress(ProcessLookupError):
-                os.kill(child, signal.SIGKILL)
+                os.kill(int(child), signal.SIGKILL)
                 self.kills += 1
 
     def ended(self) -> bool:

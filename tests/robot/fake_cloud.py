@@ -4,9 +4,10 @@ from dataclasses import dataclass, field, replace
 
 from wire.examples import CLOSURE, CORRECTION, HELLO, packet
 
-from fcslam.errors import UnavailableError
+from fcslam.errors import CloudError, UnavailableError
+from fcslam.records import DetectorFile
 from fcslam.wire.http_transport import Answer, CloudState, Refusal
-from fcslam.wire.messages import Acknowledgement
+from fcslam.wire.messages import Acknowledgement, Release
 from fcslam.wire.packets import decode, encode, readdress
 
 
@@ -26,6 +27,17 @@ class FakeCloud:
     """Contents of packets that it will never take."""
     refused: set[tuple[int, int]] = field(default_factory=set)
     """Their numbers, which are used up."""
+
+    releases: dict[DetectorFile, bytes] = field(default_factory=dict)
+    """Detectors that it announces all the time, and their contents; one without cannot be had."""
+    fetched: list[str] = field(default_factory=list)
+
+    def detector(self, channel, version):
+        self.fetched.append(version)
+        content = {(file.channel, file.version): content for file, content in self.releases.items()}[channel, version]
+        if content is None:
+            raise CloudError("there is none")
+        return content
 
     def state(self):
         epochs = {epoch for epoch, _ in self.stored}
@@ -50,6 +62,7 @@ class FakeCloud:
         if self.next(epoch):
             acknowledgement = Acknowledgement("alice", epoch, self.next(epoch) - 1)
             answer.append(encode(replace(packet(acknowledgement), epoch=epoch)))
+        answer += [encode(packet(Release("alice", file))) for file in self.releases]
         if self.correction > correction:
             answer.append(encode(packet(replace(CORRECTION, version=self.correction))))
         return Answer(tuple(answer))
@@ -84,6 +97,9 @@ class Network:
         if fault in ("none", "twice"):
             return self.cloud.send(packets, correction)
         raise UnavailableError("no answer")
+
+    def detector(self, channel, version):
+        return self.cloud.detector(channel, version)
 
     def _next(self):
         self.requests += 1

@@ -1,6 +1,7 @@
 """The cloud of tests behind real HTTP, on a port of its own."""
 
 import json
+import ssl
 import threading
 from collections import deque
 from contextlib import contextmanager
@@ -36,8 +37,8 @@ class HttpCloud:
 
 
 @contextmanager
-def serving(cloud=None):
-    """An HttpCloud that can be reached at its ``url``."""
+def serving(cloud=None, tls=None):
+    """An HttpCloud that can be reached at its ``url``; ``tls``: the folder of its certificate."""
     http_cloud = HttpCloud(cloud)
 
     class Handler(BaseHTTPRequestHandler):
@@ -59,9 +60,13 @@ def serving(cloud=None):
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
+    if tls is not None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(tls / "own.crt", tls / "own.key")
+        server.socket = context.wrap_socket(server.socket, server_side=True)
     thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
     thread.start()
-    http_cloud.url = f"http://127.0.0.1:{server.server_port}"
+    http_cloud.url = f"{'https' if tls else 'http'}://127.0.0.1:{server.server_port}"
     try:
         yield http_cloud
     finally:

@@ -46,7 +46,7 @@ def drive(tmp_path, network, records, resume=False, watch=lambda _: None, limit=
     outbox = Outbox(tmp_path / "outbox", "alice", limit)
     pause = threading.Event()
     agent = Agent(
-        RobotFrontend("alice", RobotConfig()), outbox, network, tmp_path / "refused", np.random.default_rng(0),
+        RobotFrontend("alice", RobotConfig()), outbox, network, tmp_path, np.random.default_rng(0),
         Clock(), lambda _: pause.wait(0.001),
     )  # fmt: skip
     try:

@@ -1,13 +1,14 @@
 """Whatever the network does, the cloud gets every packet once, in order, and the robot its corrections."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robot.fake_cloud import FakeCloud, Network, content, said
-from wire.examples import HELLO, LIDAR_PLACE
+from wire.examples import HELLO, LIDAR_PLACE, RELEASE
 
 from fcslam.errors import CloudError, UnavailableError
 from fcslam.robot.outbox import Outbox
@@ -21,12 +22,13 @@ class Robot:
 
     def __init__(self, path, network):
         self.now = 0.0
-        self.corrections, self.refused = [], []
+        self.corrections, self.kept, self.refused = [], [], []
         self.outbox = Outbox(path, "alice", 10**9)
         self.known = self.outbox.begin("r", resume=path.with_name("resumed").exists())
         path.with_name("resumed").touch()
         self.sender = Sender(
             self.outbox, network, np.random.default_rng(0), lambda: self.now, self.corrections.append,
+            lambda file, content: self.kept.append((file, content)),
             lambda data, reason: self.refused.append((content(data), reason)),
         )  # fmt: skip
 
@@ -169,6 +171,18 @@ def test_a_cloud_that_turns_the_robot_away_ends_the_sender(robot):
     robot.sender.run(threading.Event())
     assert str(robot.sender.failure) == "no token"
     assert robot.outbox.waiting.packets == 1
+
+
+def test_a_detector_is_fetched_once_and_one_that_is_not_there_not_asked_for_again(robot):
+    cloud = robot.sender._transport.cloud
+    missing = replace(RELEASE.file, version="gone")
+    cloud.releases = {RELEASE.file: b"network", missing: None}
+    for ordinal in range(5):
+        robot.outbox.put([said(ordinal)])
+        robot.step()
+    assert robot.kept == [(RELEASE.file, b"network")]
+    assert cloud.fetched == [RELEASE.file.version, "gone"]
+    assert robot.outbox.waiting.packets == 0
 
 
 def test_trouble_is_an_error_of_its_own():

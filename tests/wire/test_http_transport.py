@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from federated.authority import certificates
 from robot.fake_cloud import said
 from robot.http_cloud import serving
 from wire.examples import LIDAR_PLACE
@@ -125,6 +126,20 @@ def test_a_token_is_not_shown_to_the_network():
     for url in ("http://localhost:80", "http://[::1]:80", "https://cloud.example"):
         HttpTransport(url, "r", "ab" * 16, "secret").close()
     HttpTransport("http://cloud.example", "r", "ab" * 16).close()
+
+
+def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_path):
+    ours, others = certificates(tmp_path / "ours"), certificates(tmp_path / "others")
+    with serving(tls=ours) as cloud:
+        trusting = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ours / "ca.crt")
+        assert len(trusting.send(PACKETS, -1).packets) == 1
+        trusting.close()
+        for ca in (None, others / "ca.crt"):
+            wary = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ca)
+            with pytest.raises(CloudError, match="its certificate is not trusted"):
+                wary.send(PACKETS, -1)
+            wary.close()
+    assert len(cloud.requests) == 1, "no token went to a stranger"
 
 
 @pytest.mark.parametrize("content", [None, b"noise"])

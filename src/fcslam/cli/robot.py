@@ -171,7 +171,7 @@ def _agent(
         closing(Outbox(state / "outbox.sqlite", name, int(outbox_mb * 1e6))) as outbox,
         closing(HttpTransport(server, name, outbox.agent, token, ca)) as transport,
     ):
-        yield Agent(frontend, outbox, transport, state / "refused", rng, time.monotonic, time.sleep, budget), outbox
+        yield Agent(frontend, outbox, transport, state, rng, time.monotonic, time.sleep, budget), outbox
 
 
 def _settings(config: Path | None) -> "RobotConfig":
@@ -260,15 +260,17 @@ def _progress(console: "Console", total: int) -> "Iterator[AgentWatch]":
         progress.TextColumn("{task.fields[stage]}"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
         progress.TextColumn("scans, {task.fields[what]}"),
     ]  # fmt: skip
-    said: str | None = "connecting"
+    said: tuple[str | None, str | None] = "connecting", None
     with progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=total, stage="mapping", what="")
 
         def watch(now: "AgentProgress") -> None:
             nonlocal said
-            if now.trouble != said:
-                said = now.trouble
-                console.print(said or "connected", highlight=False, markup=False, soft_wrap=True)
+            told = now.trouble, now.notice
+            lines = [now.trouble or "connected"] * (told[0] != said[0]) + [now.notice or ""] * (told[1] != said[1])
+            for line in lines:
+                console.print(line, highlight=False, markup=False, soft_wrap=True)
+            said = told
             stage = "catching up" if now.catching_up else "mapping" if now.scans < total else "sending"
             bar.update(task, completed=now.scans, stage=stage, what=_what(now))
 

@@ -17,6 +17,7 @@ from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.localization import Localizer
 from fcslam.robot.outbox import Outbox, Waiting
+from fcslam.robot.releases import Releases
 from fcslam.robot.sender import Sender
 from fcslam.wire.http_transport import BatchTransport
 from fcslam.wire.messages import Packet
@@ -49,6 +50,8 @@ class AgentProgress:
     """Why nothing gets through; None: it does."""
     catching_up: bool
     """Whether the recording is still where it was when the robot was stopped."""
+    notice: str | None
+    """What became of the last detector that was announced; None: there was none."""
 
 
 AgentWatch = Callable[[AgentProgress], None]
@@ -79,18 +82,21 @@ class Agent:
     """One robot: front end, outbox, sender, and where it is in the fleet's map."""
 
     def __init__(
-        self, frontend: RobotFrontend, outbox: Outbox, transport: BatchTransport, refused: Path,
+        self, frontend: RobotFrontend, outbox: Outbox, transport: BatchTransport, folder: Path,
         rng: np.random.Generator, clock: Callable[[], float], sleep: Callable[[float], None],
         budget: Budget | None = None,
     ) -> None:  # fmt: skip
-        """``refused``: folder for packets that the cloud will never store; without a ``budget`` all may be sent."""
+        """``folder``: for packets that the cloud will never take, and for detectors; without ``budget`` all is sent."""
         self.localizer = Localizer(clock)
         self._frontend = frontend
         self._outbox = outbox
-        self._refused = refused
+        self._refused = folder / "refused"
         self._sleep = sleep
         self._budget = budget
-        self._sender = Sender(outbox, transport, rng, clock, self.localizer.correct, self._keep_refused)
+        self._releases = Releases(folder / "detectors", outbox, frontend)
+        self._sender = Sender(
+            outbox, transport, rng, clock, self.localizer.correct, self._releases.keep, self._keep_refused
+        )
         self._known = self._said = self._keyscans = self._crowded_out = 0
 
     def run(self, records: Iterable[SensorRecord], known: int, pace: Pace, watch: AgentWatch) -> None:
@@ -102,8 +108,10 @@ class Agent:
             SourceError: the recording cannot be read.
         """
         self._known = known
+        self._releases.resume()
         with self._sending():
-            for record in records:
+            for number, record in enumerate(records):
+                self._releases.take(number, self._said < known)
                 if isinstance(record, LaserScan) and self._said >= known:
                     pace.wait(record.stamp)
                 self._say(self._frontend.process(record))
@@ -119,7 +127,7 @@ class Agent:
         return AgentProgress(
             len(self._frontend.scan_poses), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
             left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
-            self._said < self._known,
+            self._said < self._known, self._releases.notice,
         )  # fmt: skip
 
     def trajectory(self) -> tuple[FloatArray, FloatArray] | None:
@@ -168,7 +176,7 @@ class Agent:
             thread.join(FAREWELL_S)
 
     def _keep_refused(self, data: bytes, reason: str) -> None:
-        self._refused.mkdir(exist_ok=True)
+        self._refused.mkdir(parents=True, exist_ok=True)
         stem = f"{len(list(self._refused.glob('*.bin'))):06d}"
         (self._refused / f"{stem}.bin").write_bytes(data)
         (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")

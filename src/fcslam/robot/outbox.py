@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fcslam.errors import StateError
-from fcslam.records import Place
+from fcslam.records import Channel, DetectorFile, Place
 from fcslam.wire.batches import LENGTH
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, readdress
@@ -31,6 +31,10 @@ CREATE TABLE IF NOT EXISTS sessions (
 CREATE TABLE IF NOT EXISTS packets (
     epoch INTEGER NOT NULL, ordinal INTEGER NOT NULL, digest BLOB NOT NULL, sequence INTEGER, data BLOB,
     PRIMARY KEY (epoch, ordinal)
+);
+CREATE TABLE IF NOT EXISTS releases (
+    epoch INTEGER NOT NULL, record INTEGER NOT NULL, channel TEXT NOT NULL, version TEXT NOT NULL,
+    format INTEGER NOT NULL, size INTEGER NOT NULL, sha256 BLOB NOT NULL
 );
 CREATE INDEX IF NOT EXISTS waiting ON packets (epoch, sequence) WHERE data IS NOT NULL;
 """
@@ -139,6 +143,19 @@ class Outbox:
                 number += 1
         return left_out
 
+    def take_release(self, record: int, file: DetectorFile) -> None:
+        """Remember that the front end takes a detector before this record of the session."""
+        told = (self.epoch, record, file.channel.value, file.version, file.format, file.size, file.sha256)
+        with self._transaction():
+            self._database.execute("INSERT INTO releases VALUES (?, ?, ?, ?, ?, ?, ?)", told)
+
+    def releases(self) -> dict[int, DetectorFile]:
+        """What the session has taken, by record."""
+        columns = "record, channel, version, format, size, sha256"
+        with self._transaction():
+            rows = self._database.execute(f"SELECT {columns} FROM releases WHERE epoch = ?", (self.epoch,)).fetchall()
+        return {record: DetectorFile(Channel(channel), *rest) for record, channel, *rest in rows}
+
     def batch(self, maximum_bytes: int, maximum_packets: int) -> Batch | None:
         """The oldest waiting packets that fit one batch, at least one; None if nothing waits."""
         question = "SELECT epoch, sequence, data FROM packets WHERE data IS NOT NULL ORDER BY epoch, sequence LIMIT ?"
@@ -208,8 +225,8 @@ class Outbox:
                 self._database.execute(
                     "UPDATE packets SET data = ? WHERE epoch = ? AND ordinal = ?", (moved, epoch, ordinal)
                 )
-        self._database.execute("UPDATE packets SET epoch = ? WHERE epoch = ?", (to, epoch))
-        self._database.execute("UPDATE sessions SET epoch = ? WHERE epoch = ?", (to, epoch))
+        for table in ("packets", "sessions", "releases"):
+            self._database.execute(f"UPDATE {table} SET epoch = ? WHERE epoch = ?", (to, epoch))
         self.waiting = Waiting(*self._count("data IS NOT NULL"))
         if self.epoch == epoch:
             self.epoch = to

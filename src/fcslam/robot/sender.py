@@ -2,15 +2,16 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 
-from fcslam.errors import FcslamError, PacketError, UnavailableError
-from fcslam.records import Correction
+from fcslam.errors import CloudError, FcslamError, PacketError, UnavailableError
+from fcslam.records import Correction, DetectorFile
 from fcslam.robot.outbox import Batch, Outbox
 from fcslam.wire.http_transport import Answer, BatchTransport
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
-from fcslam.wire.messages import Acknowledgement
+from fcslam.wire.messages import Acknowledgement, Release
 from fcslam.wire.packets import decode
 
 EVERY_S = 1.0
@@ -33,17 +34,21 @@ class Sender:
 
     def __init__(
         self, outbox: Outbox, transport: BatchTransport, rng: np.random.Generator, clock: Callable[[], float],
-        correct: Callable[[Correction], None], refused: Callable[[bytes, str], None],
+        correct: Callable[[Correction], None], keep: Callable[[DetectorFile, bytes], None],
+        refused: Callable[[bytes, str], None],
     ) -> None:  # fmt: skip
-        """``correct`` is told of corrections newer than all before, ``refused`` of packets that the cloud will never
-        store, and why; both are called from where ``step`` is."""
+        """Whom to tell, from where ``step`` is called: ``correct`` of corrections newer than all before, ``keep`` of
+        detectors that were announced and fetched, ``refused`` of packets that the cloud will never take, and why."""
         self._outbox = outbox
         self._transport = transport
         self._rng = rng
         self._clock = clock
         self._correct = correct
+        self._keep = keep
         self._refused = refused
         self._met = False
+        self._known: set[DetectorFile] = set()
+        """Detectors that were fetched, or cannot be."""
         self._correction = -1
         self._failures = 0
         self._last_answer_s = -np.inf
@@ -120,3 +125,11 @@ class Sender:
                 case Correction(version=version) if version > self._correction:
                     self._correction = version
                     self._correct(body)
+                case Release(file=file) if file not in self._known:
+                    self._fetch(file)
+
+    def _fetch(self, file: DetectorFile) -> None:
+        """The robot goes on with its old detector if there is no such file."""
+        with suppress(CloudError):
+            self._keep(file, self._transport.detector(file.channel, file.version))
+        self._known.add(file)

@@ -70,6 +70,14 @@ class BatchTransport(Protocol):
             CloudError: it turns this robot away.
         """
 
+    def detector(self, channel: Channel, version: str) -> bytes:
+        """The file of a detector that was announced.
+
+        Raises:
+            UnavailableError: it cannot be had now.
+            CloudError: there is none of this version.
+        """
+
 
 class HttpTransport:
     """One connection to one cloud for one robot; docs/howto-robot.md says what it makes of which answer."""
@@ -128,12 +136,7 @@ class HttpTransport:
             raise UnavailableError(f"{self._url}: the answer is broken ({error})") from error
 
     def detector(self, channel: Channel, version: str) -> bytes:
-        """The network that describes images from now on.
-
-        Raises:
-            UnavailableError: it cannot be had now.
-            CloudError: there is none of this version.
-        """
+        """As in BatchTransport."""
         response = self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}", accept="*/*")
         self._require(response, 200)
         return response.content
