@@ -31,7 +31,7 @@ from fcslam.sources import open_source, split
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
-BUDGETS_KBPS = (None, 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
+BUDGETS_KBPS = (float("inf"), 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
 COLUMNS = {"log": "", "budget, kB/s": "", "sent, kB/s a robot": ".2f", "places": "", "left out": "",
            "descriptors a place": ".0f", "closures between": "", "maps": "", "relations across robots": "",
            "mean, m": ".4f", "max, m": ".3f", "mean, deg": ".3f"}  # fmt: skip
@@ -40,13 +40,14 @@ COLUMNS = {"log": "", "budget, kB/s": "", "sent, kB/s a robot": ".2f", "places":
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--logs", nargs="+", choices=common.SPLITS, default=list(common.SPLITS))
+    parser.add_argument("--budgets", nargs="+", type=float, default=BUDGETS_KBPS, help="of a robot, kB/s; inf: none")
     chosen = parser.parse_args()
     folder = common.recordings(*common.slam_benchmark_files())
     report = common.Report(__file__, __doc__, chosen)
     rows = []
     for name in chosen.logs:
         robots = drive(common.log_path(folder, name), common.SPLITS[name])
-        for budget in BUDGETS_KBPS:
+        for budget in chosen.budgets:
             rows.append((name, *row(robots, budget, common.relations_path(folder, name))))
             print(*rows[-1], flush=True)
     report.table("Budgets", COLUMNS, rows)
@@ -64,9 +65,9 @@ def drive(log: Path, parts: int) -> dict[str, tuple[RobotFrontend, list[Packet]]
     return robots
 
 
-def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: float | None, relations: Path) -> tuple:
+def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: float, relations: Path) -> tuple:
     config = MissionConfig()
-    budgets = {robot: Budget(1e3 * (budget_kbps or np.inf)) for robot in robots}
+    budgets = {robot: Budget(1e3 * budget_kbps) for robot in robots}
     streams = [numbered(budgets[robot].fit(packets)) for robot, (_, packets) in robots.items()]
     fleet = Fleet(config.fleet, config.seed)
     for packet in heapq.merge(*streams, key=lambda packet: packet.order):
@@ -81,7 +82,7 @@ def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: floa
     places = [packet.body for stream in streams for packet in stream if isinstance(packet.body, Place)]
     closures = [c for c in result.closures if c.i.robot != c.j.robot and c.status is ClosureStatus.ACCEPTED]
     return (
-        "all" if budget_kbps is None else f"{budget_kbps:g}", sent / seconds / 1e3, len(places),
+        f"{budget_kbps:g}", sent / seconds / 1e3, len(places),
         sum(budget.left_out for budget in budgets.values()), mean(len(place.descriptors) for place in places),
         len(closures), len({robot.map_index for robot in result.robots}), f"{errors.used} of {errors.total}",
         errors.translation.mean, errors.translation.maximum, errors.rotation.mean,

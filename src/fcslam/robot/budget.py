@@ -48,10 +48,11 @@ class Budget:
     def _thinned(self, packet: Packet, place: Place) -> Packet | None:
         seconds = packet.time - (packet.time if self._began is None else self._began)
         room = self._bytes_per_s * (seconds + BURST_S) - self._spent - ENVELOPE_BYTES
-        count = int(room // (CODE_BYTES + BYTES_PER_AXIS * KEYPOINT_AXES[place.channel]))
-        if count >= len(place.descriptors):
+        fitting = room / (CODE_BYTES + BYTES_PER_AXIS * KEYPOINT_AXES[place.channel])
+        if fitting >= len(place.descriptors):
             return packet
-        if count < FEWEST_DESCRIPTORS:
+        if fitting < FEWEST_DESCRIPTORS:
             return None
+        count = int(fitting)
         few = replace(place, keypoints=place.keypoints[:count], descriptors=place.descriptors[:count])
         return replace(packet, body=few)
