@@ -29,7 +29,7 @@ HOSTILE = {
     "motion of an unknown robot": (motion("x", 0, 1, STEP), "does not lead to a new keyscan"),
     "closure of an unknown robot": (motion("x", 0, 1, STEP, ConstraintKind.CLOSURE), "names keyscan 0"),
     "place of an unknown robot": (place("x", 0), "names keyscan 0"),
-    "second hello": (Hello("a", 0, LASER, {}), "said hello before"),
+    "another laser": (Hello("a", 0, replace(LASER, max_range_m=9.0), {}), "hello again with another laser"),
     "too many beams": (keyscan("a", NUMBER, NOW, beams=9), "9 beams, 8 announced"),
     "too few beams": (keyscan("a", NUMBER, NOW, beams=1), "1 beams, 8 announced"),
     "a keyscan left out": (keyscan("a", NUMBER + 1, NOW), f"keyscan {NUMBER + 1} where {NUMBER} is next"),
@@ -87,10 +87,11 @@ def test_what_comes_early_and_does_not_fit_does_no_harm_either(scripted, referen
     assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
 
 
-def test_a_robot_that_starts_again_under_its_old_name_is_refused(scripted, reference):
+@pytest.mark.parametrize("name", ["a+1", "a+0", "x+2+3"])
+def test_a_robot_that_is_called_like_a_session_is_refused(scripted, reference, name):
     fleet = feed(scripted(SCRIPT), PACKETS[:HALF])
-    again = Packet("a", 1, 0, NOW, Hello("a", 1, LASER, {}))
-    assert "epoch 1" in (InMemoryTransport(fleet.receive).send(encode(again)).refusal or "")
+    again = Packet(name, 0, 0, NOW, Hello(name, 0, LASER, {}))
+    assert "without '+" in (InMemoryTransport(fleet.receive).send(encode(again)).refusal or "")
     assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
 
 

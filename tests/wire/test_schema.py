@@ -32,6 +32,8 @@ LONGEST = {
     "Packet.robot": 64,
     "Detector.version": 64,
     "Place.detector_version": 64,
+    "Release.version": 64,
+    "Release.sha256": 32,
     "Keyscan.ranges": 2 * 4096,
     "Place.keypoints": 6 * 2048,
     "Place.descriptors": 32 * 2048,
@@ -154,5 +156,6 @@ def test_the_document_names_every_field_and_limit():
         limits.MAXIMUM_PACKET_BYTES,
         limits.MAXIMUM_BEAMS,
         limits.MAXIMUM_KEYPOINTS,
+        limits.MAXIMUM_NETWORK_BYTES,
     ):
         assert str(number) in plain

@@ -4,7 +4,9 @@ A plain object without a network. Robots stay in maps of their own until the evi
 arrives later may still revoke it. ``finalize`` depends on the set of packets only, not on their arrival.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +17,7 @@ from fcslam.cloud.ledger import ClosureLedger, Entry
 from fcslam.cloud.result import FleetResult, Fusion, conclude
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.robots import RobotStore
+from fcslam.cloud.sessions import in_session, session_name
 from fcslam.cloud.strategy import FusionStrategy
 from fcslam.cloud.submaps import SubmapShelf
 from fcslam.cloud.verdict import reconsider
@@ -30,6 +33,7 @@ from fcslam.records import (
     Constraint,
     ConstraintKind,
     Correction,
+    DetectorFile,
     FloatArray,
     Keyscan,
     KeyscanId,
@@ -37,7 +41,7 @@ from fcslam.records import (
     Veto,
     frozen,
 )
-from fcslam.wire.messages import Acknowledgement, Hello, Packet
+from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
 from fcslam.wire.packets import decode, encode
 
 
@@ -59,6 +63,16 @@ class FleetConfig(Settings):
     submaps_kept: int = Field(default=300, gt=1, description="submaps held ready for comparison; others are rebuilt")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place matching")
     consistency: ConsistencySettings = Field(default=ConsistencySettings(), description="pairwise consistency")
+
+
+class VocabularyState(NamedTuple):
+    """How far one kind of words has grown."""
+
+    channel: Channel
+    detector_version: str
+    words: int
+    places: int
+    """Those that can be found again."""
 
 
 _Words = tuple[Channel, str]
@@ -89,6 +103,8 @@ class Fleet:
         """Whether evidence has turned against a join."""
         self._patience = 0
         """Closures up to which doubts wait: the same doubts soon again would be dispelled again."""
+        self._releases: dict[Channel, DetectorFile] = {}
+        """The newest detectors."""
         self._version = 0
         self._disturbed = False
         """Whether something but a packet left its mark on the graph."""
@@ -100,8 +116,13 @@ class Fleet:
             PacketError: it is no valid packet, or does not fit what its robot sent before.
         """
         packet = decode(data)
-        self._admit(packet)
+        ours = in_session(packet)
+        self._admit(ours, self._store.admit(ours))
         return self._replies(packet)
+
+    def skip(self, robot: str, epoch: int, sequence: int) -> None:
+        """The packet with this number was refused for good: its robot's next ones take effect without it."""
+        self._admit(None, self._store.skip(session_name(robot, epoch), sequence))
 
     def finalize(self) -> FleetResult:
         """The result of all packets so far, in their canonical order.
@@ -113,9 +134,18 @@ class Fleet:
         replay = Fleet(self._config, self._seed)
         for veto in self._vetoes:
             replay.veto(veto)
+        for robot, sequence in sorted(self._store.skipped):
+            replay._admit(None, replay._store.skip(robot, sequence))
         for packet in self._store.canonical():
-            replay._admit(packet)
+            replay._admit(packet, replay._store.admit(packet))
         return replay._conclude()
+
+    def estimate(self) -> FleetResult:
+        """What is believed now, with nothing decided anew: quick, and live maps are made of it."""
+        poses: dict[str, FloatArray] = {robot: frozen(self._graph.trajectory(robot)) for robot in self._store.robots}
+        own: dict[str, FloatArray] = {robot: frozen(self._graph.chain(robot)) for robot in self._store.robots}
+        fusion = Fusion(self._maps, poses, own, tuple(entry.closure for entry in self._ledger))
+        return conclude(self._store, self._graph, self._ledger, fusion, self._version)
 
     def _conclude(self) -> FleetResult:
         self._disturbed = True
@@ -133,6 +163,21 @@ class Fleet:
             self._disturbed = True
             self._reconsider()
 
+    def corrections(self) -> tuple[Correction, ...]:
+        """Where every session's odometry lies in its map, as believed now."""
+        return tuple(self._correction(session) for session in self._store.robots)
+
+    def vocabularies(self) -> tuple[VocabularyState, ...]:
+        """What is known of every kind of words."""
+        return tuple(
+            VocabularyState(channel, version, matcher.word_count, len(matcher))
+            for (channel, version), matcher in self._matchers.items()
+        )
+
+    def announce(self, file: DetectorFile) -> None:
+        """From now on robots that describe this channel are told of this detector, until they have taken it."""
+        self._releases[file.channel] = file
+
     def closure_counts(self) -> dict[str, int]:
         """Closures so far by kind, for progress displays."""
         counts = {"within robots": 0, "between robots": 0}
@@ -141,14 +186,14 @@ class Fleet:
                 counts["between robots" if entry.is_between else "within robots"] += 1
         return counts
 
-    def _admit(self, packet: Packet) -> None:
-        """Take a packet and those that waited for it.
+    def _admit(self, packet: Packet | None, arriving: Iterator[Packet]) -> None:
+        """Take a packet that has come, if it is one, and those that waited for it.
 
         Raises:
             PacketError: ``packet`` is refused. One that came early and proves wrong only now is forgotten: it is not
                 its sender's fault that shows in this call, and sent again it is refused for itself.
         """
-        for ready in self._store.admit(packet):
+        for ready in arriving:
             try:
                 self._take(ready)
             except Exception as error:
@@ -180,7 +225,7 @@ class Fleet:
             case Place() as place:
                 self._store.add_place(place)
                 self._add_place(place)  # place recognition and map fusion
-            case Correction() | Acknowledgement():
+            case Correction() | Acknowledgement() | Release():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
 
     def _add_place(self, place: Place) -> None:
@@ -189,7 +234,7 @@ class Fleet:
             words = place.channel, place.detector_version
             matcher = self._matcher(words)
             matches = matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
-            entries = [self._ledger.add(match) for match in matches]
+            entries = [self._ledger.add(match) for match in matches if not self._ledger.confirms(match)]
             waiting = [entry for entry in entries if not self._is_vetoed(entry) and self._accept_or_wait(entry)]
             for other in dict.fromkeys(entry.closure.i.robot for entry in waiting):
                 self._judge_pair(other, place.id.robot)
@@ -323,11 +368,22 @@ class Fleet:
         return fusion
 
     def _replies(self, packet: Packet) -> list[bytes]:
-        """Acknowledgement and, after a place, where the robot's odometry lies in the map."""
-        robot, epoch = packet.robot, packet.epoch
-        bodies: list[Acknowledgement | Correction] = [Acknowledgement(robot, epoch, packet.sequence)]
-        if isinstance(packet.body, Place) and self._graph.keyscan_count(robot):
-            index = next(k for k, robots in enumerate(self._maps) if robot in robots)
-            bodies.append(Correction(robot, self._version, index, frozen(self._graph.T_map_odom(robot))))
-        first = self._store.number_replies(robot, len(bodies))
+        """Acknowledgement; after a place, where the robot's odometry lies in the map; newer detectors."""
+        robot, epoch, session = packet.robot, packet.epoch, session_name(packet.robot, packet.epoch)
+        bodies: list[Acknowledgement | Correction | Release] = [Acknowledgement(robot, epoch, packet.sequence)]
+        if isinstance(packet.body, Place) and self._graph.keyscan_count(session):
+            bodies.append(replace(self._correction(session), robot=robot))
+        if isinstance(packet.body, Hello | Place):
+            bodies += [Release(robot, file) for file in self._newer_detectors(session)]
+        first = self._store.number_replies(session, len(bodies))
         return [encode(Packet(robot, epoch, first + k, packet.time, body)) for k, body in enumerate(bodies)]
+
+    def _correction(self, session: str) -> Correction:
+        index = next(k for k, robots in enumerate(self._maps) if session in robots)
+        return Correction(session, self._version, index, frozen(self._graph.T_map_odom(session)))
+
+    def _newer_detectors(self, session: str) -> list[DetectorFile]:
+        """Of the channels that the robot has."""
+        versions = self._store.detector_versions(session)
+        newest = self._releases.items()
+        return [file for channel, file in newest if versions.get(channel, file.version) != file.version]
