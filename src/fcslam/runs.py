@@ -36,7 +36,7 @@ METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
 _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
 _CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", "reason"]
-_SAFE_NAME = re.compile(r"\w[\w.-]*")
+_SAFE_NAME = re.compile(r"\w[\w.+-]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ def check_names(names: Iterable[str]) -> None:
     """
     for name in names:
         if not _SAFE_NAME.fullmatch(name):
-            raise OutputError(f"{name!r} cannot be a file name; use letters, digits, '_', '-' and '.'")
+            raise OutputError(f"{name!r} cannot be a file name; use letters, digits, '_', '-', '+' and '.'")
 
 
 def is_run_folder(path: Path) -> bool:

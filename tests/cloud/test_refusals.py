@@ -87,10 +87,11 @@ def test_what_comes_early_and_does_not_fit_does_no_harm_either(scripted, referen
     assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
 
 
-def test_a_robot_that_starts_again_under_its_old_name_is_refused(scripted, reference):
+@pytest.mark.parametrize("name", ["a+1", "a+0", "x+2+3"])
+def test_a_robot_that_is_called_like_a_session_is_refused(scripted, reference, name):
     fleet = feed(scripted(SCRIPT), PACKETS[:HALF])
-    again = Packet("a", 1, 0, NOW, Hello("a", 1, LASER, {}))
-    assert "epoch 1" in (InMemoryTransport(fleet.receive).send(encode(again)).refusal or "")
+    again = Packet(name, 0, 0, NOW, Hello(name, 0, LASER, {}))
+    assert "without '+" in (InMemoryTransport(fleet.receive).send(encode(again)).refusal or "")
     assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
 
 

@@ -52,7 +52,7 @@ LIDAR_PLACE = Place(
     "orb-1",
     2,
     12,
-    frozen([[0.0, 0.0], [1.25, -3.5], [-327.67, 327.67]], np.float32),
+    frozen([[-327.67, 327.67], [0.0, 0.0], [1.25, -3.5]], np.float32),
     frozen(np.arange(96).reshape(3, 32), np.uint8),
 )
 CAMERA_PLACE = Place(

@@ -17,7 +17,8 @@ from fcslam.records import (
 )
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
-from fcslam.wire.quantisation import dequantise
+from fcslam.wire.quantisation import dequantise, quantise_keypoints
+from fcslam.wire.streams import ascending
 
 NAMES = st.text("AZaz09._+-", min_size=0, max_size=63).map(lambda rest: "a" + rest)
 SEQUENCES = st.integers(0, 2**63 - 1)
@@ -64,18 +65,20 @@ def descriptors(count):
 
 @st.composite
 def places(draw, robot):
+    """With keypoints in the order in which they travel."""
     count = draw(st.integers(0, 20))
     first = draw(NUMBERS)
     last = draw(st.integers(first, 2**31 - 1))
     channel = draw(st.sampled_from(Channel))
     shape = (count, KEYPOINT_AXES[channel])
+    keypoints = draw(hnp.arrays(np.float32, shape, elements=st.floats(-327.0, 327.0, width=32)))
     return Place(
         KeyscanId(robot, draw(st.integers(first, last))),
         channel,
         draw(NAMES),
         first,
         last,
-        draw(hnp.arrays(np.float32, shape, elements=st.floats(-327.0, 327.0, width=32))),
+        keypoints[ascending(quantise_keypoints(keypoints))],
         draw(descriptors(count)),
     )
 

@@ -21,7 +21,7 @@ from fcslam.errors import PacketError
 from fcslam.records import Channel, KeyscanId
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.packets import decode, encode
-from fcslam.wire.quantisation import pack_ranges
+from fcslam.wire.streams import pack_ranges
 
 NAN, INF = float("nan"), float("inf")
 
@@ -210,10 +210,12 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
         ("keyscan", {"number": 2**31}, "number"),
         ("keyscan", {"stamp": -INF}, "stamp"),
         ("keyscan", {"stamp": 1e9}, "later"),
-        ("keyscan", {"ranges": b""}, "cut off"),
-        ("keyscan", {"ranges": bytes(12289)}, "12289 bytes of ranges"),
-        ("keyscan", {"ranges": pack_ranges(np.zeros(4097, np.uint16))}, "no differences"),
-        ("keyscan", {"ranges": pack_ranges(np.zeros(0, np.uint16))}, "0 ranges"),
+        ("keyscan", {"ranges": bytes(29)}, "29 bytes, at most 28"),
+        ("keyscan", {"ranges": b"\x01\x02\x03\x00"}, "cut off or goes on"),
+        ("keyscan", {"count": 4097, "ranges": bytes(2 * 4097)}, "4097, at most 4096"),
+        ("keyscan", {"count": 2**32 - 1}, "at most 4096"),
+        ("keyscan", {"count": 0, "ranges": b""}, "0 ranges"),
+        ("keyscan", {"ranges": pack_ranges(np.full(14, 5, np.uint16)) + b"x"}, "goes on"),
         ("closure", {"i": 12}, "not below"),
         ("closure", {"kind": 0}, "kind 0 is unknown"),
         ("closure", {"kind": 9}, "kind 9 is unknown"),
@@ -230,10 +232,14 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
         ("lidar_place", {"channel": 3}, "channel 3 is unknown"),
         ("lidar_place", {"detector_version": "a b"}, "detector version"),
         ("lidar_place", {"first": 13}, "after last"),
-        ("lidar_place", {"descriptors": bytes(97)}, "97 bytes of descriptors"),
-        ("lidar_place", {"descriptors": bytes(64)}, "12 bytes of keypoints for 2 descriptors"),
-        ("lidar_place", {"descriptors": bytes(32 * 2049), "keypoints": bytes(4 * 2049)}, "2049 descriptors"),
-        ("lidar_place", {"keypoints": b"\x00\x80" * 6}, "not within"),
+        ("lidar_place", {"descriptors": bytes(97)}, "descriptors: 97 bytes, at most 96"),
+        ("lidar_place", {"descriptors": bytes(64)}, "descriptors: the stream is cut off"),
+        ("lidar_place", {"keypoints": bytes(13)}, "keypoints: 13 bytes, at most 12"),
+        ("lidar_place", {"count": 2}, "at most 8"),
+        ("lidar_place", {"count": 2049}, "keypoints: 2049, at most 2048"),
+        ("lidar_place", {"count": 2**32 - 1}, "at most 2048"),
+        ("lidar_place", {"keypoints": b"\x00\x80" * 6}, "no 16-bit number"),
+        ("lidar_place", {"keypoints": b"\x01\x00" * 4 + bytes(4)}, "ascending order"),
         ("correction", {"t_map_odom": pb.Pose(y_m=2e6)}, "not within"),
         ("correction", {"t_map_odom": None}, "t_map_odom is missing"),
         ("acknowledgement", {"robot": "a" * 65}, "no name"),

@@ -4,7 +4,9 @@ A plain object without a network. Robots stay in maps of their own until the evi
 arrives later may still revoke it. ``finalize`` depends on the set of packets only, not on their arrival.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +17,7 @@ from fcslam.cloud.ledger import ClosureLedger, Entry
 from fcslam.cloud.result import FleetResult, Fusion, conclude
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.robots import RobotStore
+from fcslam.cloud.sessions import in_session, session_name
 from fcslam.cloud.strategy import FusionStrategy
 from fcslam.cloud.submaps import SubmapShelf
 from fcslam.cloud.verdict import reconsider
@@ -62,6 +65,16 @@ class FleetConfig(Settings):
     consistency: ConsistencySettings = Field(default=ConsistencySettings(), description="pairwise consistency")
 
 
+class VocabularyState(NamedTuple):
+    """How far one kind of words has grown."""
+
+    channel: Channel
+    detector_version: str
+    words: int
+    places: int
+    """Those that can be found again."""
+
+
 _Words = tuple[Channel, str]
 """Channel and detector version of places that can be compared."""
 
@@ -103,8 +116,13 @@ class Fleet:
             PacketError: it is no valid packet, or does not fit what its robot sent before.
         """
         packet = decode(data)
-        self._admit(packet)
+        ours = in_session(packet)
+        self._admit(ours, self._store.admit(ours))
         return self._replies(packet)
+
+    def skip(self, robot: str, epoch: int, sequence: int) -> None:
+        """The packet with this number was refused for good: its robot's next ones take effect without it."""
+        self._admit(None, self._store.skip(session_name(robot, epoch), sequence))
 
     def finalize(self) -> FleetResult:
         """The result of all packets so far, in their canonical order.
@@ -116,9 +134,18 @@ class Fleet:
         replay = Fleet(self._config, self._seed)
         for veto in self._vetoes:
             replay.veto(veto)
+        for robot, sequence in sorted(self._store.skipped):
+            replay._admit(None, replay._store.skip(robot, sequence))
         for packet in self._store.canonical():
-            replay._admit(packet)
+            replay._admit(packet, replay._store.admit(packet))
         return replay._conclude()
+
+    def estimate(self) -> FleetResult:
+        """What is believed now, with nothing decided anew: quick, and live maps are made of it."""
+        poses: dict[str, FloatArray] = {robot: frozen(self._graph.trajectory(robot)) for robot in self._store.robots}
+        own: dict[str, FloatArray] = {robot: frozen(self._graph.chain(robot)) for robot in self._store.robots}
+        fusion = Fusion(self._maps, poses, own, tuple(entry.closure for entry in self._ledger))
+        return conclude(self._store, self._graph, self._ledger, fusion, self._version)
 
     def _conclude(self) -> FleetResult:
         self._disturbed = True
@@ -136,6 +163,17 @@ class Fleet:
             self._disturbed = True
             self._reconsider()
 
+    def corrections(self) -> tuple[Correction, ...]:
+        """Where every session's odometry lies in its map, as believed now."""
+        return tuple(self._correction(session) for session in self._store.robots)
+
+    def vocabularies(self) -> tuple[VocabularyState, ...]:
+        """What is known of every kind of words."""
+        return tuple(
+            VocabularyState(channel, version, matcher.word_count, len(matcher))
+            for (channel, version), matcher in self._matchers.items()
+        )
+
     def announce(self, file: DetectorFile) -> None:
         """From now on robots that describe this channel are told of this detector, until they have taken it."""
         self._releases[file.channel] = file
@@ -148,14 +186,14 @@ class Fleet:
                 counts["between robots" if entry.is_between else "within robots"] += 1
         return counts
 
-    def _admit(self, packet: Packet) -> None:
-        """Take a packet and those that waited for it.
+    def _admit(self, packet: Packet | None, arriving: Iterator[Packet]) -> None:
+        """Take a packet that has come, if it is one, and those that waited for it.
 
         Raises:
             PacketError: ``packet`` is refused. One that came early and proves wrong only now is forgotten: it is not
                 its sender's fault that shows in this call, and sent again it is refused for itself.
         """
-        for ready in self._store.admit(packet):
+        for ready in arriving:
             try:
                 self._take(ready)
             except Exception as error:
@@ -331,20 +369,21 @@ class Fleet:
 
     def _replies(self, packet: Packet) -> list[bytes]:
         """Acknowledgement; after a place, where the robot's odometry lies in the map; newer detectors."""
-        robot, epoch = packet.robot, packet.epoch
+        robot, epoch, session = packet.robot, packet.epoch, session_name(packet.robot, packet.epoch)
         bodies: list[Acknowledgement | Correction | Release] = [Acknowledgement(robot, epoch, packet.sequence)]
-        if isinstance(packet.body, Place) and self._graph.keyscan_count(robot):
-            index = next(k for k, robots in enumerate(self._maps) if robot in robots)
-            bodies.append(Correction(robot, self._version, index, frozen(self._graph.T_map_odom(robot))))
+        if isinstance(packet.body, Place) and self._graph.keyscan_count(session):
+            bodies.append(replace(self._correction(session), robot=robot))
         if isinstance(packet.body, Hello | Place):
-            bodies += self._newer_detectors(robot)
-        first = self._store.number_replies(robot, len(bodies))
+            bodies += [Release(robot, file) for file in self._newer_detectors(session)]
+        first = self._store.number_replies(session, len(bodies))
         return [encode(Packet(robot, epoch, first + k, packet.time, body)) for k, body in enumerate(bodies)]
 
-    def _newer_detectors(self, robot: str) -> list[Release]:
+    def _correction(self, session: str) -> Correction:
+        index = next(k for k, robots in enumerate(self._maps) if session in robots)
+        return Correction(session, self._version, index, frozen(self._graph.T_map_odom(session)))
+
+    def _newer_detectors(self, session: str) -> list[DetectorFile]:
         """Of the channels that the robot has."""
-        versions = self._store.detector_versions(robot)
-        newer = [
-            file for channel, file in self._releases.items() if versions.get(channel, file.version) != file.version
-        ]
-        return [Release(robot, file) for file in newer]
+        versions = self._store.detector_versions(session)
+        newest = self._releases.items()
+        return [file for channel, file in newest if versions.get(channel, file.version) != file.version]

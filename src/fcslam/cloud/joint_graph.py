@@ -49,9 +49,10 @@ class JointGraph:
         steps = np.array(self._step_covariance[robot]).reshape(-1, 3, 3)
         return trajectory(self.trajectory(robot), settings, steps)
 
-    def chain(self, robot: str, first: int, last: int) -> FloatArray:
+    def chain(self, robot: str, first: int = 0, last: int | None = None) -> FloatArray:
         """T_odom_base of keyscans first to last (inclusive): the robot's motions alone, before any correction."""
-        return np.array(self._chains[robot][first : last + 1])
+        end = None if last is None else last + 1
+        return np.array(self._chains[robot][first:end])
 
     def T_map_odom(self, robot: str, T_map_newest: FloatArray | None = None) -> FloatArray:
         """Where the robot's odometry (the chain of its motions) starts in the map, by its newest keyscan.

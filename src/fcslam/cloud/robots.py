@@ -1,4 +1,4 @@
-"""What the cloud keeps of each robot: its packets in order, its laser, its keyscans."""
+"""What the cloud keeps of each robot's session: its packets in order, its laser, its keyscans."""
 
 from collections.abc import Iterator, Mapping
 
@@ -15,6 +15,8 @@ class RobotStore:
 
     def __init__(self) -> None:
         self._journal: dict[tuple[str, int], Packet] = {}
+        self._skipped: set[tuple[str, int]] = set()
+        """Robot and number of packets that will never come."""
         self._expected: dict[str, int] = {}
         self._hellos: dict[str, Hello] = {}
         self._keyscans: dict[str, list[Keyscan]] = {}
@@ -41,18 +43,32 @@ class RobotStore:
 
         A packet counts as taken when the next one is asked for.
 
-        Raises:
-            PacketError: the robot speaks in another epoch than it began.
         """
         robot = packet.robot
-        if packet.epoch != 0:
-            raise PacketError(f"{robot}: epoch {packet.epoch}; a robot that starts again needs a name of its own")
-        if (robot, packet.sequence) in self._journal:
+        if (robot, packet.sequence) in self._journal or (robot, packet.sequence) in self._skipped:
             return
         self._journal[robot, packet.sequence] = packet
-        while (ready := self._journal.get((robot, self._expected.get(robot, 0)))) is not None:
-            yield ready
-            self._expected[robot] = ready.sequence + 1
+        yield from self._ready(robot)
+
+    def skip(self, robot: str, sequence: int) -> Iterator[Packet]:
+        """As ``admit``, for a packet that was refused for good: those after it need not wait for its number."""
+        self._skipped.add((robot, sequence))
+        yield from self._ready(robot)
+
+    def _ready(self, robot: str) -> Iterator[Packet]:
+        while True:
+            sequence = self._expected.get(robot, 0)
+            if (robot, sequence) not in self._skipped:
+                ready = self._journal.get((robot, sequence))
+                if ready is None:
+                    return
+                yield ready
+            self._expected[robot] = sequence + 1
+
+    @property
+    def skipped(self) -> frozenset[tuple[str, int]]:
+        """Robot and number of every packet that will never come."""
+        return frozenset(self._skipped)
 
     def withdraw(self, packet: Packet) -> None:
         """Forget a packet that turned out to be refused: the next one with its number takes its place."""

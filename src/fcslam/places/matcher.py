@@ -77,6 +77,11 @@ class PlaceMatcher:
     def __len__(self) -> int:
         return len(self._places)
 
+    @property
+    def word_count(self) -> int:
+        """Words of the vocabulary; 0 before it is needed."""
+        return self._index.word_count
+
     def __contains__(self, place: KeyscanId) -> bool:
         return place in self._places
 

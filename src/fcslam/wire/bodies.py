@@ -9,7 +9,6 @@ from google.protobuf.message import Message
 
 from fcslam.errors import PacketError
 from fcslam.records import (
-    CODE_BYTES,
     Channel,
     Constraint,
     ConstraintKind,
@@ -23,15 +22,22 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.limits import BYTES_PER_AXIS, KEYPOINT_AXES, MAXIMUM_KEYPOINTS
+from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS
 from fcslam.wire.messages import Acknowledgement, Hello, Kind, Release
 from fcslam.wire.quantisation import (
     dequantise,
+    dequantise_keypoints,
     pack_information,
+    quantise,
+    quantise_keypoints,
+    unpack_information,
+)
+from fcslam.wire.streams import (
+    ascending,
+    pack_descriptors,
     pack_keypoints,
     pack_ranges,
-    quantise,
-    unpack_information,
+    unpack_descriptors,
     unpack_keypoints,
     unpack_ranges,
 )
@@ -74,11 +80,13 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
 
 
 def _write_keyscan(keyscan: Keyscan) -> pb.Keyscan:
-    return pb.Keyscan(number=keyscan.id.number, stamp=keyscan.stamp, ranges=pack_ranges(quantise(keyscan.ranges_m)))
+    codes = quantise(keyscan.ranges_m)
+    return pb.Keyscan(number=keyscan.id.number, stamp=keyscan.stamp, count=len(codes), ranges=pack_ranges(codes))
 
 
 def _read_keyscan(message: pb.Keyscan, envelope: pb.Packet) -> Keyscan:
-    ranges = dequantise(unpack_ranges(message.ranges))
+    _check_at_most(message.count, MAXIMUM_BEAMS, "keyscan: ranges")
+    ranges = dequantise(unpack_ranges(message.ranges, message.count))
     return Keyscan(KeyscanId(envelope.robot, message.number), message.stamp, ranges)
 
 
@@ -103,36 +111,40 @@ def _read_constraint(message: pb.Constraint, envelope: pb.Packet) -> Constraint:
 
 
 def _write_place(place: Place) -> pb.Place:
+    """Keypoints travel in ascending order, and their descriptors with them."""
+    codes = quantise_keypoints(place.keypoints)
+    order = ascending(codes)
     return pb.Place(
         number=place.id.number,
         channel=_CHANNELS[place.channel],
         detector_version=place.detector_version,
         first=place.first,
         last=place.last,
-        keypoints=pack_keypoints(place.keypoints),
-        descriptors=place.descriptors.tobytes(),
+        count=len(codes),
+        keypoints=pack_keypoints(codes[order]),
+        descriptors=pack_descriptors(place.descriptors[order], codes[order], place.channel),
     )
 
 
 def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
-    count, rest = divmod(len(message.descriptors), CODE_BYTES)
-    if rest:
-        raise PacketError(f"place: {len(message.descriptors)} bytes of descriptors, not {CODE_BYTES} for each")
-    if count > MAXIMUM_KEYPOINTS:
-        raise PacketError(f"place: {count} descriptors, at most {MAXIMUM_KEYPOINTS}")
+    _check_at_most(message.count, MAXIMUM_KEYPOINTS, "place: keypoints")
     channel = read_channel(message.channel)
-    axes = KEYPOINT_AXES[channel]
-    if len(message.keypoints) != BYTES_PER_AXIS * axes * count:
-        raise PacketError(f"place: {len(message.keypoints)} bytes of keypoints for {count} descriptors")
+    codes = unpack_keypoints(message.keypoints, message.count, KEYPOINT_AXES[channel])
     return Place(
         KeyscanId(envelope.robot, message.number),
         channel,
         message.detector_version,
         message.first,
         message.last,
-        unpack_keypoints(message.keypoints, axes),
-        np.frombuffer(message.descriptors, dtype=np.uint8).reshape(count, CODE_BYTES),
+        dequantise_keypoints(codes),
+        frozen(unpack_descriptors(message.descriptors, codes, channel), np.uint8),
     )
+
+
+def _check_at_most(count: int, most: int, what: str) -> None:
+    """Before memory is taken for them."""
+    if count > most:
+        raise PacketError(f"{what}: {count}, at most {most}")
 
 
 def _write_correction(correction: Correction) -> pb.Correction:

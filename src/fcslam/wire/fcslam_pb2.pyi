@@ -88,14 +88,16 @@ class Detector(_message.Message):
     def __init__(self, channel: _Optional[_Union[Channel, str]] = ..., version: _Optional[str] = ...) -> None: ...
 
 class Keyscan(_message.Message):
-    __slots__ = ("number", "stamp", "ranges")
+    __slots__ = ("number", "stamp", "count", "ranges")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     STAMP_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
     RANGES_FIELD_NUMBER: _ClassVar[int]
     number: int
     stamp: float
+    count: int
     ranges: bytes
-    def __init__(self, number: _Optional[int] = ..., stamp: _Optional[float] = ..., ranges: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, number: _Optional[int] = ..., stamp: _Optional[float] = ..., count: _Optional[int] = ..., ranges: _Optional[bytes] = ...) -> None: ...
 
 class Constraint(_message.Message):
     __slots__ = ("i", "j", "kind", "t_i_j", "information")
@@ -112,12 +114,13 @@ class Constraint(_message.Message):
     def __init__(self, i: _Optional[int] = ..., j: _Optional[int] = ..., kind: _Optional[_Union[ConstraintKind, str]] = ..., t_i_j: _Optional[_Union[Pose, _Mapping]] = ..., information: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Place(_message.Message):
-    __slots__ = ("number", "channel", "detector_version", "first", "last", "keypoints", "descriptors")
+    __slots__ = ("number", "channel", "detector_version", "first", "last", "count", "keypoints", "descriptors")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     CHANNEL_FIELD_NUMBER: _ClassVar[int]
     DETECTOR_VERSION_FIELD_NUMBER: _ClassVar[int]
     FIRST_FIELD_NUMBER: _ClassVar[int]
     LAST_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
     KEYPOINTS_FIELD_NUMBER: _ClassVar[int]
     DESCRIPTORS_FIELD_NUMBER: _ClassVar[int]
     number: int
@@ -125,9 +128,10 @@ class Place(_message.Message):
     detector_version: str
     first: int
     last: int
+    count: int
     keypoints: bytes
     descriptors: bytes
-    def __init__(self, number: _Optional[int] = ..., channel: _Optional[_Union[Channel, str]] = ..., detector_version: _Optional[str] = ..., first: _Optional[int] = ..., last: _Optional[int] = ..., keypoints: _Optional[bytes] = ..., descriptors: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, number: _Optional[int] = ..., channel: _Optional[_Union[Channel, str]] = ..., detector_version: _Optional[str] = ..., first: _Optional[int] = ..., last: _Optional[int] = ..., count: _Optional[int] = ..., keypoints: _Optional[bytes] = ..., descriptors: _Optional[bytes] = ...) -> None: ...
 
 class Correction(_message.Message):
     __slots__ = ("version", "map_index", "t_map_odom")

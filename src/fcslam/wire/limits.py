@@ -13,10 +13,7 @@ MAXIMUM_NUMBER = 2**31 - 1
 """Numbers of keyscans, versions and maps."""
 
 MAXIMUM_BEAMS = 4096
-BYTES_PER_RANGE = 3
-"""The longest varint of a difference between two 16-bit ranges."""
-MAXIMUM_RANGES_BYTES = BYTES_PER_RANGE * MAXIMUM_BEAMS
-"""Length of a keyscan's ranges, both before and after inflating."""
+BYTES_PER_RANGE = 2
 
 MAXIMUM_KEYPOINTS = 2048
 KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
@@ -35,3 +32,7 @@ MINIMUM_INFORMATION = 2.0**-20
 """A standard deviation of 1 km or 1000 rad. Both bounds hold for the diagonal."""
 MINIMUM_CORRELATION_EIGENVALUE = 1e-6
 """Well above the rounding of float32: what is positive definite here stays so."""
+
+MAXIMUM_BATCH_BYTES = 1024 * 1024
+MAXIMUM_BATCH_PACKETS = 1024
+"""Of packets that travel together, their lengths included in the bytes."""

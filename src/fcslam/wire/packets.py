@@ -9,7 +9,7 @@ from fcslam.records import Channel
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
-from fcslam.wire.limits import MAXIMUM_PACKET_BYTES, PROTOCOL_VERSION
+from fcslam.wire.limits import MAXIMUM_PACKET_BYTES, MAXIMUM_SEQUENCE, PROTOCOL_VERSION
 from fcslam.wire.messages import Kind, Packet
 
 
@@ -55,6 +55,17 @@ def decode(data: bytes) -> Packet:
     return packet
 
 
+def readdress(data: bytes, epoch: int, sequence: int) -> bytes:
+    """The same packet with another epoch and number on its envelope.
+
+    Raises:
+        PacketError: ``data`` is not a packet of a known version, with the reason.
+    """
+    message, _ = _parse(data)
+    message.epoch, message.sequence = epoch, sequence
+    return message.SerializeToString(deterministic=True)
+
+
 def read_label(data: bytes) -> Label:
     """Robot, kind and channel of a packet without the cost, and without the checks, of reading its body.
 
@@ -64,6 +75,18 @@ def read_label(data: bytes) -> Label:
     message, kind = _parse(data)
     check_name(message.robot, "robot")
     return Label(message.robot, kind, read_channel(message.place.channel) if kind is Kind.PLACE else None)
+
+
+def read_number(data: bytes) -> tuple[str, int, int] | None:
+    """Robot, epoch and sequence of what ``decode`` refuses: whose number is used up by it; None if nobody can tell."""
+    message = pb.Packet()
+    try:
+        message.ParseFromString(data)
+        check_name(message.robot, "robot")
+    except (DecodeError, PacketError):
+        return None
+    known = message.version == PROTOCOL_VERSION and max(message.epoch, message.sequence) <= MAXIMUM_SEQUENCE
+    return (message.robot, message.epoch, message.sequence) if known else None
 
 
 def _parse(data: bytes) -> tuple[pb.Packet, Kind]:

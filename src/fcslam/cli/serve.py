@@ -1,0 +1,125 @@
+"""`fcslam serve`: the cloud as a service for robots in their own processes."""
+
+import ipaddress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    import socket
+
+    from fcslam.cloud.service.state import ServiceState
+    from fcslam.cloud.settings import CloudConfig
+
+_TLS = "TLS"
+
+
+def serve(
+    *,
+    data: Annotated[Path, typer.Option("--data", help="Folder of the missions; made if it is not there.")],
+    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen at; 0: any that is free.")] = 8340,
+    tokens: Annotated[
+        Path | None, typer.Option(help="Who may ask for what; `fcslam certificates` makes such a file.")
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Listen beyond this machine though nobody is asked for a token.")
+    ] = False,
+    tls_certificate: Annotated[
+        Path | None, typer.Option(help="Certificate of this service (PEM).", rich_help_panel=_TLS)
+    ] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="Its private key (PEM).", rich_help_panel=_TLS)] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="Configuration of new missions; see `fcslam config dump`.")
+    ] = None,
+    docs: Annotated[bool, typer.Option("--docs", help="Show the interface at /docs.")] = False,
+) -> None:
+    """Take in what robots send, map it, and show the map; runs until it is stopped."""
+    import logging
+
+    import uvicorn
+
+    from fcslam.cloud.service.app import create_app
+    from fcslam.errors import ServiceError
+
+    if (tls_certificate is None) != (tls_key is None):
+        raise ServiceError("--tls-certificate and --tls-key belong together; give both or none")
+    if tokens is None and not insecure and not _is_loopback(host):
+        raise ServiceError(f"anybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
+    _check_tls(tls_certificate, tls_key)
+    listening = _listen(host, port)
+    state = _state(data, tokens, _cloud_config(config))
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    server = uvicorn.Server(
+        uvicorn.Config(
+            create_app(state, docs=docs),
+            ssl_certfile=tls_certificate,
+            ssl_keyfile=tls_key,
+            log_level="warning",
+            server_header=False,
+            timeout_graceful_shutdown=10,
+            h11_max_incomplete_event_size=64 * 1024,
+            limit_concurrency=512,
+        )
+    )
+    scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
+    mission = state.mission.folder.name
+    typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{address}:{number}; Ctrl-C stops it")
+    server.run(sockets=[listening])
+
+
+def _state(data: Path, tokens: Path | None, config: "CloudConfig") -> "ServiceState":
+    import time
+
+    from fcslam.cloud.missions import Missions
+    from fcslam.cloud.service.authentication import Authenticator, read_tokens
+    from fcslam.cloud.service.events import EventStream
+    from fcslam.cloud.service.limits import RateLimit
+    from fcslam.cloud.service.state import ServiceState
+
+    authenticator = Authenticator(None if tokens is None else read_tokens(tokens))
+    events = EventStream()
+    missions = Missions(data, config, time.monotonic, time.time, events.publish)
+    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events)
+
+
+def _cloud_config(path: Path | None) -> "CloudConfig":
+    from fcslam.cloud.settings import CloudConfig
+    from fcslam.config import load
+    from fcslam.mission import MissionConfig
+
+    settings = MissionConfig() if path is None else load(MissionConfig, path)
+    return CloudConfig(seed=settings.seed, fleet=settings.fleet, map=settings.map)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _check_tls(certificate: Path | None, key: Path | None) -> None:
+    import ssl
+
+    from fcslam.errors import ServiceError
+
+    if certificate is None or key is None:
+        return
+    try:
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        raise ServiceError(f"{certificate}, {key}: no certificate with its key ({error})") from error
+
+
+def _listen(host: str, port: int) -> "socket.socket":
+    import socket
+
+    from fcslam.errors import ServiceError
+
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        return socket.create_server(address[:2], family=family, backlog=512)
+    except OSError as error:
+        raise ServiceError(f"cannot listen at {host}:{port} ({error}); choose another --port or --host") from error

@@ -1,0 +1,60 @@
+"""Where a service keeps its missions.
+
+detectors/<channel>/<version>.onnx   networks that robots may fetch
+missions/<name>/mission.sqlite       what was received: all that must not be lost
+                live/                the run folder of what is believed now
+                runs/<number>/       the run folders that were asked for
+open                                 name of the open mission
+lock                                 held by the service that uses the folder
+"""
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from fcslam.runs import Run, write_run
+
+
+@dataclass(frozen=True, slots=True)
+class MissionFolder:
+    """One mission's files."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        """Of the mission."""
+        return self.path.name
+
+    @property
+    def store(self) -> Path:
+        """The file that holds what was received."""
+        return self.path / "mission.sqlite"
+
+    @property
+    def live(self) -> Path:
+        """The run folder of what is believed now: a link, so it is the old one or the new one, and always whole."""
+        return self.path / "live"
+
+    def run(self, name: str) -> Path:
+        """A run folder that was asked for."""
+        return self.path / "runs" / name
+
+    def publish(self, run: Run) -> None:
+        """Make ``run`` the live one; the one before stays for those who are still reading it.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        snapshots = self.path / "snapshots"
+        before = int(self.live.resolve().name) if self.live.exists() else 0
+        name = str(before + 1)
+        write_run(run, snapshots / name, force=True)
+        link = self.path / ".live.partial"
+        link.unlink(missing_ok=True)
+        link.symlink_to(Path("snapshots") / name, target_is_directory=True)
+        os.replace(link, self.live)
+        for old in snapshots.iterdir():
+            if old.name not in (str(before), name):
+                shutil.rmtree(old, ignore_errors=True)

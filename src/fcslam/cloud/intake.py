@@ -1,0 +1,141 @@
+"""Batches of packets from robots: checked, stored, acknowledged. No network here, and no waiting for the fleet."""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from fcslam.cloud.sessions import check_robot
+from fcslam.cloud.store import MissionStore, StoredPacket
+from fcslam.errors import FcslamError, PacketError
+from fcslam.records import Place
+from fcslam.wire.batches import read_batch, write_batch
+from fcslam.wire.messages import UPLINK, Acknowledgement, Body, Kind, Packet
+from fcslam.wire.packets import decode, encode, read_label, read_number
+
+LEASE_S = 30.0
+"""So long after an agent's last request its robot is its own."""
+LONGEST_QUEUE = 50_000
+"""Packets that have not taken effect: more are not taken in before some have."""
+FURTHEST_AHEAD = 20_000
+"""Numbers after the first missing packet of a session: what is further ahead has to wait for it."""
+RETRY_AFTER_S = 2
+
+
+class BusyError(FcslamError):
+    """Nothing is wrong, but it has to wait."""
+
+
+class LeaseError(FcslamError):
+    """Another agent speaks for this robot."""
+
+
+class RefusedPacketError(FcslamError):
+    """One packet of a batch is refused for good; those before it are stored."""
+
+    def __init__(self, message: str, index: int) -> None:
+        super().__init__(message)
+        self.index = index
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What goes back to a robot, and what came in."""
+
+    batch: bytes
+    """Acknowledgements and, if it is news, a correction."""
+    packets: tuple[StoredPacket, ...]
+    """What the batch held; all of it is on disk."""
+
+
+class Intake:
+    """Takes batches for one mission. Any thread may call."""
+
+    def __init__(self, store: MissionStore, clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
+        self._store, self._clock, self._wall_clock = store, clock, wall_clock
+        self._lock = threading.Lock()
+        self._leases: dict[str, tuple[str, float]] = {}
+        """Agent of each robot, and when it was heard last."""
+
+    def take(self, robot: str, agent: str, batch: bytes, known_correction: int) -> Answer:
+        """Store a robot's packets; what comes back acknowledges all that is stored without a gap.
+
+        Raises:
+            PacketError: the batch cannot be taken apart; nothing is stored.
+            RefusedPacketError: a packet of it is refused.
+            PacketConflictError: a packet has the number of another one.
+            LeaseError: another agent speaks for the robot.
+            BusyError: it has to be sent again later.
+            StoreError: the disk is full; nothing is stored.
+        """
+        self._lease(robot, agent)
+        check_robot(robot)
+        packets, refusal = _checked(robot, read_batch(batch))
+        self._make_room(robot, packets)
+        self._store.put(packets, self._wall_clock())
+        if refusal:
+            raise refusal
+        epochs = sorted({packet.epoch for packet in packets}) or [s.epoch for s in self._store.sessions(robot)[-1:]]
+        return Answer(self._answer(robot, epochs, known_correction), tuple(packets))
+
+    def last_heard_s(self, robot: str) -> float | None:
+        """Seconds since the robot's last batch; None: never since the service started."""
+        lease = self._leases.get(robot)
+        return None if lease is None else self._clock() - lease[1]
+
+    def _lease(self, robot: str, agent: str) -> None:
+        now = self._clock()
+        with self._lock:
+            holder, heard = self._leases.get(robot, (agent, now))
+            if holder != agent and now < heard + LEASE_S:
+                raise LeaseError(
+                    f"{robot}: another agent speaks for this robot; stop one of the two or name it differently, "
+                    f"or wait {heard + LEASE_S - now:.0f} s if it is gone"
+                )
+            self._leases[robot] = agent, now
+
+    def _make_room(self, robot: str, packets: Sequence[StoredPacket]) -> None:
+        queue = self._store.turn_count() - self._store.applied() + self._store.waiting_count()
+        if queue > LONGEST_QUEUE:
+            raise BusyError(f"{queue} packets have not taken effect yet; send these again later")
+        expected = {session.epoch: session.next for session in self._store.sessions(robot)}
+        for packet in packets:
+            first = expected.get(packet.epoch, 0)
+            if packet.sequence > first + FURTHEST_AHEAD:
+                raise BusyError(f"{robot}: packet {packet.sequence} is far ahead; send packet {first} first")
+
+    def _answer(self, robot: str, epochs: Sequence[int], known_correction: int) -> bytes:
+        told: list[tuple[int, float, Body]] = []
+        for epoch in epochs:
+            expected = self._store.next_sequence(robot, epoch)
+            if expected > 0:
+                told.append((epoch, 0.0, Acknowledgement(robot, epoch, expected - 1)))
+        news = self._store.correction(robot, epochs[-1]) if epochs else None
+        if news and news.correction.version > known_correction:
+            told.append((news.epoch, news.time, news.correction))
+        return write_batch(
+            encode(Packet(robot, epoch, number, time_s, body)) for number, (epoch, time_s, body) in enumerate(told)
+        )
+
+
+def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], RefusedPacketError | None]:
+    """The packets to be stored: all, or those up to and with the first that is refused."""
+    packets: list[StoredPacket] = []
+    for index, data in enumerate(batch):
+        try:
+            packets.append(_read(robot, data))
+        except PacketError as error:
+            number = read_number(data)
+            if number is not None and number[0] == robot:
+                packets.append(StoredPacket(*number, 0.0, None, None, data, str(error)))
+            return packets, RefusedPacketError(str(error), index)
+    return packets, None
+
+
+def _read(robot: str, data: bytes) -> StoredPacket:
+    packet, kind = decode(data), read_label(data).kind
+    if packet.robot != robot:
+        raise PacketError(f"a packet of robot {packet.robot}, sent by {robot}")
+    if kind not in UPLINK:
+        raise PacketError(f"{robot}: a {kind} goes to a robot, not to the cloud")
+    channel = packet.body.channel if isinstance(packet.body, Place) else None
+    return StoredPacket(robot, packet.epoch, packet.sequence, packet.time, Kind(kind), channel, data)

@@ -1,0 +1,138 @@
+"""A fleet's result as a run: trajectories, closures, maps and numbers, ready to be written as a folder."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.cloud.fusion import FusedMap, fuse
+from fcslam.cloud.picture import Meeting, map_png
+from fcslam.cloud.result import FleetResult, MappedRobot
+from fcslam.geometry import se2
+from fcslam.graph.g2o import g2o_text
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.map_files import map_yaml, pgm_bytes
+from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure
+from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
+from fcslam.wire.ledger import Ledger
+from fcslam.wire.messages import Kind
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A robot's scans, each hung on a keyscan."""
+
+    stamps: FloatArray
+    """Shape (N,)."""
+    keyscans: NDArray[np.int64]
+    """Number of each scan's keyscan, shape (N,)."""
+    T_keyscan_base: FloatArray
+    """Pose of each scan in its keyscan's base, shape (N, 3)."""
+
+    def laid_on(self, T_keyscans: FloatArray) -> FloatArray:
+        """Poses (N, 3) of all scans, those of the keyscans (K, 3) being given."""
+        return se2.compose(T_keyscans[self.keyscans], self.T_keyscan_base)
+
+
+def keyscan_track(robot: MappedRobot) -> Track:
+    """What the cloud knows of a robot's scans: the keyscans alone."""
+    count = len(robot.keyscans)
+    return Track(np.array([keyscan.stamp for keyscan in robot.keyscans]), np.arange(count), np.zeros((count, 3)))
+
+
+def run_of(
+    result: FleetResult,
+    tracks: Mapping[str, Track],
+    metrics: Sequence[Metric],
+    config_yaml: str,
+    grid: OccupancyConfig,
+    with_local_maps: bool = True,
+) -> Run:
+    """Collect what the run folder holds; ``tracks`` has every robot of the result, and orders them."""
+    mapped = {robot.robot: robot for robot in result.robots}
+    trajectories = tuple(
+        RobotTrajectory(name, mapped[name].map_index, track.stamps, track.laid_on(mapped[name].T_map_base))
+        for name, track in tracks.items()
+    )
+    return Run(
+        trajectories=trajectories,
+        closures=tuple(_closure_row(closure, mapped) for closure in result.closures),
+        metrics=(*_counts(result), *metrics),
+        config_yaml=config_yaml,
+        pose_graph_g2o=g2o_text(result.graph),
+        map_files=_map_files(result, trajectories, grid),
+        local_maps=tuple(_local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps),
+    )
+
+
+def traffic_metrics(ledger: Ledger) -> list[Metric]:
+    """Packets and bytes per kind of message and channel of places, of the whole fleet; bytes that each robot sent."""
+    traffic = {str(kind): ledger.total(kind=kind) for kind in sorted({label.kind for label in ledger.accepted})}
+    traffic |= {f"{channel}_{Kind.PLACE}": ledger.total(channel=channel) for channel in Channel}
+    robots = sorted({label.robot for label in ledger.accepted})
+    return [
+        *(Metric(f"{name}_packets", total.count, "1") for name, total in traffic.items()),
+        *(Metric(f"{name}_bytes", total.bytes, "B") for name, total in traffic.items()),
+        *(Metric(f"uplink_bytes_{robot}", ledger.uplink(robot).bytes, "B") for robot in robots),
+    ]
+
+
+def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> LocalMap:
+    """What the robot would have mapped had it been alone."""
+    fused = fuse(robot.keyscans, robot.T_local_base, {robot.robot: robot.laser}, grid)
+    name = f"{robot.robot}.pgm"
+    return LocalMap(
+        robot.robot, track.stamps, track.laid_on(robot.T_local_base), pgm_bytes(fused), map_yaml(fused, name)
+    )
+
+
+def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> ClosureRow:
+    i, j = closure.i, closure.j
+    return ClosureRow(
+        i.robot, mapped[i.robot].keyscans[i.number].stamp, j.robot, mapped[j.robot].keyscans[j.number].stamp,
+        closure.channel, closure.similarity, closure.T_i_j, closure.status, closure.reason,
+    )  # fmt: skip
+
+
+def _map_files(result: FleetResult, trajectories: Sequence[RobotTrajectory], grid: OccupancyConfig) -> dict[str, bytes]:
+    """map.* of the largest map, map_<k>.* of robots that are not connected to it."""
+    files: dict[str, bytes] = {}
+    for k in sorted({robot.map_index for robot in result.robots}):
+        members = [robot for robot in result.robots if robot.map_index == k]
+        stem = "map" if k == 0 else f"map_{k}"
+        fused = _fuse(members, grid)
+        drawn = {t.robot: t.T_map_base for t in trajectories if t.map_index == k}
+        files[f"{stem}.pgm"] = pgm_bytes(fused)
+        files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
+        files[f"{stem}.png"] = map_png(fused, drawn, _meetings(result.closures, members))
+    return files
+
+
+def _fuse(members: Sequence[MappedRobot], grid: OccupancyConfig) -> FusedMap:
+    keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
+    poses: FloatArray = np.concatenate([robot.T_map_base for robot in members])
+    return fuse(keyscans, poses, {robot.robot: robot.laser for robot in members}, grid)
+
+
+def _meetings(closures: Sequence[LoopClosure], members: Sequence[MappedRobot]) -> list[Meeting]:
+    """Accepted closures between robots, as lines of the picture."""
+    poses = {robot.robot: robot.T_map_base for robot in members}
+    return [
+        Meeting(poses[c.i.robot][c.i.number][:2], poses[c.j.robot][c.j.number][:2], c.i.robot, c.j.robot)
+        for c in closures
+        if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot and c.i.robot in poses
+    ]
+
+
+def _counts(result: FleetResult) -> list[Metric]:
+    between = [c.status for c in result.closures if c.i.robot != c.j.robot]
+    within = [c.status for c in result.closures if c.i.robot == c.j.robot]
+    return [
+        Metric("robots", len(result.robots), "1"),
+        Metric("maps", len({robot.map_index for robot in result.robots}), "1"),
+        Metric("keyscans", sum(len(robot.keyscans) for robot in result.robots), "1"),
+        Metric("intra_robot_closures_accepted", within.count(ClosureStatus.ACCEPTED), "1"),
+        Metric("intra_robot_closures_revoked", within.count(ClosureStatus.REVOKED), "1"),
+        *(Metric(f"inter_robot_closures_{status}", between.count(status), "1") for status in ClosureStatus),
+    ]

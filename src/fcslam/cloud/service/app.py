@@ -1,0 +1,51 @@
+"""The ASGI application; what it needs is given to it."""
+
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
+
+from fastapi import APIRouter, FastAPI, Request, Response
+
+import fcslam
+from fcslam.cloud.service.decisions import decision_router
+from fcslam.cloud.service.missions import mission_router
+from fcslam.cloud.service.operations import operations_router
+from fcslam.cloud.service.problems import add_handlers
+from fcslam.cloud.service.robots import robot_router
+from fcslam.cloud.service.state import ServiceState
+from fcslam.cloud.service.viewers import fleet_router, map_router
+from fcslam.cloud.service.watching import event_router
+
+PREFIX = "/api/v1"
+
+
+def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool = False) -> FastAPI:
+    """The service; ``more`` routers come from rooms that this one does not know. Closes the missions at its end."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        state.closing = True
+        state.missions.close()
+
+    app = FastAPI(
+        title="fcslam",
+        version=fcslam.__version__,
+        docs_url="/docs" if docs else None,
+        redoc_url=None,
+        lifespan=lifespan,
+    )
+    add_handlers(app)
+    for make in (robot_router, fleet_router, map_router, mission_router, decision_router, event_router):
+        app.include_router(make(state), prefix=PREFIX)
+    app.include_router(operations_router(state))
+    for router in more:
+        app.include_router(router)
+
+    @app.middleware("http")
+    async def measure(request: Request, call: Callable[[Request], Awaitable[Response]]) -> Response:
+        response = await call(request)
+        if response.status_code >= 400:
+            state.measures.refuse(response.status_code)
+        return response
+
+    return app

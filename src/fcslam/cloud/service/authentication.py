@@ -1,0 +1,77 @@
+"""Who may ask for what: bearer tokens, of which the service knows the SHA-256 only."""
+
+import hashlib
+import hmac
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+
+from pydantic import Field
+
+from fcslam.config import Settings, load
+from fcslam.errors import ServiceError
+from fcslam.records import NAME
+
+
+class Role(StrEnum):
+    """What a token is good for."""
+
+    ROBOT = "robot"
+    """Sends packets as the robot that it names."""
+    VIEWER = "viewer"
+    """Reads everything."""
+    ADMIN = "admin"
+    """Reads everything, and decides about missions."""
+
+
+class TokenEntry(Settings):
+    """One token."""
+
+    name: str = Field(pattern=f"^{NAME.pattern}$", description="of a robot, or of whoever has it")
+    role: Role = Field(description="robot, viewer or admin")
+    sha256: str = Field(pattern="^[0-9a-f]{64}$", description="of the token, in hexadecimal")
+
+
+class TokensFile(Settings):
+    """All tokens."""
+
+    tokens: tuple[TokenEntry, ...] = Field(description="who may ask")
+
+
+class Authenticator:
+    """Tells who has a token."""
+
+    def __init__(self, tokens: Sequence[TokenEntry] | None) -> None:
+        """None: nobody is asked for a token, and everybody may do everything."""
+        self._tokens = tokens
+
+    @property
+    def is_open(self) -> bool:
+        """Whether nobody is asked for a token."""
+        return self._tokens is None
+
+    def who(self, authorization: str | None) -> TokenEntry | None:
+        """Whose token an ``Authorization`` header has; None if it is nobody's. Takes as long for each."""
+        scheme, _, token = (authorization or "").partition(" ")
+        digest = hashlib.sha256(token.strip().encode("utf-8", "surrogateescape")).hexdigest()
+        found = None
+        for entry in self._tokens or ():
+            if hmac.compare_digest(entry.sha256, digest) and scheme.lower() == "bearer":
+                found = entry
+        return found
+
+
+def read_tokens(path: Path) -> tuple[TokenEntry, ...]:
+    """Tokens of a file.
+
+    Raises:
+        ConfigError: it cannot be read or has a key or a value that does not belong.
+        ServiceError: one robot, or one token, is named twice.
+    """
+    tokens = load(TokensFile, path).tokens
+    for what in ("sha256", "name"):
+        values = [getattr(entry, what) for entry in tokens]
+        double = next((entry for entry in tokens if values.count(getattr(entry, what)) > 1), None)
+        if double:
+            raise ServiceError(f"{path}: two entries have the {what} of '{double.name}'; each needs its own")
+    return tokens

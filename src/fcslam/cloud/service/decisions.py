@@ -1,0 +1,60 @@
+"""What decides about the open mission."""
+
+import asyncio
+from typing import Any
+
+from fastapi import APIRouter, Depends, HTTPException
+from starlette.concurrency import run_in_threadpool
+
+from fcslam.cloud.service.authentication import Role
+from fcslam.cloud.service.state import ServiceState
+from fcslam.config import Settings
+from fcslam.records import Veto
+
+LOOK_EVERY_S = 0.1
+
+
+class NewVeto(Settings):
+    """Two keyscans, or two robots, that did not see the same place."""
+
+    robot_i: str
+    robot_j: str
+    stamp_i: float | None = None
+    stamp_j: float | None = None
+
+
+def decision_router(state: ServiceState) -> APIRouter:
+    """Results and vetoes."""
+    router = APIRouter(tags=["decisions"], dependencies=[Depends(state.require(Role.ADMIN))])
+
+    @router.post("/finalize")
+    async def finalize() -> dict[str, Any]:
+        """The result of all that is stored now, as a run folder on the service's machine; answers when it is there."""
+        mission = state.mission
+        number = await run_in_threadpool(mission.store.ask_to_finalize)
+        mission.worker.ring()
+        while not state.closing and mission is state.mission:
+            asked = await run_in_threadpool(mission.store.finalization, number)
+            if asked.failure:
+                raise HTTPException(500, asked.failure)
+            if asked.run:
+                return {"number": number, "run": str(mission.folder.run(asked.run).resolve())}
+            await asyncio.sleep(LOOK_EVERY_S)
+        raise HTTPException(503, "the mission was closed; the result will be there when it is open again")
+
+    @router.post("/vetoes", status_code=201)
+    def veto(told: NewVeto) -> dict[str, int]:
+        """From now on these closures count for nothing."""
+        if (told.stamp_i is None) != (told.stamp_j is None):
+            raise HTTPException(400, "two stamps or none are needed")
+        stamps = None if told.stamp_i is None or told.stamp_j is None else (told.stamp_i, told.stamp_j)
+        mission = state.mission
+        known = {robot.robot for robot in mission.store.sessions()}
+        unknown = [name for name in (told.robot_i, told.robot_j) if name.partition("+")[0] not in known]
+        if unknown:
+            raise HTTPException(400, f"there is no robot '{unknown[0]}'; there are {', '.join(sorted(known))}")
+        mission.store.veto(Veto(told.robot_i, told.robot_j, stamps))
+        mission.worker.ring()
+        return {"vetoes": len(mission.store.vetoes())}
+
+    return router

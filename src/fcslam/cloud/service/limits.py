@@ -1,0 +1,48 @@
+"""How much one robot may ask for."""
+
+from collections.abc import Callable
+
+from fastapi import HTTPException, Request
+
+from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
+
+BYTES_PER_S = 8.0 * 2**20
+"""A thousand times what a robot sends while it drives: so fast it may send what an outage kept back."""
+BURST_BYTES = 32.0 * 2**20
+REQUEST_BYTES = 16.0 * 2**10
+"""What a request costs besides its bytes."""
+
+
+class RateLimit:
+    """A bucket for each robot, which requests empty and time fills."""
+
+    def __init__(
+        self, clock: Callable[[], float], bytes_per_s: float = BYTES_PER_S, burst: float = BURST_BYTES
+    ) -> None:
+        self._clock, self._rate, self._burst = clock, bytes_per_s, burst
+        self._level: dict[str, tuple[float, float]] = {}
+        """What is left in each bucket, and when that was."""
+
+    def wait_s(self, robot: str, size: int) -> float:
+        """Count a request of ``size`` bytes; if it is over the limit, how long to wait, and it is not counted."""
+        now = self._clock()
+        level, then = self._level.get(robot, (self._burst, now))
+        level = min(self._burst, level + (now - then) * self._rate) - REQUEST_BYTES - size
+        if level < 0.0:
+            return -level / self._rate
+        self._level[robot] = level, now
+        return 0.0
+
+
+async def read_body(request: Request) -> bytes:
+    """A request's body, refused (HTTPException 413) before more of it is read than a batch may have."""
+    announced = request.headers.get("content-length", "0")
+    too_long = HTTPException(413, f"the body is over {MAXIMUM_BATCH_BYTES} bytes; send fewer packets at once")
+    if announced.isdecimal() and int(announced) > MAXIMUM_BATCH_BYTES:
+        raise too_long
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > MAXIMUM_BATCH_BYTES:
+            raise too_long
+    return bytes(body)

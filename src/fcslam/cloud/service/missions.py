@@ -1,0 +1,103 @@
+"""Missions: begin, open, take away, bring in."""
+
+import asyncio
+import tempfile
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, HTTPException, Query, Request
+from fastapi.responses import StreamingResponse
+from pydantic import Field
+from starlette.concurrency import run_in_threadpool
+
+from fcslam.cloud.service.authentication import Role
+from fcslam.cloud.service.robots import Name
+from fcslam.cloud.service.state import ServiceState
+from fcslam.config import Settings
+from fcslam.records import NAME
+
+CHUNK_BYTES = 2**20
+LONGEST_IMPORT_BYTES = 64 * 2**30
+
+MissionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
+
+
+class NewMission(Settings):
+    """A mission to begin."""
+
+    name: MissionName
+
+
+def mission_router(state: ServiceState) -> APIRouter:
+    """All missions of the service."""
+    router = APIRouter(tags=["missions"])
+    as_admin = [Depends(state.require(Role.ADMIN))]
+    changing = asyncio.Lock()
+
+    @router.get("/missions", dependencies=[Depends(state.require(Role.VIEWER, Role.ADMIN))])
+    def list_missions() -> dict[str, Any]:
+        """All missions, and which one is open."""
+        return {"open": state.mission.folder.name, "missions": state.missions.names}
+
+    @router.post("/missions", status_code=201, dependencies=as_admin)
+    async def create_mission(mission: NewMission) -> dict[str, Any]:
+        """Begin a mission and open it."""
+        async with changing:
+            await run_in_threadpool(state.missions.create, mission.name)
+        return list_missions()
+
+    @router.post("/missions/import", status_code=201, dependencies=as_admin)
+    async def import_mission(request: Request, name: Annotated[MissionName, Query()]) -> dict[str, Any]:
+        """Make a mission of a file that an export gave; the open one stays open."""
+        with tempfile.TemporaryDirectory(dir=state.missions.root, prefix=".import") as folder:
+            path = Path(folder) / "mission.sqlite"
+            await _receive(request, path)
+            async with changing:
+                await run_in_threadpool(state.missions.take_in, name, path)
+        return list_missions()
+
+    @router.post("/missions/{name}/open", dependencies=as_admin)
+    async def open_mission(name: Name) -> dict[str, Any]:
+        """Let robots' packets go to this mission from now on."""
+        if name not in state.missions.names:
+            raise HTTPException(404, f"there is no mission '{name}'")
+        async with changing:
+            await run_in_threadpool(state.missions.open, name)
+        return list_missions()
+
+    @router.get("/missions/{name}/export", dependencies=as_admin)
+    async def export_mission(name: Name) -> StreamingResponse:
+        """A mission as one file."""
+        if name not in state.missions.names:
+            raise HTTPException(404, f"there is no mission '{name}'")
+        folder = tempfile.TemporaryDirectory(dir=state.missions.root, prefix=".export")
+        path = Path(folder.name) / f"{name}.sqlite"
+        try:
+            await run_in_threadpool(state.missions.export, name, path)
+        except BaseException:
+            folder.cleanup()
+            raise
+        headers = {"Content-Disposition": f'attachment; filename="{name}.sqlite"'}
+        return StreamingResponse(_content(path, folder), media_type="application/vnd.sqlite3", headers=headers)
+
+    return router
+
+
+async def _receive(request: Request, path: Path) -> None:
+    size = 0
+    with path.open("wb") as file:
+        async for chunk in request.stream():
+            size += len(chunk)
+            if size > LONGEST_IMPORT_BYTES:
+                raise HTTPException(413, f"the file is over {LONGEST_IMPORT_BYTES} bytes")
+            await run_in_threadpool(file.write, chunk)
+
+
+async def _content(path: Path, folder: "tempfile.TemporaryDirectory[str]") -> AsyncIterator[bytes]:
+    try:
+        with path.open("rb") as file:
+            while chunk := await run_in_threadpool(file.read, CHUNK_BYTES):
+                yield chunk
+    finally:
+        folder.cleanup()

@@ -1,0 +1,60 @@
+"""What all parts of the HTTP service share."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fastapi import HTTPException, Request
+
+from fcslam.cloud.missions import Missions, OpenMission
+from fcslam.cloud.service.authentication import Authenticator, Role
+from fcslam.cloud.service.events import EventStream
+from fcslam.cloud.service.limits import RateLimit
+from fcslam.cloud.service.measures import Measures
+
+
+@dataclass(slots=True)
+class ServiceState:
+    """Handed to every router."""
+
+    missions: Missions
+    authenticator: Authenticator
+    rate: RateLimit
+    events: EventStream
+    measures: Measures = field(default_factory=Measures)
+    closing: bool = False
+    """Nothing new is begun any more."""
+
+    @property
+    def mission(self) -> OpenMission:
+        """The one that robots' packets go to."""
+        return self.missions.open_mission
+
+    @property
+    def detectors(self) -> Path:
+        """Folder of the networks that robots may fetch."""
+        return self.missions.root / "detectors"
+
+    def require(self, *roles: Role) -> Callable[[Request], Awaitable[None]]:
+        """A dependency: whoever asks has a token of one of the roles; a robot's is good for that robot alone.
+
+        Refuses (HTTPException): 401 without a token that is known, 403 with another one's, 429 too many requests.
+        """
+
+        async def check(request: Request) -> None:
+            if self.closing:
+                raise HTTPException(503, "the service is stopping; try again")
+            if self.authenticator.is_open:
+                return
+            entry = self.authenticator.who(request.headers.get("authorization"))
+            if entry is None:
+                headers = {"WWW-Authenticate": "Bearer"}
+                raise HTTPException(401, "no token, or an unknown one; send Authorization: Bearer TOKEN", headers)
+            if entry.role not in roles:
+                needed = " or ".join(roles)
+                raise HTTPException(403, f"the token of '{entry.name}' is a {entry.role}'s; this takes {needed}'s")
+            robot = request.path_params.get("robot")
+            if entry.role is Role.ROBOT and robot not in (None, entry.name):
+                raise HTTPException(403, f"the token of robot '{entry.name}' is not good for robot '{robot}'")
+
+        return check

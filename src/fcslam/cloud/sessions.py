@@ -1,0 +1,51 @@
+"""Sessions: what a robot sends from one start to the next, with odometry that began at zero.
+
+Each is a robot of its own to the cloud: it hangs on the robot's earlier sessions by closures alone, as on any other
+robot. It is named after the robot and the epoch, ``robot`` for epoch 0 and ``robot+1``, ``robot+2`` after it.
+"""
+
+import re
+from dataclasses import replace
+
+from fcslam.errors import PacketError
+from fcslam.records import Constraint, Correction, Keyscan, KeyscanId, Place
+from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet, Release
+
+_SESSION = re.compile(r"(.+)\+(\d+)", re.ASCII)
+
+
+def session_name(robot: str, epoch: int) -> str:
+    """Name of the robot's session ``epoch``."""
+    return f"{robot}+{epoch}" if epoch else robot
+
+
+def check_robot(robot: str) -> None:
+    """Refuse a robot that is called like a session of another one.
+
+    Raises:
+        PacketError: its name ends in ``+`` and digits.
+    """
+    taken = _SESSION.fullmatch(robot)
+    if taken:
+        raise PacketError(f"robot: '{robot}' is the name of a session of '{taken[1]}'; name it without '+{taken[2]}'")
+
+
+def in_session(packet: Packet) -> Packet:
+    """The packet as its session's: the robot's name in it is the session's.
+
+    Raises:
+        PacketError: the robot is called like a session of another one.
+    """
+    check_robot(packet.robot)
+    if packet.epoch == 0:
+        return packet
+    session = session_name(packet.robot, packet.epoch)
+    return replace(packet, robot=session, body=_renamed(packet.body, session))
+
+
+def _renamed(body: Body, session: str) -> Body:
+    match body:
+        case Keyscan() | Place():
+            return replace(body, id=KeyscanId(session, body.id.number))
+        case Hello() | Constraint() | Correction() | Acknowledgement() | Release():
+            return replace(body, robot=session)

@@ -1,0 +1,176 @@
+"""The worker: the process in which the fleet of one mission lives. Taking packets in never waits for it.
+
+It reads the store by turn, keeps the fleet in memory, and leaves what it made of the packets on disk: corrections in
+the store, the live run folder, the run folders that were asked for. Killed at any moment it begins again at turn 0,
+and says nothing new before it is where it was.
+
+    python -m fcslam.cloud.worker MISSION_FOLDER
+
+A byte on stdin says that there is something to do, its end that the service is gone. On stdout there is a line for
+every change of the live run folder and for every answered request.
+"""
+
+import gc
+import json
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.folder import MissionFolder
+from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
+from fcslam.cloud.result import FleetResult
+from fcslam.cloud.sessions import session_name
+from fcslam.cloud.settings import CloudConfig
+from fcslam.cloud.store import Finalization, MissionStore, SessionCorrection, StoredPacket
+from fcslam.config import dump
+from fcslam.errors import FcslamError, PacketError
+from fcslam.runs import Metric, Run, write_run
+
+CONFIG = "config"
+"""A fact of the store: the mission's configuration."""
+
+AT_ONCE = 64
+"""Packets between two looks at what else there is to do."""
+LIVE_SHARE = 0.1
+"""Of the worker's time, for the live run folder."""
+LIVE_EVERY_S = 1.0
+"""The live run folder is not written more often than this."""
+
+Tell = Callable[[str, int], None]
+"""Is told of an event and its number."""
+
+
+class Worker:
+    """One mission's fleet; ``step`` by ``step`` it follows what the store holds."""
+
+    def __init__(self, folder: MissionFolder, store: MissionStore, clock: Callable[[], float], tell: Tell) -> None:
+        config = store.fact(CONFIG)
+        self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
+        self._folder, self._store, self._clock, self._tell = folder, store, clock, tell
+        self._fleet = Fleet(self._config.fleet, self._config.seed)
+        self._turn = self._vetoes = 0
+        self._resumed_at = store.applied()
+        """Turns that took effect before a restart: what they bring is known already."""
+        self._times: dict[tuple[str, int], float] = {}
+        """Newest time of each session."""
+        self._published = -1
+        self._publish_at = clock()
+
+    def step(self) -> bool:
+        """Do one piece of work; False: there is none."""
+        return self._take_vetoes() or self._take_packets() or self._finalize() or self._publish()
+
+    def wait_s(self) -> float:
+        """How long there is nothing to do unless something comes in."""
+        return max(self._publish_at - self._clock(), 0.0) if self._published < self._turn else LIVE_EVERY_S
+
+    def _take_vetoes(self) -> bool:
+        vetoes = self._store.vetoes()[self._vetoes :]
+        for veto in vetoes:
+            self._fleet.veto(veto)
+        self._vetoes += len(vetoes)
+        if vetoes:
+            self._published = -1
+        return bool(vetoes)
+
+    def _take_packets(self) -> bool:
+        packets = self._store.turns(self._turn, AT_ONCE)
+        for packet in packets:
+            self._take(packet)
+            self._turn += 1
+        if packets and self._turn > self._resumed_at:
+            self._store.progress(self._turn, self._corrections())
+        return bool(packets)
+
+    def _take(self, packet: StoredPacket) -> None:
+        """One packet takes effect, or is refused and from now on counts as refused."""
+        if packet.refusal is None:
+            try:
+                self._fleet.receive(packet.data)
+            except PacketError as error:
+                self._store.refuse(self._turn, str(error))
+            except Exception as error:
+                # Nobody knows what it left behind: the next worker begins anew and without it.
+                self._store.refuse(self._turn, f"the cloud failed on it: {type(error).__name__}: {error}")
+                raise
+            else:
+                self._times[packet.robot, packet.epoch] = packet.time
+                return
+        self._fleet.skip(packet.robot, packet.epoch, packet.sequence)
+
+    def _corrections(self) -> list[SessionCorrection]:
+        by_session = {correction.robot: correction for correction in self._fleet.corrections()}
+        return [
+            SessionCorrection(robot, epoch, time_s, by_session[name])
+            for (robot, epoch), time_s in self._times.items()
+            if (name := session_name(robot, epoch)) in by_session
+        ]
+
+    def _finalize(self) -> bool:
+        """Answer the oldest request whose packets and vetoes have all taken effect."""
+        for asked in self._store.finalizations():
+            if asked.run or asked.failure or asked.turns > self._turn or asked.vetoes > self._vetoes:
+                continue
+            self._answer(asked)
+            return True
+        return False
+
+    def _answer(self, asked: Finalization) -> None:
+        name = str(asked.number)
+        try:
+            write_run(self._run(self._fleet.finalize()), self._folder.run(name), force=True)
+        except FcslamError as error:
+            self._store.answer(asked.number, None, str(error))
+        else:
+            self._store.answer(asked.number, name)
+        self._published = -1
+        self._tell("finalized", asked.number)
+
+    def _publish(self) -> bool:
+        """Write the live run folder, if something is new and the last time is long enough ago."""
+        now = self._clock()
+        if self._published == self._turn or self._turn < self._resumed_at or now < self._publish_at:
+            return False
+        self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False))
+        self._published = self._turn
+        self._publish_at = self._clock() + max((self._clock() - now) / LIVE_SHARE, LIVE_EVERY_S)
+        self._tell("live", self._turn)
+        return True
+
+    def _run(self, result: FleetResult, with_local_maps: bool = True) -> Run:
+        words = [
+            Metric(f"words_{state.channel}_{state.detector_version}", state.words, "1")
+            for state in self._fleet.vocabularies()
+        ]
+        metrics = [Metric("turns", self._turn, "1"), *words, *traffic_metrics(self._store.traffic())]
+        tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+        return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Work until stdin ends."""
+    # Who stops the service stops it first; its end ends stdin.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    gc.freeze()
+    gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
+    folder = MissionFolder(Path(arguments[0]))
+    worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print)
+    while True:
+        wait_s = 0.0 if worker.step() else worker.wait_s()
+        if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
+            return 0
+
+
+def _print(event: str, number: int) -> None:
+    sys.stdout.write(json.dumps({"event": event, "number": number}) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

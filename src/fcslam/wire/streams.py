@@ -1,0 +1,178 @@
+"""Ranges, keypoints and descriptors as streams of bytes: nothing is lost, and what is to be expected costs little.
+
+A content travels coded where that is shorter than its plain bytes, else plainly. Which of the two it is follows from
+the length, as the receiver knows how many numbers to expect. No stream can stand for more than these.
+"""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fcslam.errors import PacketError
+from fcslam.records import CODE_BYTES, Channel, Codes
+from fcslam.wire.entropy import (
+    CONTEXTS_OF_NUMBER,
+    Bytes,
+    Coder,
+    code_learnt,
+    code_number,
+    code_signed,
+    fresh_model,
+    is_at_end,
+    reader,
+    writer,
+    written,
+)
+from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_RANGE
+from fcslam.wire.prediction import PROBABILITIES, code_descriptors, predictor_of
+
+RangeCodes = NDArray[np.uint16]
+KeypointCodes = NDArray[np.int16]
+
+_APART: Final = 2
+"""Keypoints so many steps apart along x, or more, tell little about each other's y and z."""
+_MOST_AXES: Final = 3
+_REFUSED: Final = -1
+
+
+def pack_ranges(codes: RangeCodes) -> bytes:
+    """Ranges (N,) in steps, 0 for none."""
+    return _pack(codes.astype("<u2").tobytes(), _code_ranges, codes.astype(np.int64))
+
+
+def unpack_ranges(data: bytes, count: int) -> RangeCodes:
+    """Inverse of ``pack_ranges``.
+
+    Raises:
+        PacketError: ``data`` was not made by it of ``count`` ranges.
+    """
+    if len(data) == BYTES_PER_RANGE * count:
+        return np.frombuffer(data, "<u2").astype(np.uint16)
+    codes = np.zeros(count, np.int64)
+    _unpack(data, BYTES_PER_RANGE * count, "keyscan: ranges", _code_ranges, codes)
+    if codes.min(initial=0) < 0 or codes.max(initial=0) > np.iinfo(np.uint16).max:
+        raise PacketError("keyscan: a range is no 16-bit number")
+    return codes.astype(np.uint16)
+
+
+def pack_keypoints(codes: KeypointCodes) -> bytes:
+    """Keypoints (N, axes) in steps, rows in ascending order."""
+    return _pack(codes.astype("<i2").tobytes(), _code_keypoints, codes.astype(np.int64))
+
+
+def unpack_keypoints(data: bytes, count: int, axes: int) -> KeypointCodes:
+    """Inverse of ``pack_keypoints``.
+
+    Raises:
+        PacketError: ``data`` was not made by it of ``count`` keypoints.
+    """
+    if len(data) == BYTES_PER_AXIS * count * axes:
+        codes = np.frombuffer(data, "<i2").reshape(count, axes).astype(np.int64)
+    else:
+        codes = np.zeros((count, axes), np.int64)
+        _unpack(data, BYTES_PER_AXIS * count * axes, "place: keypoints", _code_keypoints, codes)
+    if np.abs(codes).max(initial=0) > np.iinfo(np.int16).max:
+        raise PacketError("place: a keypoint is no 16-bit number of steps")
+    if not np.array_equal(ascending(codes), np.arange(count)):
+        raise PacketError("place: keypoints are not in ascending order")
+    keypoints: KeypointCodes = codes.astype(np.int16)
+    if len(data) < BYTES_PER_AXIS * codes.size and pack_keypoints(keypoints) != data:
+        raise PacketError("place: keypoints are not in steps of their grid")
+    return keypoints
+
+
+def ascending(keypoints: NDArray[Any]) -> NDArray[np.int64]:
+    """The order in which keypoints travel: by x, then y, then z; those at one point stay as they are."""
+    return np.lexsort(keypoints.T[::-1])
+
+
+def pack_descriptors(descriptors: Codes, keypoints: KeypointCodes, channel: Channel) -> bytes:
+    """Descriptors (N, 32) of keypoints in ascending order."""
+    bits = np.unpackbits(descriptors, axis=1)
+    return _pack(descriptors.tobytes(), code_descriptors, bits, *_expectation(keypoints, channel))
+
+
+def unpack_descriptors(data: bytes, keypoints: KeypointCodes, channel: Channel) -> Codes:
+    """Inverse of ``pack_descriptors``.
+
+    Raises:
+        PacketError: ``data`` was not made by it of as many descriptors.
+    """
+    count = len(keypoints)
+    if len(data) == CODE_BYTES * count:
+        return np.frombuffer(data, np.uint8).reshape(count, CODE_BYTES)
+    bits = np.zeros((count, 8 * CODE_BYTES), np.uint8)
+    expectation = _expectation(keypoints, channel)
+    _unpack(data, CODE_BYTES * count, "place: descriptors", code_descriptors, bits, *expectation)
+    return np.packbits(bits, axis=1)
+
+
+def _expectation(keypoints: KeypointCodes, channel: Channel) -> tuple[NDArray[Any], ...]:
+    return (keypoints.astype(np.int64), *predictor_of(channel), PROBABILITIES)
+
+
+def _pack(plain: bytes, code: Callable[..., None], *content: NDArray[Any]) -> bytes:
+    coder, data = writer(len(plain))
+    code(coder, data, *content)
+    size = written(coder, data)
+    return data[:size].tobytes() if 0 <= size < len(plain) else plain
+
+
+def _unpack(data: bytes, plain: int, what: str, code: Callable[..., None], *content: NDArray[Any]) -> None:
+    """Fill the first of ``content`` with what ``data`` holds."""
+    if len(data) > plain:
+        raise PacketError(f"{what}: {len(data)} bytes, at most {plain}")
+    stream = np.frombuffer(bytearray(data), np.uint8)
+    coder = reader(stream)
+    code(coder, stream, *content)
+    if not is_at_end(coder, stream):
+        raise PacketError(f"{what}: the stream is cut off or goes on after its end")
+
+
+@njit(cache=True)
+def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
+    """Each range: whether there is one, which the beam before tells; its difference from the last one that was."""
+    model = fresh_model(2 + CONTEXTS_OF_NUMBER)
+    last, none = np.int64(0), 0
+    for k in range(len(codes)):
+        none = code_learnt(coder, data, model, none, int(codes[k] == 0))
+        if none:
+            codes[k] = 0
+        else:
+            last += code_signed(coder, data, model, 2, codes[k] - last)
+            codes[k] = last if last > 0 else _REFUSED
+
+
+@njit(cache=True)
+def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
+    """The grid of each axis, then each keypoint's differences from the one before, in steps of the grid."""
+    axes = codes.shape[1]
+    model = fresh_model((2 + _MOST_AXES * (1 + _APART)) * CONTEXTS_OF_NUMBER)
+    grid = np.ones(axes, np.int64)
+    for axis in range(axes if len(codes) > 0 else 0):
+        grid[axis] += code_number(coder, data, model, 0, max(_common_divisor(codes[:, axis]), 1) - 1)
+        codes[0, axis] = code_signed(coder, data, model, CONTEXTS_OF_NUMBER, codes[0, axis])
+    for k in range(1, len(codes)):
+        steps = (codes[k] - codes[k - 1]) // grid
+        context = 2 * CONTEXTS_OF_NUMBER
+        steps[0] = code_number(coder, data, model, context, steps[0])
+        context += min(steps[0], _APART) * CONTEXTS_OF_NUMBER
+        for axis in range(1, axes):
+            context += (1 + _APART) * CONTEXTS_OF_NUMBER
+            steps[axis] = code_signed(coder, data, model, context, steps[axis])
+        codes[k] = codes[k - 1] + steps * grid
+
+
+@njit(cache=True)
+def _common_divisor(values: NDArray[np.int64]) -> int:
+    """Of all differences; 0 if there are none."""
+    divisor = np.int64(0)
+    for k in range(1, len(values)):
+        a, b = divisor, abs(values[k] - values[k - 1])
+        while b:
+            a, b = b, a % b
+        divisor = a
+    return int(divisor)
