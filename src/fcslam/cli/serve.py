@@ -77,10 +77,13 @@ def _state(data: Path, tokens: Path | None, config: "CloudConfig") -> "ServiceSt
     from fcslam.cloud.service.events import EventStream
     from fcslam.cloud.service.limits import RateLimit
     from fcslam.cloud.service.state import ServiceState
+    from fcslam.cloud.supervisor import Supervisor
 
     authenticator = Authenticator(None if tokens is None else read_tokens(tokens))
     events = EventStream()
-    missions = Missions(data, config, time.monotonic, time.time, events.publish)
+    missions = Missions(
+        data, config, time.monotonic, time.time, lambda folder: Supervisor(folder, time.monotonic, events.publish)
+    )
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events)
 
 
