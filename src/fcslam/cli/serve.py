@@ -57,6 +57,7 @@ def serve(
             ssl_certfile=tls_certificate,
             ssl_keyfile=tls_key,
             log_level="warning",
+            ws="none",
             server_header=False,
             timeout_graceful_shutdown=10,
             h11_max_incomplete_event_size=64 * 1024,

@@ -44,13 +44,10 @@ class InlineWorker:
     def __init__(self, folder: MissionFolder) -> None:
         self._now = 0.0
         self._store = MissionStore(folder.store)
-        self._worker = Worker(folder, self._store, self._clock, lambda *_: None)
-
-    def _clock(self) -> float:
-        self._now += 100.0
-        return self._now
+        self._worker = Worker(folder, self._store, lambda: self._now, lambda *_: None)
 
     def ring(self) -> None:
+        self._now += 1000.0
         while self._worker.step():
             pass
 
@@ -64,10 +61,12 @@ class Desk:
     def __init__(self, root: Path, tokens: Sequence[TokenEntry] | None = tuple(ENTRIES)) -> None:
         self.now = 0.0
         missions = Missions(root, CloudConfig(), lambda: self.now, lambda: 1e9, InlineWorker)
-        self.state = ServiceState(missions, Authenticator(tokens), RateLimit(lambda: self.now), EventStream())
+        self.state = ServiceState(
+            missions, Authenticator(tokens), RateLimit(lambda: self.now, burst=2.0**21), EventStream()
+        )
         self.app = create_app(self.state)
         self._listening = socket.create_server(("127.0.0.1", 0))
-        self._server = uvicorn.Server(uvicorn.Config(self.app, log_level="critical"))
+        self._server = uvicorn.Server(uvicorn.Config(self.app, log_level="critical", ws="none"))
         self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [self._listening]})
         port = self._listening.getsockname()[1]
         self.client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0)
@@ -75,6 +74,7 @@ class Desk:
     def __enter__(self) -> "Desk":
         self._thread.start()
         while not self._server.started:
+            assert self._thread.is_alive()
             time.sleep(0.01)
         return self
 
