@@ -10,9 +10,12 @@ FcslamError
 │   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
 │   ├── EvaluationError   a reference file or a run folder cannot be evaluated
 │   ├── ServiceError      the cloud service cannot start as it is told to: tokens, certificates, address, folder
-│   └── StoreError        a mission cannot be kept or read: the disk is full, the file is broken or something else
-└── PacketError           bytes received are not a packet that may be trusted
-    └── PacketConflictError   two different packets have one number
+│   ├── StoreError        a mission cannot be kept or read: the disk is full, the file is broken or something else
+│   ├── StateError        a robot's state folder cannot be used
+│   └── CloudError        the cloud turns a robot away: its token, its name or what it sends
+├── PacketError           bytes received are not a packet that may be trusted
+│   └── PacketConflictError   two different packets have one number
+└── UnavailableError      the cloud cannot be reached or is busy: try again
 """
 
 
@@ -50,6 +53,23 @@ class TrainingError(InputError):
 
 class EvaluationError(InputError):
     """A reference file or a run folder cannot be evaluated."""
+
+
+class StateError(InputError):
+    """A robot's state folder is another robot's, in use, damaged, or not what the recording says."""
+
+
+class CloudError(InputError):
+    """The cloud turns a robot away, and will again: its token, its name, its certificate, or what it sends."""
+
+
+class UnavailableError(FcslamError):
+    """The cloud cannot be reached or has no time; the same request may succeed later."""
+
+    def __init__(self, message: str, retry_after_s: float = 0.0) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
+        """The cloud asks not to be asked before; 0: it says nothing."""
 
 
 class ServiceError(InputError):

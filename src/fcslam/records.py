@@ -186,6 +186,21 @@ class Place:
     """Shape (N, 32)."""
 
 
+@dataclass(frozen=True, slots=True)
+class DetectorFile:
+    """A network that describes places, as a file that is not here yet."""
+
+    channel: Channel
+    version: str
+    """Stamps every descriptor that it makes."""
+    format: int
+    """Of the network, as its own metadata say."""
+    size: int
+    """Bytes of the file."""
+    sha256: bytes
+    """Of the file, 32 bytes."""
+
+
 class ClosureStatus(StrEnum):
     """How far a closure has come; three different things and two ways to end."""
 

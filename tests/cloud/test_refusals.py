@@ -29,7 +29,7 @@ HOSTILE = {
     "motion of an unknown robot": (motion("x", 0, 1, STEP), "does not lead to a new keyscan"),
     "closure of an unknown robot": (motion("x", 0, 1, STEP, ConstraintKind.CLOSURE), "names keyscan 0"),
     "place of an unknown robot": (place("x", 0), "names keyscan 0"),
-    "second hello": (Hello("a", 0, LASER, {}), "said hello before"),
+    "another laser": (Hello("a", 0, replace(LASER, max_range_m=9.0), {}), "hello again with another laser"),
     "too many beams": (keyscan("a", NUMBER, NOW, beams=9), "9 beams, 8 announced"),
     "too few beams": (keyscan("a", NUMBER, NOW, beams=1), "1 beams, 8 announced"),
     "a keyscan left out": (keyscan("a", NUMBER + 1, NOW), f"keyscan {NUMBER + 1} where {NUMBER} is next"),

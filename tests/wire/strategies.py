@@ -4,9 +4,19 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from fcslam.records import Channel, Constraint, ConstraintKind, Correction, Keyscan, KeyscanId, LaserModel, Place
+from fcslam.records import (
+    Channel,
+    Constraint,
+    ConstraintKind,
+    Correction,
+    DetectorFile,
+    Keyscan,
+    KeyscanId,
+    LaserModel,
+    Place,
+)
 from fcslam.wire.limits import KEYPOINT_AXES
-from fcslam.wire.messages import Acknowledgement, Hello, Packet
+from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
 from fcslam.wire.quantisation import dequantise
 
 NAMES = st.text("AZaz09._+-", min_size=0, max_size=63).map(lambda rest: "a" + rest)
@@ -77,6 +87,11 @@ def constraints(draw, robot):
     return Constraint(robot, i, j, draw(st.sampled_from(ConstraintKind)), draw(poses()), draw(informations()))
 
 
+def detector_files():
+    digests = st.binary(min_size=32, max_size=32)
+    return st.builds(DetectorFile, st.sampled_from(Channel), NAMES, NUMBERS, st.integers(1, 2**26), digests)
+
+
 def bodies(robot, epoch, time):
     versions = st.dictionaries(st.sampled_from(Channel), NAMES)
     stamps = st.floats(max_value=time, allow_nan=False, allow_infinity=False)
@@ -88,6 +103,7 @@ def bodies(robot, epoch, time):
         places(robot),
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses()),
         st.builds(Acknowledgement, st.just(robot), SEQUENCES, SEQUENCES),
+        st.builds(Release, st.just(robot), detector_files()),
     )
 
 

@@ -32,6 +32,8 @@ LONGEST = {
     "Packet.robot": 64,
     "Detector.version": 64,
     "Place.detector_version": 64,
+    "Release.version": 64,
+    "Release.sha256": 32,
     "Keyscan.ranges": 3 * 4096,
     "Place.keypoints": 6 * 2048,
     "Place.descriptors": 32 * 2048,
@@ -145,5 +147,6 @@ def test_the_document_names_every_field_and_limit():
         limits.MAXIMUM_BEAMS,
         limits.MAXIMUM_RANGES_BYTES,
         limits.MAXIMUM_KEYPOINTS,
+        limits.MAXIMUM_NETWORK_BYTES,
     ):
         assert str(number) in plain

@@ -10,6 +10,7 @@ import fcslam
 from fcslam.cli import certificates, config, demo, evaluate, extract, federate, serve, simulate, train
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
+from fcslam.cli import robot as robots
 from fcslam.errors import FcslamError
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -46,6 +47,11 @@ app.command(
     epilog="Example: fcslam federate --local robot1 robot2 robot3 --output fleet --public photos, "
     "fcslam federate --local robot1 robot2 --output try --quick",
 )(federate.federate)
+app.command(
+    "robot",
+    epilog="Example: fcslam robot robot1.clf.gz --server https://cloud.example:8443 --state state/robot1 "
+    "--token-file robot1.token, fcslam robot --explain-traffic",
+)(robots.robot)
 app.command(
     "serve",
     epilog="Example: fcslam serve --data missions, fcslam serve --data missions --host 0.0.0.0 --tokens tokens.yaml "

@@ -1,8 +1,8 @@
-"""`fcslam demo`: a fleet simulated, mapped together, measured against the truth, and drawn."""
+"""`fcslam demo`: a fleet simulated, taught, mapped together, measured against the truth, and drawn."""
 
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,9 +14,12 @@ from fcslam.simulation.kinds import Building
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fcslam.mission import MissionConfig
     from fcslam.simulation.fleet import SimulatedFleet, SimulationSettings
+    from fcslam.sources import Source
 
-RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
+RECORDINGS, LEARNING, RUN, FIGURE, TABLE = "recordings", "learning", "run", "figure.png", "evaluation.csv"
+STAGES = 5
 ABOUT = "about"
 """It tells a folder that a demo wrote from one that holds somebody's work."""
 
@@ -37,7 +40,6 @@ def demo(
 
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
-    from fcslam.mission import MissionConfig
     from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
     from fcslam.simulation.recording import prepare_fleet_folder
     from fcslam.sources import open_source
@@ -52,8 +54,10 @@ def demo(
     console = Console(stderr=True)
     _announce(console, 1, f"simulate: {robots} robots drive {path_length:g} m each; none is told where it starts")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, False, console)
-    _announce(console, 2, "map each robot, recognise places, fuse")
-    map_sources([open_source(place) for place in recordings], MissionConfig(seed=seed), output / RUN, force=True)
+    sources = [open_source(place) for place in recordings]
+    config = _learn(sources, output / LEARNING, seed, camera is not None, console)
+    _announce(console, 3, "map each robot, recognise places, fuse")
+    map_sources(sources, config, output / RUN, force=True)
     _evaluate(output, console)
     _draw(output, fleet, console)
     typer.echo(f"{time.perf_counter() - began:.0f} s in all")
@@ -85,7 +89,7 @@ def _prepare(output: Path) -> None:
             raise OutputError(
                 f"{output}: holds something that is no demo; remove it, or name another folder with --output"
             )
-        names = (RECORDINGS, RUN, FIGURE, TABLE)
+        names = (RECORDINGS, LEARNING, RUN, FIGURE, TABLE)
         (output / ABOUT).write_text(
             f"Written by `fcslam demo`, which replaces {', '.join(names)} here when it runs again.\n", encoding="utf-8"
         )
@@ -98,6 +102,30 @@ def _prepare(output: Path) -> None:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
 
 
+def _learn(sources: "Sequence[Source]", folder: Path, seed: int, camera: bool, console: "Console") -> "MissionConfig":
+    """Train the detector for a moment where that can be done; the mission, with what came of it if it is no worse."""
+    from fcslam.cli.demo_learning import learn_together, missing_libraries
+    from fcslam.mission import MissionConfig
+
+    config, missing = MissionConfig(seed=seed), missing_libraries()
+    if not camera:
+        _announce(console, 2, "learn: left out, there is no camera")
+        return config
+    if missing:
+        how = "pip install 'fcslam[federated]', or make demo EXTRAS=dev,federated"
+        _announce(console, 2, f"learn: left out, as {' and '.join(missing)} are not installed; to have it: {how}")
+        return config
+    _announce(console, 2, "learn: the robots train the detector together, no image leaves its robot")
+    released = learn_together(sources, folder, seed, console)
+    if released is None:
+        console.print("no round was as good on held-out images as what came with fcslam: the fleet keeps that")
+        return config
+    console.print("no worse on held-out images than what came with fcslam: the fleet takes it", highlight=False)
+    onnx = config.robot.views.onnx.model_copy(update={"weights": released})
+    views = config.robot.views.model_copy(update={"onnx": onnx})
+    return config.model_copy(update={"robot": config.robot.model_copy(update={"views": views})})
+
+
 def _evaluate(output: Path, console: "Console") -> None:
     from rich.console import Console
 
@@ -106,7 +134,7 @@ def _evaluate(output: Path, console: "Console") -> None:
     from fcslam.evaluation.fleet_metrics import fleet_metrics
     from fcslam.evaluation.relations import write_metrics
 
-    _announce(console, 3, "evaluate: compare with the truth")
+    _announce(console, 4, "evaluate: compare with the truth")
     with _busy(console, "evaluating"):
         report = evaluate_fleet(output / RUN, output / RECORDINGS)
         write_metrics(fleet_metrics(report), output / TABLE)
@@ -119,7 +147,7 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.evaluation.figure import write_figure
     from fcslam.simulation.floorplan import Kind
 
-    _announce(console, 4, "draw")
+    _announce(console, 5, "draw")
     with _busy(console, "drawing"):
         solid = [piece for piece in fleet.plan.pieces if piece.kind is not Kind.LINTEL]
         outlines = [Outline(piece.outline, piece.kind is not Kind.WALL) for piece in solid]
@@ -127,7 +155,7 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
 
 
 def _announce(console: "Console", stage: int, what: str) -> None:
-    console.print(f"[bold]{stage} of 4[/bold] {what}", highlight=False, soft_wrap=True)
+    console.print(f"[bold]{stage} of {STAGES}[/bold] {what}", highlight=False, soft_wrap=True)
 
 
 @contextmanager

@@ -33,7 +33,8 @@ def federate(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for all that is made; the same one resumes.")],
     config: Annotated[Path | None, typer.Option(help="YAML file of federated settings.")] = None,
     start: Annotated[
-        Path | None, typer.Option(help="checkpoint.npz of a training to begin from; without it, synthetic shapes.")
+        Path | None,
+        typer.Option(help="checkpoint.npz or detector.onnx of a training to begin from; without it, synthetic shapes."),
     ] = None,
     public: Annotated[
         list[Path] | None,

@@ -9,8 +9,8 @@ import typer
 from fcslam.errors import TrainingError
 
 if TYPE_CHECKING:
-    from fcslam.federated.launch import Address, Certificates
     from fcslam.federated.task import Task
+    from fcslam.federated.tls import Address, Certificates
 
 NEEDED = "give --ca, --certificate, --key and --robot-key, or --insecure where nobody else is on the network"
 
@@ -31,7 +31,7 @@ class Security:
         Raises:
             TrainingError: something is missing, or is no file.
         """
-        from fcslam.federated.launch import Certificates
+        from fcslam.federated.tls import Certificates
 
         files = [file for file in (self.ca, self.certificate, self.key, *self.robot_keys) if file is not None]
         for file in files:
@@ -103,7 +103,7 @@ def run_robot(where: str, folders: list[Path], output: Path, device: str, securi
 
 
 def _address(text: str) -> "Address":
-    from fcslam.federated.launch import Address
+    from fcslam.federated.tls import Address
 
     host, colon, port = text.removeprefix("https://").removeprefix("http://").rpartition(":")
     if not (colon and host and port.isdecimal() and 0 < int(port) < 65536):

@@ -33,6 +33,7 @@ from fcslam.records import (
     Constraint,
     ConstraintKind,
     Correction,
+    DetectorFile,
     FloatArray,
     Keyscan,
     KeyscanId,
@@ -40,7 +41,7 @@ from fcslam.records import (
     Veto,
     frozen,
 )
-from fcslam.wire.messages import Acknowledgement, Hello, Packet
+from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
 from fcslam.wire.packets import decode, encode
 
 
@@ -102,6 +103,8 @@ class Fleet:
         """Whether evidence has turned against a join."""
         self._patience = 0
         """Closures up to which doubts wait: the same doubts soon again would be dispelled again."""
+        self._releases: dict[Channel, DetectorFile] = {}
+        """The newest detectors."""
         self._version = 0
         self._disturbed = False
         """Whether something but a packet left its mark on the graph."""
@@ -171,6 +174,10 @@ class Fleet:
             for (channel, version), matcher in self._matchers.items()
         )
 
+    def announce(self, file: DetectorFile) -> None:
+        """From now on robots that describe this channel are told of this detector, until they have taken it."""
+        self._releases[file.channel] = file
+
     def closure_counts(self) -> dict[str, int]:
         """Closures so far by kind, for progress displays."""
         counts = {"within robots": 0, "between robots": 0}
@@ -218,7 +225,7 @@ class Fleet:
             case Place() as place:
                 self._store.add_place(place)
                 self._add_place(place)  # place recognition and map fusion
-            case Correction() | Acknowledgement():
+            case Correction() | Acknowledgement() | Release():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
 
     def _add_place(self, place: Place) -> None:
@@ -227,7 +234,7 @@ class Fleet:
             words = place.channel, place.detector_version
             matcher = self._matcher(words)
             matches = matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
-            entries = [self._ledger.add(match) for match in matches]
+            entries = [self._ledger.add(match) for match in matches if not self._ledger.confirms(match)]
             waiting = [entry for entry in entries if not self._is_vetoed(entry) and self._accept_or_wait(entry)]
             for other in dict.fromkeys(entry.closure.i.robot for entry in waiting):
                 self._judge_pair(other, place.id.robot)
@@ -361,14 +368,22 @@ class Fleet:
         return fusion
 
     def _replies(self, packet: Packet) -> list[bytes]:
-        """Acknowledgement and, after a place, where the robot's odometry lies in the map."""
+        """Acknowledgement; after a place, where the robot's odometry lies in the map; newer detectors."""
         robot, epoch, session = packet.robot, packet.epoch, session_name(packet.robot, packet.epoch)
-        bodies: list[Acknowledgement | Correction] = [Acknowledgement(robot, epoch, packet.sequence)]
+        bodies: list[Acknowledgement | Correction | Release] = [Acknowledgement(robot, epoch, packet.sequence)]
         if isinstance(packet.body, Place) and self._graph.keyscan_count(session):
             bodies.append(replace(self._correction(session), robot=robot))
+        if isinstance(packet.body, Hello | Place):
+            bodies += [Release(robot, file) for file in self._newer_detectors(session)]
         first = self._store.number_replies(session, len(bodies))
         return [encode(Packet(robot, epoch, first + k, packet.time, body)) for k, body in enumerate(bodies)]
 
     def _correction(self, session: str) -> Correction:
         index = next(k for k, robots in enumerate(self._maps) if session in robots)
         return Correction(session, self._version, index, frozen(self._graph.T_map_odom(session)))
+
+    def _newer_detectors(self, session: str) -> list[DetectorFile]:
+        """Of the channels that the robot has."""
+        versions = self._store.detector_versions(session)
+        newest = self._releases.items()
+        return [file for channel, file in newest if versions.get(channel, file.version) != file.version]

@@ -32,6 +32,8 @@ class ClosureLedger:
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
+        self._confirmed: set[tuple[frozenset[KeyscanId], Channel]] = set()
+        """Pairs of places between which geometry has confirmed a closure, with its channel."""
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries)
@@ -39,9 +41,15 @@ class ClosureLedger:
     def __len__(self) -> int:
         return len(self._entries)
 
+    def confirms(self, match: PlaceMatch) -> bool:
+        """Whether geometry has confirmed these two places before: described anew they are no second witness."""
+        return (frozenset((match.i, match.j)), match.channel) in self._confirmed
+
     def add(self, match: PlaceMatch) -> Entry:
         """Book a match as verified or, if geometry does not confirm it, as a candidate."""
         status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
+        if match.M:
+            self._confirmed.add((frozenset((match.i, match.j)), match.channel))
         closure = LoopClosure(
             match.i, match.j, match.channel, match.similarity, frozen(match.check.T_a_b),
             frozen(match.check.information), status, match.check.reason, match.check.informative,

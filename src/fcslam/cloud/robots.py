@@ -1,6 +1,6 @@
 """What the cloud keeps of each robot's session: its packets in order, its laser, its keyscans."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from fcslam.errors import PacketError
 from fcslam.records import Channel, Constraint, Keyscan, KeyscanId, LaserModel, Place
@@ -22,7 +22,10 @@ class RobotStore:
         self._keyscans: dict[str, list[Keyscan]] = {}
         self._connected: dict[str, int] = {}
         """Keyscans that motions tie to the first; only they are known to others."""
-        self._places: set[tuple[KeyscanId, Channel]] = set()
+        self._announced: dict[str, set[tuple[Channel, str]]] = {}
+        """Detectors that each robot has said it describes places with, of all its hellos."""
+        self._places: set[tuple[KeyscanId, Channel, str]] = set()
+        """With their detector versions."""
         self._replies: dict[str, int] = {}
 
     @property
@@ -76,14 +79,16 @@ class RobotStore:
         return sorted(self._journal.values(), key=lambda packet: packet.order)
 
     def greet(self, hello: Hello) -> None:
-        """A robot introduces its laser.
+        """The robot begins, or has changed a detector.
 
         Raises:
-            PacketError: it did before.
+            PacketError: it has another laser than before.
         """
-        if hello.robot in self._hellos:
-            raise PacketError(f"{hello.robot}: said hello before")
+        before = self._hellos.get(hello.robot)
+        if before is not None and before.laser != hello.laser:
+            raise PacketError(f"{hello.robot}: says hello again with another laser")
         self._hellos[hello.robot] = hello
+        self._announced.setdefault(hello.robot, set()).update(hello.detector_versions.items())
 
     def add_keyscan(self, keyscan: Keyscan) -> None:
         """The robot's next keyscan.
@@ -120,18 +125,20 @@ class RobotStore:
         """A place of the robot.
 
         Raises:
-            PacketError: its keyscans are not there, it was described before, or by a detector not announced.
+            PacketError: its keyscans are not there, this detector described it before, or was not announced.
         """
         self.require(place.id, KeyscanId(place.id.robot, place.last))
-        announced = self._hellos[place.id.robot].detector_versions.get(place.channel)
-        if place.detector_version != announced:
+        robot, number = place.id
+        announced = sorted(version for channel, version in self._announced[robot] if channel is place.channel)
+        if place.detector_version not in announced:
             raise PacketError(
-                f"{place.id.robot}: a {place.channel} place of detector {place.detector_version}; "
-                f"{announced or 'none'} was announced"
+                f"{robot}: a {place.channel} place of detector {place.detector_version}; "
+                f"{', '.join(announced) or 'none'} was announced"
             )
-        if (place.id, place.channel) in self._places:
-            raise PacketError(f"{place.id.robot}: {place.channel} place {place.id.number} was described before")
-        self._places.add((place.id, place.channel))
+        described = place.id, place.channel, place.detector_version
+        if described in self._places:
+            raise PacketError(f"{robot}: {place.channel} place {number} was described before")
+        self._places.add(described)
 
     def require(self, *ids: KeyscanId) -> None:
         """Check that the keyscans are there.
@@ -151,6 +158,10 @@ class RobotStore:
     def stamp(self, keyscan: KeyscanId) -> float:
         """When the keyscan was taken."""
         return self._keyscans[keyscan.robot][keyscan.number].stamp
+
+    def detector_versions(self, robot: str) -> Mapping[Channel, str]:
+        """What the robot describes places with now; nothing before its hello."""
+        return self._hellos[robot].detector_versions if robot in self._hellos else {}
 
     def laser(self, robot: str) -> LaserModel:
         """The robot's laser."""

@@ -1,6 +1,7 @@
 """Start Flower's daemons for a fleet on several machines, with our apps in them."""
 
 import contextlib
+import ctypes
 import json
 import os
 import signal
@@ -10,7 +11,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
@@ -18,10 +18,14 @@ from fcslam.errors import OutputError, TrainingError
 from fcslam.federated.deployed import STATUS_FILE, read_status, task_text
 from fcslam.federated.flower import QUIET
 from fcslam.federated.task import Task
+from fcslam.federated.tls import Address, Certificates, check_own, check_server
 
 LINK: Final = "fleet"
-START_S: Final = 60.0
+START_S: Final = 180.0
 LOG_FILE: Final = "flower.log"
+LOOPBACK: Final = "127.0.0.1"
+PR_SET_PDEATHSIG: Final = 1
+"""Of Linux; Flower's own children watch their parents themselves."""
 
 _APP: Final = """[build-system]
 requires = ["hatchling"]
@@ -48,31 +52,6 @@ task = %s
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Certificates:
-    """PEM files of one machine."""
-
-    ca: Path
-    certificate: Path
-    key: Path
-
-    def options(self) -> list[str]:
-        """For Flower's daemons."""
-        files = ("--ssl-ca-certfile", self.ca), ("--ssl-certfile", self.certificate), ("--ssl-keyfile", self.key)
-        return [word for option, file in files for word in (option, str(file.resolve()))]
-
-
-@dataclass(frozen=True, slots=True)
-class Address:
-    """Where the server listens."""
-
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        return f"{self.host}:{self.port}"
-
-
 def serve(
     task: Task,
     device: str,
@@ -92,9 +71,11 @@ def serve(
         say: called about every second, to look at the run folder.
 
     Raises:
-        TrainingError: Flower does not start, or the training failed; the message says why.
+        TrainingError: certificates do not fit, Flower does not start, or the training failed; the message says why.
         OutputError: the run folder cannot be written.
     """
+    if certificates is not None:
+        check_own(certificates, address.host)
     _made(task.output)
     (task.output / STATUS_FILE).unlink(missing_ok=True)
     with tempfile.TemporaryDirectory() as place, (task.output / LOG_FILE).open("ab") as log:
@@ -134,14 +115,20 @@ def join(
         certificates: of this machine, as Flower's processes on it talk over TLS as well; None as in ``serve``.
         private_key: of a key pair whose public half the server has.
         log_file: for what Flower says.
+
+    Raises:
+        TrainingError: certificates do not fit.
+        OutputError: the folder of ``log_file`` cannot be written.
     """
     security = ["--insecure"]
     if certificates is not None:
+        check_own(certificates, LOOPBACK)
+        check_server(address, certificates.ca)
         security = ["--root-certificates", str(certificates.ca.resolve()), *certificates.options()]
     if private_key is not None:
         security += ["--auth-supernode-private-key", str(private_key.resolve())]
     config = " ".join(f"{name}={json.dumps(value)}" for name, value in robot.items())
-    where = ["--superlink", str(address), "--host", "127.0.0.1", "--port", str(free_port()), "--node-config", config]
+    where = ["--superlink", str(address), "--host", LOOPBACK, "--port", str(free_port()), "--node-config", config]
     _made(log_file.parent)
     with (
         tempfile.TemporaryDirectory() as home,
@@ -154,7 +141,7 @@ def join(
 def free_port() -> int:
     """A port of this machine that nobody listens on."""
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
 
 
@@ -183,9 +170,7 @@ def _wait_for(address: Address, link: "subprocess.Popen[bytes]") -> None:
         with contextlib.suppress(OSError), socket.create_connection((address.host, address.port), timeout=1.0):
             return
         time.sleep(0.2)
-    raise TrainingError(
-        f"{address}: Flower's SuperLink does not listen there; is the port free, do certificate and key fit?"
-    )
+    raise TrainingError(f"{address}: Flower's SuperLink does not listen there; is the port free?")
 
 
 def _flwr(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
@@ -216,7 +201,12 @@ def _daemon(
 ) -> "Iterator[subprocess.Popen[bytes]]":
     """A process in a session of its own, which ends with the block and takes its children with it."""
     process = subprocess.Popen(
-        [*_program(command[0]), *command[1:]], env=dict(environment), stdout=log, stderr=log, start_new_session=True
+        [*_program(command[0]), *command[1:]],
+        env=dict(environment),
+        stdout=log,
+        stderr=log,
+        start_new_session=True,
+        preexec_fn=_die_with_parent if sys.platform == "linux" else None,  # noqa: PLW1509 - there are no threads yet
     )
     try:
         yield process
@@ -226,6 +216,11 @@ def _daemon(
                 os.killpg(process.pid, number)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(10.0)
+
+
+def _die_with_parent() -> None:
+    """A daemon whose starter is killed outright ends as well; else it would keep the port, or train on unseen."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _made(folder: Path) -> None:

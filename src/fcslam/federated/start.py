@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fcslam.errors import TrainingError
 from fcslam.features.detector import GreyImage
 from fcslam.federated.network import network_of, weights_of
+from fcslam.federated.released import SUFFIX, read_released
 from fcslam.federated.rounds import Judge
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
@@ -31,10 +32,10 @@ GROUPS: Final = ("best/", "average/")
 def first_weights(
     start: Path | None, folder: Path, settings: FederatedSettings, pace: Pace, watch: Watch
 ) -> dict[str, NDArray[np.float32]]:
-    """Weights of a checkpoint, or, without one, of a detector trained on synthetic shapes in ``folder``.
+    """Weights of a checkpoint or a released detector; without one, of a detector trained on shapes in ``folder``.
 
     Raises:
-        TrainingError: the checkpoint is none or of another network, or ``folder`` holds another run.
+        TrainingError: ``start`` is neither or of another network, or ``folder`` holds another run.
         OutputError: something cannot be written.
     """
     if start is None:
@@ -43,11 +44,13 @@ def first_weights(
 
 
 def read_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
-    """The weights in a checkpoint of federated or central training.
+    """The weights in a checkpoint of federated or central training, or in a released detector's ONNX file.
 
     Raises:
-        TrainingError: it is none, or of another network.
+        TrainingError: it is none of these, or of another network.
     """
+    if path.suffix == SUFFIX:
+        return read_released(path, encoder)
     tensors = read_checkpoint(path).tensors
     for group in GROUPS:
         arrays = {

@@ -2,13 +2,15 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 from pydantic import Field
 
 from fcslam.config import Settings
+from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig, describe
 from fcslam.lidar.mapper import FinishedSubmap, LidarConfig, Mapper, ScanPose, Step
-from fcslam.records import CameraImage, Channel, KeyscanId, LaserScan, Place, SensorRecord
+from fcslam.records import CameraImage, Channel, DetectorFile, KeyscanId, LaserScan, Place, SensorRecord
 from fcslam.robot.views import View, ViewFinder, ViewsConfig
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.quantisation import dequantise, quantise
@@ -36,6 +38,10 @@ class RobotFrontend:
         self._view_finder = ViewFinder(config.views)
         self._views: list[View] = []
         """Those that wait for the submap around them."""
+        self._submaps: dict[int, tuple[int, int]] = {}
+        """First and last keyscan of the submap that each camera place was sent with."""
+        self._has_switched = False
+        """Whether the detector has changed and nobody was told yet."""
         self._sequence = 0
         self._time = float("-inf")
 
@@ -48,15 +54,32 @@ class RobotFrontend:
                 self._process_image(record)
         return []  # a scan brings its own odometry; images never leave the robot
 
+    def adopt(self, file: DetectorFile, path: Path) -> None:
+        """Describe camera images by another network from now on, and, with the next scan, those that are still here.
+
+        Args:
+            file: as the cloud announced it.
+            path: where it was fetched to.
+
+        Raises:
+            FeatureError: it is not that file, cannot be used, or this robot has no use for it; nothing has changed.
+        """
+        if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
+            raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
+        self._view_finder.take(file, path)
+        self._has_switched = True
+
     def _process_scan(self, record: LaserScan) -> list[Packet]:
         self._time = max(self._time, record.stamp)
         # The robot works with the ranges that the cloud will see, to the last bit.
         scan = replace(record, ranges_m=dequantise(quantise(record.ranges_m)))
-        hello = [] if self.scan_poses else [self._hello(scan)]
+        news: list[Body] = []
+        if self._has_switched or not self.scan_poses:
+            news = [self._hello(scan), *self._places_again()]
         step = self._mapper.process(scan)
         self.scan_poses.append(step.pose)
         self._view_finder.at(scan, step.pose)
-        return self._packets([*hello, *self._bodies(step)])
+        return self._packets([*news, *self._bodies(step)])
 
     def _process_image(self, image: CameraImage) -> None:
         view = self._view_finder.look(image)
@@ -88,7 +111,17 @@ class RobotFrontend:
         self._views = self._views[len(ripe) :]
         # Between two scans a robot may jump: a view whose surroundings no submap shows is no place.
         shown = [view for view in ripe if submap.first <= view.keyscan <= submap.last]
-        return [*bodies, *(self._camera_place(view, submap) for view in shown)]
+        self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
+        return [*bodies, *(self._camera_place(view) for view in shown)]
+
+    def _places_again(self) -> list[Place]:
+        """Camera places of before, where the detector has changed and their images are still here."""
+        if not self._has_switched:
+            return []
+        self._has_switched = False
+        views = {view.keyscan: view for view in self._view_finder.look_again()}
+        self._views = [views.get(view.keyscan, view) for view in self._views]
+        return [self._camera_place(view) for keyscan, view in views.items() if keyscan in self._submaps]
 
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
         features = describe(submap.surface, self._config.birdseye)
@@ -97,10 +130,11 @@ class RobotFrontend:
             features.keypoints_m, features.descriptors,
         )  # fmt: skip
 
-    def _camera_place(self, view: View, submap: FinishedSubmap) -> Place:
+    def _camera_place(self, view: View) -> Place:
+        first, last = self._submaps[view.keyscan]
         return Place(
-            KeyscanId(self.robot, view.keyscan), Channel.CAMERA, self._view_finder.detector_version, submap.first,
-            submap.last, view.keypoints, view.descriptors,
+            KeyscanId(self.robot, view.keyscan), Channel.CAMERA, view.detector_version, first, last, view.keypoints,
+            view.descriptors,
         )  # fmt: skip
 
     def _hello(self, scan: LaserScan) -> Hello:

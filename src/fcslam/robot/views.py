@@ -1,6 +1,7 @@
 """Keyframe images: what the camera shows of a place, as descriptors with metric positions. The images stay here."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +10,15 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.features.choice import make_detector
 from fcslam.features.classical import OrbConfig
-from fcslam.features.detector import OnnxConfig, decode_grey
+from fcslam.features.detector import GreyImage, OnnxConfig, decode_grey
 from fcslam.features.kinds import DetectorKind
 from fcslam.features.placing import LidarView, place_keypoints
+from fcslam.features.release import open_release
 from fcslam.geometry import se2
 from fcslam.lidar.mapper import ScanPose
 from fcslam.lidar.scan import point_scan
-from fcslam.records import CameraImage, Codes, FloatArray, LaserScan, frozen
+from fcslam.records import CameraImage, Codes, DetectorFile, FloatArray, LaserScan, frozen
+from fcslam.robot.album import Album, AlbumConfig, Shot
 
 
 class ViewsConfig(Settings):
@@ -28,6 +31,7 @@ class ViewsConfig(Settings):
     detector: DetectorKind = Field(default=DetectorKind.ONNX, description="what describes images: a network or orb")
     orb: OrbConfig = Field(default=OrbConfig(), description="settings of detector orb")
     onnx: OnnxConfig = Field(default=OnnxConfig(), description="settings of detector onnx")
+    album: AlbumConfig = Field(default=AlbumConfig(), description="images kept for another detector")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +43,7 @@ class View:
     """Shape (K, 3): x, y, z in metres in the keyscan's base."""
     descriptors: Codes
     """Shape (K, 32)."""
+    detector_version: str
 
 
 class ViewFinder:
@@ -52,6 +57,7 @@ class ViewFinder:
         """
         self._config = config
         self._detector = make_detector(config.detector, config.orb, config.onnx)
+        self._album = Album(config.album)
         self._scan: LaserScan | None = None
         self._pose: ScanPose | None = None
         self._last: tuple[int, FloatArray] | None = None
@@ -80,21 +86,42 @@ class ViewFinder:
         if picture is None or picture.shape != (image.camera.height, image.camera.width):
             return None
         self._last = self._pose.keyscan, odometry
-        features = self._detector.detect(picture)
         T_scan_image = se2.between(self._scan.T_odom_base, odometry)
         returns = point_scan(self._scan.ranges_m, self._scan.laser)
         spacing_rad = abs(self._scan.laser.angle_increment_rad)
         ends = se2.transform(se2.inverse(T_scan_image), np.vstack((returns.origin, returns.points)))
+        T_keyscan_image = se2.compose(self._pose.T_keyscan_base, T_scan_image)
+        surroundings = LidarView(ends[1:], ends[0], spacing_rad)
+        shot = Shot(self._pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
+        view = self._describe(shot, picture)
+        if view is not None:
+            self._album.add(shot)
+        return view
+
+    def take(self, file: DetectorFile, path: Path) -> None:
+        """Look with a network that was announced and fetched from now on.
+
+        Raises:
+            FeatureError: it is another file, or cannot be used; nothing has changed.
+        """
+        self._detector = open_release(file, path, self._config.onnx)
+
+    def look_again(self) -> list[View]:
+        """The views in the images that are still here, oldest first, as the detector sees them now."""
+        pictures = ((shot, decode_grey(shot.encoded)) for shot in self._album)
+        views = (self._describe(shot, picture) for shot, picture in pictures if picture is not None)
+        return [view for view in views if view is not None]
+
+    def _describe(self, shot: Shot, picture: GreyImage) -> View | None:
+        features = self._detector.detect(picture)
         positions, placed = place_keypoints(
-            features.keypoints_px, image.camera, LidarView(ends[1:], ends[0], spacing_rad), self._config.ceiling_m
+            features.keypoints_px, shot.camera, shot.surroundings, self._config.ceiling_m
         )
         if placed.sum() < self._config.fewest_keypoints:
             return None
-        T_keyscan_image = se2.compose(self._pose.T_keyscan_base, T_scan_image)
-        positions[:, :2] = se2.transform(T_keyscan_image, positions[:, :2])
-        return View(
-            self._pose.keyscan, frozen(positions[placed], np.float32), frozen(features.descriptors[placed], np.uint8)
-        )
+        positions[:, :2] = se2.transform(shot.T_keyscan_image, positions[:, :2])
+        keypoints, codes = frozen(positions[placed], np.float32), frozen(features.descriptors[placed], np.uint8)
+        return View(shot.keyscan, keypoints, codes, self._detector.version)
 
     def _is_new(self, keyscan: int, T_odom_base: FloatArray) -> bool:
         """A keyscan has one view at most, which names its place."""

@@ -14,6 +14,7 @@ from fcslam.records import (
     Constraint,
     ConstraintKind,
     Correction,
+    DetectorFile,
     FloatArray,
     Keyscan,
     KeyscanId,
@@ -23,7 +24,7 @@ from fcslam.records import (
 )
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import BYTES_PER_AXIS, KEYPOINT_AXES, MAXIMUM_KEYPOINTS
-from fcslam.wire.messages import Acknowledgement, Hello, Kind
+from fcslam.wire.messages import Acknowledgement, Hello, Kind, Release
 from fcslam.wire.quantisation import (
     dequantise,
     pack_information,
@@ -152,6 +153,19 @@ def _read_acknowledgement(message: pb.Acknowledgement, envelope: pb.Packet) -> A
     return Acknowledgement(envelope.robot, message.epoch, message.sequence)
 
 
+def _write_release(release: Release) -> pb.Release:
+    file = release.file
+    return pb.Release(
+        channel=_CHANNELS[file.channel], version=file.version, format=file.format, size=file.size, sha256=file.sha256
+    )
+
+
+def _read_release(message: pb.Release, envelope: pb.Packet) -> Release:
+    channel = read_channel(message.channel)
+    file = DetectorFile(channel, message.version, message.format, message.size, message.sha256)
+    return Release(envelope.robot, file)
+
+
 def _write_pose(pose: FloatArray) -> pb.Pose:
     x, y, theta = pose.tolist()
     return pb.Pose(x_m=x, y_m=y, theta_rad=theta)
@@ -192,5 +206,6 @@ CODECS = {
     Kind.PLACE: Codec(Place, _write_place, _read_place),
     Kind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     Kind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
+    Kind.RELEASE: Codec(Release, _write_release, _read_release),
 }
 CODEC_OF_TYPE = {codec.type: (kind, codec) for kind, codec in CODECS.items()}

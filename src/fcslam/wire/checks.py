@@ -10,18 +10,20 @@ from numpy.typing import NDArray
 from fcslam.errors import PacketError
 from fcslam.records import CODE_BYTES, NAME, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
 from fcslam.wire.limits import (
+    DIGEST_BYTES,
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
     MAXIMUM_COORDINATE_M,
     MAXIMUM_INFORMATION,
     MAXIMUM_KEYPOINTS,
     MAXIMUM_LASER_RANGE_M,
+    MAXIMUM_NETWORK_BYTES,
     MAXIMUM_NUMBER,
     MAXIMUM_SEQUENCE,
     MINIMUM_CORRELATION_EIGENVALUE,
     MINIMUM_INFORMATION,
 )
-from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet
+from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet, Release
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise, unpack_information
 
 FULL_TURN_RAD = 2.0 * math.pi
@@ -136,6 +138,15 @@ def _check_acknowledgement(acknowledgement: Acknowledgement, _: Packet) -> None:
     _check_count(acknowledgement.sequence, "acknowledgement: sequence", MAXIMUM_SEQUENCE)
 
 
+def _check_release(release: Release, _: Packet) -> None:
+    file = release.file
+    check_name(file.version, "release: detector version")
+    _check_count(file.format, "release: format", MAXIMUM_NUMBER)
+    within = 0 < file.size <= MAXIMUM_NETWORK_BYTES
+    _require(within, f"release: a file of {file.size} bytes, not of 1..{MAXIMUM_NETWORK_BYTES}")
+    _require(len(file.sha256) == DIGEST_BYTES, f"release: sha256 has {len(file.sha256)} bytes, not {DIGEST_BYTES}")
+
+
 _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     Hello: _check_hello,
     Keyscan: _check_keyscan,
@@ -143,6 +154,7 @@ _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     Place: _check_place,
     Correction: _check_correction,
     Acknowledgement: _check_acknowledgement,
+    Release: _check_release,
 }
 
 

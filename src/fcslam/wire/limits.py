@@ -23,6 +23,10 @@ KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
 """Coordinates of a keypoint; a camera sees how high it is, too."""
 BYTES_PER_AXIS = 2
 
+MAXIMUM_NETWORK_BYTES = 64 * 1024 * 1024
+"""Of a detector's file; those of today have 0.5 to 5 MB."""
+DIGEST_BYTES = 32
+
 MAXIMUM_COORDINATE_M = 1e6
 MAXIMUM_LASER_RANGE_M = 1e3
 MAXIMUM_INFORMATION = 2.0**40

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from fcslam.records import Channel, Constraint, Correction, Keyscan, LaserModel, Place
+from fcslam.records import Channel, Constraint, Correction, DetectorFile, Keyscan, LaserModel, Place
 
 
 class Kind(StrEnum):
@@ -16,6 +16,7 @@ class Kind(StrEnum):
     PLACE = "place"
     CORRECTION = "correction"
     ACKNOWLEDGEMENT = "acknowledgement"
+    RELEASE = "release"
 
 
 UPLINK = frozenset({Kind.HELLO, Kind.KEYSCAN, Kind.CONSTRAINT, Kind.PLACE})
@@ -24,7 +25,7 @@ UPLINK = frozenset({Kind.HELLO, Kind.KEYSCAN, Kind.CONSTRAINT, Kind.PLACE})
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """The first packet of an epoch: how to read the ones that follow."""
+    """How to read the packets that follow: the first of an epoch, and again whenever a detector has changed."""
 
     robot: str
     epoch: int
@@ -43,7 +44,15 @@ class Acknowledgement:
     """Its sequence number."""
 
 
-Body = Hello | Keyscan | Constraint | Place | Correction | Acknowledgement
+@dataclass(frozen=True, slots=True)
+class Release:
+    """What the cloud tells a robot: there is a newer detector, to be fetched and used from then on."""
+
+    robot: str
+    file: DetectorFile
+
+
+Body = Hello | Keyscan | Constraint | Place | Correction | Acknowledgement | Release
 
 
 @dataclass(frozen=True, slots=True)

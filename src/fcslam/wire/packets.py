@@ -55,6 +55,17 @@ def decode(data: bytes) -> Packet:
     return packet
 
 
+def readdress(data: bytes, epoch: int, sequence: int) -> bytes:
+    """The same packet with another epoch and number on its envelope.
+
+    Raises:
+        PacketError: ``data`` is not a packet of a known version, with the reason.
+    """
+    message, _ = _parse(data)
+    message.epoch, message.sequence = epoch, sequence
+    return message.SerializeToString(deterministic=True)
+
+
 def read_label(data: bytes) -> Label:
     """Robot, kind and channel of a packet without the cost, and without the checks, of reading its body.
 

@@ -1,0 +1,414 @@
+"""The same map whatever the network, the machines and their disks do: real processes on loopback.
+
+    python benchmarks/faults.py
+
+A simulated fleet is mapped by `fcslam serve` and one `fcslam robot` a robot, which play their recordings faster than
+they were made and reach the server through a proxy that does to requests what the scenario says: loses them or their
+answers, cuts them in the middle, delays them, lets them arrive twice and in another order, or lets nothing through
+for what is five minutes of the recording. Processes are killed (SIGKILL) at random instants and started again; the
+server's disk is full for a while; the robots' clocks are minutes apart.
+
+After each scenario the result is asked for and compared with what `fcslam map` makes of the same recordings in one
+process: accepted closures, pose graph (largest difference of any number), bytes of the map, packets that count.
+"""
+
+import asyncio
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+
+ROBOTS, PATH_M, SPEED = 3, 60.0, 5.0
+MANY_ROBOTS, MANY_PATH_M = 20, 12.0
+OUTAGE_S = 300.0
+"""Of the recording's time."""
+SKEW_S = 240.0
+LATE_S = 3.0
+"""Up to so much later a request arrives for the second time."""
+FULL_BYTES = 4096
+PATIENCE_S = 600.0
+"""A scenario that takes longer has failed."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What goes wrong, as shares of all requests and numbers of events."""
+
+    lost: float = 0.0
+    """The request never arrives; as many answers are lost on their way back."""
+    cut: float = 0.0
+    """The connection breaks in the middle of the request."""
+    twice: float = 0.0
+    """The request arrives once more, up to LATE_S later: after its successors."""
+    delay_s: float = 0.0
+    """Up to so long it is on its way."""
+    away: bool = False
+    """For OUTAGE_S of the recording nothing gets through."""
+    server_kills: int = 0
+    worker_kills: int = 0
+    """The server lives on; only the process in which its fleet lives is killed."""
+    robot_kills: int = 0
+    disk_full: bool = False
+    """The server cannot write for a third of the recording."""
+    skewed: bool = False
+    """Each robot's clock is SKEW_S ahead of the one before."""
+    robots: int = ROBOTS
+    path_m: float = PATH_M
+
+
+SCENARIOS = {
+    "undisturbed": Scenario(),
+    "30 % lost": Scenario(lost=0.15, cut=0.05),
+    "5 minutes away": Scenario(away=True),
+    "late and out of order": Scenario(twice=0.5, delay_s=1.0),
+    "everything twice": Scenario(twice=1.0),
+    "server killed": Scenario(server_kills=4),
+    "worker killed": Scenario(worker_kills=4),
+    "robots killed": Scenario(robot_kills=6),
+    "all at once": Scenario(lost=0.1, cut=0.05, twice=0.3, delay_s=0.5, server_kills=2, robot_kills=3),
+    "disk full": Scenario(disk_full=True),
+    "clocks apart": Scenario(skewed=True),
+    "20 robots": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M),
+}
+
+UPLINK = ("hello", "keyscan", "constraint", "place")
+COLUMNS = {"scenario": "", "robots": "", "packets": ",.0f", "lost": ".0f", "twice": ".0f", "closures": "",
+           "the same": "", "graph off by": ".1e", "map the same": "", "requests": ",.0f", "disturbed": ",.0f",
+           "turned away": ",.0f", "kills": "", "s": ".0f", "passed": ""}  # fmt: skip
+
+
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS))
+    parser.add_argument("--robots", type=int, help=f"in each scenario ({ROBOTS}, and {MANY_ROBOTS} in the last one)")
+    parser.add_argument("--path", type=float, help=f"of each robot, m ({PATH_M}, {MANY_PATH_M})")
+    parser.add_argument("--speed", type=float, default=SPEED, help="so many times as fast as recorded")
+    parser.add_argument("--seed", type=int, default=1, help="of the fleet and of the faults")
+    chosen = parser.parse_args()
+    report = common.Report(__file__, __doc__, chosen)
+    rows = []
+    with tempfile.TemporaryDirectory() as place:
+        worlds = Worlds(Path(place), chosen.seed)
+        for name in chosen.scenarios:
+            scenario = SCENARIOS[name]
+            changes = {"robots": chosen.robots, "path_m": chosen.path}
+            scenario = replace(scenario, **{key: value for key, value in changes.items() if value is not None})
+            rows.append((name, *play(scenario, worlds, Path(place) / name.replace(" ", "-"), chosen)))
+            print(*rows[-1], flush=True)
+    report.table("Scenarios", COLUMNS, rows)
+    report.write()
+    if not all(row[-1] == "yes" for row in rows):
+        sys.exit("faults: a scenario failed")
+
+
+class Worlds:
+    """Recordings, and what `fcslam map` makes of them; each is made once."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self._folder = folder
+        self._seed = seed
+        self._known: dict[tuple[int, float, bool], tuple[list[Path], Path, float]] = {}
+
+    def get(self, scenario: Scenario) -> tuple[list[Path], Path, float]:
+        """Recordings, the run folder of reference, and the longest recording's duration in seconds."""
+        key = scenario.robots, scenario.path_m, scenario.skewed
+        if key not in self._known:
+            folder = self._folder / f"world-{len(self._known)}"
+            folder.mkdir()
+            logs, duration_s = self._record(scenario, folder)
+            common.run_fcslam("map", *logs, "--output", folder / "run")
+            self._known[key] = logs, folder / "run", duration_s
+        return self._known[key]
+
+    def _record(self, scenario: Scenario, folder: Path) -> tuple[list[Path], float]:
+        from fcslam.simulation.fleet import SimulationSettings, simulate_fleet
+        from fcslam.simulation.noise import LidarSettings
+        from fcslam.sources import write_carmen
+
+        lidar = LidarSettings(beams=180, rate_hz=3.0)
+        settings = SimulationSettings(robots=scenario.robots, path_length_m=scenario.path_m, lidar=lidar, camera=None)
+        logs, longest_s = [], 0.0
+        for number, robot in enumerate(simulate_fleet(settings, self._seed).robots):
+            logs.append(folder / f"{robot.name}.clf")
+            skew_s = number * SKEW_S * scenario.skewed
+            write_carmen(logs[-1], (replace(scan, stamp=scan.stamp + skew_s) for scan in robot.scans()))
+            longest_s = max(longest_s, float(robot.stamps[-1] - robot.stamps[0]))
+        return logs, longest_s
+
+
+class Proxy:
+    """Passes HTTP requests on, or does what the scenario says; runs in a thread of its own."""
+
+    def __init__(self, scenario: Scenario, to_port: int, rng: np.random.Generator) -> None:
+        self.counts: Counter[str] = Counter()
+        self.is_open = True
+        self._scenario = scenario
+        self._to_port = to_port
+        self._rng = rng
+        self._loop = asyncio.new_event_loop()
+        self._late: set[asyncio.Task[Any]] = set()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+        starting = asyncio.start_server(self._serve, "127.0.0.1", 0)
+        self._server = asyncio.run_coroutine_threadsafe(starting, self._loop).result()
+        self.port: int = self._server.sockets[0].getsockname()[1]
+
+    def open(self, is_open: bool) -> None:
+        """Whether anything gets through."""
+        self.is_open = is_open
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(OSError, asyncio.IncompleteReadError):
+            while answer := await self._pass_on(await http_message(reader)):
+                writer.write(answer)
+                await writer.drain()
+        writer.transport.abort()
+
+    async def _pass_on(self, request: bytes) -> bytes | None:
+        """The answer; None: the connection breaks."""
+        scenario, (lost, answer_lost, cut, twice, late) = self._scenario, self._rng.random(5)
+        self.counts["requests"] += 1
+        disturbed = not self.is_open or lost < scenario.lost or answer_lost < scenario.lost or cut < scenario.cut
+        self.counts["disturbed"] += bool(disturbed or twice < scenario.twice)
+        if not self.is_open or lost < scenario.lost:
+            return None
+        await asyncio.sleep(float(self._rng.uniform(0.0, scenario.delay_s)))
+        if cut < scenario.cut:
+            await self._ask(request[: len(request) // 2], wait=False)
+            return None
+        if twice < scenario.twice:
+            task = asyncio.ensure_future(self._once_more(request, late * LATE_S))
+            self._late.add(task)
+            task.add_done_callback(self._late.discard)
+        answer = await self._ask(request)
+        self.counts["turned away"] += answer is not None and not answer.startswith(b"HTTP/1.1 200")
+        return None if answer_lost < scenario.lost else answer
+
+    async def _once_more(self, request: bytes, after_s: float) -> None:
+        await asyncio.sleep(after_s)
+        await self._ask(request)
+
+    async def _ask(self, request: bytes, wait: bool = True) -> bytes | None:
+        try:
+            reader, writer = await asyncio.open_connection("127.0.0.1", self._to_port)
+            writer.write(request)
+            await writer.drain()
+            answer = await http_message(reader) if wait else None
+        except (OSError, asyncio.IncompleteReadError):
+            return None
+        writer.transport.abort()
+        return answer
+
+
+async def http_message(reader: asyncio.StreamReader) -> bytes:
+    """A request or an answer, head and body."""
+    head = await reader.readuntil(b"\r\n\r\n")
+    lengths = [line.split(b":")[1] for line in head.lower().split(b"\r\n") if line.startswith(b"content-length:")]
+    return head + await reader.readexactly(int(lengths[0]) if lengths else 0)
+
+
+class Process:
+    """A command that can be killed and started again."""
+
+    def __init__(self, arguments: Sequence[object], log: Path) -> None:
+        self._arguments = [sys.executable, "-c", common._COMMAND, *map(str, arguments)]
+        self.log = log
+        self.kills = 0
+        self.start()
+
+    def start(self) -> None:
+        environment = {**os.environ, "PYTHONPATH": str(Path(common.fcslam.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+        with self.log.open("ab") as output:
+            self.process = subprocess.Popen(self._arguments, env=environment, stdout=output, stderr=output)
+
+    def kill_and_start(self) -> None:
+        """Without a word; one that is done rests."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+            self.kills += 1
+            self.start()
+
+    def kill_children(self) -> None:
+        """What it has started; it is expected to start them again."""
+        threads = Path(f"/proc/{self.process.pid}/task").glob("*/children")
+        for child in " ".join(path.read_text(encoding="ascii") for path in threads).split():
+            with suppress(ProcessLookupError):
+                os.kill(int(child), signal.SIGKILL)
+                self.kills += 1
+
+    def ended(self) -> bool:
+        """Whether it is done; that it failed ends the script."""
+        code = self.process.poll()
+        if code:
+            sys.exit(f"{' '.join(self._arguments[3:])} ended with {code}:\n{self.log.read_text()[-3000:]}")
+        return code == 0
+
+    def fill_disk(self) -> None:
+        """No file may become larger than a few kB: what SQLite writes next fails as on a full disk."""
+        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (FULL_BYTES, resource.RLIM_INFINITY))
+
+    def empty_disk(self) -> None:
+        unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, unlimited)
+
+
+def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
+    """One scenario from empty folders to the compared result; a row without its name."""
+    place.mkdir()
+    rng = np.random.default_rng(chosen.seed)
+    logs, reference, duration_s = worlds.get(scenario)
+    began = time.perf_counter()
+    with cloud(place) as (server, port):
+        proxy = Proxy(scenario, port, rng)
+        robots = [robot(log, proxy.port, place, chosen.speed) for log in logs]
+        disturb(scenario, server, robots, proxy, duration_s / chosen.speed, OUTAGE_S / chosen.speed, rng)
+        run = finalize(port)
+        proxy.close()
+    kills = server.kills + sum(robot.kills for robot in robots)
+    compared = compare(run, reference)
+    elapsed_s = time.perf_counter() - began
+    return (
+        len(logs),
+        *compared[:-1],
+        proxy.counts["requests"],
+        proxy.counts["disturbed"],
+        proxy.counts["turned away"],
+        kills,
+        elapsed_s,
+        compared[-1],
+    )
+
+
+@contextmanager
+def cloud(place: Path) -> Iterator[tuple[Process, int]]:
+    """A server on a port of its own."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    server = Process(("serve", "--data", place / "cloud", "--host", "127.0.0.1", "--port", port), place / "server.log")
+    wait_for(port, server)
+    try:
+        yield server, port
+    finally:
+        server.process.send_signal(signal.SIGTERM)
+        server.process.wait(PATIENCE_S)
+
+
+def wait_for(port: int, server: Process) -> None:
+    """Until the server answers."""
+    until = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until:
+        if server.ended():
+            sys.exit("the server ended")
+        with suppress(OSError):
+            urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5).close()
+            return
+        time.sleep(0.2)
+    sys.exit("the server does not answer")
+
+
+def robot(log: Path, port: int, place: Path, speed: float) -> Process:
+    state = place / "state" / log.stem
+    url = f"http://127.0.0.1:{port}"
+    arguments = ("robot", log, "--server", url, "--state", state, "--speed", speed, "--resume")
+    return Process(arguments, place / f"{log.stem}.log")
+
+
+def disturb(
+    scenario: Scenario, server: Process, robots: Sequence[Process], proxy: Proxy, play_s: float, outage_s: float,
+    rng: np.random.Generator,
+) -> None:  # fmt: skip
+    """Let the scenario's events happen while the robots play, and wait until the server has all that they said."""
+    events: list[tuple[float, Callable[[], None]]] = []
+    if scenario.away:
+        events += [(play_s / 3.0, lambda: proxy.open(False)), (play_s / 3.0 + outage_s, lambda: proxy.open(True))]
+    if scenario.disk_full:
+        events += [(play_s / 3.0, server.fill_disk), (play_s * 2.0 / 3.0, server.empty_disk)]
+    events += [(at, server.kill_and_start) for at in rng.uniform(0.1, 1.1, scenario.server_kills) * play_s]
+    events += [(at, server.kill_children) for at in rng.uniform(0.1, 1.1, scenario.worker_kills) * play_s]
+    victims = rng.choice(len(robots), scenario.robot_kills)
+    instants = rng.uniform(0.1, 1.0, scenario.robot_kills) * play_s
+    events += [(at, robots[victim].kill_and_start) for at, victim in zip(instants, victims, strict=True)]
+    events.sort(key=lambda event: event[0])
+    began = time.monotonic()
+    while proxy.counts["requests"] < len(robots) and time.monotonic() - began < PATIENCE_S:
+        time.sleep(0.05)  # starting takes long on a busy machine
+    began = time.monotonic()
+    while events or not all(robot.ended() for robot in robots):
+        if events and time.monotonic() - began >= events[0][0]:
+            events.pop(0)[1]()
+        if time.monotonic() - began > PATIENCE_S:
+            sys.exit(f"robots are not done after {PATIENCE_S} s; see {robots[0].log.parent}")
+        server.ended()
+        time.sleep(0.05)
+
+
+def compare(run: Path, reference: Path) -> tuple:
+    """Packets that count, lost and twice, accepted closures and whether they are the same, graph, map, verdict."""
+    ours, theirs = common.metrics(run), common.metrics(reference)
+    kinds = [name for name in theirs if name.endswith("_packets") and name.split("_")[0] in UPLINK]
+    more = [ours[name] - theirs[name] for name in kinds]
+    closures, expected = accepted(run), accepted(reference)
+    off = graph_difference(run, reference)
+    same_map = maps(run) == maps(reference)
+    lost, twice = sum(max(0.0, -n) for n in more), sum(max(0.0, n) for n in more)
+    passed = closures == expected and off <= 1e-9 and same_map and lost == twice == 0.0
+    same = ["yes" if is_same else "NO" for is_same in (closures == expected, same_map, passed)]
+    return sum(ours[name] for name in kinds), lost, twice, len(closures), same[0], off, *same[1:]
+
+
+def maps(run: Path) -> dict[str, bytes]:
+    """Every map of the run, byte for byte."""
+    return {path.name: path.read_bytes() for path in run.glob("map*.pgm")}
+
+
+def accepted(run: Path) -> list[str]:
+    lines = (run / "closures.csv").read_text(encoding="utf-8").splitlines()
+    return [line for line in lines[1:] if line.split(",")[9] == "accepted"]
+
+
+def graph_difference(run: Path, reference: Path) -> float:
+    """Largest difference of any number of the two graphs; infinite if they have not the same lines."""
+    graphs = [(folder / "pose_graph.g2o").read_text(encoding="utf-8").split() for folder in (run, reference)]
+    if len(graphs[0]) != len(graphs[1]):
+        return float("inf")
+    largest = 0.0
+    for ours, theirs in zip(*graphs, strict=True):
+        if ours != theirs:
+            try:
+                largest = max(largest, abs(float(ours) - float(theirs)))
+            except ValueError:
+                return float("inf")
+    return largest
+
+
+def finalize(port: int) -> Path:
+    """Ask for the result of all packets, and wait for its run folder."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/v1/finalize", data=b"", timeout=PATIENCE_S) as answer:
+        return Path(json.load(answer)["run"])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""Federated training deployed for real, a robot killed amid a round; and what rounds cost beside training.
+
+    python benchmarks/federated_deployed.py
+
+Needs fcslam[federated]; images are drawn. Five robots and a server, each a command of a user with Flower's daemons
+under it, train for a few steps on this machine. One robot is killed (SIGKILL) while it trains in the first round and
+never comes back. The same run in one process, without that robot, must end in the same bytes.
+
+Then one process trains with the default settings, five robots of 5 images each, and the processor's time is split:
+what the robots' training legs take, what judging takes, and the rest, which is the fleet's: Flower's records,
+screening, merging, checkpoints, versions. The rest does not depend on the number of steps; its share at the default
+number follows.
+"""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import common
+import cv2
+import numpy as np
+
+import fcslam
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(fcslam.__file__).parents[1])}
+ROBOTS = ("a", "b", "c", "d", "e")
+KILLED = ROBOTS[-1]
+PATIENCE_S = 900.0
+TINY = """rounds: 3
+local_steps: 4
+minimum_robots: 4
+training: {shape_steps: 2, pairs: 1, side_px: 96, points: 32, label_copies: 1}
+"""
+ROUNDS = {"round": "", "robots": "", "left out": "", "up, MB": ".2f", "down, MB": ".2f", "deployed, s": ".0f",
+          "one process, s": ".1f", "same version": ""}  # fmt: skip
+COST = {"CPU of": "", "s a round": ".2f", "share of training": ".1%"}
+
+
+def drawn(folder: Path, count: int, seed: int, side: tuple[int, int] = (320, 240)) -> Path:
+    """Pictures with corners everywhere: rectangles of random shades."""
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(seed)
+    for number in range(count):
+        picture = np.full(side[::-1], 128, np.uint8)
+        for corner in rng.integers(0, side, (300, 2)):
+            far = corner + rng.integers(6, 40, 2)
+            cv2.rectangle(picture, corner.tolist(), far.tolist(), int(rng.integers(256)), -1)
+        cv2.imwrite(str(folder / f"{number}.png"), cv2.GaussianBlur(picture, (3, 3), 0))
+    return folder
+
+
+@contextmanager
+def federate(*words: object, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
+    """A command in the background, interrupted at the end of the block."""
+    command = [sys.executable, "-m", "fcslam.cli", "federate", *map(str, words)]
+    with log.open("wb") as file:
+        process = subprocess.Popen(command, env=ENVIRONMENT, stdout=file, stderr=file)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(60.0)
+
+
+def wait_for(happened: Callable[[], bool], what: str, log: Path) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not happened():
+        if time.monotonic() > end:
+            sys.exit(f"{what} did not happen:\n{log.read_text()}")
+        time.sleep(0.05)
+
+
+def deploy(folder: Path, options: Sequence[object]) -> Path:
+    """Server and robots in processes of their own; one robot is killed while it trains."""
+    from contextlib import ExitStack
+
+    from fcslam.federated.launch import free_port
+
+    where, output, log = f"127.0.0.1:{free_port()}", folder / "deployed", folder / "server.log"
+    with ExitStack() as running:
+        server = running.enter_context(federate("--serve", where, "-o", output, *options, "--insecure", log=log))
+        wait_for(lambda: "waiting: 0 robots" in log.read_text(), "the server's start", log)
+        robots = {}
+        for robot in ROBOTS:
+            words = ["--join", where, folder / robot, "-o", folder / f"home-{robot}", "--insecure"]
+            robots[robot] = running.enter_context(federate(*words, log=folder / f"{robot}.log"))
+        # It labels its images when the first order to train has come.
+        labels = folder / f"home-{KILLED}" / "labels"
+        wait_for(labels.exists, "the first order", log)
+        robots[KILLED].kill()
+        wait_for(lambda: server.poll() is not None, "the server's end", log)
+    if server.returncode:
+        sys.exit(log.read_text())
+    return output
+
+
+def rounds(folder: Path) -> list[dict[str, str]]:
+    with (folder / "rounds.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def weights(folder: Path) -> list[tuple[str, bytes]]:
+    """All arrays of weights in the checkpoint, as bytes."""
+    with np.load(folder / "checkpoint.npz") as file:
+        return [(name, file[name].tobytes()) for name in sorted(file.files) if "weights/" in name or "best/" in name]
+
+
+def compare(report: common.Report, folder: Path) -> None:
+    """The deployed run beside the one in a process."""
+    for seed, robot in enumerate(ROBOTS):
+        drawn(folder / robot, 3, seed)
+    (folder / "tiny.yaml").write_text(TINY)
+    options = ["--config", folder / "tiny.yaml", "--public", drawn(folder / "public", 4, 99), "--device", "cpu"]
+    embedded, rest = folder / "embedded", [folder / robot for robot in ROBOTS if robot != KILLED]
+    common.run_fcslam("federate", "--local", *rest, "-o", embedded, *options)
+    began = time.perf_counter()
+    deployed = deploy(folder, options)
+    wall_s = time.perf_counter() - began
+    rows = [
+        (there["round"], there["robots"].replace(" | ", " "), there["left_out"], int(there["bytes_up"]) / 1e6,
+         int(there["bytes_down"]) / 1e6, float(there["seconds"]), float(here["seconds"]),
+         "yes" if there["version"] == here["version"] else "no")
+        for there, here in zip(rounds(deployed), rounds(embedded), strict=True)
+    ]  # fmt: skip
+    report.table("Rounds of five robots, one killed in the first", ROUNDS, rows)
+    arrays = weights(deployed)
+    same = bool(arrays) and arrays == weights(embedded)
+    files = (deployed / "detector.onnx").read_bytes() == (embedded / "detector.onnx").read_bytes()
+    report.say(
+        f"From the first command to the end {wall_s:.0f} s. {len(arrays)} arrays of weights, byte by byte those of one "
+        f"process without robot {KILLED}: {'yes' if same else 'NO'}; the detector's file: {'yes' if files else 'NO'}."
+    )
+
+
+class Stopwatch:
+    """The processor's time that calls take, those of threads included."""
+
+    def __init__(self) -> None:
+        self.spent_s = 0.0
+
+    def around(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any, **named: Any) -> Any:
+            began = time.process_time()
+            try:
+                return call(*arguments, **named)
+            finally:
+                self.spent_s += time.process_time() - began
+
+        return timed
+
+
+def overhead(report: common.Report, folder: Path, steps: int, count: int) -> None:
+    """What a round takes beside training."""
+    import torch
+
+    from fcslam.federated import robot as robots
+    from fcslam.federated.client import client_app
+    from fcslam.federated.grid import InProcessGrid
+    from fcslam.federated.network import version_maker, weights_of
+    from fcslam.federated.rounds import Outside, Server
+    from fcslam.federated.settings import FederatedSettings
+    from fcslam.federated.start import judge_by, public_images
+    from fcslam.learning.network import KeypointNetwork
+
+    torch.set_num_threads(1)
+    torch.manual_seed(1)
+    settings = FederatedSettings(local_steps=steps, rounds=count)
+    fleet = [
+        robots.RobotLearner(name, drawn(folder / name, 5, seed), folder / "labels" / name, robots.secret_noise)
+        for seed, name in enumerate(ROBOTS)
+    ]
+    start = weights_of(KeypointNetwork("light"))
+    for each in fleet:
+        each.learn(start, 0, settings.model_copy(update={"local_steps": 1}))  # labels, and what torch does first
+    legs, judging = Stopwatch(), Stopwatch()
+    judge = judge_by(public_images([drawn(folder / "public", 4, 99)]), "light", "cpu")
+    outside = Outside(version_maker("light"), judging.around(judge))
+    grid = InProcessGrid(client_app(lambda context: fleet[int(context.node_config["partition-id"])]), len(fleet))
+    train_leg, robots.train_leg = robots.train_leg, legs.around(robots.train_leg)
+    began = time.process_time()
+    Server(settings, start, folder / "run", outside).run(grid)
+    total_s = time.process_time() - began
+    robots.train_leg = train_leg
+    rest_s = (total_s - legs.spent_s - judging.spent_s) / count
+    leg_s, default = legs.spent_s / count, FederatedSettings().local_steps
+    report.table(f"Processor time of a round, {len(fleet)} robots, {steps} steps each, mean of {count}", COST, [
+        ("training legs", leg_s, 1.0),
+        ("the fleet around them", rest_s, rest_s / leg_s),
+        ("judging on 24 pairs", judging.spent_s / (count + 1), judging.spent_s / (count + 1) / leg_s),
+        (f"the fleet around the default {default} steps", rest_s, rest_s / leg_s * steps / default),
+    ])  # fmt: skip
+
+
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("--steps", type=int, default=10, help="of a robot in a round, where processor time is measured")
+    chosen = parser.parse_args()
+    try:
+        import flwr  # noqa: F401
+        import torch  # noqa: F401
+    except ImportError:
+        print("skipped: needs fcslam[federated]")
+        return
+    report = common.Report(__file__, __doc__, chosen)
+    with tempfile.TemporaryDirectory() as place:
+        compare(report, Path(place) / "fleet")
+        overhead(report, Path(place) / "cost", chosen.steps, 3)
+    report.write()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""A detector's file on its way to robots: what is announced of it, and whether what arrived is that."""
+
+import hashlib
+from pathlib import Path
+
+from fcslam.errors import FeatureError
+from fcslam.features.detector import NETWORK_FORMAT, Detector, OnnxConfig, OnnxDetector
+from fcslam.records import Channel, DetectorFile
+
+
+def file_of(path: Path) -> DetectorFile:
+    """What a fleet is told of a network for its cameras.
+
+    Raises:
+        FeatureError: the file is no such network.
+    """
+    version = OnnxDetector(OnnxConfig(weights=path)).version
+    content = _read(path)
+    digest = hashlib.sha256(content).digest()
+    return DetectorFile(Channel.CAMERA, version, int(NETWORK_FORMAT), len(content), digest)
+
+
+def open_release(file: DetectorFile, path: Path, config: OnnxConfig) -> Detector:
+    """The detector in a file that was fetched, run as ``config`` says.
+
+    Raises:
+        FeatureError: it is another file than announced, or no network that this fcslam runs.
+    """
+    if file.format != int(NETWORK_FORMAT):
+        raise FeatureError(f"{file.version}: its format is {file.format}, not {NETWORK_FORMAT}; update fcslam")
+    content = _read(path)
+    if len(content) != file.size or hashlib.sha256(content).digest() != file.sha256:
+        raise FeatureError(f"{path}: is not the file that was announced as {file.version}; fetch it again")
+    detector = OnnxDetector(config.model_copy(update={"weights": path}))
+    if detector.version != file.version:
+        raise FeatureError(f"{path}: holds detector {detector.version}, but was announced as {file.version}")
+    return detector
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FeatureError(f"{path}: cannot be read ({error}); fetch it again") from error

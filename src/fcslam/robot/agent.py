@@ -1,0 +1,182 @@
+"""A robot that takes part in a mission over a network that fails: it maps as if there were none.
+
+The front end runs where ``run`` is called and hands its packets to the outbox, which is on disk. A thread of its own
+brings them to the cloud; the front end never waits for it, unless the outbox is full.
+"""
+
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, LaserScan, SensorRecord
+from fcslam.robot.budget import Budget
+from fcslam.robot.frontend import RobotFrontend
+from fcslam.robot.localization import Localizer
+from fcslam.robot.outbox import Outbox, Waiting
+from fcslam.robot.releases import Releases
+from fcslam.robot.sender import Sender
+from fcslam.wire.http_transport import BatchTransport
+from fcslam.wire.messages import Packet
+
+LOOK_EVERY_S = 0.1
+"""How often what waits for the sender looks after it."""
+FAREWELL_S = 2.0
+"""How long a request under way may take when the robot stops; what it brought is sent again next time."""
+
+
+@dataclass(frozen=True, slots=True)
+class AgentProgress:
+    """How far a robot is."""
+
+    scans: int
+    keyscans: int
+    waiting: Waiting
+    """Packets that the cloud has not confirmed."""
+    confirmed: int
+    """Packets that it has."""
+    sent_bytes: int
+    left_out: int
+    """Places that are not sent: too much waits, or the budget does not allow for them."""
+    refused: int
+    """Packets that the cloud will never store."""
+    map_index: int | None
+    """Which of the fleet's maps the robot is in; None: the cloud has not said."""
+    correction_age_s: float | None
+    trouble: str | None
+    """Why nothing gets through; None: it does."""
+    catching_up: bool
+    """Whether the recording is still where it was when the robot was stopped."""
+    notice: str | None
+    """What became of the last detector that was announced; None: there was none."""
+
+
+AgentWatch = Callable[[AgentProgress], None]
+
+
+class Pace:
+    """Plays a recording by its own clock."""
+
+    def __init__(self, speed: float | None, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
+        """``speed`` times as fast as it was recorded; None: as fast as it can be mapped."""
+        self._speed = speed
+        self._clock = clock
+        self._sleep = sleep
+        self._origin: tuple[float, float] | None = None
+        """A stamp, and the time that it stands for."""
+
+    def wait(self, stamp: float) -> None:
+        """Until ``stamp`` is due; the first one is at once."""
+        if self._speed is None:
+            return
+        if self._origin is None:
+            self._origin = stamp, self._clock()
+        due = self._origin[1] + (stamp - self._origin[0]) / self._speed
+        self._sleep(max(0.0, due - self._clock()))
+
+
+class Agent:
+    """One robot: front end, outbox, sender, and where it is in the fleet's map."""
+
+    def __init__(
+        self, frontend: RobotFrontend, outbox: Outbox, transport: BatchTransport, folder: Path,
+        rng: np.random.Generator, clock: Callable[[], float], sleep: Callable[[float], None],
+        budget: Budget | None = None,
+    ) -> None:  # fmt: skip
+        """``folder``: for packets that the cloud will never take, and for detectors; without ``budget`` all is sent."""
+        self.localizer = Localizer(clock)
+        self._frontend = frontend
+        self._outbox = outbox
+        self._refused = folder / "refused"
+        self._sleep = sleep
+        self._budget = budget
+        self._releases = Releases(folder / "detectors", outbox, frontend)
+        self._sender = Sender(
+            outbox, transport, rng, clock, self.localizer.correct, self._releases.keep, self._keep_refused
+        )
+        self._known = self._said = self._keyscans = self._crowded_out = 0
+
+    def run(self, records: Iterable[SensorRecord], known: int, pace: Pace, watch: AgentWatch) -> None:
+        """Map a whole recording and send all of it; ``known`` packets of it were said before, and hurry by.
+
+        Raises:
+            CloudError: the cloud turns the robot away; what it does not have stays in the outbox.
+            StateError: the outbox cannot be used.
+            SourceError: the recording cannot be read.
+        """
+        self._known = known
+        self._releases.resume()
+        with self._sending():
+            for number, record in enumerate(records):
+                self._releases.take(number, self._said < known)
+                if isinstance(record, LaserScan) and self._said >= known:
+                    pace.wait(record.stamp)
+                self._say(self._frontend.process(record))
+                self._wait_while(lambda: self._outbox.is_full, watch)
+                watch(self.progress())
+            self._say(self._frontend.finish())
+            self._wait_while(lambda: self._outbox.waiting.packets > 0, watch)
+
+    def progress(self) -> AgentProgress:
+        """Where the robot is now."""
+        sender = self._sender
+        left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
+        return AgentProgress(
+            len(self._frontend.scan_poses), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
+            left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
+            self._said < self._known, self._releases.notice,
+        )  # fmt: skip
+
+    def trajectory(self) -> tuple[FloatArray, FloatArray] | None:
+        """Stamps (N,) and poses (N, 3) of ``base`` in the fleet's map at every scan, by the newest correction.
+
+        None: the cloud has not said where the map is.
+        """
+        poses = [self.localizer.T_map_base(pose) for pose in self._frontend.scan_poses]
+        known = [pose for pose in poses if pose is not None]
+        if not known:
+            return None
+        return np.array([pose.stamp for pose in self._frontend.scan_poses]), np.array(known)
+
+    def _say(self, packets: list[Packet]) -> None:
+        for body in (packet.body for packet in packets):
+            if isinstance(body, Constraint) and body.kind is ConstraintKind.ODOMETRY:
+                self.localizer.extend(body)
+            self._keyscans += isinstance(body, Keyscan)
+        chosen = packets if self._budget is None else self._budget.fit(packets)
+        if chosen:
+            self._crowded_out += self._outbox.put(chosen)
+            self._said += len(chosen)
+
+    def _wait_while(self, condition: Callable[[], bool], watch: AgentWatch) -> None:
+        """Until the sender has changed that."""
+        self._require_sender()
+        while condition():
+            watch(self.progress())
+            self._sleep(LOOK_EVERY_S)
+            self._require_sender()
+
+    def _require_sender(self) -> None:
+        if self._sender.failure is not None:
+            raise self._sender.failure
+
+    @contextmanager
+    def _sending(self) -> Iterator[None]:
+        """A thread that sends meanwhile."""
+        stop = threading.Event()
+        thread = threading.Thread(target=self._sender.run, args=(stop,), name="sender", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join(FAREWELL_S)
+
+    def _keep_refused(self, data: bytes, reason: str) -> None:
+        self._refused.mkdir(parents=True, exist_ok=True)
+        stem = f"{len(list(self._refused.glob('*.bin'))):06d}"
+        (self._refused / f"{stem}.bin").write_bytes(data)
+        (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")

@@ -1,0 +1,123 @@
+"""What leaves a robot and what comes back, field by field of the schema, and what each field could tell a stranger."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from google.protobuf.descriptor import FieldDescriptor
+
+from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.messages import UPLINK, Kind
+
+REVEALS: Mapping[str, str] = MappingProxyType(
+    {
+        "Packet.version": "nothing of the robot",
+        "Packet.robot": "which robot speaks",
+        "Packet.epoch": "how often it was started",
+        "Packet.sequence": "how much it has said",
+        "Packet.time": "when it drove, by its own clock",
+        "Hello.beam_count": "which LiDAR it has",
+        "Hello.angle_min_rad": "which LiDAR it has, and how it is mounted",
+        "Hello.angle_increment_rad": "which LiDAR it has",
+        "Hello.max_range_m": "which LiDAR it has",
+        "Hello.t_base_laser": "where its LiDAR is mounted",
+        "Hello.detectors": "whether it has a camera, and which software describes what it sees",
+        "Detector.channel": "whether it has a camera",
+        "Detector.version": "which network it uses, and so which training it took part in",
+        "Keyscan.number": "how far it has driven",
+        "Keyscan.stamp": "when it was there, by its own clock",
+        "Keyscan.ranges": "the floor plan at the height of the LiDAR: walls, doors, furniture, legs of people",
+        "Constraint.i": "nothing by itself",
+        "Constraint.j": "nothing by itself",
+        "Constraint.kind": "whether it came back to a place",
+        "Constraint.t_i_j": "how it moved: speed and way",
+        "Constraint.information": "how well its surroundings fix its pose: a bare corridor or a room",
+        "Place.number": "where along its way this was seen",
+        "Place.channel": "whether a camera or the LiDAR saw it",
+        "Place.detector_version": "which network described it",
+        "Place.first": "nothing by itself",
+        "Place.last": "nothing by itself",
+        "Place.keypoints": "where corners and texture are, in metres; of a camera also how high: shelves, signs",
+        "Place.descriptors": "256 bits of each spot's texture: enough to know it again, and to guess at what it is "
+        "by many known images; no image, no colour",
+        "Correction.version": "how often the cloud's map has changed",
+        "Correction.map_index": "whether the robot has met others",
+        "Correction.t_map_odom": "where the robot is in the building's map",
+        "Release.channel": "nothing of the robot",
+        "Release.version": "that the fleet has trained",
+        "Release.format": "nothing of the robot",
+        "Release.size": "nothing of the robot",
+        "Release.sha256": "nothing of the robot",
+        "Acknowledgement.epoch": "nothing by itself",
+        "Acknowledgement.sequence": "how much the cloud has",
+    }
+)
+"""By message and field of fcslam.proto; a test asks for every field, and for no other."""
+
+PLAIN = frozenset({"Pose"})
+"""Messages that say no more than the field that they stand in."""
+
+_TYPES = {
+    FieldDescriptor.TYPE_DOUBLE: "double",
+    FieldDescriptor.TYPE_FLOAT: "float",
+    FieldDescriptor.TYPE_UINT32: "uint32",
+    FieldDescriptor.TYPE_UINT64: "uint64",
+    FieldDescriptor.TYPE_STRING: "string",
+    FieldDescriptor.TYPE_BYTES: "bytes",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FieldDisclosure:
+    """One field of one message."""
+
+    name: str
+    """With the fields that it stands in, as in ``detectors.version``."""
+    type: str
+    reveals: str
+
+
+@dataclass(frozen=True, slots=True)
+class Disclosure:
+    """One kind of message, or the envelope that all of them have."""
+
+    name: str
+    direction: str
+    fields: tuple[FieldDisclosure, ...]
+
+
+def disclosures() -> list[Disclosure]:
+    """The envelope and every kind of message in the order of the schema, with all that is in them."""
+    envelope: Any = pb.Packet.DESCRIPTOR
+    own = tuple(
+        FieldDisclosure(field.name, _type(field), _reveals(field))
+        for field in envelope.fields
+        if field.containing_oneof is None
+    )
+    return [
+        Disclosure("every packet", "both ways", own),
+        *(_disclosure(field) for field in envelope.oneofs_by_name["body"].fields),
+    ]
+
+
+def _disclosure(body: Any) -> Disclosure:
+    direction = "robot to cloud" if Kind(body.name) in UPLINK else "cloud to robot"
+    return Disclosure(body.name, direction, tuple(_walk(body.message_type, "")))
+
+
+def _walk(message: Any, prefix: str) -> Iterator[FieldDisclosure]:
+    for field in message.fields:
+        yield FieldDisclosure(prefix + field.name, _type(field), _reveals(field))
+        if field.message_type is not None and field.message_type.name not in PLAIN:
+            yield from _walk(field.message_type, f"{prefix}{field.name}.")
+
+
+def _reveals(field: Any) -> str:
+    return REVEALS[f"{field.containing_type.name}.{field.name}"]
+
+
+def _type(field: Any) -> str:
+    named = field.message_type or field.enum_type
+    name = named.name if named is not None else _TYPES[field.type]
+    return f"repeated {name}" if field.is_repeated else name

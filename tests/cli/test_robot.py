@@ -1,0 +1,103 @@
+"""The command: one robot against a cloud behind real HTTP."""
+
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+import small_fleet
+from robot.fake_cloud import FakeCloud
+from robot.http_cloud import serving
+
+from fcslam.cli import main
+from fcslam.runs import read_tum
+from fcslam.sources import write_carmen
+from fcslam.wire.packets import decode
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "alice.clf"
+    write_carmen(path, small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
+    return path
+
+
+@pytest.fixture
+def cloud():
+    with serving(FakeCloud(correction=4)) as cloud:
+        yield cloud
+
+
+def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
+    state = tmp_path / "state"
+    assert main(["robot", str(log), "--server", cloud.url, "--state", str(state)]) == 0
+    out, err = capsys.readouterr()
+    stored = [decode(data) for data in cloud.cloud.stored.values()]
+    assert {packet.robot for packet in stored} == {"alice"}
+    scans, keyscans = map(int, re.match(r"(\d+) scans, (\d+) keyscans; ", out).groups())
+    assert len(read_tum(state / "trajectory.tum")[0]) == scans
+    assert keyscans == sum(type(packet.body).__name__ == "Keyscan" for packet in stored)
+    assert "connected" in err
+    assert main(["robot", str(log), "--server", cloud.url, "--state", str(state), "--resume"]) == 0
+    assert len(cloud.cloud.stored) == len(stored), "nothing twice"
+    assert main(["robot", str(log), "--server", cloud.url, "--state", str(state), "--name", "bob"]) == 2
+    assert "belongs to robot 'alice'" in capsys.readouterr().err
+
+
+def test_the_token_goes_with_every_request(log, cloud, tmp_path):
+    (tmp_path / "token").write_text("s3cret\n")
+    arguments = ["--server", cloud.url, "--state", str(tmp_path), "--token-file", str(tmp_path / "token")]
+    assert main(["robot", str(log), *arguments]) == 0
+    assert {headers["Authorization"] for _, _, headers, _ in cloud.requests} == {"Bearer s3cret"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--server", "cloud"], "no address of a cloud"),
+        (["--speed", "fast"], "--speed 'fast' is no speed"),
+        (["--speed", "-1"], "no speed"),
+        (["--speed", "nan"], "no speed"),
+        (["--name", "r+2"], "how a later start of 'r' is called"),
+        (["--name", "r/2"], "is no name"),
+        (["--token-file", "nowhere"], "no token can be read"),
+        (["--state", "/dev/null/state"], "cannot be made"),
+        (["--ca", "nowhere"], "no certificate authority"),
+    ],
+)
+def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reason):
+    given = ["--server", cloud.url, "--state", str(tmp_path / "state")]
+    assert main(["robot", str(log), *given, *arguments]) == 2
+    err = capsys.readouterr().err
+    assert reason in err
+    assert err.count("\n") == 1
+    assert cloud.cloud.stored == {}
+
+
+def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, capsys):
+    cloud.canned.append((401, {}, b'{"error": "no token"}'))
+    assert main(["robot", str(log), "--server", cloud.url, "--state", str(tmp_path)]) == 2
+    assert f"fcslam: {cloud.url}: no token (401)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_robot_says_what_is_left_and_goes_on_later(log, cloud, tmp_path, number):
+    command = [sys.executable, "-c", "import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"]
+    nowhere = ["robot", str(log), "--state", str(tmp_path), "--speed", "2", "--server"]
+    with subprocess.Popen([*command, *nowhere, "http://127.0.0.1:9"], stderr=subprocess.PIPE, text=True) as robot:
+        assert "127.0.0.1:9" in robot.stderr.readline()
+        robot.send_signal(number)
+        err = robot.stderr.read()
+    assert robot.returncode == 130
+    assert re.search(r"\d+ packets \(\d+ kB\) wait in .*--resume goes on", err.replace("\n", " "))
+    assert "Traceback" not in err
+    assert main([*nowhere[:-3], "--server", cloud.url, "--resume"]) == 0
+    assert list(cloud.cloud.stored) == [(0, k) for k in range(len(cloud.cloud.stored))]
+
+
+def test_the_traffic_is_explained_without_a_recording(capsys):
+    assert main(["robot", "--explain-traffic"]) == 0
+    out = capsys.readouterr().out
+    assert "descriptors" in out
+    assert "no image" in " ".join(out.split())

@@ -1,0 +1,63 @@
+"""A released detector read back gives what it gave, and can be trained on."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+
+from features.networks import tiny_network  # noqa: E402
+
+from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.federated.network import network_of  # noqa: E402
+from fcslam.federated.start import read_weights  # noqa: E402
+from fcslam.federated.weights import trained_names  # noqa: E402
+from fcslam.learning.export import export, quantise  # noqa: E402
+from fcslam.learning.network import KeypointNetwork  # noqa: E402
+
+
+def lived_in(encoder):
+    """A network whose normalisations are not those it was born with."""
+    torch.manual_seed(5)
+    network = KeypointNetwork(encoder)
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            for tensor in (module.weight, module.running_var):
+                tensor.data.uniform_(0.5, 2.0)
+            for tensor in (module.bias, module.running_mean):
+                tensor.data.uniform_(-0.5, 0.5)
+    for parameter in network.parameters():
+        if not parameter.any():  # layers that begin as no change
+            parameter.data.uniform_(-0.1, 0.1)
+    return network.eval()
+
+
+@pytest.mark.parametrize("encoder", ["light", "vgg"])
+def test_it_is_the_same_function(encoder, tmp_path):
+    network = lived_in(encoder)
+    export(network, tmp_path / "detector.onnx")
+    read = network_of(read_weights(tmp_path / "detector.onnx", encoder), encoder)
+    images = torch.rand(2, 1, 64, 96, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        for ours, theirs in zip(read(images), network(images), strict=True):
+            assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4 * float(theirs.abs().max()))
+
+
+def test_its_normalisations_begin_as_none(tmp_path):
+    """So everything that training moves is there, and statistics can be frozen."""
+    export(lived_in("light"), tmp_path / "detector.onnx")
+    weights = read_weights(tmp_path / "detector.onnx", "light")
+    statistics = set(weights) - set(trained_names(weights, frozen_statistics=True))
+    assert statistics
+    for name in statistics:
+        assert np.allclose(weights[name], 0.0 if name.endswith("mean") else 1.0, atol=2e-5)
+
+
+def test_another_network_is_refused_by_name(tmp_path):
+    export(lived_in("light"), tmp_path / "light.onnx")
+    quantise(tmp_path / "light.onnx", tmp_path / "int8.onnx", [np.full((64, 64), 128, np.uint8)])
+    (tmp_path / "text.onnx").write_text("hello")
+    tiny_network(tmp_path / "tiny.onnx")
+    for name, encoder in (("light", "vgg"), ("int8", "light"), ("text", "light"), ("tiny", "light")):
+        with pytest.raises(TrainingError, match=name):
+            read_weights(tmp_path / f"{name}.onnx", encoder)

@@ -1,0 +1,192 @@
+"""A robot maps the same whether its cloud is there, slow, or away, and comes back where it was."""
+
+import threading
+
+import numpy as np
+import pytest
+import small_fleet
+from robot.fake_cloud import FakeCloud, Network, content
+from wire.examples import CORRECTION
+
+from fcslam.errors import CloudError, StateError
+from fcslam.geometry import se2
+from fcslam.records import Place
+from fcslam.robot.agent import Agent, Pace
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.outbox import Outbox
+from fcslam.wire.packets import decode, encode
+
+AS_FAST_AS_POSSIBLE = Pace(None, lambda: 0.0, lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return list(small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
+
+
+@pytest.fixture(scope="module")
+def alone(scans):
+    """What the front end says without any network."""
+    frontend = RobotFrontend("alice", RobotConfig())
+    return [packet for scan in scans for packet in frontend.process(scan)] + frontend.finish()
+
+
+class Clock:
+    """Each look at it takes a second; what sleeps, sleeps for no time."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        self.now += 1.0
+        return self.now
+
+
+def drive(tmp_path, network, records, resume=False, watch=lambda _: None, limit=10**9, recording="r"):
+    outbox = Outbox(tmp_path / "outbox", "alice", limit)
+    pause = threading.Event()
+    agent = Agent(
+        RobotFrontend("alice", RobotConfig()), outbox, network, tmp_path, np.random.default_rng(0),
+        Clock(), lambda _: pause.wait(0.001),
+    )  # fmt: skip
+    try:
+        agent.run(records, outbox.begin(recording, resume), AS_FAST_AS_POSSIBLE, watch)
+    finally:
+        outbox.close()
+    return agent
+
+
+def stop_after(records, count):
+    for number, record in enumerate(records):
+        if number == count:
+            raise KeyboardInterrupt
+        yield record
+
+
+def contents(packets):
+    return [encode(packet) for packet in packets]
+
+
+def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
+    cloud = FakeCloud(correction=CORRECTION.version)
+    agent = drive(tmp_path, Network(cloud), scans)
+    assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
+    assert list(cloud.stored) == [(0, k) for k in range(len(alone))]
+    now = agent.progress()
+    assert (now.scans, now.waiting.packets, now.confirmed, now.trouble) == (len(scans), 0, len(alone), None)
+    assert (now.map_index, now.left_out, now.refused, now.catching_up) == (CORRECTION.map_index, 0, 0, False)
+    assert now.sent_bytes == sum(map(len, cloud.stored.values()))
+    stamps, poses = agent.trajectory()
+    assert np.array_equal(stamps, [scan.stamp for scan in scans])
+    assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
+
+
+def test_an_outage_leaves_no_trace(scans, alone, tmp_path):
+    """The cloud is away until the recording is over; the front end never waits for it."""
+    cloud, back = FakeCloud(), threading.Event()
+
+    class Away(Network):
+        def _next(self):
+            self.requests += 1
+            return "none" if back.is_set() else "request lost"
+
+    def watch(now):
+        if now.scans == len(scans) and not back.is_set():
+            assert cloud.stored == {}
+            back.set()
+
+    drive(tmp_path, Away(cloud), scans, watch=watch)
+    assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
+
+
+@pytest.mark.parametrize("stop", [1, 40])
+def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_path, stop):
+    cloud = FakeCloud()
+    with pytest.raises(KeyboardInterrupt):
+        drive(tmp_path, Network(cloud, ["request lost"] * 2), stop_after(scans, stop))
+    seen = []
+    drive(tmp_path, Network(cloud, ["answer lost"]), scans, resume=True, watch=lambda now: seen.append(now.catching_up))
+    assert list(cloud.stored) == [(0, k) for k in range(len(alone))]
+    assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
+    assert seen[-1] is False
+
+
+def test_a_robot_that_starts_anew_has_a_new_epoch_and_the_old_one_is_not_lost(scans, alone, tmp_path):
+    cloud = FakeCloud()
+    with pytest.raises(KeyboardInterrupt):
+        drive(tmp_path, Network(cloud, ["request lost"] * 99), stop_after(scans, 40))
+    assert cloud.stored == {}
+    drive(tmp_path, Network(cloud), scans)
+    epochs = [epoch for epoch, _ in cloud.stored]
+    assert epochs.count(1) == len(alone)
+    assert 0 < epochs.count(0) < len(alone)
+    assert epochs == sorted(epochs), "what was left goes first"
+
+
+def test_another_recording_cannot_be_resumed(scans, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        drive(tmp_path, Network(FakeCloud()), stop_after(scans, 20))
+    with pytest.raises(StateError, match="not what this recording said"):
+        drive(tmp_path, Network(FakeCloud()), scans[1:], resume=True)
+
+
+def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone, tmp_path):
+    """The cloud is away until the outbox is full."""
+    cloud = FakeCloud()
+    limit = sum(map(len, contents(alone))) // 3
+    waits = []
+
+    class Away(Network):
+        def _next(self):
+            return "none" if len(waits) > 3 else "request lost"
+
+    def watch(now):
+        if now.waiting.bytes >= limit:
+            waits.append(now.scans)
+
+    agent = drive(tmp_path, Away(cloud), scans, watch=watch, limit=limit)
+    assert len(set(waits)) < len(waits), "the front end waited"
+    places = [packet for packet in alone if isinstance(packet.body, Place)]
+    sent = [decode(data).body for data in cloud.stored.values()]
+    left_out = len(places) - sum(isinstance(body, Place) for body in sent)
+    assert 0 < left_out == agent.progress().left_out
+    assert len(sent) == len(alone) - left_out
+    assert list(cloud.stored) == [(0, k) for k in range(len(sent))]
+
+
+def test_a_refused_packet_is_kept_with_its_reason(scans, alone, tmp_path):
+    place = next(packet for packet in alone if isinstance(packet.body, Place))
+    cloud = FakeCloud(unwanted={content(encode(place))})
+    agent = drive(tmp_path, Network(cloud), scans)
+    assert agent.progress().refused == 1
+    assert content((tmp_path / "refused" / "000000.bin").read_bytes()) == content(encode(place))
+    assert (tmp_path / "refused" / "000000.txt").read_text() == "unwanted\n"
+    assert len(cloud.stored) == len(alone) - 1
+
+
+def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, tmp_path):
+    class Closed(Network):
+        def state(self):
+            raise CloudError("no token")
+
+    with pytest.raises(CloudError, match="no token"):
+        drive(tmp_path, Closed(FakeCloud()), scans)
+    cloud = FakeCloud()
+    drive(tmp_path, Network(cloud), scans, resume=True)
+    assert len(cloud.stored) == len(alone)
+
+
+def test_a_recording_is_played_by_its_own_clock():
+    now, slept = 100.0, []
+
+    def sleep(seconds):
+        nonlocal now
+        slept.append(seconds)
+        now += seconds
+
+    pace = Pace(2.0, lambda: now, sleep)
+    for stamp in (5.0, 6.0, 8.0):
+        pace.wait(stamp)
+    now += 10.0  # mapping took long: nothing is left out, the recording just comes late
+    pace.wait(9.0)
+    assert slept == [0.0, 0.5, 1.0, 0.0]

@@ -1,0 +1,20 @@
+"""What a robot keeps of its images: the newest, never more than it may."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fcslam.robot.album import Album, AlbumConfig, Shot
+
+
+@given(st.lists(st.integers(0, 3_000_000), max_size=30), st.integers(0, 8), st.floats(0.0, 10.0))
+def test_the_newest_that_fit_are_kept(sizes, most, megabytes):
+    album = Album(AlbumConfig(most_images=most, most_megabytes=megabytes))
+    for number, size in enumerate(sizes):
+        album.add(Shot(number, bytes(size), None, None, None))
+    kept = [shot.keyscan for shot in album]
+    assert kept == list(range(len(sizes) - len(kept), len(sizes)))
+    assert len(kept) <= most
+    assert sum(sizes[number] for number in kept) <= 1e6 * megabytes
+    if len(kept) < len(sizes):  # one more would not have fitted, now or when it was let go of
+        latest = [sizes[: end + 1][-len(kept) - 1 :] for end in range(len(kept), len(sizes))]
+        assert any(len(some) > most or sum(some) > 1e6 * megabytes for some in latest)

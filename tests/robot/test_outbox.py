@@ -1,0 +1,248 @@
+"""The outbox forgets what the cloud has, and nothing else, whatever happens to its process."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from robot.fake_cloud import said
+from wire.examples import HELLO, KEYSCAN, LIDAR_PLACE
+
+from fcslam.errors import StateError
+from fcslam.robot.outbox import Outbox
+from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
+from fcslam.wire.packets import decode, encode
+
+LIMIT = 10_000_000
+BODIES = [HELLO, KEYSCAN, LIDAR_PLACE]
+
+
+def drain(outbox, packets=MAXIMUM_BATCH_PACKETS):
+    """All that waits, by epoch and sequence, as a cloud would store it."""
+    stored = {}
+    while batch := outbox.batch(MAXIMUM_BATCH_BYTES, packets):
+        for number, data in enumerate(batch.packets, start=batch.first):
+            assert (decode(data).epoch, decode(data).sequence) == (batch.epoch, number)
+            stored[batch.epoch, number] = data
+        assert outbox.acknowledge(batch.epoch, number) == len(batch.packets)
+    return stored
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "outbox.sqlite"
+
+
+@pytest.fixture
+def outbox(path):
+    outbox = Outbox(path, "alice", LIMIT)
+    outbox.begin("r", resume=False)
+    yield outbox
+    outbox.close()
+
+
+class Deliveries(RuleBasedStateMachine):
+    """Against a list of what was said and a set of what the cloud has."""
+
+    @initialize()
+    def open(self):
+        self.path = Path(tempfile.mkdtemp()) / "outbox"
+        self.outbox = Outbox(self.path, "alice", LIMIT)
+        self.outbox.begin("r", resume=False)
+        self.outbox.meet({})
+        self.said, self.cloud = [], 0
+
+    @rule(body=st.sampled_from(BODIES), count=st.integers(1, 4))
+    def put(self, body, count):
+        packets = [said(len(self.said) + k, body) for k in range(count)]
+        assert self.outbox.put(packets) == 0
+        self.said += packets
+
+    @rule(keep=st.integers(0, 5), packets=st.integers(1, 5))
+    def deliver(self, keep, packets):
+        """The cloud stores some of the next batch; whether the robot hears of it or not, it may come again."""
+        batch = self.outbox.batch(MAXIMUM_BATCH_BYTES, packets)
+        if batch is not None:
+            assert len(batch.packets) <= packets
+            self.cloud = max(self.cloud, batch.first + min(keep, len(batch.packets)))
+            self.outbox.acknowledge(0, self.cloud - 1)
+
+    @precondition(lambda self: self.cloud < len(self.said))
+    @rule()
+    def drop(self):
+        data = self.outbox.drop(0, self.cloud)
+        assert data == encode(self.said[self.cloud])
+        self.cloud += 1
+        self.outbox.acknowledge(0, self.cloud - 1)
+
+    @rule()
+    def die_and_resume(self):
+        """Without a word of farewell; then the recording is read once more."""
+        self.outbox.close()
+        self.outbox = Outbox(self.path, "alice", LIMIT)
+        assert self.outbox.begin("r", resume=True) == len(self.said)
+        self.outbox.meet({0: self.cloud} if self.cloud else {})
+        assert self.outbox.put(self.said) == 0
+
+    @invariant()
+    def all_is_there(self):
+        batch = self.outbox.batch(MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS)
+        rest = [encode(packet) for packet in self.said[self.cloud :]]
+        assert (list(batch.packets) if batch else []) == rest
+        assert batch is None or batch.first == self.cloud
+        assert self.outbox.waiting == (len(rest), sum(map(len, rest)))
+
+    def teardown(self):
+        self.outbox.close()
+
+
+Deliveries.TestCase.settings = settings(max_examples=25, stateful_step_count=20)
+TestDeliveries = Deliveries.TestCase
+
+
+def test_oldest_first_one_epoch_a_batch_and_within_the_limits(outbox, path):
+    outbox.put([said(k) for k in range(5)])
+    outbox.close()
+    again = Outbox(path, "alice", LIMIT)
+    again.begin("another", resume=False)
+    assert again.epoch == 1
+    again.put([said(k, LIDAR_PLACE) for k in range(3)])
+    first = again.batch(MAXIMUM_BATCH_BYTES, 100)
+    assert (first.epoch, first.first, len(first.packets)) == (0, 0, 5)
+    size = len(first.packets[1]) + 4
+    assert len(again.batch(2 * size + 1, 100).packets) == 2
+    assert len(again.batch(1, 100).packets) == 1, "one is better than none"
+    assert list(drain(again, 2)) == [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (1, 0), (1, 1), (1, 2)]
+
+
+def test_an_epoch_that_the_cloud_knows_from_before_is_not_taken_again(outbox):
+    outbox.put([said(0, HELLO), said(1)])
+    outbox.meet({0: 7, 3: 2})
+    assert outbox.epoch == 4
+    outbox.put([said(2)])
+    outbox.meet({0: 7, 3: 2})
+    stored = drain(outbox)
+    assert list(stored) == [(4, 0), (4, 1), (4, 2)]
+    assert decode(stored[4, 0]).body.epoch == 4
+
+
+@pytest.mark.parametrize(
+    ("starts", "known", "epochs"), [(3, {}, [0, 1, 2]), (3, {0: 1}, [1, 2, 3]), (2, {5: 1}, [6, 7])]
+)
+def test_starts_that_never_met_the_cloud_keep_their_order(path, starts, known, epochs):
+    for start in range(starts):
+        outbox = Outbox(path, "alice", LIMIT)
+        outbox.begin("r", resume=False)
+        outbox.put([replace(said(0), time=2000.0 + start)])
+        outbox.close()
+    outbox = Outbox(path, "alice", LIMIT)
+    outbox.meet(known)
+    assert {epoch: decode(data).time for (epoch, _), data in drain(outbox).items()} == {
+        epoch: 2000.0 + start for start, epoch in enumerate(epochs)
+    }
+    outbox.close()
+
+
+def test_a_cloud_that_lost_what_it_confirmed_is_found_out(outbox):
+    outbox.put([said(k) for k in range(5)])
+    outbox.meet({})
+    outbox.acknowledge(0, 3)
+    outbox.meet({0: 4})
+    with pytest.raises(StateError, match="it has 2 of 4"):
+        outbox.meet({0: 2})
+
+
+def test_a_full_outbox_leaves_places_out_and_keeps_the_chain(path):
+    size = len(encode(said(0)))
+    outbox = Outbox(path, "alice", 20 * size)
+    outbox.begin("r", resume=False)
+    assert outbox.put([said(k) for k in range(15)]) == 0
+    assert outbox.put([said(15, LIDAR_PLACE), said(16), said(17, LIDAR_PLACE)]) == 2
+    assert not outbox.is_full
+    outbox.put([said(k) for k in range(18, 23)])
+    assert outbox.is_full
+    outbox.close()
+    outbox = Outbox(path, "alice", 20 * size)
+    assert outbox.begin("r", resume=True) == 23
+    stored = drain(outbox)
+    assert list(stored) == [(0, number) for number in range(21)], "no gap where places were left out"
+    assert not any(decode(data).body == LIDAR_PLACE for data in stored.values())
+    assert outbox.put([said(17, LIDAR_PLACE), said(23, LIDAR_PLACE)]) == 0
+    assert list(drain(outbox)) == [(0, 21)]
+    outbox.close()
+
+
+def test_what_is_resumed_must_be_the_same(outbox, path):
+    outbox.put([said(0), said(1)])
+    outbox.close()
+    again = Outbox(path, "alice", LIMIT)
+    with pytest.raises(StateError, match="another recording"):
+        again.begin("another", resume=True)
+    again.begin("r", resume=True)
+    with pytest.raises(StateError, match="packet 1 is not what this recording said"):
+        again.put([said(0), said(1, LIDAR_PLACE)])
+    again.close()
+
+
+def test_where_there_is_nothing_to_resume_a_robot_starts(path):
+    outbox = Outbox(path, "alice", LIMIT)
+    assert outbox.begin("r", resume=True) == 0
+    assert outbox.epoch == 0
+    outbox.close()
+
+
+def test_a_folder_has_one_robot_and_one_process(outbox, path):
+    with pytest.raises(StateError, match="another process runs on it"):
+        Outbox(path, "alice", LIMIT)
+    agent = outbox.agent
+    outbox.close()
+    with pytest.raises(StateError, match="belongs to robot 'alice', not 'bob'"):
+        Outbox(path, "bob", LIMIT)
+    again = Outbox(path, "alice", LIMIT)
+    assert again.agent == agent
+    again.close()
+
+
+def test_no_outbox_is_one_line(tmp_path):
+    (tmp_path / "outbox").write_bytes(b"noise" * 1000)
+    with pytest.raises(StateError, match="file is not a database"):
+        Outbox(tmp_path / "outbox", "alice", LIMIT)
+    with pytest.raises(StateError, match="unable to open"):
+        Outbox(tmp_path / "nowhere" / "outbox", "alice", LIMIT)
+
+
+WRITER = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from wire.examples import KEYSCAN, packet
+from fcslam.robot.outbox import Outbox
+outbox = Outbox(Path(sys.argv[1]), "alice", 10**9)
+outbox.begin("r", resume=sys.argv[2] == "True")
+for k in range(10**6):
+    outbox.put([replace(packet(KEYSCAN), epoch=0, sequence=k)])
+    print(k, flush=True)
+"""
+
+
+def test_a_killed_robot_has_all_that_it_put(path):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    most = -1
+    for kill_at in (1, 150, 170):
+        command = [sys.executable, "-c", WRITER, str(path), str(most >= 0)]
+        with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as writer:
+            put = next(number for number in map(int, writer.stdout) if number >= kill_at)
+            writer.send_signal(signal.SIGKILL)
+        most = max(most, put)
+        outbox = Outbox(path, "alice", LIMIT)
+        (first, *_, last) = (decode(data).sequence for data in outbox.batch(10**9, 10**9).packets)
+        assert (first, last + 1) == (0, outbox.waiting.packets)
+        assert last >= most
+        outbox.close()

@@ -1,0 +1,90 @@
+"""A detector is taken between two records, and a resumed recording takes it at the same one."""
+
+from dataclasses import replace
+
+import pytest
+from wire.examples import RELEASE
+
+from fcslam.errors import FeatureError
+from fcslam.robot.outbox import Outbox
+from fcslam.robot.releases import Releases
+
+FIRST, SECOND = RELEASE.file, replace(RELEASE.file, version="second")
+
+
+class Frontend:
+    def __init__(self):
+        self.took = []
+
+    def adopt(self, file, path):
+        if path.read_bytes() == b"broken":
+            raise FeatureError("it is broken")
+        self.took.append(file.version)
+
+
+@pytest.fixture
+def start(tmp_path):
+    opened = []
+
+    def start(resume=False):
+        for outbox in opened:
+            outbox.close()
+        opened.append(Outbox(tmp_path / "outbox", "alice", 10**6))
+        opened[-1].begin("r", resume)
+        frontend = Frontend()
+        releases = Releases(tmp_path / "detectors", opened[-1], frontend)
+        releases.resume()
+        return releases, frontend
+
+    yield start
+    for outbox in opened:
+        outbox.close()
+
+
+def drive(releases, frontend, records, catching_up=0):
+    """What was taken before each record."""
+    taken = {}
+    for number in records:
+        before = len(frontend.took)
+        releases.take(number, number < catching_up)
+        if frontend.took[before:]:
+            (taken[number],) = frontend.took[before:]
+    return taken
+
+
+def test_what_was_fetched_is_taken_before_the_next_record(start):
+    releases, frontend = start()
+    assert drive(releases, frontend, range(3)) == {}
+    releases.keep(FIRST, b"network")
+    releases.keep(SECOND, b"network")
+    assert drive(releases, frontend, range(3, 9)) == {3: FIRST.version, 4: "second"}
+    assert releases.notice == "detector second from now on"
+
+
+def test_a_resumed_recording_takes_the_same_at_the_same_place(start):
+    releases, frontend = start()
+    releases.keep(FIRST, b"network")
+    drive(releases, frontend, range(5, 9))
+    again, frontend = start(resume=True)
+    again.keep(FIRST, b"network")  # it is announced again
+    again.keep(SECOND, b"network")
+    assert drive(again, frontend, range(20), catching_up=9) == {5: FIRST.version, 10: "second"}
+    anew, frontend = start()
+    assert drive(anew, frontend, range(20)) == {}, "another session"
+
+
+def test_news_wait_for_what_was_taken_before(start):
+    """Even if nothing was said since then."""
+    releases, frontend = start()
+    releases.keep(FIRST, b"network")
+    drive(releases, frontend, range(5, 9))
+    again, frontend = start(resume=True)
+    again.keep(SECOND, b"network")
+    assert drive(again, frontend, range(20)) == {5: FIRST.version, 6: "second"}
+
+
+def test_one_that_cannot_be_used_is_said_and_nothing_stops(start):
+    releases, frontend = start()
+    releases.keep(FIRST, b"broken")
+    assert drive(releases, frontend, range(3)) == {}
+    assert releases.notice == f"detector {FIRST.version} not taken: it is broken"

@@ -1,0 +1,209 @@
+"""Whatever the network does, the cloud gets every packet once, in order, and the robot its corrections."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robot.fake_cloud import FakeCloud, Network, content, said
+from wire.examples import HELLO, LIDAR_PLACE, RELEASE
+
+from fcslam.errors import CloudError, UnavailableError
+from fcslam.robot.outbox import Outbox
+from fcslam.robot.sender import ASK_AFTER_S, EVERY_S, LONGEST_RETRY_S, Sender, retry_delay_s
+from fcslam.wire.http_transport import Answer
+from fcslam.wire.packets import decode, encode
+
+
+class Robot:
+    """An outbox and its sender, on a clock that only moves when the sender sleeps."""
+
+    def __init__(self, path, network):
+        self.now = 0.0
+        self.corrections, self.kept, self.refused = [], [], []
+        self.outbox = Outbox(path, "alice", 10**9)
+        self.known = self.outbox.begin("r", resume=path.with_name("resumed").exists())
+        path.with_name("resumed").touch()
+        self.sender = Sender(
+            self.outbox, network, np.random.default_rng(0), lambda: self.now, self.corrections.append,
+            lambda file, content: self.kept.append((file, content)),
+            lambda data, reason: self.refused.append((content(data), reason)),
+        )  # fmt: skip
+
+    def step(self):
+        delay = self.sender.step()
+        self.now += delay
+        return delay
+
+
+@pytest.fixture
+def robot(tmp_path):
+    robot = Robot(tmp_path / "outbox", Network(FakeCloud()))
+    yield robot
+    robot.outbox.close()
+
+
+MOMENTS = st.one_of(
+    st.integers(1, 5).map(lambda count: ("say", count)),
+    st.sampled_from(Network.FAULTS).map(lambda fault: ("fault", fault)),
+    st.just(("die", None)),
+    st.just(("step", None)),
+)
+
+
+@settings(max_examples=60)
+@given(st.lists(MOMENTS, max_size=40), st.integers(1, 7))
+def test_every_packet_arrives_once_and_in_order(tmp_path_factory, moments, large):
+    """Requests and answers lost, cut, repeated or refused for now; the robot killed and resumed at any moment."""
+    network = Network(FakeCloud())
+    path = tmp_path_factory.mktemp("robot") / "outbox"
+    robot, packets = Robot(path, network), []
+    for what, argument in moments:
+        if what == "say":
+            new = [said(len(packets) + k, LIDAR_PLACE if k % large == 0 else HELLO) for k in range(argument)]
+            robot.outbox.put(new)
+            packets += new
+        elif what == "fault":
+            network.faults.append(argument)
+        elif what == "die":
+            robot.outbox.close()
+            robot = Robot(path, network)
+            assert robot.outbox.put(packets) == 0
+        robot.step()
+    for _ in range(len(network.faults) + 3):
+        robot.step()
+    stored = network.cloud.stored
+    assert list(stored) == [(0, k) for k in range(len(packets))]
+    assert [content(data) for data in stored.values()] == [content(data) for data in map(encode, packets)]
+    assert robot.outbox.waiting == (0, 0)
+    robot.outbox.close()
+
+
+def test_a_cloud_that_is_away_costs_nothing_but_time(robot):
+    network = robot.sender._transport
+    network.faults += ["request lost"] * 12
+    robot.outbox.put([said(k) for k in range(10)])
+    delays = [robot.step() for _ in range(12)]
+    assert robot.sender.trouble == "no answer"
+    assert max(delays) <= LONGEST_RETRY_S
+    assert network.cloud.stored == {}
+    robot.step()
+    assert len(network.cloud.stored) == 10
+    assert robot.sender.trouble is None
+
+
+def test_waiting_grows_to_a_bound_and_is_spread_over_all_of_it():
+    rng = np.random.default_rng(1)
+    for failures, bound in ((1, 1.0), (3, 4.0), (6, LONGEST_RETRY_S), (10**6, LONGEST_RETRY_S)):
+        delays = np.array([retry_delay_s(failures, rng) for _ in range(2000)])
+        assert 0.0 <= delays.min() < 0.05 * bound
+        assert 0.95 * bound < delays.max() <= bound
+        assert abs(delays.mean() - bound / 2.0) < 0.05 * bound
+
+
+def test_a_cloud_that_asks_for_patience_gets_it(robot):
+    robot.step()
+    robot.outbox.put([said(0)])
+    robot.sender._transport.faults.append("busy")
+    assert 2.0 <= robot.step() <= 3.0
+
+
+def test_what_collects_goes_together_and_what_is_too_much_goes_at_once(robot):
+    large = [said(k, LIDAR_PLACE) for k in range(1500)]
+    robot.outbox.put(large)
+    assert robot.step() == 0.0, "more than a batch holds"
+    assert robot.step() == EVERY_S
+    assert robot.sender._transport.requests == 3, "the state, and two batches"
+
+
+def test_a_robot_at_rest_asks_now_and_then_and_hears_of_corrections_once(robot):
+    network = robot.sender._transport
+    robot.outbox.put([said(0)])
+    robot.step()
+    network.cloud.correction = 3
+    steps = [robot.step() for _ in range(4 * int(ASK_AFTER_S))]
+    assert set(steps) == {EVERY_S}
+    assert [correction.version for correction in robot.corrections] == [3]
+    assert 4 <= network.requests - 2 <= 5
+    network.cloud.correction = 2
+    assert network.cloud.send((), -1).packets, "an older one, if it were asked for"
+    for _ in range(10):
+        robot.step()
+    assert len(robot.corrections) == 1
+
+
+def test_a_correction_of_an_earlier_start_is_about_another_odometry(tmp_path):
+    network = Network(FakeCloud(correction=5))
+    network.faults = ["request lost"]
+    before = Robot(tmp_path / "outbox", network)
+    before.outbox.put([said(0)])
+    before.step()
+    before.outbox.close()
+    (tmp_path / "resumed").unlink()
+    anew = Robot(tmp_path / "outbox", network)
+    anew.outbox.put([said(0)])
+    anew.step()
+    assert list(network.cloud.stored) == [(0, 0)]
+    assert anew.corrections == []
+    anew.step()
+    assert list(network.cloud.stored) == [(0, 0), (1, 0)]
+    assert [correction.version for correction in anew.corrections] == [5]
+    anew.outbox.close()
+
+
+def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
+    packets = [said(k, time=2000.0 + k) for k in range(6)]
+    network = robot.sender._transport
+    network.cloud.unwanted = {content(encode(packets[k])) for k in (2, 3)}
+    robot.outbox.put(packets)
+    for _ in range(5):
+        robot.step()
+    assert robot.refused == [(content(encode(packets[k])), "unwanted") for k in (2, 3)]
+    times = {(0, k): 2000.0 + k for k in (0, 1, 4, 5)}
+    assert {key: decode(data).time for key, data in network.cloud.stored.items()} == times
+    assert (robot.sender.confirmed, robot.sender.refusals) == (4, 2)
+    assert robot.outbox.waiting == (0, 0)
+
+
+def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):
+    class Deaf(Network):
+        def send(self, *_):
+            return Answer()
+
+    deaf = Deaf(FakeCloud())
+    robot.sender._transport = deaf
+    robot.outbox.put([said(0)])
+    delays = [robot.step() for _ in range(8)]
+    assert "confirms nothing" in robot.sender.trouble
+    assert sum(delays) > 2.0
+    assert robot.outbox.waiting.packets == 1
+
+
+def test_a_cloud_that_turns_the_robot_away_ends_the_sender(robot):
+    def turned_away():
+        raise CloudError("no token")
+
+    robot.sender._transport.state = turned_away
+    robot.outbox.put([said(0)])
+    robot.sender.run(threading.Event())
+    assert str(robot.sender.failure) == "no token"
+    assert robot.outbox.waiting.packets == 1
+
+
+def test_a_detector_is_fetched_once_and_one_that_is_not_there_not_asked_for_again(robot):
+    cloud = robot.sender._transport.cloud
+    missing = replace(RELEASE.file, version="gone")
+    cloud.releases = {RELEASE.file: b"network", missing: None}
+    for ordinal in range(5):
+        robot.outbox.put([said(ordinal)])
+        robot.step()
+    assert robot.kept == [(RELEASE.file, b"network")]
+    assert cloud.fetched == [RELEASE.file.version, "gone"]
+    assert robot.outbox.waiting.packets == 0
+
+
+def test_trouble_is_an_error_of_its_own():
+    assert UnavailableError("x").retry_after_s == 0.0
+    assert not isinstance(UnavailableError("x"), CloudError)

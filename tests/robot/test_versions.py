@@ -1,0 +1,179 @@
+"""A robot gets another detector on the way: what it sends from then on, and what becomes of its places of before."""
+
+from dataclasses import replace
+
+import pytest
+from features.networks import tiny_network
+from robot.test_views import records_of
+from small_fleet import fingerprint
+
+from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.errors import FeatureError
+from fcslam.features.detector import SHIPPED_NETWORK
+from fcslam.features.kinds import DetectorKind
+from fcslam.features.release import file_of
+from fcslam.records import CameraImage, Channel, DetectorFile, LaserScan, Place
+from fcslam.robot.album import AlbumConfig
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.views import ViewsConfig
+from fcslam.wire.messages import Hello, Release
+from fcslam.wire.packets import decode, encode
+
+WITH_ORB = RobotConfig(channels=(Channel.CAMERA,), views=ViewsConfig(detector=DetectorKind.ORB))
+WITH_NETWORK = RobotConfig(channels=(Channel.CAMERA,))
+SHIPPED = file_of(SHIPPED_NETWORK)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return records_of([(1.5, 1.5), (14.5, 1.5), (14.5, 6.0)], 10)[0]
+
+
+def driven(robot, records, switch_after=None):
+    """All packets of a drive; after so many records the robot takes the network that comes with fcslam."""
+    packets = []
+    for number, record in enumerate(records):
+        if number == switch_after:
+            robot.adopt(SHIPPED, SHIPPED_NETWORK)
+        packets += robot.process(record)
+    return packets + robot.finish()
+
+
+def places(packets, version):
+    return [p.body for p in packets if isinstance(p.body, Place) and p.body.detector_version == version]
+
+
+def test_old_places_are_described_again_and_new_ones_by_the_new_detector_alone(seen):
+    half = len(seen) // 2
+    robot = RobotFrontend("r", WITH_ORB)
+    packets = driven(robot, seen, half)
+    hellos = [k for k, packet in enumerate(packets) if isinstance(packet.body, Hello)]
+    first, second = (packets[k].body for k in hellos)
+    assert first.laser == second.laser
+    orb = first.detector_versions[Channel.CAMERA]
+    assert second.detector_versions == {Channel.CAMERA: SHIPPED.version}
+    before, after = packets[: hellos[1]], packets[hellos[1] :]
+    assert places(before, orb)
+    assert not places(before, SHIPPED.version)
+    assert not places(after, orb)
+    old = {place.id: (place.first, place.last) for place in places(before, orb)}
+    described = {place.id: (place.first, place.last) for place in places(after, SHIPPED.version)}
+    assert old.items() <= described.items()
+    assert max(described) > max(old)
+    # As if it had never had another: where the detector is the same, so are its places.
+    always = driven(RobotFrontend("r", WITH_NETWORK), seen)
+    assert content(after).items() <= content(always).items()
+
+
+def content(packets):
+    """Places as bytes, whenever they were sent."""
+    return {p.body.id: encode(replace(p, sequence=0, time=1e9)) for p in packets if isinstance(p.body, Place)}
+
+
+def test_a_robot_that_keeps_no_images_describes_none_again(seen):
+    config = replace_album(WITH_ORB, AlbumConfig(most_images=0))
+    half = len(seen) // 2
+    packets = driven(RobotFrontend("r", config), seen, half)
+    numbers = [packet.body.id.number for packet in packets if isinstance(packet.body, Place)]
+    assert numbers == sorted(set(numbers))
+    assert places(packets, SHIPPED.version)
+
+
+def replace_album(config, album):
+    return config.model_copy(update={"views": config.views.model_copy(update={"album": album})})
+
+
+def test_a_detector_that_comes_before_the_first_scan_is_announced_once(seen):
+    packets = driven(RobotFrontend("r", WITH_ORB), seen[:40], 0)
+    (hello,) = [packet.body for packet in packets if isinstance(packet.body, Hello)]
+    assert hello.detector_versions == {Channel.CAMERA: SHIPPED.version}
+
+
+def test_what_is_not_the_file_that_was_announced_changes_nothing(seen, tmp_path):
+    tiny_network(tmp_path / "tiny.onnx", version="tiny-1")
+    tiny = file_of(tmp_path / "tiny.onnx")
+    (tmp_path / "cut.onnx").write_bytes((tmp_path / "tiny.onnx").read_bytes()[:-1])
+    robot = RobotFrontend("r", WITH_ORB)
+    for file, path, reason in (
+        (SHIPPED, tmp_path / "tiny.onnx", "is not the file"),
+        (tiny, tmp_path / "cut.onnx", "is not the file"),
+        (tiny, tmp_path / "missing.onnx", "cannot be read"),
+        (replace(tiny, version="tiny-2"), tmp_path / "tiny.onnx", "holds detector tiny-1"),
+        (replace(tiny, format=2), tmp_path / "tiny.onnx", "its format is 2"),
+        (replace(tiny, channel=Channel.LIDAR), tmp_path / "tiny.onnx", "describes lidar places"),
+    ):
+        with pytest.raises(FeatureError, match=reason):
+            robot.adopt(file, path)
+    with pytest.raises(FeatureError, match="takes none"):
+        RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,))).adopt(tiny, tmp_path / "tiny.onnx")
+    untouched = driven(RobotFrontend("r", WITH_ORB), seen[:40])
+    assert [encode(packet) for packet in driven(robot, seen[:40])] == [encode(packet) for packet in untouched]
+
+
+def test_no_image_leaves_with_what_is_described_again(seen):
+    pieces = {record.encoded[k : k + 12] for record in seen if isinstance(record, CameraImage)
+              for k in range(640, len(record.encoded) - 12)}  # fmt: skip
+    for packet in driven(RobotFrontend("r", WITH_ORB), seen, len(seen) - 1):
+        data = encode(packet)
+        assert not any(data[k : k + 12] in pieces for k in range(len(data) - 11))
+
+
+@pytest.fixture(scope="module")
+def fleet(seen):
+    """Robot old drove with ORB and never met the other's words; robot new has had the network from the start."""
+    others = records_of([(4.0, 1.6), (14.4, 1.6), (14.4, 8.0)], 11)[0]
+    last = max(k for k, record in enumerate(seen) if isinstance(record, LaserScan))
+    return {
+        "switched": driven(RobotFrontend("old", WITH_ORB), seen, last),
+        "stayed": driven(RobotFrontend("old", WITH_ORB), seen),
+        "new": driven(RobotFrontend("new", WITH_NETWORK), others),
+    }
+
+
+def received(packets):
+    cloud = Fleet(FleetConfig(), 0)
+    for packet in packets:
+        cloud.receive(encode(packet))
+    return cloud.finalize()
+
+
+def between(result):
+    return [closure for closure in result.closures if closure.i.robot != closure.j.robot]
+
+
+def test_places_of_before_match_what_others_see_once_they_are_described_again(fleet):
+    joined = received([*fleet["switched"], *fleet["new"]])
+    assert {robot.map_index for robot in joined.robots} == {0}
+    described = {place.id for place in places(fleet["switched"], SHIPPED.version)}
+    of_old = {end for closure in between(joined) for end in (closure.i, closure.j) if end.robot == "old"}
+    assert of_old
+    assert of_old <= described
+    # Whatever arrives first: old places, described again, meet places that are there already.
+    other_way = received([*fleet["new"], *fleet["switched"]])
+    assert fingerprint(other_way) == fingerprint(joined)
+
+
+def test_codes_of_different_versions_are_not_compared(fleet):
+    apart = received([*fleet["stayed"], *fleet["new"]])
+    assert {robot.map_index for robot in apart.robots} == {0, 1}
+    assert between(apart) == []
+
+
+def releases(cloud, packet):
+    replies = [decode(reply).body for reply in cloud.receive(encode(packet))]
+    return [body.file for body in replies if isinstance(body, Release)]
+
+
+def test_the_cloud_tells_of_a_release_until_it_is_taken(fleet):
+    cloud = Fleet(FleetConfig(join_maps=False), 0)
+    other = DetectorFile(Channel.CAMERA, "other-1", 1, 5, bytes(32))
+    cloud.announce(other)
+    cloud.announce(SHIPPED)
+    told = [(packet.body, releases(cloud, packet)) for packet in fleet["switched"]]
+    orb = places(fleet["stayed"], told[0][0].detector_versions[Channel.CAMERA])[0].detector_version
+    for body, files in told:
+        asks = isinstance(body, Hello) and body.detector_versions[Channel.CAMERA] == orb
+        asks |= isinstance(body, Place) and body.detector_version == orb
+        assert files == ([SHIPPED] if asks else [])
+    hello = Hello("blind", 0, told[0][0].laser, {Channel.LIDAR: "birdseye-1"})  # it has no camera
+    assert releases(cloud, replace(fleet["new"][0], robot="blind", body=hello)) == []

@@ -1,0 +1,150 @@
+"""HTTP one request at a time: what goes over the wire, and what each answer means."""
+
+import json
+
+import pytest
+from federated.authority import certificates
+from robot.fake_cloud import said
+from robot.http_cloud import serving
+from wire.examples import LIDAR_PLACE
+
+from fcslam.errors import CloudError, UnavailableError
+from fcslam.records import Channel
+from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch
+from fcslam.wire.http_transport import Answer, HttpTransport, Refusal
+from fcslam.wire.messages import Acknowledgement
+from fcslam.wire.packets import decode, encode
+
+PACKETS = [encode(said(0)), encode(said(1, LIDAR_PLACE))]
+
+
+@pytest.fixture
+def cloud():
+    with serving() as cloud:
+        yield cloud
+
+
+@pytest.fixture
+def transport(cloud):
+    transport = HttpTransport(cloud.url + "/", "r 1+2", "ab" * 16, "secret")
+    yield transport
+    transport.close()
+
+
+def error(status, text="no", **more):
+    headers = {"Retry-After": str(more.pop("after"))} if "after" in more else {}
+    return status, headers, json.dumps({"error": text, **more}).encode()
+
+
+def test_a_batch_and_what_comes_back(cloud, transport):
+    answer = transport.send(PACKETS, 7)
+    assert [decode(data).body for data in answer.packets] == [Acknowledgement("alice", 0, 1)]
+    ((method, path, headers, body),) = cloud.requests
+    assert (method, path) == ("POST", "/api/v1/robots/r%201%2B2/packets")
+    assert read_batch(body) == PACKETS
+    told = {name: headers[name] for name in (AGENT_HEADER, CORRECTION_HEADER, "Content-Type", "Authorization")}
+    assert told == {
+        AGENT_HEADER: "ab" * 16, CORRECTION_HEADER: "7", "Content-Type": MEDIA_TYPE, "Authorization": "Bearer secret",
+    }  # fmt: skip
+    assert transport.state().expected == {0: 2}
+    assert cloud.requests[-1][:2] == ("GET", "/api/v1/robots/r%201%2B2/state")
+
+
+def test_asking_for_what_is_new_sends_no_bytes(cloud, transport):
+    assert transport.send((), -1) == Answer()
+    assert cloud.requests[0][3] == b""
+
+
+def test_a_refused_packet_is_told_by_its_place(cloud, transport):
+    cloud.canned.append(error(400, "bad", index=1))
+    assert transport.send(PACKETS, -1) == Answer(refusal=Refusal(1, f"{cloud.url}: bad (400)"))
+
+
+@pytest.mark.parametrize(
+    ("status", "more", "wait_s"),
+    [
+        (400, {}, 0.0), (400, {"index": 2}, 0.0), (400, {"index": -1}, 0.0), (400, {"index": "1"}, 0.0),
+        (409, {}, 0.0), (409, {"after": 12}, 12.0), (429, {"after": 3}, 3.0), (429, {}, 0.0), (500, {}, 0.0),
+        (502, {}, 0.0), (503, {"after": "soon"}, 0.0), (507, {}, 0.0),
+    ],
+)  # fmt: skip
+def test_what_may_succeed_later(cloud, transport, status, more, wait_s):
+    cloud.canned.append(error(status, "why", **more))
+    with pytest.raises(UnavailableError, match=rf"why \({status}\)") as caught:
+        transport.send(PACKETS, -1)
+    assert caught.value.retry_after_s == wait_s
+
+
+@pytest.mark.parametrize(
+    ("status", "more"), [(401, {}), (403, {}), (404, {}), (409, {"index": 1}), (413, {}), (302, {})]
+)
+def test_what_never_will(cloud, transport, status, more):
+    cloud.canned.append(error(status, "why", **more))
+    with pytest.raises(CloudError, match=rf"why \({status}\)"):
+        transport.send(PACKETS, -1)
+
+
+def test_answers_that_are_none(cloud, transport):
+    cloud.canned += [(200, {}, b"noise"), (502, {}, b"<html>"), (404, {}, b"[]")]
+    with pytest.raises(UnavailableError, match="the answer is broken"):
+        transport.send(PACKETS, -1)
+    with pytest.raises(UnavailableError, match=r"Bad Gateway \(502\)"):
+        transport.send(PACKETS, -1)
+    with pytest.raises(CloudError, match=r"Not Found \(404\)"):
+        transport.send(PACKETS, -1)
+
+
+@pytest.mark.parametrize("body", [b"<html>", b"[]", b"{}", b'{"next": {"a": 1}}', b'{"next": [1]}'])
+def test_another_server_is_no_cloud(cloud, transport, body):
+    cloud.canned.append((200, {}, body))
+    with pytest.raises(CloudError, match="not as a cloud of fcslam"):
+        transport.state()
+
+
+def test_nobody_there_is_no_reason_to_give_up():
+    away = HttpTransport("http://127.0.0.1:9", "r", "ab" * 16)
+    with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
+        away.state()
+    away.close()
+
+
+def test_a_network_comes_as_it_is(cloud, transport):
+    cloud.canned.append((200, {}, b"onnx"))
+    assert transport.detector(Channel.CAMERA, "cnn-0.3+r12") == b"onnx"
+    assert cloud.requests[0][:2] == ("GET", "/api/v1/detectors/camera/cnn-0.3%2Br12")
+
+
+@pytest.mark.parametrize("url", ["cloud.example", "ftp://cloud.example", "https://", "8443", ""])
+def test_an_address_must_be_one(url):
+    with pytest.raises(CloudError, match="no address of a cloud"):
+        HttpTransport(url, "r", "ab" * 16)
+
+
+def test_a_token_is_not_shown_to_the_network():
+    with pytest.raises(CloudError, match="use https"):
+        HttpTransport("http://cloud.example", "r", "ab" * 16, "secret")
+    for url in ("http://localhost:80", "http://[::1]:80", "https://cloud.example"):
+        HttpTransport(url, "r", "ab" * 16, "secret").close()
+    HttpTransport("http://cloud.example", "r", "ab" * 16).close()
+
+
+def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_path):
+    ours, others = certificates(tmp_path / "ours"), certificates(tmp_path / "others")
+    with serving(tls=ours) as cloud:
+        trusting = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ours / "ca.crt")
+        assert len(trusting.send(PACKETS, -1).packets) == 1
+        trusting.close()
+        for ca in (None, others / "ca.crt"):
+            wary = HttpTransport(cloud.url, "r", "ab" * 16, "secret", ca)
+            with pytest.raises(CloudError, match="its certificate is not trusted"):
+                wary.send(PACKETS, -1)
+            wary.close()
+    assert len(cloud.requests) == 1, "no token went to a stranger"
+
+
+@pytest.mark.parametrize("content", [None, b"noise"])
+def test_an_authority_must_be_readable(tmp_path, content):
+    if content is not None:
+        (tmp_path / "ca.pem").write_bytes(content)
+    with pytest.raises(CloudError, match="give a PEM file"):
+        HttpTransport("https://cloud.example", "r", "ab" * 16, ca=tmp_path / "ca.pem")
