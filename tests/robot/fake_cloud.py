@@ -64,7 +64,7 @@ class FakeCloud:
             answer.append(encode(replace(packet(acknowledgement), epoch=epoch)))
         answer += [encode(packet(Release("alice", file))) for file in self.releases]
         if self.correction > correction:
-            answer.append(encode(packet(replace(CORRECTION, version=self.correction))))
+            answer.append(encode(replace(packet(replace(CORRECTION, version=self.correction)), epoch=epoch)))
         return Answer(tuple(answer))
 
 

@@ -134,6 +134,25 @@ def test_a_robot_at_rest_asks_now_and_then_and_hears_of_corrections_once(robot):
     assert len(robot.corrections) == 1
 
 
+def test_a_correction_of_an_earlier_start_is_about_another_odometry(tmp_path):
+    network = Network(FakeCloud(correction=5))
+    network.faults = ["request lost"]
+    before = Robot(tmp_path / "outbox", network)
+    before.outbox.put([said(0)])
+    before.step()
+    before.outbox.close()
+    (tmp_path / "resumed").unlink()
+    anew = Robot(tmp_path / "outbox", network)
+    anew.outbox.put([said(0)])
+    anew.step()
+    assert list(network.cloud.stored) == [(0, 0)]
+    assert anew.corrections == []
+    anew.step()
+    assert list(network.cloud.stored) == [(0, 0), (1, 0)]
+    assert [correction.version for correction in anew.corrections] == [5]
+    anew.outbox.close()
+
+
 def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
     packets = [said(k, time=2000.0 + k) for k in range(6)]
     network = robot.sender._transport

@@ -7,7 +7,7 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import config, demo, evaluate, extract, federate, serve, simulate, train
+from fcslam.cli import certificates, config, demo, evaluate, extract, federate, serve, simulate, train
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.cli import robot as robots
@@ -57,6 +57,11 @@ app.command(
     epilog="Example: fcslam serve --data missions, fcslam serve --data missions --host 0.0.0.0 --tokens tokens.yaml "
     "--tls-certificate cloud.pem --tls-key cloud.key",
 )(serve.serve)
+app.command(
+    "certificates",
+    epilog="Example: fcslam certificates --output credentials --host cloud.local --robot robot1 --robot robot2 "
+    "--viewer lab --admin boss",
+)(certificates.certificates)
 app.add_typer(config.app, name="config")
 app.add_typer(evaluate.app, name="evaluate")
 

@@ -48,25 +48,27 @@ def serve(
     if tokens is None and not insecure and not _is_loopback(host):
         raise ServiceError(f"anybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
     _check_tls(tls_certificate, tls_key)
-    listening = _listen(host, port)
-    state = _state(data, tokens, _cloud_config(config))
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    server = uvicorn.Server(
-        uvicorn.Config(
-            create_app(state, docs=docs),
-            ssl_certfile=tls_certificate,
-            ssl_keyfile=tls_key,
-            log_level="warning",
-            server_header=False,
-            timeout_graceful_shutdown=10,
-            h11_max_incomplete_event_size=64 * 1024,
-            limit_concurrency=512,
+    with _listen(host, port) as listening:
+        state = _state(data, tokens, _cloud_config(config))
+        server = uvicorn.Server(
+            uvicorn.Config(
+                create_app(state, docs=docs),
+                ssl_certfile=tls_certificate,
+                ssl_keyfile=tls_key,
+                log_level="warning",
+                ws="none",
+                server_header=False,
+                timeout_graceful_shutdown=10,
+                h11_max_incomplete_event_size=64 * 1024,
+                limit_concurrency=512,
+            )
         )
-    )
-    scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
-    mission = state.mission.folder.name
-    typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{address}:{number}; Ctrl-C stops it")
-    server.run(sockets=[listening])
+        scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
+        mission = state.mission.folder.name
+        shown = f"[{address}]" if ":" in address else address
+        typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{shown}:{number}; Ctrl-C stops it")
+        server.run(sockets=[listening])
 
 
 def _state(data: Path, tokens: Path | None, config: "CloudConfig") -> "ServiceState":
@@ -77,10 +79,13 @@ def _state(data: Path, tokens: Path | None, config: "CloudConfig") -> "ServiceSt
     from fcslam.cloud.service.events import EventStream
     from fcslam.cloud.service.limits import RateLimit
     from fcslam.cloud.service.state import ServiceState
+    from fcslam.cloud.supervisor import Supervisor
 
     authenticator = Authenticator(None if tokens is None else read_tokens(tokens))
     events = EventStream()
-    missions = Missions(data, config, time.monotonic, time.time, events.publish)
+    missions = Missions(
+        data, config, time.monotonic, time.time, lambda folder: Supervisor(folder, time.monotonic, events.publish)
+    )
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events)
 
 

@@ -10,7 +10,7 @@ from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.intake import Intake
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cloud.store import MissionStore, check_mission
-from fcslam.cloud.supervisor import Listen, Supervisor
+from fcslam.cloud.supervisor import RunningWorker
 from fcslam.cloud.worker import CONFIG
 from fcslam.errors import ServiceError, StoreError
 from fcslam.wire.checks import check_name
@@ -19,19 +19,23 @@ FIRST = "mission"
 """Name of the mission that is open when there was none."""
 
 
+Launch = Callable[[MissionFolder], RunningWorker]
+"""Starts the worker of a mission."""
+
+
 class OpenMission:
     """A mission that takes packets in and has a worker."""
 
     def __init__(
         self, folder: MissionFolder, config: CloudConfig, clock: Callable[[], float],
-        wall_clock: Callable[[], float], listen: Listen,
+        wall_clock: Callable[[], float], launch: Launch,
     ) -> None:  # fmt: skip
         self.folder = folder
         self.store = MissionStore(folder.store)
         if self.store.fact(CONFIG) is None:
             self.store.remember(CONFIG, config.model_dump_json())
         self.intake = Intake(self.store, clock, wall_clock)
-        self.worker = Supervisor(folder, clock, listen)
+        self.worker = launch(folder)
 
     def close(self) -> None:
         """Stop the worker, then let go of the file."""
@@ -44,7 +48,7 @@ class Missions:
 
     def __init__(
         self, root: Path, config: CloudConfig, clock: Callable[[], float], wall_clock: Callable[[], float],
-        listen: Listen,
+        launch: Launch,
     ) -> None:  # fmt: skip
         """Open the mission that was open last, or a first one.
 
@@ -53,7 +57,7 @@ class Missions:
             StoreError: the mission cannot be opened.
         """
         self.root = root
-        self._config, self._clock, self._wall_clock, self._listen = config, clock, wall_clock, listen
+        self._config, self._clock, self._wall_clock, self._launch = config, clock, wall_clock, launch
         self._lock = _locked(root)
         named = self._open_file.read_text(encoding="utf-8").strip() if self._open_file.exists() else FIRST
         self.open_mission = self._opened(named)
@@ -141,7 +145,7 @@ class Missions:
     def _opened(self, name: str) -> OpenMission:
         folder = self.folder(name)
         folder.path.mkdir(parents=True, exist_ok=True)
-        mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._listen)
+        mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._launch)
         staging = self._open_file.with_name(".open.partial")
         staging.write_text(name + "\n", encoding="utf-8")
         staging.replace(self._open_file)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from fcslam.cloud.folder import MissionFolder
 
@@ -15,6 +16,25 @@ STEADY_S = 60.0
 
 Listen = Callable[[str, int], None]
 """Is told of a worker's events; from a thread of its own."""
+
+
+class RunningWorker(Protocol):
+    """A worker, wherever it runs."""
+
+    @property
+    def pid(self) -> int | None:
+        """Of its process; None while there is none."""
+
+    @property
+    def starts(self) -> int:
+        """How often it was started."""
+
+    def ring(self) -> None:
+        """Tell it that there is something to do."""
+
+    def stop(self) -> None:
+        """Let it end what it is doing, and wait for that."""
+
 
 _log = logging.getLogger(__name__)
 
@@ -28,8 +48,7 @@ class Supervisor:
         self._stopping = threading.Event()
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
-        self.starts = 0
-        """How often a worker was started."""
+        self._starts = 0
         self._thread = threading.Thread(target=self._run, name=f"worker of {folder.name}", daemon=True)
         self._thread.start()
 
@@ -38,6 +57,11 @@ class Supervisor:
         """Of the worker; None while there is none."""
         process = self._process
         return process.pid if process is not None and process.poll() is None else None
+
+    @property
+    def starts(self) -> int:
+        """How often a worker was started."""
+        return self._starts
 
     def ring(self) -> None:
         """Tell the worker that there is something to do."""
@@ -73,7 +97,7 @@ class Supervisor:
         with subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
             with self._lock:
                 self._process = process
-                self.starts += 1
+                self._starts += 1
                 if self._stopping.is_set() and process.stdin is not None:
                     process.stdin.close()
             assert process.stdout is not None

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from fcslam.errors import CloudError, FcslamError, PacketError, UnavailableError
+from fcslam.errors import CloudError, PacketError, UnavailableError
 from fcslam.records import Correction, DetectorFile
 from fcslam.robot.outbox import Batch, Outbox
 from fcslam.wire.http_transport import Answer, BatchTransport
@@ -59,15 +59,15 @@ class Sender:
         self.refusals = 0
         self.trouble: str | None = "connecting"
         """Why nothing gets through; None: it does."""
-        self.failure: FcslamError | None = None
+        self.failure: Exception | None = None
         """What ended ``run``."""
 
     def run(self, stop: threading.Event) -> None:
-        """Work until ``stop`` is set or the cloud turns the robot away, which ``failure`` then tells."""
+        """Work until ``stop`` is set or something ends it, as the cloud that turns the robot away: see ``failure``."""
         try:
             while not stop.is_set():
                 stop.wait(self.step())
-        except FcslamError as error:
+        except Exception as error:  # the thread that waits for this one raises it
             self.failure = error
 
     def step(self) -> float:
@@ -118,13 +118,14 @@ class Sender:
             packets = [decode(data) for data in answer.packets]
         except PacketError as error:
             raise UnavailableError(f"the cloud's answer is broken: {error}") from error
-        for body in (packet.body for packet in packets):
-            match body:
+        for packet in packets:
+            match packet.body:
                 case Acknowledgement(epoch=epoch, sequence=sequence):
                     self.confirmed += self._outbox.acknowledge(epoch, sequence)
-                case Correction(version=version) if version > self._correction:
-                    self._correction = version
-                    self._correct(body)
+                # That of an earlier session, whose packets go first, is about another odometry.
+                case Correction() as news if packet.epoch == self._outbox.epoch and news.version > self._correction:
+                    self._correction = news.version
+                    self._correct(news)
                 case Release(file=file) if file not in self._known:
                     self._fetch(file)
 

@@ -1,0 +1,169 @@
+"""`fcslam serve` and `fcslam certificates`: what is refused at once, and a real service behind TLS."""
+
+import os
+import re
+import signal
+import socket
+import ssl
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+import yaml
+from small_fleet import in_order
+
+from fcslam.cli import main
+from fcslam.runs import open_run
+from fcslam.wire.batches import read_batch, write_batch
+from fcslam.wire.packets import decode, encode
+
+API = "/api/v1"
+
+
+@pytest.fixture(scope="module")
+def credentials(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("credentials")
+    names = [f"--robot=robot_{k}" for k in (1, 2, 3)]
+    assert main(["certificates", "-o", str(folder), "--host", "cloud.test", *names, "--admin", "boss"]) == 0
+    return folder
+
+
+def token(folder, name):
+    return (folder / "tokens" / name).read_text().strip()
+
+
+def test_secrets_are_their_owners_alone_and_the_cloud_knows_hashes_only(credentials):
+    for name in ("ca.key", "cloud.key", "tokens/robot_1", "tokens/boss"):
+        assert stat.S_IMODE((credentials / name).stat().st_mode) == 0o600
+    text = (credentials / "tokens.yaml").read_text()
+    assert token(credentials, "robot_1") not in text
+    assert [entry["name"] for entry in yaml.safe_load(text)["tokens"]] == ["robot_1", "robot_2", "robot_3", "boss"]
+
+
+def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials):
+    before = {name: (credentials / name).read_bytes() for name in ("ca.pem", "ca.key", "tokens/boss")}
+    assert main(["certificates", "-o", str(credentials), "--robot", "new", "--robot", "robot_1"]) == 0
+    assert {name: (credentials / name).read_bytes() for name in before} == before
+    names = [entry["name"] for entry in yaml.safe_load((credentials / "tokens.yaml").read_text())["tokens"]]
+    assert names == ["robot_1", "robot_2", "robot_3", "boss", "new"]
+
+
+@pytest.mark.parametrize("wrong", [["--robot", "a", "--viewer", "a"], ["--robot", "a+1"], ["--robot", "../a"]])
+def test_names_that_cannot_be_are_refused(tmp_path, wrong, capsys):
+    assert main(["certificates", "-o", str(tmp_path / "out"), *wrong]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (["--host", "0.0.0.0"], "--tokens"),
+        (["--host", "::"], "--insecure"),
+        (["--tls-key", "k.pem"], "belong together"),
+        (["--tls-key", "no.pem", "--tls-certificate", "no.pem"], "no.pem"),
+        (["--tokens", "no.yaml"], "no.yaml"),
+        (["--config", "no.yaml"], "no.yaml"),
+        (["--host", "256.1.1.1", "--insecure"], "256.1.1.1"),
+    ],
+)
+def test_a_service_that_cannot_run_as_told_says_so_in_one_line(tmp_path, wrong, says, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["serve", "--data", "data", "--port", "0", *wrong]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert says in line
+
+
+def test_a_port_that_is_taken_is_told(tmp_path, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert main(["serve", "--data", str(tmp_path / "data"), "--port", str(taken.getsockname()[1])]) == 2
+    assert "--port" in capsys.readouterr().err
+
+
+class Service:
+    """A real one."""
+
+    def __init__(self, data, *options):
+        command = [sys.executable, "-m", "fcslam.cli", "serve", "--data", str(data), "--port", "0", *options]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        self.url = re.search(r"https?://\S+:\d+", self.process.stdout.readline())[0]
+
+    def kill(self):
+        self.process.kill()
+        self.process.wait()
+        self.process.stdout.close()
+
+    def stop(self):
+        self.process.send_signal(signal.SIGTERM)
+        self.process.wait(60)
+        self.process.stdout.close()
+
+
+def send(client, robot, packets, **headers):
+    batch = write_batch([encode(packet) for packet in packets])
+    response = client.post(f"{API}/robots/{robot}/packets", content=batch, headers={"Fcslam-Agent": "x", **headers})
+    assert response.status_code == 200, response.text
+    return decode(read_batch(response.content)[0]).body.sequence
+
+
+def children(pid):
+    """Processes that this one started, of all its threads."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+
+
+@pytest.mark.system
+def test_killed_at_any_moment_a_service_loses_nothing_and_finds_the_same(tmp_path, packets):
+    """Twice the same packets: once undisturbed, once with kill -9 of the service or its worker at every third."""
+    by_robot = {robot: [p for p in packets if p.robot == robot] for robot in ("robot_1", "robot_2", "robot_3")}
+    runs = []
+    for disturbed in (False, True):
+        data = tmp_path / f"data {disturbed}"
+        service = Service(data)
+        for third in range(3):
+            with httpx.Client(base_url=service.url, timeout=300.0) as client:
+                for robot, mine in by_robot.items():
+                    size = len(mine) // 3 + 1
+                    last = mine[third * size : (third + 1) * size][-1].sequence
+                    # what was not acknowledged is sent again: some of the batch before, too
+                    assert send(client, robot, mine[max(third * size - 5, 0) : (third + 1) * size]) == last
+            if disturbed and third < 2:
+                worker = children(service.process.pid)
+                if third == 0:
+                    service.kill()
+                    service = Service(data)
+                elif worker:
+                    os.kill(worker[0], signal.SIGKILL)
+        with httpx.Client(base_url=service.url, timeout=300.0) as client:
+            for robot, mine in by_robot.items():
+                state = client.get(f"{API}/robots/{robot}/state").json()
+                assert state["next"] == {"0": len(mine)}
+            runs.append(open_run(Path(client.post(f"{API}/finalize").json()["run"])))
+        service.stop()
+    assert runs[0].pose_graph_g2o == runs[1].pose_graph_g2o
+    assert runs[0].map_files == runs[1].map_files
+    assert [str(c) for c in runs[0].closures] == [str(c) for c in runs[1].closures]
+
+
+@pytest.mark.system
+def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, credentials):
+    mine = in_order(p for p in packets if p.robot == "robot_1")[:40]
+    tls = ["--tls-certificate", str(credentials / "cloud.pem"), "--tls-key", str(credentials / "cloud.key")]
+    service = Service(tmp_path / "data", "--tokens", str(credentials / "tokens.yaml"), *tls)
+    trusted = ssl.create_default_context(cafile=str(credentials / "ca.pem"))
+    bearer = {"Authorization": f"Bearer {token(credentials, 'robot_1')}"}
+    with httpx.Client(base_url=service.url, verify=trusted, timeout=60.0) as client:
+        assert send(client, "robot_1", mine, **bearer) == 39
+        assert client.get(f"{API}/robots/robot_2/state", headers=bearer).status_code == 403
+        assert client.get(f"{API}/robots/robot_1/state").status_code == 401
+        assert client.get(f"{API}/fleet", headers=bearer).status_code == 403
+        boss = {"Authorization": f"Bearer {token(credentials, 'boss')}"}
+        assert client.get(f"{API}/fleet", headers=boss).json()["packets"] == 40
+    with httpx.Client(base_url=service.url, timeout=60.0) as client, pytest.raises(httpx.ConnectError):
+        client.get("/healthz")
+    service.stop()

@@ -1,0 +1,12 @@
+import pytest
+from cloud.service.desk import Desk
+
+
+@pytest.fixture
+def desk(tmp_path, scripted):
+    """A service over scripted robots a and b, with a token for each role."""
+    from cloud.service.desk import SCRIPT
+
+    scripted(SCRIPT)
+    with Desk(tmp_path / "data") as desk:
+        yield desk

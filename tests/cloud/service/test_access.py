@@ -1,0 +1,122 @@
+"""Every route, taken from the application itself: who has no right to it gets nothing and changes nothing."""
+
+import hashlib
+import sqlite3
+
+import pytest
+from cloud.service.desk import A, Desk
+from fastapi.routing import APIRoute, iter_route_contexts
+
+from fcslam.cloud.service.authentication import Authenticator, Role, TokenEntry
+
+OPEN = {"/healthz", "/openapi.json"}
+VALUES = {
+    "robot": "a", "k": "0", "suffix": "png", "z": "0", "x": "0", "y": "0", "session": "a", "name": "mission",
+    "channel": "camera", "version": "v1",
+}  # fmt: skip
+READERS = {Role.VIEWER, Role.ADMIN}
+RIGHTS = {"robots": {Role.ROBOT}, "decisions": {Role.ADMIN}, "missions": {Role.ADMIN}}
+"""By tag; what is not listed is for readers."""
+EXCEPTIONS = {
+    ("GET", "/api/v1/detectors/{channel}/{version}"): set(Role),
+    ("GET", "/api/v1/missions"): READERS,
+}
+ENDLESS = {"/api/v1/events"}
+
+
+@pytest.fixture(scope="module")
+def routes(tmp_path_factory):
+    with Desk(tmp_path_factory.mktemp("service") / "data") as desk:
+        return [
+            (method, route.path, route)
+            for route in iter_route_contexts(desk.app.routes)
+            for method in sorted(route.methods or ())
+            if method != "HEAD"
+        ]
+
+
+def rights(method, path, route):
+    (tag,) = route.route.tags
+    return EXCEPTIONS.get((method, path), RIGHTS.get(tag, READERS))
+
+
+def content(desk):
+    """All that is stored."""
+    with sqlite3.connect(desk.state.mission.folder.store) as database:
+        text = hashlib.sha256("\n".join(database.iterdump()).encode()).hexdigest()
+    database.close()
+    return text, desk.state.missions.names, desk.state.mission.folder.name
+
+
+def test_the_routes_are_all_there(routes):
+    assert len(routes) >= 25
+    assert {path for _, path, route in routes if not isinstance(route.route, APIRoute)} <= OPEN
+
+
+@pytest.mark.parametrize("who", [None, "nobody", "a", "b", "eye", "boss"])
+def test_who_has_no_right_gets_nothing_and_changes_nothing(desk, routes, who):
+    desk.told(desk.send("a", A[:9]))
+    (desk.state.detectors / "camera").mkdir(parents=True)
+    (desk.state.detectors / "camera" / "v1.onnx").write_bytes(b"secret network")
+    before = content(desk)
+    role = {"a": Role.ROBOT, "b": Role.ROBOT, "eye": Role.VIEWER, "boss": Role.ADMIN}.get(who)
+    refused = 0
+    for method, path, route in routes:
+        if path in OPEN:
+            continue
+        allowed = role in rights(method, path, route) and not (who == "b" and "{robot}" in path)
+        if allowed:
+            continue
+        response = desk.ask(method, path.format(**VALUES), who, content=b"x" * 10)
+        assert response.status_code == (401 if role is None else 403), (method, path, response.text)
+        assert set(response.json()) == {"error"}
+        refused += 1
+    assert refused > (0 if who == "boss" else 5)
+    assert content(desk) == before
+
+
+@pytest.mark.parametrize("who", ["a", "eye", "boss"])
+def test_who_has_the_right_is_not_turned_away(desk, routes, who):
+    desk.told(desk.send("a", A[:9]))
+    role = {"a": Role.ROBOT, "eye": Role.VIEWER, "boss": Role.ADMIN}[who]
+    for method, path, route in routes:
+        if path in OPEN | ENDLESS or role not in rights(method, path, route):
+            continue
+        response = desk.ask(method, path.format(**VALUES), who)
+        assert response.status_code not in (401, 403, 405), (method, path)
+        assert response.status_code < 500, (method, path, response.text)
+
+
+def test_without_tokens_nobody_is_asked_for_one(tmp_path, routes):
+    with Desk(tmp_path / "data", tokens=None) as desk:
+        for method, path, _ in routes:
+            if path not in ENDLESS:
+                assert desk.ask(method, path.format(**VALUES)).status_code not in (401, 403)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "",
+        "Bearer",
+        "Bearer ",
+        "Basic token of eye",
+        "Bearer token of eye2",
+        "token of eye",
+        "Bearer \xff\xfe",
+        "B" * 5000,
+    ],
+)
+def test_what_is_no_known_token_is_nobody(header):
+    digest = hashlib.sha256(b"token of eye").hexdigest()
+    authenticator = Authenticator([TokenEntry(name="eye", role=Role.VIEWER, sha256=digest)])
+    assert authenticator.who(header) is None
+    assert authenticator.who(None) is None
+    assert authenticator.who(f"bearer {'token of eye'}").name == "eye"
+    assert authenticator.who(f"Bearer {digest}") is None
+
+
+def test_health_needs_no_token_and_says_when_the_worker_is_down(desk):
+    assert desk.ask("GET", "/healthz").status_code == 200
+    desk.state.mission.worker.pid = None
+    assert desk.ask("GET", "/healthz").status_code == 503

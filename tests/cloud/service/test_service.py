@@ -1,0 +1,240 @@
+"""What the service answers: robots, viewers, administrators; and what it does not let happen."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cloud.service.desk import POSES, A, B, Desk
+
+from fcslam.cloud.store import MissionStore
+from fcslam.errors import ServiceError
+from fcslam.records import Correction
+from fcslam.runs import open_run
+from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
+from fcslam.wire.messages import Acknowledgement
+
+API = "/api/v1"
+PACKETS = f"{API}/robots/a/packets"
+
+
+@pytest.fixture
+def mapped(desk):
+    for robot, data in (("a", A), ("b", B)):
+        desk.told(desk.send(robot, data))
+    return desk
+
+
+def get(desk, path, as_="eye"):
+    response = desk.ask("GET", f"{API}/{path}", as_)
+    assert response.status_code == 200, response.text
+    return response
+
+
+def test_a_robot_hears_what_is_stored_and_where_it_is(mapped):
+    told = mapped.told(mapped.send("b", B[-1:]))
+    assert told[0] == Acknowledgement("b", 0, len(B) - 1)
+    assert isinstance(told[1], Correction)
+    known = {"Fcslam-Correction": str(told[1].version)}
+    assert mapped.told(mapped.send("b", [], **known)) == told[:1]
+    state = mapped.ask("GET", f"{API}/robots/b/state", "b").json()
+    assert state == {"robot": "b", "epoch": 0, "next": {"0": len(B)}, "correction": told[1].version, "map": 0}
+    assert mapped.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
+
+
+def test_a_robot_that_is_not_known_has_nothing_stored(desk):
+    state = desk.ask("GET", f"{API}/robots/a/state", "a").json()
+    assert state == {"robot": "a", "epoch": None, "next": {}, "correction": -1, "map": None}
+    assert desk.told(desk.send("a", [])) == []
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [([A[0], b"no packet", A[2]], 400), ([A[0], B[0]], 400), ([A[0], A[1][:-1]], 400)],
+)
+def test_a_refused_packet_has_an_index_and_a_reason(desk, data, status):
+    response = desk.send("a", data)
+    assert response.status_code == status
+    assert response.json()["index"] == 1
+    assert response.json()["error"]
+    assert desk.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": 1}
+
+
+def test_a_second_agent_is_refused(desk):
+    desk.told(desk.send("a", A[:2]))
+    response = desk.send("a", A[2:4], **{"Fcslam-Agent": "y"})
+    assert (response.status_code, "another agent" in response.json()["error"]) == (409, True)
+    desk.now += 31.0
+    desk.told(desk.send("a", A[2:4], **{"Fcslam-Agent": "y"}))
+
+
+@pytest.mark.parametrize("announced", [True, False])
+def test_a_body_that_is_too_long_is_not_read(desk, announced):
+    body = b"\0" * (MAXIMUM_BATCH_BYTES + 1)
+    content = body if announced else iter([body[: 2**19], body[2**19 :]])
+    response = desk.ask("POST", PACKETS, "a", content=content)
+    assert response.status_code == 413
+    assert desk.state.mission.store.turn_count() == 0
+
+
+def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
+    statuses = [desk.ask("POST", PACKETS, "a", content=b"").status_code for _ in range(200)]
+    limit = statuses.index(429)
+    assert set(statuses[:limit]) == {200}
+    response = desk.ask("POST", PACKETS, "a", content=b"")
+    assert desk.ask("POST", f"{API}/robots/b/packets", "b", content=b"").status_code == 200
+    desk.now += int(response.headers["Retry-After"])
+    assert desk.ask("POST", PACKETS, "a", content=b"").status_code == 200
+
+
+def test_a_full_disk_is_507_and_nothing_is_acknowledged(desk):
+    desk.told(desk.send("a", A[:3]))
+    database = desk.state.mission.store._database
+    database.rows(f"PRAGMA max_page_count={database.value('PRAGMA page_count')}")
+    response = desk.send("a", A[3:])
+    assert response.status_code == 507
+    assert "full" in response.json()["error"]
+    database.rows("PRAGMA max_page_count=1000000")
+    assert desk.told(desk.send("a", A[3:]))[0] == Acknowledgement("a", 0, len(A) - 1)
+
+
+def test_viewers_see_the_fleet(mapped):
+    fleet = get(mapped, "fleet").json()
+    assert (fleet["robots"], fleet["maps"], fleet["packets"]) == (["a", "b"], 1, len(A) + len(B))
+    robots = get(mapped, "robots").json()
+    assert [(robot["session"], robot["map"], robot["packets"]) for robot in robots] == [
+        ("a", 0, len(A)),
+        ("b", 0, len(B)),
+    ]
+    assert get(mapped, "robots/a").json()["refused"] == []
+    assert mapped.ask("GET", f"{API}/robots/c", "eye").status_code == 404
+    accepted = get(mapped, "closures?status=accepted").json()
+    assert len(accepted) == 4
+    assert {(c["robot_i"], c["robot_j"]) for c in accepted} == {("a", "b")}
+    assert get(mapped, "closures?status=accepted&limit=3").json() == accepted[1:]
+    assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a", "b"]}]
+
+
+def test_viewers_get_the_files_of_the_live_run(mapped):
+    live = mapped.state.mission.folder.live
+    for path, name in {
+        "maps/0.png": "map.png",
+        "maps/0.pgm": "map.pgm",
+        "maps/0.yaml": "map.yaml",
+        "pose_graph.g2o": "pose_graph.g2o",
+        "trajectories/b.tum": "trajectories/b.tum",
+    }.items():
+        assert get(mapped, path).content == (live / name).read_bytes()
+    for path in ("maps/1.png", "trajectories/c.tum", "maps/0.exe", "trajectories/..%2F..%2Fmission.tum"):
+        assert mapped.ask("GET", f"{API}/{path}", "eye").status_code in (400, 404)
+
+
+def test_before_the_first_map_there_is_none(desk):
+    assert get(desk, "fleet").json()["robots"] == []
+    assert get(desk, "maps").json() == []
+    assert desk.ask("GET", f"{API}/maps/0.png", "eye").status_code == 404
+
+
+def test_tiles_show_what_the_map_shows(mapped):
+    import cv2
+
+    fine = get(mapped, "maps/0/tiles/8/0/0.png")
+    assert fine.headers["content-type"] == "image/png"
+    picture = cv2.imdecode(np.frombuffer(fine.content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture.shape == (256, 256)
+    far = cv2.imdecode(
+        np.frombuffer(get(mapped, "maps/0/tiles/8/5000/-5000.png").content, np.uint8), cv2.IMREAD_GRAYSCALE
+    )
+    assert set(np.unique(far)) == {205}, "where the map ends nothing is known"
+    assert mapped.ask("GET", f"{API}/maps/0/tiles/9/0/0.png", "eye").status_code == 400
+
+
+def test_a_result_is_a_run_folder(mapped):
+    answer = mapped.ask("POST", f"{API}/finalize", "boss").json()
+    run = open_run(Path(answer["run"]))
+    assert sum(len(t.stamps) for t in run.trajectories) == 2 * len(POSES)
+    assert mapped.ask("POST", f"{API}/finalize", "boss").json()["number"] == answer["number"] + 1
+
+
+def test_a_veto_parts_what_only_it_held_together(mapped):
+    assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b"}).status_code == 201
+    assert len(get(mapped, "maps").json()) == 2
+    for wrong in ({"robot_i": "a", "robot_j": "x"}, {"robot_i": "a"}, {"robot_i": "a", "robot_j": "b", "stamp_i": 1.0}):
+        assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == 400
+
+
+def test_missions_are_begun_opened_and_rest_as_they_were(mapped):
+    assert mapped.ask("POST", f"{API}/missions", "boss", json={"name": "next"}).json() == {
+        "open": "next",
+        "missions": ["mission", "next"],
+    }
+    assert get(mapped, "fleet").json()["packets"] == 0
+    mapped.told(mapped.send("a", A[:5]))
+    mapped.ask("POST", f"{API}/missions/mission/open", "boss")
+    assert get(mapped, "fleet").json()["packets"] == len(A) + len(B)
+    mapped.ask("POST", f"{API}/missions/next/open", "boss")
+    assert get(mapped, "fleet").json()["packets"] == 5
+    for wrong in ("next", "../x", "", ".hidden"):
+        assert mapped.ask("POST", f"{API}/missions", "boss", json={"name": wrong}).status_code in (400, 507)
+    assert mapped.ask("POST", f"{API}/missions/none/open", "boss").status_code == 404
+
+
+def test_a_mission_travels_as_one_file(mapped, tmp_path, scripted):
+    content = mapped.ask("GET", f"{API}/missions/mission/export", "boss").content
+    with Desk(tmp_path / "elsewhere") as other:
+        response = other.ask("POST", f"{API}/missions/import?name=brought", "boss", content=content)
+        assert response.json() == {"open": "mission", "missions": ["brought", "mission"]}
+        other.ask("POST", f"{API}/missions/brought/open", "boss")
+        other.state.mission.worker.ring()
+        assert get(other, "maps").json() == get(mapped, "maps").json()
+        assert other.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
+        for name, wrong in (("brought", content), ("broken", content[:1000]), ("text", b"hello")):
+            refused = other.ask("POST", f"{API}/missions/import?name={name}", "boss", content=wrong)
+            assert refused.status_code >= 400
+        assert other.state.missions.names == ["brought", "mission"]
+
+
+def test_the_open_mission_is_open_again_when_the_service_starts_again(tmp_path, scripted):
+    scripted()
+    with Desk(tmp_path / "data") as desk:
+        desk.ask("POST", f"{API}/missions", "boss", json={"name": "next"})
+        desk.told(desk.send("a", A[:5]))
+    with Desk(tmp_path / "data") as again:
+        assert again.state.mission.folder.name == "next"
+        assert again.told(again.send("a", A[5:6]))[:1] == [Acknowledgement("a", 0, 5)]
+
+
+def test_two_services_do_not_share_a_folder(desk):
+    with pytest.raises(ServiceError, match="another service"):
+        Desk(desk.state.missions.root)
+
+
+def test_measures_say_what_came_in(mapped):
+    text = get(mapped, "../../metrics").text
+    lines = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+    assert float(lines['fcslam_packets_total{channel="lidar",kind="place",robot="a"}']) > 0
+    total = sum(float(v) for k, v in lines.items() if k.startswith("fcslam_bytes_total{") and 'robot="a"' in k)
+    assert total == sum(map(len, A))
+    assert float(lines["fcslam_packets_stored"]) == len(A) + len(B)
+    assert float(lines["fcslam_packets_queued"]) == 0
+
+
+def test_the_interface_describes_itself(desk):
+    told = desk.ask("GET", "/openapi.json").json()
+    assert PACKETS.replace("/a/", "/{robot}/") in told["paths"]
+    assert desk.ask("GET", "/docs").status_code == 404
+
+
+def test_a_robot_can_fetch_a_detector(desk):
+    (desk.state.detectors / "camera").mkdir(parents=True)
+    (desk.state.detectors / "camera" / "v1.onnx").write_bytes(b"network")
+    assert desk.ask("GET", f"{API}/detectors/camera/v1", "a").content == b"network"
+    assert get(desk, "detectors").json() == [{"channel": "camera", "version": "v1"}]
+    assert desk.ask("GET", f"{API}/detectors/camera/v2", "a").status_code == 404
+    assert desk.ask("GET", f"{API}/detectors/smell/v1", "a").status_code == 400
+
+
+def test_packets_are_on_disk_before_they_are_acknowledged(desk):
+    desk.told(desk.send("a", A[:7]))
+    seen = MissionStore(desk.state.mission.folder.store)
+    assert [packet.data for packet in seen.turns(0, 100)] == A[:7]
+    seen.close()
