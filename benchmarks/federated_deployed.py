@@ -169,10 +169,11 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     from fcslam.federated.settings import FederatedSettings
     from fcslam.federated.start import judge_by, public_images
     from fcslam.learning.network import KeypointNetwork
+    from fcslam.learning.settings import TrainingSettings
 
     torch.set_num_threads(1)
     torch.manual_seed(1)
-    settings = FederatedSettings(local_steps=steps, rounds=count)
+    settings = FederatedSettings(local_steps=steps, rounds=count, training=TrainingSettings(label_copies=1))
     fleet = [
         robots.RobotLearner(name, drawn(folder / name, 5, seed), folder / "labels" / name, robots.secret_noise)
         for seed, name in enumerate(ROBOTS)

@@ -169,14 +169,16 @@ def test_a_server_whose_robots_all_die_waits_and_one_that_is_killed_goes_on(depl
     """Power cuts: both robots after the first round, then the server; who comes back ends as if nothing had been."""
     server = deployment.server()
     robots = [deployment.robot(robot) for robot in ("one", "two")]
-    deployment.until("server", "round 1/2")
+    deployment.until("server", "round 1/2 ")
     for robot in robots:
         robot.kill()
     deployment.until("server", "waiting: ")
     server.kill()
     server.wait(60)
-    again = deployment.server()
     for robot in ("one", "two"):
         deployment.robot(robot)
+    for robot in ("one", "two"):
+        deployment.until(robot, "waiting: nobody listens")
+    again = deployment.server()
     assert again.wait(LIMIT_S) == 0, deployment.said("server")
     assert_same(deployment.folder / "deployed", embedded / "out")

@@ -89,6 +89,25 @@ def test_a_detector_that_comes_before_the_first_scan_is_announced_once(seen):
     assert hello.detector_versions == {Channel.CAMERA: SHIPPED.version}
 
 
+def test_going_back_and_forth_describes_nothing_twice(seen, tmp_path):
+    """A release that was withdrawn: places of the version before are there already."""
+    tiny_network(tmp_path / "tiny.onnx", version="tiny-1")
+    robot, packets = RobotFrontend("r", WITH_NETWORK), []
+    changes = {len(seen) // 3: tmp_path / "tiny.onnx", len(seen) // 2: SHIPPED_NETWORK, len(seen) - 1: SHIPPED_NETWORK}
+    for number, record in enumerate(seen):
+        if number in changes:
+            robot.adopt(file_of(changes[number]), changes[number])
+        packets += robot.process(record)
+    robot.adopt(file_of(tmp_path / "tiny.onnx"), tmp_path / "tiny.onnx")
+    packets += robot.finish()  # the last change is told even though no scan comes after it
+    announced = [packet.body.detector_versions[Channel.CAMERA] for packet in packets if isinstance(packet.body, Hello)]
+    assert announced == [SHIPPED.version, "tiny-1", SHIPPED.version, "tiny-1"]
+    described = [(p.body.id, p.body.detector_version) for p in packets if isinstance(p.body, Place)]
+    assert len(described) == len(set(described))
+    assert {id for id, version in described if version == "tiny-1"} == {id for id, _ in described}
+    received(packets)  # and the cloud takes all of it
+
+
 def test_what_is_not_the_file_that_was_announced_changes_nothing(seen, tmp_path):
     tiny_network(tmp_path / "tiny.onnx", version="tiny-1")
     tiny = file_of(tmp_path / "tiny.onnx")

@@ -80,7 +80,9 @@ def run_server(where: str, task: "Task", device: str, security: Security, folder
 
 
 def run_robot(where: str, folders: list[Path], output: Path, device: str, security: Security) -> None:
-    """Be a robot until interrupted."""
+    """Be a robot until interrupted; a line while there is no server."""
+    from rich.console import Console
+
     from fcslam.cli.train import pace_on
     from fcslam.federated.launch import LOG_FILE, join
 
@@ -97,9 +99,16 @@ def run_robot(where: str, folders: list[Path], output: Path, device: str, securi
         "device": pace_on(device, False).device,
     }
     private_key = security.robot_keys[0] if security.robot_keys else None
-    code = join(_address(where), robot, certificates, private_key, output / LOG_FILE)
+    console, told = Console(stderr=True), set[str]()
+
+    def say(reason: str) -> None:
+        if reason not in told:
+            told.add(reason)
+            console.print(f"waiting: {reason}", highlight=False, soft_wrap=True)
+
+    code = join(_address(where), robot, certificates, private_key, output / LOG_FILE, say)
     if code != 0:
-        raise TrainingError(f"{where}: the server does not take this robot, or is gone; see {output / LOG_FILE}")
+        raise TrainingError(f"{where}: the server does not take this robot; see {output / LOG_FILE}")
 
 
 def _address(text: str) -> "Address":

@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import json
+import math
 import os
 import signal
 import socket
@@ -22,6 +23,9 @@ from fcslam.federated.tls import Address, Certificates, check_own, check_server
 
 LINK: Final = "fleet"
 START_S: Final = 180.0
+GRACE_S: Final = 90.0
+"""A server that has just started does not know its robots' keys yet: it refuses them for a moment."""
+RETRY_S: Final = 3.0
 LOG_FILE: Final = "flower.log"
 LOOPBACK: Final = "127.0.0.1"
 PR_SET_PDEATHSIG: Final = 1
@@ -106,8 +110,11 @@ def join(
     certificates: Certificates | None,
     private_key: Path | None,
     log_file: Path,
+    say: Callable[[str], None],
 ) -> int:
-    """Be a robot's SuperNode until interrupted; returns its exit code.
+    """Be a robot's SuperNode until interrupted; the exit code of one that the server does not take.
+
+    A server that is not there, or gone, is waited for.
 
     Args:
         address: of the server.
@@ -115,6 +122,7 @@ def join(
         certificates: of this machine, as Flower's processes on it talk over TLS as well; None as in ``serve``.
         private_key: of a key pair whose public half the server has.
         log_file: for what Flower says.
+        say: told what is waited for.
 
     Raises:
         TrainingError: certificates do not fit.
@@ -123,19 +131,48 @@ def join(
     security = ["--insecure"]
     if certificates is not None:
         check_own(certificates, LOOPBACK)
-        check_server(address, certificates.ca)
         security = ["--root-certificates", str(certificates.ca.resolve()), *certificates.options()]
     if private_key is not None:
         security += ["--auth-supernode-private-key", str(private_key.resolve())]
     config = " ".join(f"{name}={json.dumps(value)}" for name, value in robot.items())
-    where = ["--superlink", str(address), "--host", LOOPBACK, "--port", str(free_port()), "--node-config", config]
+    command = ["flower-supernode", *security, "--superlink", str(address), "--host", LOOPBACK, "--node-config", config]
     _made(log_file.parent)
+    refused_since = math.inf
+    while True:
+        _await(address, say)
+        if certificates is not None:
+            check_server(address, certificates.ca)
+        began = time.monotonic()
+        code = _be_node([*command, "--port", str(free_port())], log_file)
+        if code == 0:
+            return code
+        taken = time.monotonic() - began > GRACE_S
+        refused_since = math.inf if taken else min(refused_since, began)
+        if time.monotonic() - refused_since > GRACE_S:
+            return code
+        time.sleep(RETRY_S)
+
+
+def _be_node(command: Sequence[str], log_file: Path) -> int:
     with (
         tempfile.TemporaryDirectory() as home,
         log_file.open("ab") as log,
-        _daemon(["flower-supernode", *security, *where], _environment(Path(home)), log) as node,
+        _daemon(command, _environment(Path(home)), log) as node,
     ):
         return node.wait()
+
+
+def _await(address: Address, say: Callable[[str], None]) -> None:
+    """Return when somebody listens there."""
+    while not _listens(address):
+        say(f"nobody listens at {address}")
+        time.sleep(RETRY_S)
+
+
+def _listens(address: Address) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection((address.host, address.port), timeout=1.0):
+        return True
+    return False
 
 
 def free_port() -> int:
@@ -167,7 +204,7 @@ def _write_app(home: Path, task: str, address: Address, certificates: Certificat
 def _wait_for(address: Address, link: "subprocess.Popen[bytes]") -> None:
     end = time.monotonic() + START_S
     while time.monotonic() < end and link.poll() is None:
-        with contextlib.suppress(OSError), socket.create_connection((address.host, address.port), timeout=1.0):
+        if _listens(address):
             return
         time.sleep(0.2)
     raise TrainingError(f"{address}: Flower's SuperLink does not listen there; is the port free?")

@@ -10,7 +10,16 @@ from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig, describe
 from fcslam.lidar.mapper import FinishedSubmap, LidarConfig, Mapper, ScanPose, Step
-from fcslam.records import CameraImage, Channel, DetectorFile, KeyscanId, LaserScan, Place, SensorRecord
+from fcslam.records import (
+    CameraImage,
+    Channel,
+    DetectorFile,
+    KeyscanId,
+    LaserModel,
+    LaserScan,
+    Place,
+    SensorRecord,
+)
 from fcslam.robot.views import View, ViewFinder, ViewsConfig
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.quantisation import dequantise, quantise
@@ -40,8 +49,11 @@ class RobotFrontend:
         """Those that wait for the submap around them."""
         self._submaps: dict[int, tuple[int, int]] = {}
         """First and last keyscan of the submap that each camera place was sent with."""
-        self._has_switched = False
-        """Whether the detector has changed and nobody was told yet."""
+        self._described: set[tuple[int, str]] = set()
+        """Keyscans of camera places that were sent, with the version of the detector."""
+        self._laser: LaserModel | None = None
+        self._is_news = True
+        """Whether nobody was told of the laser or of the detectors that are there now."""
         self._sequence = 0
         self._time = float("-inf")
 
@@ -66,16 +78,16 @@ class RobotFrontend:
         """
         if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
             raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
-        self._view_finder.take(file, path)
-        self._has_switched = True
+        if file.version != self._view_finder.detector_version:
+            self._view_finder.take(file, path)
+            self._is_news = True
 
     def _process_scan(self, record: LaserScan) -> list[Packet]:
         self._time = max(self._time, record.stamp)
         # The robot works with the ranges that the cloud will see, to the last bit.
         scan = replace(record, ranges_m=dequantise(quantise(record.ranges_m)))
-        news: list[Body] = []
-        if self._has_switched or not self.scan_poses:
-            news = [self._hello(scan), *self._places_again()]
+        self._laser = scan.laser
+        news = self._news()
         step = self._mapper.process(scan)
         self.scan_poses.append(step.pose)
         self._view_finder.at(scan, step.pose)
@@ -88,9 +100,10 @@ class RobotFrontend:
 
     def finish(self) -> list[Packet]:
         """The packets of what was still open when the recording ended."""
-        rest = self._mapper.finish()
+        news, rest = self._news(), self._mapper.finish()
         last = rest[-1:]
-        return self._packets([body for submap in rest for body in self._submap_bodies(submap, submap in last)])
+        bodies = [body for submap in rest for body in self._submap_bodies(submap, submap in last)]
+        return self._packets([*news, *bodies])
 
     def _bodies(self, step: Step) -> list[Body]:
         bodies: list[Body] = []
@@ -114,14 +127,16 @@ class RobotFrontend:
         self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
         return [*bodies, *(self._camera_place(view) for view in shown)]
 
-    def _places_again(self) -> list[Place]:
-        """Camera places of before, where the detector has changed and their images are still here."""
-        if not self._has_switched:
+    def _news(self) -> list[Body]:
+        """A hello, first of all and with another detector; then the camera places that this had not described yet."""
+        if self._laser is None or not self._is_news:
             return []
-        self._has_switched = False
-        views = {view.keyscan: view for view in self._view_finder.look_again()}
+        self._is_news = False
+        views = {view.keyscan: view for view in self._view_finder.look_again()} if self._submaps else {}
         self._views = [views.get(view.keyscan, view) for view in self._views]
-        return [self._camera_place(view) for keyscan, view in views.items() if keyscan in self._submaps]
+        sent = [view for view in views.values() if view.keyscan in self._submaps]
+        fresh = [view for view in sent if (view.keyscan, view.detector_version) not in self._described]
+        return [self._hello(self._laser), *(self._camera_place(view) for view in fresh)]
 
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
         features = describe(submap.surface, self._config.birdseye)
@@ -132,14 +147,15 @@ class RobotFrontend:
 
     def _camera_place(self, view: View) -> Place:
         first, last = self._submaps[view.keyscan]
+        self._described.add((view.keyscan, view.detector_version))
         return Place(
             KeyscanId(self.robot, view.keyscan), Channel.CAMERA, view.detector_version, first, last, view.keypoints,
             view.descriptors,
         )  # fmt: skip
 
-    def _hello(self, scan: LaserScan) -> Hello:
+    def _hello(self, laser: LaserModel) -> Hello:
         versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_finder.detector_version}
-        return Hello(self.robot, 0, scan.laser, {channel: versions[channel] for channel in self._config.channels})
+        return Hello(self.robot, 0, laser, {channel: versions[channel] for channel in self._config.channels})
 
     def _packets(self, bodies: Iterable[Body]) -> list[Packet]:
         packets = []
