@@ -33,8 +33,8 @@ import fcslam
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(fcslam.__file__).parents[1])}
 ROBOTS = ("a", "b", "c", "d", "e")
 KILLED = ROBOTS[-1]
-PATIENCE_S = 900.0
-TINY = """rounds: 3
+PATIENCE_S = 1800.0
+TINY = """rounds: 2
 local_steps: 4
 minimum_robots: 4
 training: {shape_steps: 2, pairs: 1, side_px: 96, points: 32, label_copies: 1}
@@ -67,7 +67,7 @@ def federate(*words: object, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
         yield process
     finally:
         process.send_signal(signal.SIGINT)
-        process.wait(60.0)
+        process.wait(180.0)
 
 
 def wait_for(happened: Callable[[], bool], what: str, log: Path) -> None:

@@ -130,7 +130,7 @@ class Deployment:
         for process in self._processes:
             process.send_signal(signal.SIGINT)
         for process in self._processes:
-            process.wait(60)
+            process.wait(180)
 
     def _started(self, *words, log):
         process = start(*words, log=self.folder / f"{log}.log")

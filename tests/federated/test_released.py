@@ -9,6 +9,7 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 from features.networks import tiny_network  # noqa: E402
 
 from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.features.detector import SHIPPED_NETWORK, OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.federated.network import network_of  # noqa: E402
 from fcslam.federated.start import read_weights  # noqa: E402
 from fcslam.federated.weights import trained_names  # noqa: E402
@@ -41,6 +42,16 @@ def test_it_is_the_same_function(encoder, tmp_path):
     with torch.inference_mode():
         for ours, theirs in zip(read(images), network(images), strict=True):
             assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4 * float(theirs.abs().max()))
+
+
+def test_the_network_that_comes_with_fcslam_can_be_trained_on():
+    read = network_of(read_weights(SHIPPED_NETWORK, "light"), "light")
+    picture = np.random.default_rng(0).integers(0, 256, (64, 96), np.uint8)
+    scores, logits = OnnxDetector(OnnxConfig()).infer(picture)
+    with torch.inference_mode():
+        maps = read(torch.from_numpy(picture)[None, None].float() / 255.0)
+        assert np.allclose(read.scores(maps)[0], scores, atol=1e-4)
+    assert np.allclose(maps.code_logits[0], logits, rtol=1e-3, atol=1e-3)
 
 
 def test_its_normalisations_begin_as_none(tmp_path):

@@ -118,9 +118,9 @@ def _learn(sources: "Sequence[Source]", folder: Path, seed: int, camera: bool, c
     _announce(console, 2, "learn: the robots train the detector together, no image leaves its robot")
     released = learn_together(sources, folder, seed, console)
     if released is None:
-        console.print("no round was as good on held-out images as what came with fcslam: the fleet keeps that")
+        _say(console, "no round was as good on held-out images as what came with fcslam: the fleet keeps that")
         return config
-    console.print("no worse on held-out images than what came with fcslam: the fleet takes it", highlight=False)
+    _say(console, "no worse on held-out images than what came with fcslam: the fleet takes it")
     onnx = config.robot.views.onnx.model_copy(update={"weights": released})
     views = config.robot.views.model_copy(update={"onnx": onnx})
     return config.model_copy(update={"robot": config.robot.model_copy(update={"views": views})})
@@ -155,7 +155,11 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
 
 
 def _announce(console: "Console", stage: int, what: str) -> None:
-    console.print(f"[bold]{stage} of {STAGES}[/bold] {what}", highlight=False, soft_wrap=True)
+    _say(console, f"[bold]{stage} of {STAGES}[/bold] {what}")
+
+
+def _say(console: "Console", text: str) -> None:
+    console.print(text, highlight=False, soft_wrap=True)
 
 
 @contextmanager

@@ -1,0 +1,68 @@
+"""How long a robot tries to join, told by a clock that the test moves."""
+
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+
+from fcslam.federated import launch
+from fcslam.federated.tls import Address
+
+REFUSED, INTERRUPTED = 1, 0
+STARTS_S = 2.0
+
+
+@pytest.fixture
+def joined(monkeypatch, tmp_path):
+    """Runs ``join``: each time a SuperNode starts, ``lives`` says how long it runs and what it ends with."""
+
+    def run(lives, listening=lambda _now: True):
+        now, starts, said = [0.0], [], []
+
+        def sleep(seconds):
+            now[0] += seconds
+
+        def be_node(_command, _log):
+            starts.append(now[0])
+            lived, code = lives(len(starts))
+            now[0] += STARTS_S + lived
+            return code
+
+        monkeypatch.setattr(launch, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+        monkeypatch.setattr(launch, "_be_node", be_node)
+        monkeypatch.setattr(launch, "_listens", lambda _address: listening(now[0]))
+        code = launch.join(Address("there", 1), {"robot": "r"}, None, None, tmp_path / "log", said.append)
+        return code, starts, now[0], said
+
+    return run
+
+
+def test_a_robot_that_is_not_known_is_refused_after_a_while(joined):
+    code, starts, end, said = joined(lambda _: (0.0, REFUSED))
+    assert code == REFUSED
+    assert launch.GRACE_S < end < launch.GRACE_S + launch.RETRY_S + 2 * STARTS_S
+    assert len(starts) > 5
+    assert said == []
+
+
+def test_a_robot_whose_key_comes_late_is_taken(joined):
+    """And when it is interrupted it ends well."""
+    late = 4
+    code, starts, _, _ = joined(lambda start: (0.0, REFUSED) if start < late else (1000.0, INTERRUPTED))
+    assert (code, len(starts)) == (INTERRUPTED, late)
+
+
+def test_a_server_that_is_not_there_is_waited_for(joined):
+    code, starts, _, said = joined(lambda _: (1.0, INTERRUPTED), listening=lambda now: now > 500.0)
+    assert code == INTERRUPTED
+    assert starts[0] > 500.0
+    assert set(said) == {"nobody listens at there:1"}
+
+
+def test_a_server_that_goes_and_comes_back_is_joined_again(joined):
+    """However often: a robot that was taken once is no stranger, and each time it may be refused for a moment."""
+    lives = {1: (1000.0, REFUSED), 2: (0.0, REFUSED), 3: (1000.0, REFUSED), 4: (0.0, REFUSED), 5: (9.0, INTERRUPTED)}
+    code, starts, _, _ = joined(lives.__getitem__)
+    assert (code, len(starts)) == (INTERRUPTED, 5)
