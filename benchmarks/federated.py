@@ -56,8 +56,8 @@ ROBUST: dict[str, dict[str, Any]] = {
     "trimmed": {"strategy": "fedtrimmedavg", **TRUSTING},
     "krum": {"strategy": "krum", "normalisation": "frozen", **TRUSTING},
 }
-NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3}
-"""Multipliers; noise of more than that is longer than all updates together."""
+NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3, "noise-01": 1e-2}
+"""Multipliers."""
 KEPT = {"compatible-3": 3.0, "compatible-30": 30.0}
 """Strengths of the pull to the codes of the start."""
 CLIP_NORM = 3.0
