@@ -101,7 +101,7 @@ def main() -> None:
     if chosen.study is None:
         print("skipped: takes an hour or more; name a folder by --study")
         sys.exit(0)
-    folder: Path = chosen.study
+    folder: Path = chosen.study.resolve()
     vision = common.recordings(*VISION.values(), PUBLIC, kind="vision")
     folder.mkdir(parents=True, exist_ok=True)
     prepare(vision, folder)
