@@ -229,6 +229,7 @@ def draw(rows: "Rows") -> Figure:
     left.axvline(2.0, color="grey", linewidth=1, linestyle=":")
     left.set_yticks(range(len(names)), names)
     left.invert_yaxis()
+    left.set_xscale("symlog", linthresh=5.0)
     left.set_xlabel("points below central training, 95 %")
     right.set_xscale("log")
     right.set_xlabel("epsilon; dashed: without noise")
