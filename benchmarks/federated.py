@@ -56,8 +56,8 @@ ROBUST: dict[str, dict[str, Any]] = {
     "trimmed": {"strategy": "fedtrimmedavg", **TRUSTING},
     "krum": {"strategy": "krum", "normalisation": "frozen", **TRUSTING},
 }
-NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3}
-"""Multipliers; noise of more than that is longer than all updates together."""
+NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3, "noise-01": 1e-2}
+"""Multipliers."""
 KEPT = {"compatible-3": 3.0, "compatible-30": 30.0}
 """Strengths of the pull to the codes of the start."""
 CLIP_NORM = 3.0
@@ -101,7 +101,7 @@ def main() -> None:
     if chosen.study is None:
         print("skipped: takes an hour or more; name a folder by --study")
         sys.exit(0)
-    folder: Path = chosen.study
+    folder: Path = chosen.study.resolve()
     vision = common.recordings(*VISION.values(), PUBLIC, kind="vision")
     folder.mkdir(parents=True, exist_ok=True)
     prepare(vision, folder)
@@ -229,6 +229,7 @@ def draw(rows: "Rows") -> Figure:
     left.axvline(2.0, color="grey", linewidth=1, linestyle=":")
     left.set_yticks(range(len(names)), names)
     left.invert_yaxis()
+    left.set_xscale("symlog", linthresh=5.0)
     left.set_xlabel("points below central training, 95 %")
     right.set_xscale("log")
     right.set_xlabel("epsilon; dashed: without noise")

@@ -84,17 +84,17 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(robots, tmp_path):
 
 
 def test_arms_and_seeds_may_be_added_to_a_study(robots, tmp_path):
-    run_study(study(robots, tmp_path, seeds=1, arms={"averaged": {}}))
+    run_study(study(robots, tmp_path, seeds=1, arms={"averaged": {"seeds": 1}}))
     told = []
-    arms = {"frozen": {"settings": {"normalisation": "frozen"}, "seeds": 1}}
+    arms = {"averaged": {}, "frozen": {"settings": {"normalisation": "frozen"}, "seeds": 1}}
     found = run_study(study(robots, tmp_path, lambda name, *_: told.append(name), seeds=2, arms=arms))
     assert {name: len(values) for name, values in found.measured.items()} == {
-        "start": 1, "central": 2, "local": 2, "alone": 2, "frozen": 1,
+        "start": 1, "central": 2, "local": 2, "alone": 2, "averaged": 2, "frozen": 1,
     }  # fmt: skip
     assert "frozen, seed 1" in told
     assert "central, seed 1" not in told
     with pytest.raises(EvaluationError, match="another study"):
-        run_study(study(robots, tmp_path, seeds=2, arms={"averaged": {"seeds": 1}}))
+        run_study(study(robots, tmp_path, seeds=2, arms={"averaged": {"poison": "nan", "seeds": 1}}))
 
 
 def test_robots_own_networks_share_the_pairs_out(robots, tmp_path):

@@ -137,7 +137,8 @@ def _claim(study: Study) -> None:
             before = load(StudySettings, path)
             known = before.model_copy(update={"arms": before.arms | settings.arms, "seeds": settings.seeds})
             settings = settings.model_copy(update={"arms": known.arms})
-            changed = any(known.arms[name] != arm for name, arm in before.arms.items())
+            same = {name: known.arms[name].model_copy(update={"seeds": arm.seeds}) for name, arm in before.arms.items()}
+            changed = same != before.arms
             if changed or known != settings or not path.read_text(encoding="utf-8").startswith(robots):
                 raise EvaluationError(f"{path}: is of another study; name another folder")
         path.write_text(robots + dump(settings), encoding="utf-8")
