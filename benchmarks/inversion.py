@@ -89,7 +89,7 @@ def main() -> None:
 
 def look(folders: Sequence[Path], most: int, detector: Detector) -> Iterator[Seen]:
     """Evenly spread images of all folders together, as a robot's camera gives them, with what is detected in them."""
-    files = find_images(folders)
+    files = [file for folder in folders for file in find_images([folder])]
     for file in files[:: max(1, len(files) // most)][:most]:
         picture = read_image(file.path)
         if picture is None:
