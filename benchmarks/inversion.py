@@ -33,6 +33,7 @@ from fcslam.mission import MissionConfig
 SIZE = (320, 240)
 HALF = 24
 RIDGE = 50.0
+SHOWN = 4
 THUMBNAIL = (32, 24)
 PHOTOGRAPHS = ("bsds500/train", "coco_subset/train2017")
 FLOORS = ("floor3", "floor6", "floor9", "floor20")
@@ -58,8 +59,8 @@ class Seen:
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--fleet", type=Path, required=True, help="a folder that `fcslam simulate` recorded")
-    parser.add_argument("--photographs", type=int, default=300, help="that the attacker has, of each collection")
-    parser.add_argument("--targets", type=int, default=60, help="images of each kind")
+    parser.add_argument("--photographs", type=int, default=150, help="that the attacker has, of each collection")
+    parser.add_argument("--targets", type=int, default=40, help="images of each kind")
     chosen = parser.parse_args()
     folder = common.recordings(*PHOTOGRAPHS, *(f"ie_tower/{floor}" for floor in FLOORS), kind="vision")
     report = common.Report(__file__, __doc__, chosen)
@@ -72,24 +73,26 @@ def main() -> None:
         "IE tower": list(look([folder / "ie_tower" / floor for floor in FLOORS], chosen.targets, detector)),
         "simulated": list(look(sorted(chosen.fleet.glob("robot_*/images")), chosen.targets, detector)),
     }
-    rows, shown = [], []
+    rows = []
     for name, seen in targets.items():
         made = {attack: [rebuild(one, invert, grey) for one in seen] for attack, invert in attacks.items()}
         made["baseline"] = [(np.full_like(one.image, grey), made["regression"][k][1]) for k, one in enumerate(seen)]
         told = [(np.full_like(one.image, one.image.mean()), made["regression"][k][1]) for k, one in enumerate(seen)]
         made["told the mean"] = told
         rows += [row(name, attack, seen, results) for attack, results in made.items()]
-        middle = len(seen) // 2
-        shown += [[seen[k].image, *(made[attack][k][0] for attack in attacks)] for k in (middle // 2, middle)]
     report.say(f"{sum(len(seen.signs) for seen in known):,} keypoints of {len(known)} photographs.")
     report.table("Reconstructions", COLUMNS, rows)
-    report.picture("True image, nearest code, regression", draw(shown))
+    few = targets["simulated"][:: max(1, len(targets["simulated"]) // SHOWN)][:SHOWN]
+    report.picture(
+        "Simulated images and what regression brings back",
+        draw([(seen.image, rebuild(seen, attacks["regression"], grey)[0]) for seen in few]),
+    )
     report.write()
 
 
 def look(folders: Sequence[Path], most: int, detector: Detector) -> Iterator[Seen]:
     """Evenly spread images of all folders together, as a robot's camera gives them, with what is detected in them."""
-    files = find_images(folders)
+    files = [file for folder in folders for file in find_images([folder])]
     for file in files[:: max(1, len(files) // most)][:most]:
         picture = read_image(file.path)
         if picture is None:
@@ -178,17 +181,16 @@ def thumbnails(images: Sequence[Image]) -> NDArray[np.float64]:
     return level / np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
 
 
-def draw(rows: Sequence[Sequence[Image]]) -> Any:
+def draw(pairs: Sequence[tuple[Image, Image]]) -> Any:
+    """Above the true images, below the attacker's; of photographs that are not ours nothing is shown."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 2.3 * len(rows)))
-    grid = figure.subplots(len(rows), len(rows[0]), squeeze=False)
-    for line, images in zip(grid, rows, strict=True):
-        for axes, image in zip(line, images, strict=True):
-            axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-            axes.axis("off")
-    for axes, title in zip(grid[0], ("true", "nearest code", "regression"), strict=True):
-        axes.set_title(title, fontsize=10)
+    figure = Figure(figsize=(2.6 * len(pairs), 4.2))
+    for column, axes in zip(pairs, figure.subplots(2, len(pairs)).T, strict=True):
+        for one, image in zip(axes, column, strict=True):
+            one.imshow(image, cmap="gray", vmin=0, vmax=255)
+            one.axis("off")
+    figure.subplots_adjust(wspace=0.03, hspace=0.03)
     return figure
 
 

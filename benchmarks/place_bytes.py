@@ -2,8 +2,8 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/place_bytes.py
 
-Packets of two split logs and of two simulated fleets with cameras (seeds 101 and 105; it needs a GL library), none of
-which the weights of `src/fcslam/wire/predictors` were fitted to. "Plain" is the same packet with 2 bytes a range, 2 a
+Packets of two split logs and of two simulated fleets with cameras (seeds 101 and 105; it needs a GL library, or FLEETS
+that `fcslam simulate` recorded), none of which the weights of `src/fcslam/wire/predictors` were fitted to. "Plain" is the same packet with 2 bytes a range, 2 a
 coordinate and 32 a descriptor; "deflated" is that with each of the three fields deflated by zlib at level 9. "A place
 with 300 descriptors" is every place that has as many, cut to its 300 strongest. Times are processor time of whole
 packets with all their checks.
@@ -42,12 +42,16 @@ PARTS = {"recording": "", "channel": "", "places": "", "descriptors a place": ".
 
 
 def main() -> None:
-    chosen = common.options(__doc__).parse_args()
+    parser = common.options(__doc__)
+    parser.add_argument(
+        "--fleets", type=Path, nargs="+", default=[], help="recorded fleets, instead of simulating some"
+    )
+    chosen = parser.parse_args()
     folder = common.recordings(*common.slam_benchmark_files())
     report = common.Report(__file__, __doc__, chosen)
     kinds, parts, rates = [], [], []
     with tempfile.TemporaryDirectory() as place:
-        for name, sources in recordings(folder, Path(place)):
+        for name, sources in recordings(folder, chosen.fleets, Path(place)):
             packets = [packet for source in sources for packet in sent_by(source)]
             kinds += kind_rows(name, packets)
             parts += part_rows(name, packets)
@@ -60,14 +64,14 @@ def main() -> None:
     report.write()
 
 
-def recordings(folder: Path, place: Path) -> Iterator[tuple[str, list[Source]]]:
-    """Names and robots; fleets are simulated into ``place``."""
+def recordings(folder: Path, fleets: Sequence[Path], place: Path) -> Iterator[tuple[str, list[Source]]]:
+    """Names and robots; without ``fleets`` some are simulated into ``place``."""
     for name, robots in LOGS.items():
         yield name, split(open_source(common.log_path(folder, name)), robots)
-    for seed in SEEDS:
-        fleet = place / str(seed)
-        common.run_fcslam("simulate", "--robots", 3, "--seed", seed, "--output", fleet)
-        yield f"simulated, seed {seed}", [open_source(fleet / f"robot_{k + 1}") for k in range(3)]
+    for seed in SEEDS if not fleets else ():
+        common.run_fcslam("simulate", "--robots", 3, "--seed", seed, "--output", place / f"seed-{seed}")
+    for fleet in fleets or sorted(place.iterdir()):
+        yield f"simulated, {fleet.name}", [open_source(robot) for robot in sorted(fleet.glob("robot_*"))]
 
 
 def sent_by(source: Source) -> Iterator[Packet]:

@@ -88,6 +88,12 @@ def test_numbers_add_up(run, drawn):
         assert values[f"place_{figure}"] == values[f"lidar_place_{figure}"] + values[f"camera_place_{figure}"]
     sent = sum(values[f"{kind}_bytes"] for kind in ("hello", "keyscan", "constraint", "place"))
     assert sent == sum(values[f"uplink_bytes_{robot.name}"] for robot in drawn.robots)
+    received = sum(values[f"{kind}_bytes"] for kind in ("correction", "acknowledgement"))
+    assert received == sum(values[f"downlink_bytes_{robot.name}"] for robot in drawn.robots)
+    for robot in drawn.robots:
+        for link in ("uplink", "downlink"):
+            over = values[f"{link}_bytes_{robot.name}"] / (robot.stamps[-1] - robot.stamps[0]) / 1e3
+            assert values[f"{link}_rate_{robot.name}"] == pytest.approx(over)
     for status in ClosureStatus:
         between = [c for c in run.closures if c.robot_i != c.robot_j and c.status is status]
         assert values[f"inter_robot_closures_{status}"] == len(between)

@@ -77,7 +77,7 @@ def run_mission(
     meter.tell(fusing=True)
     scans = (Metric("scans", meter.scans, "1"), Metric("recorded_time", meter.recorded_s, "s"))
     tracks = {robot.robot: _track(robot) for robot in robots}
-    metrics = (*scans, *traffic_metrics(transport.ledger()))
+    metrics = (*scans, *traffic_metrics(transport.ledger(), tracks))
     return run_of(cloud.finalize(), tracks, metrics, dump(config), config.map)
 
 

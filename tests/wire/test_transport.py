@@ -59,7 +59,9 @@ def test_places_are_counted_by_channel_and_what_goes_up_by_robot():
     assert ledger.total(channel=Channel.CAMERA) == Traffic(2, 2 * len(camera))
     assert ledger.total(kind=Kind.PLACE) == Traffic(3, len(lidar) + 2 * len(camera))
     assert ledger.uplink("alice") == Traffic(4, len(lidar) + 2 * len(camera) + len(hello)), "not what comes back"
-    assert ledger.uplink("bob") == Traffic()
+    assert ledger.downlink("alice") == Traffic(8, 4 * sum(map(len, DOWNLINK)))
+    assert ledger.uplink("alice") + ledger.downlink("alice") == ledger.total("alice")
+    assert ledger.uplink("bob") == ledger.downlink("bob") == Traffic()
 
 
 def test_a_place_of_an_unknown_channel_is_refused():

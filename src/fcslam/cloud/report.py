@@ -1,5 +1,6 @@
 """A fleet's result as a run: trajectories, closures, maps and numbers, ready to be written as a folder."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -9,13 +10,14 @@ from numpy.typing import NDArray
 from fcslam.cloud.fusion import FusedMap, fuse
 from fcslam.cloud.picture import Meeting, map_png
 from fcslam.cloud.result import FleetResult, MappedRobot
+from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.map_files import map_yaml, pgm_bytes
 from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
-from fcslam.wire.ledger import Ledger
+from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Kind
 
 
@@ -66,15 +68,34 @@ def run_of(
     )
 
 
-def traffic_metrics(ledger: Ledger) -> list[Metric]:
-    """Packets and bytes per kind of message and channel of places, of the whole fleet; bytes that each robot sent."""
+def traffic_metrics(ledger: Ledger, tracks: Mapping[str, Track]) -> list[Metric]:
+    """Packets and bytes by kind of message and channel of places, of the whole fleet; and by robot up and down.
+
+    Rates are over the time that a robot recorded, all its sessions together. A ledger that knows only one direction
+    says nothing about the other.
+    """
     traffic = {str(kind): ledger.total(kind=kind) for kind in sorted({label.kind for label in ledger.accepted})}
     traffic |= {f"{channel}_{Kind.PLACE}": ledger.total(channel=channel) for channel in Channel}
     robots = sorted({label.robot for label in ledger.accepted})
     return [
         *(Metric(f"{name}_packets", total.count, "1") for name, total in traffic.items()),
         *(Metric(f"{name}_bytes", total.bytes, "B") for name, total in traffic.items()),
-        *(Metric(f"uplink_bytes_{robot}", ledger.uplink(robot).bytes, "B") for robot in robots),
+        *_link_metrics("uplink", {robot: ledger.uplink(robot) for robot in robots}, tracks),
+        *_link_metrics("downlink", {robot: ledger.downlink(robot) for robot in robots}, tracks),
+    ]
+
+
+def _link_metrics(link: str, traffic: Mapping[str, Traffic], tracks: Mapping[str, Track]) -> list[Metric]:
+    if not any(total.count for total in traffic.values()):
+        return []
+    recorded_s = dict.fromkeys(traffic, 0.0)
+    for session, track in tracks.items():
+        robot = robot_of(session)
+        recorded_s[robot] = recorded_s.get(robot, 0.0) + (float(np.ptp(track.stamps)) if len(track.stamps) else 0.0)
+    rates = {robot: total.bytes / 1e3 / recorded_s[robot] for robot, total in traffic.items() if recorded_s[robot] > 0}
+    return [
+        *(Metric(f"{link}_bytes_{robot}", total.bytes, "B") for robot, total in traffic.items()),
+        *(Metric(f"{link}_rate_{robot}", rates.get(robot, math.nan), "kB/s") for robot in traffic),
     ]
 
 

@@ -19,6 +19,12 @@ def session_name(robot: str, epoch: int) -> str:
     return f"{robot}+{epoch}" if epoch else robot
 
 
+def robot_of(session: str) -> str:
+    """The robot whose session has this name."""
+    named = _SESSION.fullmatch(session)
+    return named[1] if named else session
+
+
 def check_robot(robot: str) -> None:
     """Refuse a robot that is called like a session of another one.
 

@@ -147,8 +147,8 @@ class Worker:
             Metric(f"words_{state.channel}_{state.detector_version}", state.words, "1")
             for state in self._fleet.vocabularies()
         ]
-        metrics = [Metric("turns", self._turn, "1"), *words, *traffic_metrics(self._store.traffic())]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+        metrics = [Metric("turns", self._turn, "1"), *words, *traffic_metrics(self._store.traffic(), tracks)]
         return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)
 
 

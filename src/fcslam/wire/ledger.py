@@ -42,6 +42,10 @@ class Ledger:
         """What the cloud accepted from one robot."""
         return sum((self.total(robot, kind) for kind in UPLINK), Traffic())
 
+    def downlink(self, robot: str) -> Traffic:
+        """What the cloud sent to one robot."""
+        return sum((self.total(robot, kind) for kind in Kind if kind not in UPLINK), Traffic())
+
 
 class Counter:
     """Counts traffic; ``ledger`` shows it."""
