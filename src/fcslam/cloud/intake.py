@@ -1,15 +1,15 @@
 """Batches of packets from robots: checked, stored, acknowledged. No network here, and no waiting for the fleet."""
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from fcslam.cloud.sessions import check_robot
 from fcslam.cloud.store import MissionStore, StoredPacket
 from fcslam.errors import FcslamError, PacketError
-from fcslam.records import Place
+from fcslam.records import Channel, DetectorFile, Place
 from fcslam.wire.batches import read_batch, write_batch
-from fcslam.wire.messages import UPLINK, Acknowledgement, Body, Kind, Packet
+from fcslam.wire.messages import UPLINK, Acknowledgement, Body, Hello, Kind, Packet, Release
 from fcslam.wire.packets import decode, encode, read_label, read_number
 
 LEASE_S = 30.0
@@ -42,7 +42,7 @@ class Answer:
     """What goes back to a robot, and what came in."""
 
     batch: bytes
-    """Acknowledgements and, if it is news, a correction."""
+    """Acknowledgements and, if they are news, a correction and detectors."""
     packets: tuple[StoredPacket, ...]
     """What the batch held; all of it is on disk."""
 
@@ -50,8 +50,15 @@ class Answer:
 class Intake:
     """Takes batches for one mission. Any thread may call."""
 
-    def __init__(self, store: MissionStore, clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
-        self._store, self._clock, self._wall_clock = store, clock, wall_clock
+    def __init__(
+        self,
+        store: MissionStore,
+        clock: Callable[[], float],
+        wall_clock: Callable[[], float],
+        announced: Callable[[], Mapping[Channel, DetectorFile]] = dict,
+    ) -> None:
+        """``announced``: detectors that robots are to take."""
+        self._store, self._clock, self._wall_clock, self._announced = store, clock, wall_clock, announced
         self._lock = threading.Lock()
         self._leases: dict[str, tuple[str, float]] = {}
         """Agent of each robot, and when it was heard last."""
@@ -112,9 +119,19 @@ class Intake:
         news = self._store.correction(robot, epochs[-1]) if epochs else None
         if news and news.correction.version > known_correction:
             told.append((news.epoch, news.time, news.correction))
+        if epochs:
+            told += [(epochs[-1], 0.0, Release(robot, file)) for file in self._newer_detectors(robot, epochs[-1])]
         return write_batch(
             encode(Packet(robot, epoch, number, time_s, body)) for number, (epoch, time_s, body) in enumerate(told)
         )
+
+    def _newer_detectors(self, robot: str, epoch: int) -> list[DetectorFile]:
+        """Of the channels that the robot has, what it does not use yet."""
+        announced = self._announced()
+        data = self._store.newest_hello(robot, epoch) if announced else None
+        hello = decode(data).body if data else None
+        versions = hello.detector_versions if isinstance(hello, Hello) else {}
+        return [file for channel, file in announced.items() if versions.get(channel, file.version) != file.version]
 
 
 def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], RefusedPacketError | None]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
+from fcslam.cloud.detectors import DetectorShelf
 from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.intake import Intake
 from fcslam.cloud.settings import CloudConfig
@@ -28,13 +29,13 @@ class OpenMission:
 
     def __init__(
         self, folder: MissionFolder, config: CloudConfig, clock: Callable[[], float],
-        wall_clock: Callable[[], float], launch: Launch,
+        wall_clock: Callable[[], float], launch: Launch, detectors: DetectorShelf,
     ) -> None:  # fmt: skip
         self.folder = folder
         self.store = MissionStore(folder.store)
         if self.store.fact(CONFIG) is None:
             self.store.remember(CONFIG, config.model_dump_json())
-        self.intake = Intake(self.store, clock, wall_clock)
+        self.intake = Intake(self.store, clock, wall_clock, detectors.announced)
         self.worker = launch(folder)
 
     def close(self) -> None:
@@ -59,6 +60,7 @@ class Missions:
         self.root = root
         self._config, self._clock, self._wall_clock, self._launch = config, clock, wall_clock, launch
         self._lock = _locked(root)
+        self.detectors = DetectorShelf(root / "detectors")
         named = self._open_file.read_text(encoding="utf-8").strip() if self._open_file.exists() else FIRST
         self.open_mission = self._opened(named)
 
@@ -145,7 +147,7 @@ class Missions:
     def _opened(self, name: str) -> OpenMission:
         folder = self.folder(name)
         folder.path.mkdir(parents=True, exist_ok=True)
-        mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._launch)
+        mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._launch, self.detectors)
         staging = self._open_file.with_name(".open.partial")
         staging.write_text(name + "\n", encoding="utf-8")
         staging.replace(self._open_file)

@@ -29,6 +29,7 @@ CREATE TABLE packets (
     refusal TEXT, turn INTEGER UNIQUE, data BLOB NOT NULL,
     PRIMARY KEY (robot, epoch, sequence)
 ) STRICT;
+CREATE INDEX hellos ON packets (robot, epoch, sequence) WHERE kind = 'hello';
 CREATE TABLE sessions (
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, next INTEGER NOT NULL, PRIMARY KEY (robot, epoch)
 ) STRICT;
@@ -182,6 +183,13 @@ class MissionStore:
     def next_sequence(self, robot: str, epoch: int) -> int:
         """Number of the first packet of the session that is missing."""
         return next((session.next for session in self.sessions(robot) if session.epoch == epoch), 0)
+
+    def newest_hello(self, robot: str, epoch: int) -> bytes | None:
+        """What the session said last of its detectors."""
+        where = "robot = ? AND epoch = ? AND kind = 'hello' AND refusal IS NULL"
+        statement = f"SELECT data FROM packets WHERE {where} ORDER BY sequence DESC LIMIT 1"
+        hello: bytes | None = self._database.value(statement, (robot, epoch))
+        return hello
 
     def progress(self, turns: int, corrections: Sequence[SessionCorrection]) -> None:
         """So many turns have taken effect; corrections that changed by them get a new version."""

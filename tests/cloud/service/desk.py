@@ -21,6 +21,7 @@ from fcslam.cloud.service.state import ServiceState
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cloud.store import MissionStore
 from fcslam.cloud.worker import Worker
+from fcslam.records import Channel
 from fcslam.wire.batches import MEDIA_TYPE, read_batch, write_batch
 from fcslam.wire.packets import decode, encode
 
@@ -33,6 +34,12 @@ ENTRIES = [
     TokenEntry(name=name, role=role, sha256=hashlib.sha256(f"token of {name}".encode()).hexdigest())
     for name, role in TOKENS.items()
 ]
+
+
+def put_detector(desk, content):
+    path = desk.state.detectors.path(Channel.CAMERA, "v1")
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
 
 
 class InlineWorker:

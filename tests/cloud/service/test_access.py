@@ -4,7 +4,7 @@ import hashlib
 import sqlite3
 
 import pytest
-from cloud.service.desk import A, Desk
+from cloud.service.desk import A, Desk, put_detector
 from fastapi.routing import APIRoute, iter_route_contexts
 
 from fcslam.cloud.service.authentication import Authenticator, Role, TokenEntry
@@ -56,8 +56,7 @@ def test_the_routes_are_all_there(routes):
 @pytest.mark.parametrize("who", [None, "nobody", "a", "b", "eye", "boss"])
 def test_who_has_no_right_gets_nothing_and_changes_nothing(desk, routes, who):
     desk.told(desk.send("a", A[:9]))
-    (desk.state.detectors / "camera").mkdir(parents=True)
-    (desk.state.detectors / "camera" / "v1.onnx").write_bytes(b"secret network")
+    put_detector(desk, b"secret network")
     before = content(desk)
     role = {"a": Role.ROBOT, "b": Role.ROBOT, "eye": Role.VIEWER, "boss": Role.ADMIN}.get(who)
     refused = 0

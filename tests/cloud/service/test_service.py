@@ -1,17 +1,21 @@
 """What the service answers: robots, viewers, administrators; and what it does not let happen."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud.service.desk import POSES, A, B, Desk
+from cloud.scripted import LASER
+from cloud.service.desk import POSES, A, B, Desk, put_detector
 
 from fcslam.cloud.store import MissionStore
 from fcslam.errors import ServiceError
-from fcslam.records import Correction
+from fcslam.features.detector import SHIPPED_NETWORK
+from fcslam.records import Channel, Correction
 from fcslam.runs import open_run
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
-from fcslam.wire.messages import Acknowledgement
+from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
+from fcslam.wire.packets import encode
 
 API = "/api/v1"
 PACKETS = f"{API}/robots/a/packets"
@@ -225,12 +229,27 @@ def test_the_interface_describes_itself(desk):
 
 
 def test_a_robot_can_fetch_a_detector(desk):
-    (desk.state.detectors / "camera").mkdir(parents=True)
-    (desk.state.detectors / "camera" / "v1.onnx").write_bytes(b"network")
+    put_detector(desk, b"network")
     assert desk.ask("GET", f"{API}/detectors/camera/v1", "a").content == b"network"
-    assert get(desk, "detectors").json() == [{"channel": "camera", "version": "v1"}]
+    assert get(desk, "detectors").json() == [{"channel": "camera", "version": "v1", "announced": False}]
     assert desk.ask("GET", f"{API}/detectors/camera/v2", "a").status_code == 404
     assert desk.ask("GET", f"{API}/detectors/smell/v1", "a").status_code == 400
+
+
+def test_robots_with_a_camera_are_told_of_a_newer_detector_until_they_have_it(desk):
+    network = SHIPPED_NETWORK.read_bytes()
+    version = desk.ask("POST", f"{API}/detectors", "boss", content=network).json()["version"]
+    hello = Hello("a", 0, LASER, {Channel.CAMERA: "orb-1", Channel.LIDAR: "test-1"})
+    told = desk.told(desk.send("a", [encode(Packet("a", 0, 0, 0.0, hello))]))
+    release = next(body for body in told if isinstance(body, Release))
+    assert (release.file.version, release.file.size) == (version, len(network))
+    assert desk.ask("GET", f"{API}/detectors/camera/{version}", "a").content == network
+    assert any(isinstance(body, Release) for body in desk.told(desk.send("a", [])))
+    again = replace(hello, detector_versions={**hello.detector_versions, Channel.CAMERA: version})
+    assert desk.told(desk.send("a", [encode(Packet("a", 0, 1, 0.0, again))])) == [Acknowledgement("a", 0, 1)]
+    assert not any(isinstance(body, Release) for body in desk.told(desk.send("b", B[:2]))), "it has no camera"
+    assert get(desk, "detectors").json() == [{"channel": "camera", "version": version, "announced": True}]
+    assert desk.ask("POST", f"{API}/detectors", "boss", content=b"no network").status_code == 400
 
 
 def test_packets_are_on_disk_before_they_are_acknowledged(desk):

@@ -3,10 +3,12 @@
 import asyncio
 from typing import Any
 
-from fastapi import APIRouter, Depends, HTTPException
+from fastapi import APIRouter, Depends, HTTPException, Request
 from starlette.concurrency import run_in_threadpool
 
+from fcslam.cloud.detectors import LONGEST_FILE_BYTES
 from fcslam.cloud.service.authentication import Role
+from fcslam.cloud.service.limits import read_body
 from fcslam.cloud.service.state import ServiceState
 from fcslam.config import Settings
 from fcslam.records import Veto
@@ -56,5 +58,12 @@ def decision_router(state: ServiceState) -> APIRouter:
         mission.store.veto(Veto(told.robot_i, told.robot_j, stamps))
         mission.worker.ring()
         return {"vetoes": len(mission.store.vetoes())}
+
+    @router.post("/detectors", status_code=201)
+    async def announce_detector(request: Request) -> dict[str, str]:
+        """Take in a network (ONNX) and tell every robot of it that has a camera and another one."""
+        content = await read_body(request, LONGEST_FILE_BYTES)
+        file = await run_in_threadpool(state.detectors.announce, content)
+        return {"channel": file.channel, "version": file.version}
 
     return router

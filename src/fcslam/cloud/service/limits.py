@@ -4,8 +4,6 @@ from collections.abc import Callable
 
 from fastapi import HTTPException, Request
 
-from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
-
 BYTES_PER_S = 8.0 * 2**20
 """A thousand times what a robot sends while it drives: so fast it may send what an outage kept back."""
 BURST_BYTES = 32.0 * 2**20
@@ -34,15 +32,15 @@ class RateLimit:
         return 0.0
 
 
-async def read_body(request: Request) -> bytes:
-    """A request's body, refused (HTTPException 413) before more of it is read than a batch may have."""
+async def read_body(request: Request, longest: int) -> bytes:
+    """A request's body, refused (HTTPException 413) before more than ``longest`` bytes of it are read."""
     announced = request.headers.get("content-length", "0")
-    too_long = HTTPException(413, f"the body is over {MAXIMUM_BATCH_BYTES} bytes; send fewer packets at once")
-    if announced.isdecimal() and int(announced) > MAXIMUM_BATCH_BYTES:
+    too_long = HTTPException(413, f"the body is over {longest} bytes; send less at once")
+    if announced.isdecimal() and int(announced) > longest:
         raise too_long
     body = bytearray()
     async for chunk in request.stream():
         body += chunk
-        if len(body) > MAXIMUM_BATCH_BYTES:
+        if len(body) > longest:
             raise too_long
     return bytes(body)

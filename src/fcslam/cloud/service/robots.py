@@ -11,6 +11,7 @@ from fcslam.cloud.service.limits import read_body
 from fcslam.cloud.service.state import ServiceState
 from fcslam.records import NAME, Channel
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE
+from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 
 Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 
@@ -35,7 +36,7 @@ def robot_router(state: ServiceState) -> APIRouter:
         correction: Annotated[int, Header(alias=CORRECTION_HEADER, ge=-1)] = -1,
     ) -> Response:
         """Store a batch of packets; the answer acknowledges what is on disk."""
-        body = await read_body(request)
+        body = await read_body(request, MAXIMUM_BATCH_BYTES)
         wait_s = state.rate.wait_s(robot, len(body))
         if wait_s > 0.0:
             raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
@@ -63,7 +64,7 @@ def robot_router(state: ServiceState) -> APIRouter:
     @router.get("/detectors/{channel}/{version}", dependencies=[Depends(state.require(*Role))])
     def get_detector(channel: Channel, version: Name) -> FileResponse:
         """The network of a detector version."""
-        path = state.detectors / channel / f"{version}.onnx"
+        path = state.detectors.path(channel, version)
         if not path.is_file():
             raise HTTPException(404, f"there is no {channel} detector '{version}'")
         return FileResponse(path, media_type="application/octet-stream")

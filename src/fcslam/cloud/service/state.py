@@ -2,10 +2,10 @@
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from fastapi import HTTPException, Request
 
+from fcslam.cloud.detectors import DetectorShelf
 from fcslam.cloud.missions import Missions, OpenMission
 from fcslam.cloud.service.authentication import Authenticator, Role
 from fcslam.cloud.service.events import EventStream
@@ -31,9 +31,9 @@ class ServiceState:
         return self.missions.open_mission
 
     @property
-    def detectors(self) -> Path:
-        """Folder of the networks that robots may fetch."""
-        return self.missions.root / "detectors"
+    def detectors(self) -> DetectorShelf:
+        """Networks that robots may fetch."""
+        return self.missions.detectors
 
     def require(self, *roles: Role) -> Callable[[Request], Awaitable[None]]:
         """A dependency: whoever asks has a token of one of the roles; a robot's is good for that robot alone.

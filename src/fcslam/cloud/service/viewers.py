@@ -72,10 +72,13 @@ def fleet_router(state: ServiceState) -> APIRouter:
         return {m.name.removeprefix(prefix): m.value for m in _live_run(state).metrics if m.name.startswith(prefix)}
 
     @router.get("/detectors")
-    def get_detectors() -> list[dict[str, str]]:
-        """Networks that robots may fetch."""
-        files = sorted(state.detectors.glob("*/*.onnx"))
-        return [{"channel": path.parent.name, "version": path.stem} for path in files]
+    def get_detectors() -> list[dict[str, Any]]:
+        """Networks that robots may fetch, and whether they are told of them."""
+        told = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
+        return [
+            {"channel": channel, "version": version, "announced": (channel, version) in told}
+            for channel, version in state.detectors.versions()
+        ]
 
     return router
 
