@@ -5,15 +5,18 @@ import threading
 import numpy as np
 import pytest
 import small_fleet
+from features.networks import tiny_network
 from robot.fake_cloud import FakeCloud, Network, content
 from wire.examples import CORRECTION
 
 from fcslam.errors import CloudError, StateError
+from fcslam.features.release import file_of
 from fcslam.geometry import se2
-from fcslam.records import Place
+from fcslam.records import Channel, Place
 from fcslam.robot.agent import Agent, Pace
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
+from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 
 AS_FAST_AS_POSSIBLE = Pace(None, lambda: 0.0, lambda _: None)
@@ -162,6 +165,25 @@ def test_a_refused_packet_is_kept_with_its_reason(scans, alone, tmp_path):
     assert content((tmp_path / "refused" / "000000.bin").read_bytes()) == content(encode(place))
     assert (tmp_path / "refused" / "000000.txt").read_text() == "unwanted\n"
     assert len(cloud.stored) == len(alone) - 1
+
+
+def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tmp_path):
+    tiny_network(tmp_path / "tiny.onnx", version="tiny-2")
+    file = file_of(tmp_path / "tiny.onnx")
+    cloud = FakeCloud(releases={file: (tmp_path / "tiny.onnx").read_bytes()})
+
+    def patient(records):
+        for number, record in enumerate(records):
+            while number == 20 and not list((tmp_path / "detectors").glob("*.onnx")):
+                threading.Event().wait(0.01)
+            yield record
+
+    with pytest.raises(KeyboardInterrupt):
+        drive(tmp_path, Network(cloud), stop_after(patient(scans), 70))
+    agent = drive(tmp_path, Network(cloud), scans, resume=True)
+    hellos = [decode(data).body for data in cloud.stored.values() if isinstance(decode(data).body, Hello)]
+    assert [hello.detector_versions[Channel.CAMERA] == "tiny-2" for hello in hellos] == [False, True]
+    assert agent.progress().notice == "detector tiny-2 from now on"
 
 
 def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, tmp_path):
