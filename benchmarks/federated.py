@@ -68,7 +68,8 @@ GAPS = {"arm": "s", "seeds": "d", "mean": ".1f", "gap": "s", "closed": ".2f", "o
 LOST = {"homography, %": ".1f", "lost": "s", "MMA, %": ".1f", "lost ": "s"}
 LOSSES = {"arm": "s"} | LOST
 PRIVATE = {"arm": "s", "noise": "g", "epsilon": ".3g"} | LOST
-KEEPING = {"arm": "s", "strength": "g", "new and new, MMA, %": ".1f", "old and new, MMA, %": ".1f"}
+KEEPING = {"arm": "s", "strength": "g", "new and new, MMA, %": ".1f", "below averaged": "s",
+           "old and new, MMA, %": ".1f", "below averaged ": "s"}  # fmt: skip
 SEEDS, PAIRS, IMAGES = 3, 500, 64
 COMPARED = ("start", "central", "local", "alone", "averaged", "faster", "faster-long", "frozen", *KEPT)
 """Arms without poison and noise."""
@@ -113,9 +114,10 @@ def main() -> None:
     report.say(setting(findings, folder))
     for measure, title in TITLES.items():
         report.table(title, GAPS, [gap_row(below[measure, arm]) for arm in COMPARED])
-    report.table("One of five robots poisoned", LOSSES, poison_rows(compare(findings, "averaged")))
+    unpoisoned = compare(findings, "averaged")
+    report.table("One of five robots poisoned", LOSSES, poison_rows(unpoisoned))
     report.table("Noise for privacy", PRIVATE, private_rows(compare(findings, "frozen")))
-    report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(below))
+    report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(unpoisoned))
     report.picture("Gap to central training by arm, and what noise costs", draw(below))
     report.write()
 
@@ -211,8 +213,9 @@ def promised(noise: float) -> float:
 
 def kept_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
     for arm in ("start", "central", "averaged", *KEPT):
-        new, across = rows["mma_3px", arm], rows["mma_3px_former", arm]
-        yield arm, KEPT.get(arm, 0.0), 100 * new.seeds[0], 100 * across.seeds[0]
+        found = [rows[measure, arm] for measure in ("mma_3px", "mma_3px_former")]
+        cells = [cell for row in found for cell in (100 * row.mean, points(row.gap))]
+        yield arm, KEPT.get(arm, 0.0), *cells
 
 
 def draw(rows: "Rows") -> Figure:
