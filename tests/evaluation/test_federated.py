@@ -159,6 +159,7 @@ def findings(central, federated, local):
         return np.stack([np.repeat(np.asarray(each, float)[:, None], len(MEASURES), axis=1) for each in networks])[None]
 
     measured = {"central": stacked(central), "local": stacked(*local), "federated": stacked(federated)}
+    measured["alone"] = measured["local"] - 0.2
     return Findings(("north", "south"), owners, measured)
 
 
@@ -167,7 +168,7 @@ def test_an_arm_of_fewer_seeds_is_compared_with_those():
     central = rng.random(60)
     whole = findings(central, central - 0.1, [central - 0.2, central - 0.2])
     later = findings(central + 0.5, central, [central - 0.2, central - 0.2]).measured
-    measured = {name: np.concatenate((whole.measured[name], later[name])) for name in ("central", "local")}
+    measured = {name: np.concatenate((whole.measured[name], later[name])) for name in ("central", "local", "alone")}
     measured |= {"federated": whole.measured["federated"], "poor": whole.measured["federated"] - 0.03}
     found = Findings(whole.robots, whole.owners, measured)
     rows = {row.arm: row for row in report(found) if row.measure == MEASURES[0]}
@@ -189,6 +190,7 @@ def test_gaps_are_paired_and_the_worst_robot_is_named():
     assert 0.017 < rows["federated"].gap.low < 0.02 < rows["federated"].gap.high < 0.023
     assert (rows["federated"].worst_robot, rows["federated"].worst_gap) == ("south", pytest.approx(0.04))
     assert rows["federated"].closed == pytest.approx((0.2 - 0.02) / 0.2)
+    assert rows["federated"].closed_alone == pytest.approx((0.4 - 0.02) / 0.4)
     assert rows["local"].mean == pytest.approx(hard.mean() - 0.2)
     assert rows["local"].closed == pytest.approx(0.0)
 

@@ -71,11 +71,11 @@ def _table(reports: "list[ArmReport]") -> "Table":
     from rich.table import Table
 
     table = Table(title="Federated training", title_justify="left")
-    for name in ("measure", "arm", "seeds", "mean", "gap to central", "gap closed", "worst robot"):
+    for name in ("measure", "arm", "seeds", "mean", "gap to central", "gap closed", "of alone", "worst robot"):
         table.add_column(name)
     for each in reports:
         gap = f"{100 * each.gap.mean:.1f} [{100 * each.gap.low:.1f}, {100 * each.gap.high:.1f}]"
-        closed = "" if each.closed != each.closed else f"{each.closed:.2f}"
+        closed = [f"{share:.2f}".replace("nan", "") for share in (each.closed, each.closed_alone)]
         worst = f"{each.worst_robot} {100 * each.worst_gap:.1f}"
-        table.add_row(each.measure, each.arm, str(len(each.seeds)), f"{100 * each.mean:.1f}", gap, closed, worst)
+        table.add_row(each.measure, each.arm, str(len(each.seeds)), f"{100 * each.mean:.1f}", gap, *closed, worst)
     return table

@@ -3,15 +3,20 @@
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from fcslam.errors import OutputError
 from fcslam.evaluation.federated import Findings
-from fcslam.evaluation.federated_arms import CENTRAL, LOCAL
+from fcslam.evaluation.federated_arms import ALONE, CENTRAL, LOCAL
 from fcslam.evaluation.federated_pairs import MEASURES
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
+
+COLUMNS: Final = (
+    "measure", "arm", "mean", "gap", "low", "high", "closed", "closed_alone", "worst_robot", "worst_gap", "seeds",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +31,8 @@ class ArmReport:
     paired bootstrap interval."""
     closed: float
     """(arm - local) / (central - local); NaN where central is not clearly better than local."""
+    closed_alone: float
+    """The same with robots that train alone for no longer than in the fleet."""
     worst_robot: str
     worst_gap: float
     """The gap on that robot's pairs."""
@@ -51,11 +58,9 @@ def write_report(reports: list[ArmReport], path: Path) -> None:
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             rows = csv.writer(file, lineterminator="\n")
-            rows.writerow(
-                ("measure", "arm", "mean", "gap", "low", "high", "closed", "worst_robot", "worst_gap", "seeds")
-            )
+            rows.writerow(COLUMNS)
             for each in reports:
-                numbers = (each.mean, *each.gap, each.closed)
+                numbers = (each.mean, *each.gap, each.closed, each.closed_alone)
                 seeds = " ".join(f"{mean:.4f}" for mean in each.seeds)
                 cells = [f"{number:.4f}" for number in numbers]
                 rows.writerow((each.measure, each.arm, *cells, each.worst_robot, f"{each.worst_gap:.4f}", seeds))
@@ -65,24 +70,28 @@ def write_report(reports: list[ArmReport], path: Path) -> None:
 
 def _report(findings: Findings, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
     seeds = len(findings.measured[arm])
-    values, reference, central, local = (
-        _by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL, LOCAL)
+    values, reference, central, local, alone = (
+        _by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL, LOCAL, ALONE)
     )
-    gain = mean_interval(central - local, rng)
     owners = np.array(findings.owners)
     gaps = [float(np.nanmean((reference - values)[owners == robot])) for robot in range(len(findings.robots))]
     worst = int(np.argmax(gaps))
-    closed = float(np.nanmean(values - local)) / gain.mean if gain.low > 0.0 else np.nan
     return ArmReport(
         arm=arm,
         measure=MEASURES[index],
         mean=float(np.nanmean(values)),
         gap=mean_interval(reference - values, rng),
-        closed=closed,
+        closed=_closed(values, local, central, rng),
+        closed_alone=_closed(values, alone, central, rng),
         worst_robot=findings.robots[worst],
         worst_gap=gaps[worst],
         seeds=tuple(float(np.nanmean(each[..., index])) for each in findings.measured[arm]),
     )
+
+
+def _closed(values: FloatArray, low: FloatArray, high: FloatArray, rng: np.random.Generator) -> float:
+    gain = mean_interval(high - low, rng)
+    return float(np.nanmean(values - low)) / gain.mean if gain.low > 0.0 else np.nan
 
 
 def _by_pair(measured: FloatArray, index: int) -> FloatArray:
