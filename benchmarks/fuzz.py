@@ -44,6 +44,8 @@ from fcslam.wire.quantisation import dequantise
 GOLDEN = common.REPOSITORY / "tests" / "wire" / "golden"
 LONGEST_S = 120
 CHUNK = 1000
+SIZES = {1: 100, 3: 100, 10: 50, 30: 20, 100: 5, 300: 1, MAXIMUM_KEYPOINTS: 1}
+"""Of packets, and how often one is taken: the larger the rarer."""
 INTERESTING = (0, 1, 2, 3, 127, 128, 255, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
 FLOATS = (0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), float("-inf"), 5e-324, 1e-30, 3.2, 1e6, 1.1e6, 1e30, 1e308)
 COLUMNS = {"broken by": "", "packets": ",", "read": ",", "refused": ",", "crashed": ",", "mean, us": ".0f",
@@ -150,13 +152,11 @@ def note_memory(outcome: Outcome, done: int, count: int) -> None:
 def packets_of_every_kind(rng: random.Random) -> Iterator[bytes]:
     """The golden packets several times, and random valid ones from small to the limits."""
     for path in sorted(GOLDEN.glob("*.bin")):
-        yield from [path.read_bytes()] * 4
+        yield from [path.read_bytes()] * 100
     numbers = np.random.default_rng(rng.getrandbits(64))
-    for size in (1, 3, 10, 30, 100, 300, 1000):
+    for size, copies in SIZES.items():
         for body in bodies(numbers, size):
-            yield encode(Packet("alice", 7, rng.getrandbits(40), 2e9, body))
-    for body in bodies(numbers, MAXIMUM_KEYPOINTS):
-        yield encode(Packet("alice", 7, 1, 2e9, body))
+            yield from [encode(Packet("alice", 7, rng.getrandbits(40), 2e9, body))] * copies
 
 
 def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
