@@ -41,7 +41,21 @@ ROOMS = [
 # Rooms that may see less than what stands before them: the last room that each may import.
 CEILINGS = {"learning": "features", "simulation": "sources"}
 
-HEAVY = ["torch", "flwr", "mujoco", "matplotlib", "fastapi", "gtsam", "cv2", "numba", "scipy", "rosbags"]
+HEAVY = [
+    "torch",
+    "flwr",
+    "mujoco",
+    "matplotlib",
+    "fastapi",
+    "uvicorn",
+    "httpx",
+    "cryptography",
+    "gtsam",
+    "cv2",
+    "numba",
+    "scipy",
+    "rosbags",
+]
 
 
 def room_of(module: str) -> str:

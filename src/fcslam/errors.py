@@ -9,7 +9,7 @@ FcslamError
 │   ├── FeatureError      network weights, images or extracted features cannot be used
 │   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
 │   ├── EvaluationError   a reference file or a run folder cannot be evaluated
-│   ├── ServiceError      the cloud service cannot start as it is told to: tokens, certificates, address, folder
+│   ├── ServiceError      the cloud service cannot do as it is told: tokens, certificates, address, folder, mission
 │   ├── StoreError        a mission cannot be kept or read: the disk is full, the file is broken or something else
 │   ├── StateError        a robot's state folder cannot be used
 │   └── CloudError        the cloud turns a robot away: its token, its name or what it sends
@@ -73,7 +73,7 @@ class UnavailableError(FcslamError):
 
 
 class ServiceError(InputError):
-    """The cloud service cannot start as it is told to: tokens, certificates, address or folder do not serve."""
+    """The cloud service cannot do as it is told: tokens, certificates, address, folder or mission do not serve."""
 
 
 class StoreError(InputError):

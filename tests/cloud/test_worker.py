@@ -145,13 +145,13 @@ def test_a_worker_says_nothing_old_while_it_catches_up(cloud):
 
 def test_a_packet_that_does_not_fit_is_refused_with_its_reason_and_the_session_goes_on(cloud):
     packets = stream("a", POSES, start_s=0.0)
-    wrong = packets[0]
+    wrong = packets[1]
     shifted = [*packets[:5], type(wrong)("a", 0, 5, packets[4].time, wrong.body)]
     shifted += [type(p)("a", 0, p.sequence + 1, p.time, p.body) for p in packets[5:]]
     cloud.put(shifted)
     run = cloud.finalize()
     assert [(epoch, number) for epoch, number, _ in cloud.store.refusals("a")] == [(0, 5)]
-    assert "said hello before" in cloud.store.refusals("a")[0][2]
+    assert "keyscan 0 where" in cloud.store.refusals("a")[0][2]
     assert len(run.trajectories[0].stamps) == len(POSES)
     cloud.restart()
     assert cloud.finalize().pose_graph_g2o == run.pose_graph_g2o
@@ -211,6 +211,23 @@ def test_the_live_run_follows_and_is_always_whole(cloud):
     assert seen == sorted(seen)
     assert seen[-1] == 2 * len(POSES)
     assert len(list((cloud.folder.path / "snapshots").iterdir())) <= 2
+
+
+def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):
+    packets = two_robots()
+    cloud.put(packets[:20])
+    cloud.work()
+    blocked = cloud.folder.path / "snapshots" / "2"
+    blocked.write_text("in the way")
+    cloud.put(packets[20:])
+    cloud.now += 1000.0
+    cloud.work()
+    assert cloud.store.applied() == len(packets)
+    assert cloud.folder.live.resolve().name == "1"
+    blocked.unlink()
+    cloud.now += 1000.0
+    cloud.work()
+    assert sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories) == 2 * len(POSES)
 
 
 def test_more_robots_join_a_mission_that_was_finished(cloud, tmp_path):

@@ -6,14 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
+from fcslam.cloud.database import told
 from fcslam.cloud.detectors import DetectorShelf
 from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.intake import Intake
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cloud.store import MissionStore, check_mission
+from fcslam.cloud.store import MissionStore
 from fcslam.cloud.supervisor import RunningWorker
 from fcslam.cloud.worker import CONFIG
-from fcslam.errors import ServiceError, StoreError
+from fcslam.errors import ServiceError
 from fcslam.wire.checks import check_name
 
 FIRST = "mission"
@@ -82,20 +83,20 @@ class Missions:
         """Begin a mission and open it.
 
         Raises:
-            StoreError: there is one of this name.
+            ServiceError: there is one of this name.
         """
         if self.folder(name).store.exists():
-            raise StoreError(f"mission '{name}' is there already; open it or choose another name")
+            raise ServiceError(f"mission '{name}' is there already; open it or choose another name")
         self.open(name, create=True)
 
     def open(self, name: str, create: bool = False) -> None:
         """Let robots' packets go to this mission from now on; the one that is open now rests, as it is.
 
         Raises:
-            StoreError: there is none of this name.
+            ServiceError: there is none of this name.
         """
         if not create and not self.folder(name).store.exists():
-            raise StoreError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+            raise ServiceError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
         if name == self.open_mission.folder.name:
             return
         before = self.open_mission
@@ -106,14 +107,15 @@ class Missions:
         """Write a mission as one new file.
 
         Raises:
-            StoreError: there is none of this name, or it cannot be written.
+            ServiceError: there is none of this name.
+            StoreError: it cannot be written.
         """
         folder = self.folder(name)
         if name == self.open_mission.folder.name:
             self.open_mission.store.export(path)
             return
         if not folder.store.exists():
-            raise StoreError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+            raise ServiceError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
         store = MissionStore(folder.store)
         try:
             store.export(path)
@@ -121,19 +123,20 @@ class Missions:
             store.close()
 
     def take_in(self, name: str, path: Path) -> None:
-        """Make a mission of a file that ``export`` wrote; the open one stays open.
+        """Make a mission of a file that ``export`` wrote and ``check_mission`` passed; the open one stays open.
 
         Raises:
-            StoreError: there is one of this name, or the file is no mission.
+            ServiceError: there is one of this name.
+            StoreError: it cannot be written.
         """
         folder = self.folder(name)
         if folder.store.exists():
-            raise StoreError(f"mission '{name}' is there already; choose another name")
-        check_mission(path)
-        folder.path.mkdir(parents=True, exist_ok=True)
+            raise ServiceError(f"mission '{name}' is there already; choose another name")
         staging = folder.path / ".import.partial"
-        shutil.copyfile(path, staging)
-        staging.replace(folder.store)
+        with told(staging):
+            folder.path.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, staging)
+            staging.replace(folder.store)
 
     def close(self) -> None:
         """Stop the open mission and let others use the folder."""

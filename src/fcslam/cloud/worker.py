@@ -12,6 +12,7 @@ every change of the live run folder and for every answered request.
 
 import gc
 import json
+import logging
 import os
 import select
 import signal
@@ -28,7 +29,7 @@ from fcslam.cloud.sessions import session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cloud.store import Finalization, MissionStore, SessionCorrection, StoredPacket
 from fcslam.config import dump
-from fcslam.errors import FcslamError, PacketError
+from fcslam.errors import FcslamError, OutputError, PacketError
 from fcslam.runs import Metric, Run, write_run
 
 CONFIG = "config"
@@ -38,8 +39,12 @@ AT_ONCE = 64
 """Packets between two looks at what else there is to do."""
 LIVE_SHARE = 0.1
 """Of the worker's time, for the live run folder."""
+PAUSE_S = 30.0
+"""After the live run folder could not be written."""
 LIVE_EVERY_S = 1.0
 """The live run folder is not written more often than this."""
+
+_log = logging.getLogger(__name__)
 
 Tell = Callable[[str, int], None]
 """Is told of an event and its number."""
@@ -136,7 +141,13 @@ class Worker:
         now = self._clock()
         if self._published == self._turn or self._turn < self._resumed_at or now < self._publish_at:
             return False
-        self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False))
+        run = self._run(self._fleet.estimate(), with_local_maps=False)
+        try:
+            self._folder.publish(run)
+        except OutputError as error:
+            _log.error("the live map stays as it was: %s", error)  # packets matter more, and the disk may be freed
+            self._publish_at = now + PAUSE_S
+            return False
         self._published = self._turn
         self._publish_at = self._clock() + max((self._clock() - now) / LIVE_SHARE, LIVE_EVERY_S)
         self._tell("live", self._turn)

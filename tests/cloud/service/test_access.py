@@ -2,10 +2,13 @@
 
 import hashlib
 import sqlite3
+from urllib.parse import quote
 
 import pytest
 from cloud.service.desk import A, Desk, put_detector
 from fastapi.routing import APIRoute, iter_route_contexts
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fcslam.cloud.service.authentication import Authenticator, Role, TokenEntry
 
@@ -119,3 +122,28 @@ def test_health_needs_no_token_and_says_when_the_worker_is_down(desk):
     assert desk.ask("GET", "/healthz").status_code == 200
     desk.state.mission.worker.pid = None
     assert desk.ask("GET", "/healthz").status_code == 503
+
+
+TEXT = st.one_of(st.sampled_from(["a", "0", "-1", "99999999999999999999", "..", "camera", "mission", "a+1"]), st.text())
+BODIES = st.one_of(st.binary(max_size=200), st.sampled_from([b"{}", b'{"name": 3}', b'{"name": "n"}', b"[]"]))
+
+
+@pytest.fixture(scope="module")
+def fuzzed(tmp_path_factory):
+    with Desk(tmp_path_factory.mktemp("fuzzed") / "data", tokens=None) as desk:
+        desk.told(desk.send("a", A[:9]))
+        yield desk
+
+
+@given(data=st.data())
+def test_whatever_is_asked_has_an_answer_and_never_an_internal_error(fuzzed, routes, data):
+    method, path, _ = data.draw(st.sampled_from([route for route in routes if route[1] not in ENDLESS]))
+    values = {name: quote(data.draw(TEXT), safe="") or "x" for name in VALUES}
+    query = data.draw(st.dictionaries(st.sampled_from(["name", "status", "limit", "x"]), TEXT, max_size=2))
+    headers = {"Fcslam-Correction": data.draw(st.sampled_from(["-1", "x", "7", "1e9", "-2"]))}
+    response = fuzzed.ask(
+        method, path.format(**values), params=query, headers=headers, content=data.draw(BODIES), timeout=60
+    )
+    assert response.status_code < 500, response.text
+    if response.status_code >= 400:
+        assert response.json()["error"]

@@ -11,10 +11,13 @@ from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
+from fcslam.cloud.database import told
 from fcslam.cloud.service.authentication import Role
 from fcslam.cloud.service.robots import Name
 from fcslam.cloud.service.state import ServiceState
+from fcslam.cloud.store import check_mission
 from fcslam.config import Settings
+from fcslam.errors import StoreError
 from fcslam.records import NAME
 
 CHUNK_BYTES = 2**20
@@ -53,6 +56,10 @@ def mission_router(state: ServiceState) -> APIRouter:
         with tempfile.TemporaryDirectory(dir=state.missions.root, prefix=".import") as folder:
             path = Path(folder) / "mission.sqlite"
             await _receive(request, path)
+            try:
+                await run_in_threadpool(check_mission, path)
+            except StoreError as error:
+                raise HTTPException(400, f"what was sent is no exported mission ({error})") from error
             async with changing:
                 await run_in_threadpool(state.missions.take_in, name, path)
         return list_missions()
@@ -91,7 +98,8 @@ async def _receive(request: Request, path: Path) -> None:
             size += len(chunk)
             if size > LONGEST_IMPORT_BYTES:
                 raise HTTPException(413, f"the file is over {LONGEST_IMPORT_BYTES} bytes")
-            await run_in_threadpool(file.write, chunk)
+            with told(path):
+                await run_in_threadpool(file.write, chunk)
 
 
 async def _content(path: Path, folder: "tempfile.TemporaryDirectory[str]") -> AsyncIterator[bytes]:

@@ -8,7 +8,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 
 from fcslam.cloud.intake import RETRY_AFTER_S, BusyError, LeaseError, RefusedPacketError
-from fcslam.errors import FcslamError, FeatureError, PacketConflictError, PacketError, StoreError
+from fcslam.errors import FcslamError, FeatureError, PacketConflictError, PacketError, ServiceError, StoreError
 
 STATUS: dict[type[FcslamError], int] = {
     BusyError: 429,
@@ -17,6 +17,7 @@ STATUS: dict[type[FcslamError], int] = {
     PacketConflictError: 409,
     PacketError: 400,
     StoreError: 507,
+    ServiceError: 409,
     FeatureError: 400,
 }
 """Of what goes wrong below HTTP; the nearest class of an error counts."""

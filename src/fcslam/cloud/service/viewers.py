@@ -74,11 +74,7 @@ def fleet_router(state: ServiceState) -> APIRouter:
     @router.get("/detectors")
     def get_detectors() -> list[dict[str, Any]]:
         """Networks that robots may fetch, and whether they are told of them."""
-        told = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
-        return [
-            {"channel": channel, "version": version, "announced": (channel, version) in told}
-            for channel, version in state.detectors.versions()
-        ]
+        return _detectors(state)
 
     return router
 
@@ -137,6 +133,14 @@ def _file(state: ServiceState, name: str, media_type: str = "text/plain") -> Fil
     if not path.is_file():
         raise HTTPException(404, f"there is no {name}")
     return FileResponse(path, media_type=media_type)
+
+
+def _detectors(state: ServiceState) -> list[dict[str, Any]]:
+    told = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
+    return [
+        {"channel": channel, "version": version, "announced": (channel, version) in told}
+        for channel, version in state.detectors.versions()
+    ]
 
 
 def _sessions(state: ServiceState, robot: str) -> list[dict[str, Any]]:
