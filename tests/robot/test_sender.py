@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from robot.fake_cloud import FakeCloud, Network, content, said
 from wire.examples import HELLO, LIDAR_PLACE, RELEASE
 
-from fcslam.errors import CloudError, UnavailableError
+from fcslam.errors import CloudError, StateError, UnavailableError
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import ASK_AFTER_S, EVERY_S, LONGEST_RETRY_S, Sender, retry_delay_s
 from fcslam.wire.http_transport import Answer
@@ -179,6 +179,17 @@ def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):
     assert "confirms nothing" in robot.sender.trouble
     assert sum(delays) > 2.0
     assert robot.outbox.waiting.packets == 1
+
+
+def test_a_cloud_that_opens_another_mission_is_found_out(robot):
+    network = robot.sender._transport
+    robot.outbox.put([said(0), said(1)])
+    robot.step()
+    network.cloud = FakeCloud()
+    robot.outbox.put([said(2)])
+    robot.step()
+    with pytest.raises(StateError, match="its mission is another one"):
+        robot.step()
 
 
 def test_a_cloud_that_turns_the_robot_away_ends_the_sender(robot):

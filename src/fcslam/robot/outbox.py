@@ -175,7 +175,7 @@ class Outbox:
         Sessions that it has not seen move to epochs above all that it has: the robot may have had another state folder.
 
         Raises:
-            StateError: the cloud lacks packets that it had confirmed.
+            StateError: the cloud lacks packets that it had confirmed, of a session that has more to say.
         """
         with self._transaction():
             newest = max(expected, default=-1)
@@ -186,11 +186,14 @@ class Outbox:
             for move in reversed(moves):
                 self._move(*move)
             self._database.execute("UPDATE sessions SET met = 1")
-            for epoch, stored in self._database.execute("SELECT epoch, stored FROM sessions"):
+            unfinished = "epoch = ? OR epoch IN (SELECT epoch FROM packets WHERE data IS NOT NULL)"
+            question = f"SELECT epoch, stored FROM sessions WHERE {unfinished}"
+            for epoch, stored in self._database.execute(question, (self.epoch,)):
                 if expected.get(epoch, 0) < stored:
                     raise StateError(
-                        f"{self._path}: the cloud lost packets of epoch {epoch} that it had confirmed: it has "
-                        f"{expected.get(epoch, 0)} of {stored}; start anew with another --state"
+                        f"{self._path}: the cloud has {expected.get(epoch, 0)} of {stored} packets of epoch {epoch} "
+                        "that were confirmed, so its mission is another one; start anew: without --resume, or with "
+                        "another --state"
                     )
         for epoch, sequence in expected.items():
             self.acknowledge(epoch, sequence - 1)

@@ -110,6 +110,7 @@ class Sender:
             self._refused(self._outbox.drop(batch.epoch, sequence), answer.refusal.reason)
             self.refusals += 1
         if batch is not None and self.confirmed + self.refusals == before:
+            self._met = False  # its mission may be another one
             raise UnavailableError("the cloud answers, but confirms nothing")
         self._failures, self.trouble = 0, None
 
