@@ -74,7 +74,8 @@ def matches_oracle(places, query, near_bits):
         distances = np.bitwise_count(query[:, None] ^ place[None]).sum(axis=2, dtype=int).min(axis=1)
         gives[number] = np.where(distances <= near_bits, 1.0 - (distances / (near_bits + 1)) ** 2, 0.0)
     weights = np.log((len(places) + 1) / np.maximum(sum(gives.values()), 1.0))
-    return {number: float(weights @ of_place / weights.sum()) for number, of_place in gives.items()}
+    fair = {number: min(1.0, len(query) / len(place)) ** 0.5 for number, place in places.items()}
+    return {number: float(weights @ of_place / weights.sum() * fair[number]) for number, of_place in gives.items()}
 
 
 def check_stored(index, places):

@@ -86,7 +86,8 @@ def score_matches(
 
     A descriptor of the query gives each place 1 - (d / (near_bits + 1))^2 for the nearest one of its own, d bits away:
     Epanechnikov's kernel. It counts ln((N + 1) / n), where n is the sum of what it gives to all places: what many
-    places have tells little.
+    places have tells little. A place of m times as many descriptors as the query has, m > 1, has more chances to be
+    near and 1 / sqrt(m) of the share: the geometric mean of the shares of both.
 
     Args:
         entries: the stored places.
@@ -131,7 +132,9 @@ def score_matches(
             scores[row] += weight * gives[closeness[row]]
             closeness[row] = 0
     rows, shares = _taken(tally, total)
-    return rows, shares / max(whole, TINY)
+    for position, row in enumerate(rows):
+        shares[position] *= np.sqrt(min(1.0, codes.shape[0] / entries.counts[row])) / max(whole, TINY)
+    return rows, shares
 
 
 @njit(cache=True)

@@ -60,7 +60,7 @@ class VocabularyConfig(Settings):
     capacity: int = Field(default=300, ge=1, description="Algorithm 1's C: the newest places that are trained on")
     rebuild_every: int = Field(default=20, ge=1, description="windowed: places between two trainings")
     tree: TreeConfig = Field(default=TreeConfig(), description="shape of the tree where it is trained")
-    leaf_capacity: int = Field(default=64, ge=2, description="incremental: a word of more descriptors splits")
+    leaf_capacity: int = Field(default=128, ge=2, description="incremental: a word of more descriptors splits")
     scoring: Scoring = Field(
         default=Scoring.MATCHES,
         description="words: eq. (4) on [0, 1]; matches: words propose descriptors, their bits decide",
