@@ -7,7 +7,8 @@ where it was interrupted. Five robots that see different things: a floor of a to
 from the web, and two simulated ones, by day and with lamps off. All begin from one small detector that was trained on
 synthetic shapes and on photographs that no robot has, and is far from what longer training makes of it. Central and
 local training do as many steps as all robots together, 500, a robot of a fleet a fifth of these in every arm, and so
-do robots that train alone. Faster: three times the learning rate; faster-long: in two rounds instead of five. Pairs are
+do robots that train alone. Faster: three times the learning rate, chosen after the first figures of averaged were
+seen; central training was not given it. Faster-long: in two rounds instead of five as well. Pairs are
 drawn from images that no network saw; a robot's own network is shown every fifth of them, in turns over the seeds.
 
 Gap: central minus the arm, in points, on the same pairs and seeds, with 95 % by paired bootstrap over pairs. Closed:
