@@ -236,13 +236,14 @@ def draw(rows: "Rows") -> Figure:
     left.set_yticks(range(len(names)), names)
     left.invert_yaxis()
     left.set_xscale("symlog", linthresh=5.0)
+    left.set_xticks(ticks := (-5, -2, 0, 2, 5, 10, 30), [str(tick) for tick in ticks])
     left.set_xlabel("points below central training, 95 %")
     right.set_xscale("log")
     right.set_xlabel("epsilon; dashed: without noise")
     right.set_ylabel("%")
+    right.legend(frameon=False)
     for panel in (left, right):
         panel.grid(alpha=0.3)
-        panel.legend(frameon=False)
     return figure
 
 
