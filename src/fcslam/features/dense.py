@@ -7,6 +7,7 @@ they become bits, bit = 1 where the logit is not negative (FC-SLAM, eq. (1)).
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from fcslam.features.nms import box_nms
@@ -52,15 +53,30 @@ def sample_codes(logits: Logits, positions_px: NDArray[np.float32]) -> Codes:
 def sample_logits(logits: Logits, positions_px: NDArray[np.float32]) -> NDArray[np.float32]:
     """Logits interpolated bilinearly at ``positions_px`` (K, 2), beyond the outer centres the nearest: (K, bits)."""
     bits, rows, columns = logits.shape
-    cells = np.ascontiguousarray(logits.reshape(bits, -1).T)
+    cells = np.asarray(cv2.transpose(np.ascontiguousarray(logits).reshape(bits, -1)), np.float32)
     place = (positions_px.astype(np.float64) - 0.5 * (CELL_PX - 1)) / CELL_PX
     x, y = np.clip(place[:, 0], 0, columns - 1), np.clip(place[:, 1], 0, rows - 1)
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     right, bottom = np.minimum(left + 1, columns - 1), np.minimum(top + 1, rows - 1)
-    u, v = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
-    upper = (1 - u) * cells[top * columns + left] + u * cells[top * columns + right]
-    lower = (1 - u) * cells[bottom * columns + left] + u * cells[bottom * columns + right]
-    sampled: NDArray[np.float32] = (1 - v) * upper + v * lower
+    corners = np.column_stack([row * columns + column for row in (top, bottom) for column in (left, right)])
+    u, v = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    sampled: NDArray[np.float32] = _interpolate(cells, corners, u, v)
+    return sampled
+
+
+@njit(cache=True)
+def _interpolate(
+    cells: NDArray[np.float32], corners: NDArray[np.int64], u: NDArray[np.float32], v: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Between the cells (C, bits) at four corners (K, 4), u (K,) of the way to the right, v (K,) downwards."""
+    sampled = np.empty((len(corners), cells.shape[1]), np.float32)
+    one = np.float32(1.0)
+    for k in range(len(corners)):
+        upper_left, upper_right, lower_left, lower_right = corners[k]
+        for bit in range(cells.shape[1]):
+            upper = (one - u[k]) * cells[upper_left, bit] + u[k] * cells[upper_right, bit]
+            lower = (one - u[k]) * cells[lower_left, bit] + u[k] * cells[lower_right, bit]
+            sampled[k, bit] = (one - v[k]) * upper + v[k] * lower
     return sampled
 
 

@@ -93,7 +93,7 @@ class LightBody(nn.Module):
         joint = self.joint(eighth + around)
         context = _twice(self.context_quarter(quarter) + _twice(self.context_eighth(joint)))
         points = smoothed(F.pixel_shuffle(self.point_head(half + context), 2))
-        points = points + self.refine(torch.cat((image, points), dim=1))
+        points = smoothed(points + self.refine(torch.cat((image, points), dim=1)))
         return Maps(points.squeeze(1), self.code_head(joint))
 
 
@@ -151,9 +151,15 @@ def sample_codes(code_logits: Tensor, points_px: Tensor) -> Tensor:
 
 
 def smoothed(maps: Tensor) -> Tensor:
-    """Maps (B, 1, H, W) without what alternates from pixel to pixel: it would tell even pixels from odd ones."""
-    binomial = maps.new_tensor([0.25, 0.5, 0.25])
-    return F.conv2d(F.pad(maps, (1, 1, 1, 1), mode="replicate"), torch.outer(binomial, binomial)[None, None])
+    """Maps (B, 1, H, W) without what alternates from pixel to pixel: it would tell even pixels from odd ones.
+
+    A binomial filter of 3 x 3 as sums of neighbours, which a processor does much faster than a convolution.
+    """
+    sums = F.pad(maps, (1, 1, 1, 1), mode="replicate")
+    for _ in range(2):
+        sums = sums[..., 1:, :] + sums[..., :-1, :]
+        sums = sums[..., 1:] + sums[..., :-1]
+    return sums / 16.0
 
 
 def _convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:

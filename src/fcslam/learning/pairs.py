@@ -18,7 +18,7 @@ BORDER_PX: Final = 4
 GRID_SHARE: Final = 0.35
 """Points of a pair that are drawn anywhere instead of at keypoints: every pixel has to have a code."""
 
-SHIFT_SHARE: Final = 0.15
+SHIFT_SHARE: Final = 0.3
 """Pairs whose views differ by a shift by whole pixels, and in light."""
 
 
