@@ -23,6 +23,12 @@ def test_modules_and_functions_are_short(path):
     assert too_long(path.read_text(encoding="utf-8")) == []
 
 
+def test_no_two_test_modules_have_one_name():
+    """pytest imports them by their names alone, so it would collect only one."""
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))
+
+
 def test_the_rule_itself():
     assert too_long("def f():\n" + "    x = 1\n" * 59) == []
     assert too_long("def f():\n" + "    x = 1\n" * 60) == ["f: 61 lines, at most 60"]
