@@ -1,0 +1,183 @@
+"""Many robots at once, at real time, on one service: how long it takes to take a packet in, and until it has effect.
+
+    python benchmarks/live.py [--robots 20] [--path 30]
+
+A simulated fleet (LiDAR, 360 beams at 10 Hz) is run through the robots' front ends beforehand. Then each robot's
+packets go to `fcslam serve` at the moments at which the robot had them, over a connection of its own, from one process
+that does nothing else. "Taken in": from sending a request to the answer that says that its packets are on disk. "In
+effect": from that answer until the process in which the fleet lives has matched, verified and solved what they bring,
+and a correction lies ready; seen by asking the service's metrics 20 times a second. Memory: the most that the service
+and its worker held (VmHWM, added up). Server, worker and sender share the machine.
+"""
+
+import asyncio
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import common
+import httpx
+import numpy as np
+from faults import cloud, finalize
+
+from fcslam.mission import MissionConfig
+from fcslam.robot.frontend import RobotFrontend
+from fcslam.simulation.fleet import SimulatedRobot, SimulationSettings, simulate_fleet
+from fcslam.wire.batches import MEDIA_TYPE, write_batch
+from fcslam.wire.packets import encode
+
+ROBOTS, PATH_M = 20, 30.0
+LOOK_EVERY_S = 0.05
+EFFECTLESS_S = 600.0
+"""If packets have had no effect for so long they will have none."""
+COLUMNS = {"": "s", "requests": ",d", "median": ".1f", "95 %": ".1f", "99 %": ".1f", "most": ".1f"}
+
+
+class Due(NamedTuple):
+    """What a robot has to send at a moment."""
+
+    at_s: float
+    """Since the recording began."""
+    packets: tuple[bytes, ...]
+    has_place: bool
+
+
+class Sent(NamedTuple):
+    """A request that was answered."""
+
+    asked_s: float
+    answered_s: float
+    has_place: bool
+
+
+class Look(NamedTuple):
+    """What the service said of itself."""
+
+    at_s: float
+    stored: int
+    queued: int
+
+
+def main() -> None:
+    parser = common.options(__doc__ or "")
+    parser.add_argument("--robots", type=int, default=ROBOTS)
+    parser.add_argument("--path", type=float, default=PATH_M, help="of each robot, m")
+    parser.add_argument("--seed", type=int, default=1, help="of the fleet")
+    chosen = parser.parse_args()
+    report = common.Report(__file__, __doc__ or "", chosen)
+    settings = SimulationSettings(robots=chosen.robots, path_length_m=chosen.path, camera=None)
+    agendas = {robot.name: _agenda(robot) for robot in simulate_fleet(settings, chosen.seed).robots}
+    with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (server, port):
+        sent, looks = asyncio.run(_play(agendas, f"http://127.0.0.1:{port}"))
+        memory_mb = sum(_peak_mb(pid) for pid in (server.process.pid, *_children(server.process.pid)))
+        run = finalize(port)
+        closures, maps = common.metrics(run)["inter_robot_closures_accepted"], common.metrics(run)["maps"]
+    places = [each for each in sent if each.has_place]
+    report.table(
+        "Milliseconds",
+        COLUMNS,
+        [
+            ("taken in", len(sent), *_spread([each.answered_s - each.asked_s for each in sent])),
+            ("in effect, all", len(sent), *_spread(_effect(sent, looks))),
+            ("in effect, places", len(places), *_spread(_effect(places, looks))),
+        ],
+    )
+    packets = sum(len(due.packets) for agenda in agendas.values() for due in agenda)
+    duration_s = max(agenda[-1].at_s for agenda in agendas.values())
+    size = sum(len(data) for agenda in agendas.values() for due in agenda for data in due.packets)
+    report.say(
+        f"{chosen.robots} robots for {duration_s:.0f} s: {packets:,} packets, {size / 1e6:.1f} MB, "
+        f"{size / 1e3 / duration_s / chosen.robots:.2f} kB/s a robot; {memory_mb:,.0f} MB; "
+        f"{closures:.0f} accepted closures between robots, {maps:.0f} map(s) in the end."
+    )
+    report.write()
+
+
+def _agenda(robot: SimulatedRobot) -> list[Due]:
+    """What this robot sends, and when."""
+    front = RobotFrontend(robot.name, MissionConfig().robot)
+    agenda, began = [], None
+    scans = list(robot.scans())
+    for scan in scans:
+        began = scan.stamp if began is None else began
+        agenda.append(_due(scan.stamp - began, front.process(scan)))
+    agenda.append(_due(scans[-1].stamp - began, front.finish()))
+    return [due for due in agenda if due.packets]
+
+
+def _due(at_s: float, packets: Sequence[object]) -> Due:
+    return Due(
+        at_s, tuple(encode(packet) for packet in packets), any(type(p.body).__name__ == "Place" for p in packets)
+    )
+
+
+async def _play(agendas: dict[str, list[Due]], url: str) -> tuple[list[Sent], list[Look]]:
+    sent: list[Sent] = []
+    looks: list[Look] = []
+    began = time.perf_counter()
+    watching = asyncio.create_task(_watch(url, looks))
+    async with asyncio.TaskGroup() as group:
+        for name, agenda in agendas.items():
+            group.create_task(_robot(name, agenda, url, began, sent))
+    all_sent = time.perf_counter()
+    while not (looks and looks[-1].at_s > all_sent and looks[-1].queued == 0):
+        if time.perf_counter() - all_sent > EFFECTLESS_S:
+            raise SystemExit("live: the service has not caught up")
+        await asyncio.sleep(LOOK_EVERY_S)
+    watching.cancel()
+    return sorted(sent, key=lambda each: each.answered_s), looks
+
+
+async def _robot(name: str, agenda: list[Due], url: str, began: float, sent: list[Sent]) -> None:
+    headers = {"Content-Type": MEDIA_TYPE, "Fcslam-Agent": f"{len(sent):032x}"}
+    async with httpx.AsyncClient(base_url=url, headers=headers, timeout=60.0, trust_env=False) as client:
+        for due in agenda:
+            await asyncio.sleep(max(0.0, began + due.at_s - time.perf_counter()))
+            asked = time.perf_counter()
+            answer = await client.post(f"/api/v1/robots/{name}/packets", content=write_batch(due.packets))
+            answer.raise_for_status()
+            sent.append(Sent(asked, time.perf_counter(), due.has_place))
+
+
+async def _watch(url: str, looks: list[Look]) -> None:
+    async with httpx.AsyncClient(base_url=url, timeout=60.0, trust_env=False) as client:
+        while True:
+            lines = (await client.get("/api/v1/metrics")).text.splitlines()
+            values = {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines if line[0] != "#")}
+            stored, queued = (int(values[f"fcslam_packets_{name}"]) for name in ("stored", "queued"))
+            looks.append(Look(time.perf_counter(), stored, queued))
+            await asyncio.sleep(LOOK_EVERY_S)
+
+
+def _effect(chosen: Sequence[Sent], looks: Sequence[Look]) -> list[float]:
+    """For each request the time until as many packets had taken effect as were stored when it was answered."""
+    at = np.array([look.at_s for look in looks])
+    stored = np.maximum.accumulate([look.stored for look in looks])
+    applied = np.maximum.accumulate([look.stored - look.queued for look in looks])
+    latencies = []
+    for each in chosen:
+        seen = min(int(np.searchsorted(at, each.answered_s)), len(at) - 1)
+        done = min(int(np.searchsorted(applied, stored[seen])), len(at) - 1)
+        latencies.append(float(at[done] - each.answered_s))
+    return latencies
+
+
+def _spread(seconds: Sequence[float]) -> tuple[float, ...]:
+    """Median, 95 %, 99 % and most, in milliseconds."""
+    return tuple(1e3 * float(value) for value in np.quantile(seconds, (0.5, 0.95, 0.99, 1.0)))
+
+
+def _children(pid: int) -> list[int]:
+    files = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for file in files for child in file.read_text(encoding="ascii").split()]
+
+
+def _peak_mb(pid: int) -> float:
+    lines = Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
+    return next(float(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM"))
+
+
+if __name__ == "__main__":
+    main()
