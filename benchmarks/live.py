@@ -123,6 +123,8 @@ async def _play(agendas: dict[str, list[Due]], url: str) -> tuple[list[Sent], li
             group.create_task(_robot(name, agenda, url, began, sent))
     all_sent = time.perf_counter()
     while not (looks and looks[-1].at_s > all_sent and looks[-1].queued == 0):
+        if watching.done():
+            watching.result()
         if time.perf_counter() - all_sent > EFFECTLESS_S:
             raise SystemExit("live: the service has not caught up")
         await asyncio.sleep(LOOK_EVERY_S)
@@ -144,7 +146,7 @@ async def _robot(name: str, agenda: list[Due], url: str, began: float, sent: lis
 async def _watch(url: str, looks: list[Look]) -> None:
     async with httpx.AsyncClient(base_url=url, timeout=60.0, trust_env=False) as client:
         while True:
-            lines = (await client.get("/api/v1/metrics")).text.splitlines()
+            lines = (await client.get("/metrics")).text.splitlines()
             values = {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines if line[0] != "#")}
             stored, queued = (int(values[f"fcslam_packets_{name}"]) for name in ("stored", "queued"))
             looks.append(Look(time.perf_counter(), stored, queued))
