@@ -293,6 +293,7 @@ def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
         proxy = Proxy(scenario, port, rng)
         robots = [robot(log, proxy.port, place, chosen.speed) for log in logs]
         disturb(scenario, server, robots, proxy, duration_s / chosen.speed, OUTAGE_S / chosen.speed, rng)
+        wait_for(port, server)  # the last kill may have been a moment ago
         run = finalize(port)
         proxy.close()
     kills = server.kills + sum(robot.kills for robot in robots)
