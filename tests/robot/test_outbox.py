@@ -77,8 +77,8 @@ class Deliveries(RuleBasedStateMachine):
     @precondition(lambda self: self.cloud < len(self.said))
     @rule()
     def drop(self):
-        data = self.outbox.drop(0, self.cloud)
-        assert data == encode(self.said[self.cloud])
+        assert self.outbox.packet(0, self.cloud) == encode(self.said[self.cloud])
+        self.outbox.drop(0, self.cloud)
         self.cloud += 1
         self.outbox.acknowledge(0, self.cloud - 1)
 

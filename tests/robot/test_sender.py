@@ -167,6 +167,19 @@ def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
     assert robot.outbox.waiting == (0, 0)
 
 
+def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):
+    def no_room(*_):
+        raise StateError("no room")
+
+    robot.sender._refused = no_room
+    robot.sender._transport.cloud.unwanted = {content(encode(said(1)))}
+    robot.outbox.put([said(0, HELLO), said(1)])
+    with pytest.raises(StateError, match="no room"):
+        robot.step()
+    assert robot.outbox.waiting.packets == 1
+    assert content(robot.outbox.packet(0, 1)) == content(encode(said(1)))
+
+
 def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):
     class Deaf(Network):
         def send(self, *_):

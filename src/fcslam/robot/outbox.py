@@ -202,20 +202,27 @@ class Outbox:
         """The cloud has all packets of ``epoch`` up to ``sequence``: forget them. Returns how many they were."""
         gone = f"epoch = {epoch:d} AND sequence <= {sequence:d} AND data IS NOT NULL"
         with self._transaction():
-            count, size = self._count(gone)
-            self._database.execute(f"UPDATE packets SET data = NULL WHERE {gone}")
             self._database.execute("UPDATE sessions SET stored = max(stored, ?) WHERE epoch = ?", (sequence + 1, epoch))
-            self.waiting = Waiting(self.waiting.packets - count, self.waiting.bytes - size)
-        return count
+            return self._forget(gone)
 
-    def drop(self, epoch: int, sequence: int) -> bytes:
-        """Take out a packet that the cloud will never take, but whose number it counts as used. Returns its bytes."""
-        which = "WHERE epoch = ? AND sequence = ?"
+    def packet(self, epoch: int, sequence: int) -> bytes:
+        """A packet that waits."""
+        question = "SELECT data FROM packets WHERE epoch = ? AND sequence = ?"
         with self._transaction():
-            data = bytes(self._one(f"SELECT data FROM packets {which}", epoch, sequence)[0])
-            self._database.execute(f"UPDATE packets SET data = NULL {which}", (epoch, sequence))
-            self.waiting = Waiting(self.waiting.packets - 1, self.waiting.bytes - len(data))
-        return data
+            return bytes(self._one(question, epoch, sequence)[0])
+
+    def drop(self, epoch: int, sequence: int) -> None:
+        """Forget a packet that the cloud will never take, but whose number it counts as used."""
+        which = f"epoch = {epoch:d} AND sequence = {sequence:d} AND data IS NOT NULL"
+        with self._transaction():
+            self._forget(which)
+
+    def _forget(self, which: str) -> int:
+        """These need not be sent any more. Returns how many they were."""
+        count, size = self._count(which)
+        self._database.execute(f"UPDATE packets SET data = NULL WHERE {which}")
+        self.waiting = Waiting(self.waiting.packets - count, self.waiting.bytes - size)
+        return count
 
     def _move(self, epoch: int, to: int) -> None:
         """Another epoch for a session of which the cloud has nothing."""

@@ -107,12 +107,17 @@ class Sender:
         if batch is not None and answer.refusal is not None:
             sequence = batch.first + answer.refusal.index
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)
-            self._refused(self._outbox.drop(batch.epoch, sequence), answer.refusal.reason)
-            self.refusals += 1
+            self._set_aside(batch.epoch, sequence, answer.refusal.reason)
         if batch is not None and self.confirmed + self.refusals == before:
             self._met = False  # its mission may be another one
             raise UnavailableError("the cloud answers, but confirms nothing")
         self._failures, self.trouble = 0, None
+
+    def _set_aside(self, epoch: int, sequence: int, reason: str) -> None:
+        """Forgotten only once it is kept elsewhere: whatever comes between, it is not lost."""
+        self._refused(self._outbox.packet(epoch, sequence), reason)
+        self._outbox.drop(epoch, sequence)
+        self.refusals += 1
 
     def _read(self, answer: Answer) -> None:
         try:
