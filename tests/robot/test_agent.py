@@ -183,7 +183,7 @@ def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tm
     agent = drive(tmp_path, Network(cloud), scans, resume=True)
     hellos = [decode(data).body for data in cloud.stored.values() if isinstance(decode(data).body, Hello)]
     assert [hello.detector_versions[Channel.CAMERA] == "tiny-2" for hello in hellos] == [False, True]
-    assert agent.progress().notice == "detector tiny-2 from now on"
+    assert agent.progress().notices == ("detector tiny-2 from now on",)
 
 
 def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, tmp_path):

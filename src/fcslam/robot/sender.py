@@ -59,6 +59,8 @@ class Sender:
         self.refusals = 0
         self.trouble: str | None = "connecting"
         """Why nothing gets through; None: it does."""
+        self.notice: str | None = None
+        """What became of packets of earlier starts that the cloud can no longer take; None: there were none."""
         self.failure: Exception | None = None
         """What ended ``run``."""
 
@@ -75,7 +77,7 @@ class Sender:
 
         Raises:
             CloudError: the cloud turns the robot away.
-            StateError: the outbox cannot be used, or the cloud has lost what it had confirmed.
+            StateError: the outbox cannot be used, or the cloud has lost what it had confirmed of this session.
         """
         try:
             return self._step()
@@ -86,7 +88,7 @@ class Sender:
 
     def _step(self) -> float:
         if not self._met:
-            self._outbox.meet(self._transport.state().expected)
+            self._meet()
             self._met = True
             self.trouble = None
         batch = self._outbox.batch(MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS)
@@ -97,6 +99,13 @@ class Sender:
         is_all = len(batch.packets) >= self._outbox.waiting.packets
         self._exchange(batch.packets, batch)
         return EVERY_S if is_all else 0.0
+
+    def _meet(self) -> None:
+        in_vain = self._outbox.meet(self._transport.state().expected)
+        for epoch, sequence in in_vain:
+            self._set_aside(epoch, sequence, f"epoch {epoch} is of another mission: the cloud lacks its beginning")
+        if in_vain:
+            self.notice = f"{len(in_vain)} packets of earlier starts are of another mission: set aside in refused"
 
     def _exchange(self, packets: Sequence[bytes], batch: Batch | None) -> None:
         before = self.confirmed + self.refusals
