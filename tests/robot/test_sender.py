@@ -218,6 +218,23 @@ def test_a_cloud_that_opens_another_mission_is_found_out_and_gets_the_next_start
     anew.outbox.close()
 
 
+def test_another_mission_is_found_out_though_the_cloud_takes_nothing(robot):
+    """It asks for what comes first, which this robot sent to the mission before."""
+
+    class FarBehind(Network):
+        def send(self, *_):
+            raise UnavailableError("packet 2 is far ahead; send packet 0 first")
+
+    robot.outbox.put([said(0), said(1)])
+    robot.step()
+    robot.sender._transport = FarBehind(FakeCloud())
+    robot.outbox.put([said(2)])
+    robot.step()
+    assert "far ahead" in robot.sender.trouble
+    with pytest.raises(StateError, match="its mission is another one"):
+        robot.step()
+
+
 def test_a_cloud_that_turns_the_robot_away_ends_the_sender(robot):
     def turned_away():
         raise CloudError("no token")

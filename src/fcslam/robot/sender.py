@@ -82,6 +82,7 @@ class Sender:
         try:
             return self._step()
         except UnavailableError as error:
+            self._met = False  # its mission may be another one
             self.trouble = str(error)
             self._failures += 1
             return error.retry_after_s + retry_delay_s(self._failures, self._rng)
@@ -118,7 +119,6 @@ class Sender:
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)
             self._set_aside(batch.epoch, sequence, answer.refusal.reason)
         if batch is not None and self.confirmed + self.refusals == before:
-            self._met = False  # its mission may be another one
             raise UnavailableError("the cloud answers, but confirms nothing")
         self._failures, self.trouble = 0, None
 
