@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from wire.examples import RELEASE
 
-from fcslam.errors import FeatureError
+from fcslam.errors import FeatureError, StateError
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.releases import Releases
 
@@ -88,3 +88,11 @@ def test_one_that_cannot_be_used_is_said_and_nothing_stops(start):
     releases.keep(FIRST, b"broken")
     assert drive(releases, frontend, range(3)) == {}
     assert releases.notice == f"detector {FIRST.version} not taken: it is broken"
+
+
+def test_one_that_cannot_be_kept_is_one_line(start, tmp_path):
+    releases, frontend = start()
+    (tmp_path / "detectors").touch()
+    with pytest.raises(StateError, match=f"detectors: detector {FIRST.version} cannot be kept there"):
+        releases.keep(FIRST, b"network")
+    assert drive(releases, frontend, range(3)) == {}

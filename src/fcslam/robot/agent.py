@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fcslam.errors import StateError
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, LaserScan, SensorRecord
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import RobotFrontend
@@ -106,7 +107,7 @@ class Agent:
 
         Raises:
             CloudError: the cloud turns the robot away; what it does not have stays in the outbox.
-            StateError: the outbox cannot be used.
+            StateError: the outbox or its folder cannot be used.
             SourceError: the recording cannot be read.
         """
         self._known = known
@@ -178,10 +179,15 @@ class Agent:
             thread.join(FAREWELL_S)
 
     def _keep_refused(self, data: bytes, reason: str) -> None:
-        self._refused.mkdir(parents=True, exist_ok=True)
-        if self._kept is None:
-            self._kept = len(list(self._refused.glob("*.bin")))
-        stem = f"{self._kept:06d}"
-        (self._refused / f"{stem}.bin").write_bytes(data)
-        (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
+        try:
+            self._refused.mkdir(parents=True, exist_ok=True)
+            if self._kept is None:
+                self._kept = len(list(self._refused.glob("*.bin")))
+            stem = f"{self._kept:06d}"
+            (self._refused / f"{stem}.bin").write_bytes(data)
+            (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
+        except OSError as error:
+            raise StateError(
+                f"{self._refused}: a refused packet cannot be kept there ({error}); make room, and --resume"
+            ) from error
         self._kept += 1

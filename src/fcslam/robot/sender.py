@@ -77,7 +77,7 @@ class Sender:
 
         Raises:
             CloudError: the cloud turns the robot away.
-            StateError: the outbox cannot be used, or the cloud has lost what it had confirmed of this session.
+            StateError: the outbox or its folder cannot be used, or the cloud lacks the beginning of this session.
         """
         try:
             return self._step()
