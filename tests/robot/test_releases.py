@@ -1,6 +1,7 @@
 """A detector is taken between two records, and a resumed recording takes it at the same one."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from wire.examples import RELEASE
@@ -96,3 +97,21 @@ def test_one_that_cannot_be_kept_is_one_line(start, tmp_path):
     with pytest.raises(StateError, match=f"detectors: detector {FIRST.version} cannot be kept there"):
         releases.keep(FIRST, b"network")
     assert drive(releases, frontend, range(3)) == {}
+
+
+def test_one_that_is_kept_again_replaces_the_file_in_one_piece(start, tmp_path, monkeypatch):
+    """A resumed recording may need it, whatever interrupts the writing."""
+    releases, frontend = start()
+    releases.keep(FIRST, b"network")
+    drive(releases, frontend, range(5, 9))
+    again, frontend = start(resume=True)
+
+    def full(path, content):
+        path.open("wb").close()
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(StateError, match="no space left"):
+        again.keep(FIRST, b"network")
+    assert [file.read_bytes() for file in (tmp_path / "detectors").glob("*.onnx")] == [b"network"]
+    assert drive(again, frontend, range(20), catching_up=9) == {5: FIRST.version}

@@ -37,7 +37,9 @@ class Releases:
         """
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._path(file).write_bytes(content)
+            unfinished = self._path(file).with_suffix(".part")
+            unfinished.write_bytes(content)
+            unfinished.replace(self._path(file))  # in one piece: a recording that is resumed may need the one before
         except OSError as error:
             raise StateError(
                 f"{self._folder}: detector {file.version} cannot be kept there ({error}); make room, and --resume"
