@@ -180,7 +180,8 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     ]
     start = weights_of(KeypointNetwork("light"))
     for each in fleet:
-        each.learn(start, 0, settings.model_copy(update={"local_steps": 1}))  # labels, and what torch does first
+        # Labels, and what torch does first.
+        each.learn(start, 0, "first", settings.model_copy(update={"local_steps": 1}))
     legs, judging = Stopwatch(), Stopwatch()
     judge = judge_by(public_images([drawn(folder / "public", 4, 99)]), "light", "cpu")
     outside = Outside(version_maker("light"), judging.around(judge))

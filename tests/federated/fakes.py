@@ -39,7 +39,7 @@ class Fake:
     figures: dict = field(default_factory=lambda: {"repeatability": 0.5, "mma_3px": 0.5})
     asked: list = field(default_factory=list)
 
-    def learn(self, weights, round_number, _settings):
+    def learn(self, weights, round_number, _run, _settings):
         self.asked.append(round_number)
         new = self.answer(weights, round_number) if self.answer else shifted(weights, self.by)
         return Learned(new, {"detector": self.by})

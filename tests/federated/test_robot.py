@@ -12,6 +12,7 @@ from fcslam.federated.network import network_of, version_maker, weights_of  # no
 from fcslam.federated.robot import RobotLearner, own_seed, secret_noise, seeded_noise  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.federated.weights import trained_names, update_vector  # noqa: E402
+from fcslam.learning.arrays import read_arrays  # noqa: E402
 from fcslam.learning.leg import network_with  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 
@@ -45,13 +46,13 @@ def same(first, second):
 
 
 def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
-    whole = robot(folder, tmp_path / "labels").learn(start, 0, settings())
+    whole = robot(folder, tmp_path / "labels").learn(start, 0, "run", settings())
     kept = {name: array.copy() for name, array in start.items()}
-    again = robot(folder, tmp_path / "labels").learn(start, 0, settings())
+    again = robot(folder, tmp_path / "labels").learn(start, 0, "run", settings())
     assert same(whole.weights, again.weights)
     assert same(kept, start)
-    other = robot(folder, tmp_path / "labels", "other").learn(start, 0, settings())
-    later = robot(folder, tmp_path / "labels").learn(start, 1, settings())
+    other = robot(folder, tmp_path / "labels", "other").learn(start, 0, "run", settings())
+    later = robot(folder, tmp_path / "labels").learn(start, 1, "run", settings())
     assert not same(whole.weights, other.weights)
     assert not same(whole.weights, later.weights)
     assert whole.weights.keys() == start.keys()
@@ -60,18 +61,18 @@ def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
 
 def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
     first = robot(folder, tmp_path)
-    first.learn(start, 0, settings())
+    first.learn(start, 0, "run", settings())
     labels = {file: file.read_bytes() for file in tmp_path.rglob("*.npz")}
     assert len(labels) == 3
     moved = {name: array * np.float32(1.1) for name, array in start.items()}
     fresh = robot(folder, tmp_path)
-    assert same(first.learn(moved, 1, settings()).weights, fresh.learn(moved, 1, settings()).weights)
+    assert same(first.learn(moved, 1, "run", settings()).weights, fresh.learn(moved, 1, "run", settings()).weights)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*.npz")} == labels
 
 
 def test_the_pull_holds_updates_back(folder, start, tmp_path):
     def length(**given):
-        learned = robot(folder, tmp_path).learn(start, 0, settings(local_steps=12, rounds=1, **given))
+        learned = robot(folder, tmp_path).learn(start, 0, "run", settings(local_steps=12, rounds=1, **given))
         return np.linalg.norm(update_vector(learned.weights, start, trained_names(start, frozen_statistics=True)))
 
     free, held = length(), length(strategy="fedprox", proximal=1000.0)
@@ -83,34 +84,40 @@ def test_codes_are_kept_to_those_of_the_run_s_first_weights(folder, start, tmp_p
     torch.manual_seed(4)
     moved = weights_of(KeypointNetwork("light"))
     first = robot(folder, tmp_path / "a")
-    assert "former" in first.learn(start, 0, chosen).losses
-    assert "former" not in robot(folder, tmp_path / "b").learn(start, 0, settings()).losses
-    later = first.learn(moved, 1, chosen).weights
+    assert "former" in first.learn(start, 0, "run", chosen).losses
+    assert "former" not in robot(folder, tmp_path / "b").learn(start, 0, "run", settings()).losses
+    later = first.learn(moved, 1, "run", chosen).weights
     restarted = robot(folder, tmp_path / "a")
-    assert same(restarted.learn(moved, 1, chosen).weights, later)
-    (tmp_path / "a" / "former.npz").unlink()
-    assert not same(restarted.learn(moved, 1, chosen).weights, later)
-    restarted.learn(start, 0, chosen)
-    assert same(restarted.learn(moved, 1, chosen).weights, later)
+    assert same(restarted.learn(moved, 1, "run", chosen).weights, later)
+    assert not same(restarted.learn(moved, 1, "another run", chosen).weights, later), "began before it was asked"
+    assert same(restarted.learn(moved, 1, "run", chosen).weights, later), "goes on as it was"
+    (former,) = {file for file in (tmp_path / "a").glob("former-*.npz") if same(read_arrays(file), start)}
+    former.unlink()
+    assert not same(restarted.learn(moved, 1, "run", chosen).weights, later)
+    restarted.learn(start, 0, "run", chosen)
+    assert same(restarted.learn(moved, 1, "run", chosen).weights, later)
 
 
 def test_a_robot_that_cannot_keep_the_first_weights_says_so(folder, start, tmp_path):
-    (tmp_path / "former.npz").mkdir()
-    with pytest.raises(TrainingError, match=r"former.npz: the first weights cannot be kept"):
-        robot(folder, tmp_path).learn(start, 0, settings(compatible=1.0))
+    robot(folder, tmp_path).learn(start, 0, "run", settings(compatible=1.0))
+    (former,) = tmp_path.glob("former-*.npz")
+    former.unlink()
+    former.mkdir()
+    with pytest.raises(TrainingError, match=rf"{former.name}: the first weights cannot be kept"):
+        robot(folder, tmp_path).learn(start, 0, "run", settings(compatible=1.0))
 
 
 def test_frozen_statistics_stay_and_averaged_ones_move(folder, start, tmp_path):
     statistics = [name for name in start if name not in trained_names(start, frozen_statistics=True)]
     assert statistics
     for normalisation, stay in (("frozen", True), ("averaged", False)):
-        learned = robot(folder, tmp_path).learn(start, 0, settings(normalisation=normalisation))
+        learned = robot(folder, tmp_path).learn(start, 0, "run", settings(normalisation=normalisation))
         assert all(np.array_equal(learned.weights[name], start[name]) for name in statistics) is stay
 
 
 def test_noise_is_added_before_anything_leaves(folder, start, tmp_path):
     chosen = settings(normalisation="frozen", privacy={"clip_norm": 0.5, "noise_multiplier": 0.2})
-    learned = robot(folder, tmp_path).learn(start, 0, chosen)
+    learned = robot(folder, tmp_path).learn(start, 0, "run", chosen)
     update = update_vector(learned.weights, start, trained_names(start, frozen_statistics=True))
     assert update.std() == pytest.approx(0.1, rel=0.02)
 
@@ -131,13 +138,13 @@ def test_too_few_images_are_said(content, start, tmp_path):
         for index in range(5):
             (images / f"{index}.png").write_bytes(b"no image")
     with pytest.raises(TrainingError, match=r"images: holds no image|only . of . image files can be trained on"):
-        robot(images, tmp_path / "labels").learn(start, 0, settings())
+        robot(images, tmp_path / "labels").learn(start, 0, "run", settings())
 
 
 def test_weights_of_another_network_are_refused(folder, start, tmp_path):
     chosen = settings(training={"encoder": "vgg"} | TINY["training"])
     with pytest.raises(TrainingError, match="no weights of a vgg network"):
-        robot(folder, tmp_path).learn(start, 0, chosen)
+        robot(folder, tmp_path).learn(start, 0, "run", chosen)
     with pytest.raises(TrainingError, match="not those of a light network"):
         network_with("light", {})
 

@@ -51,15 +51,16 @@ def test_what_is_no_certificate_is_said_by_name(fleet, tmp_path):
 
 
 @contextmanager
-def listening(context=None):
-    """A server of one connection, without TLS if there is no context."""
+def listening(context=None, words=b"HTTP/1.1 400 Bad Request\r\n\r\n"):
+    """A server of one connection; without a context it knows no TLS, says ``words`` and hangs up."""
 
     def answer():
         connection, _ = door.accept()
         connection.settimeout(5.0)
         try:
             if context is None:
-                connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+                connection.recv(4096)
+                connection.sendall(words)
             else:
                 connection = context.wrap_socket(connection, server_side=True)
                 connection.recv(1)
@@ -94,3 +95,9 @@ def test_a_server_without_tls_is_refused_and_one_that_is_not_there_awaited(fleet
     with listening() as address:
         assert "does not fit" in refused(check_server, address, fleet / "ca.crt")
     check_server(address, fleet / "ca.crt")
+
+
+@pytest.mark.parametrize("words", [b"", bytes.fromhex("15030300020100")], ids=["nothing", "farewell"])
+def test_a_server_that_hangs_up_in_the_middle_is_awaited(fleet, words):
+    with listening(words=words) as address:
+        check_server(address, fleet / "ca.crt")

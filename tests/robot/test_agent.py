@@ -167,6 +167,17 @@ def test_a_refused_packet_is_kept_with_its_reason(scans, alone, tmp_path):
     assert len(cloud.stored) == len(alone) - 1
 
 
+def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
+    place = next(packet for packet in alone if isinstance(packet.body, Place))
+    cloud = FakeCloud(unwanted={content(encode(place))})
+    (tmp_path / "refused").touch()
+    with pytest.raises(StateError, match="refused: a refused packet cannot be kept there"):
+        drive(tmp_path, Network(cloud), scans)
+    outbox = Outbox(tmp_path / "outbox", "alice", 10**9)
+    assert content(outbox.packet(*next(iter(cloud.refused)))) == content(encode(place))
+    outbox.close()
+
+
 def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tmp_path):
     tiny_network(tmp_path / "tiny.onnx", version="tiny-2")
     file = file_of(tmp_path / "tiny.onnx")
@@ -183,7 +194,7 @@ def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tm
     agent = drive(tmp_path, Network(cloud), scans, resume=True)
     hellos = [decode(data).body for data in cloud.stored.values() if isinstance(decode(data).body, Hello)]
     assert [hello.detector_versions[Channel.CAMERA] == "tiny-2" for hello in hellos] == [False, True]
-    assert agent.progress().notice == "detector tiny-2 from now on"
+    assert agent.progress().notices == ("detector tiny-2 from now on",)
 
 
 def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, tmp_path):

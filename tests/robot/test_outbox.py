@@ -77,8 +77,8 @@ class Deliveries(RuleBasedStateMachine):
     @precondition(lambda self: self.cloud < len(self.said))
     @rule()
     def drop(self):
-        data = self.outbox.drop(0, self.cloud)
-        assert data == encode(self.said[self.cloud])
+        assert self.outbox.packet(0, self.cloud) == encode(self.said[self.cloud])
+        self.outbox.drop(0, self.cloud)
         self.cloud += 1
         self.outbox.acknowledge(0, self.cloud - 1)
 
@@ -157,12 +157,21 @@ def test_a_cloud_that_lost_what_it_confirmed_is_found_out(outbox):
     outbox.meet({0: 4})
     with pytest.raises(StateError, match="has 2 of 4 packets of epoch 0"):
         outbox.meet({0: 2})
+    assert outbox.waiting.packets == 1
+
+
+def test_what_an_earlier_start_left_for_another_mission_waits_in_vain(outbox):
+    outbox.put([said(k) for k in range(6)])
+    outbox.meet({})
+    outbox.acknowledge(0, 3)
     outbox.begin("r", resume=False)
-    with pytest.raises(StateError, match="has 0 of 4 packets of epoch 0"):
-        outbox.meet({})
-    outbox.acknowledge(0, 4)
-    outbox.meet({})  # another mission: what is over is over
     outbox.put([said(0)])
+    assert outbox.meet({}) == [(0, 4), (0, 5)]
+    assert outbox.meet({0: 4}) == [], "it is the same mission after all"
+    assert outbox.meet({0: 1}) == [(0, 4), (0, 5)]
+    for epoch, sequence in outbox.meet({0: 1}):
+        outbox.drop(epoch, sequence)
+    assert outbox.meet({}) == [], "what is over is over"
     assert list(drain(outbox)) == [(1, 0)]
 
 

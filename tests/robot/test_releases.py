@@ -1,11 +1,12 @@
 """A detector is taken between two records, and a resumed recording takes it at the same one."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from wire.examples import RELEASE
 
-from fcslam.errors import FeatureError
+from fcslam.errors import FeatureError, StateError
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.releases import Releases
 
@@ -88,3 +89,29 @@ def test_one_that_cannot_be_used_is_said_and_nothing_stops(start):
     releases.keep(FIRST, b"broken")
     assert drive(releases, frontend, range(3)) == {}
     assert releases.notice == f"detector {FIRST.version} not taken: it is broken"
+
+
+def test_one_that_cannot_be_kept_is_one_line(start, tmp_path):
+    releases, frontend = start()
+    (tmp_path / "detectors").touch()
+    with pytest.raises(StateError, match=f"detectors: detector {FIRST.version} cannot be kept there"):
+        releases.keep(FIRST, b"network")
+    assert drive(releases, frontend, range(3)) == {}
+
+
+def test_one_that_is_kept_again_replaces_the_file_in_one_piece(start, tmp_path, monkeypatch):
+    """A resumed recording may need it, whatever interrupts the writing."""
+    releases, frontend = start()
+    releases.keep(FIRST, b"network")
+    drive(releases, frontend, range(5, 9))
+    again, frontend = start(resume=True)
+
+    def full(path, content):
+        path.open("wb").close()
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(StateError, match="no space left"):
+        again.keep(FIRST, b"network")
+    assert [file.read_bytes() for file in (tmp_path / "detectors").glob("*.onnx")] == [b"network"]
+    assert drive(again, frontend, range(20), catching_up=9) == {5: FIRST.version}

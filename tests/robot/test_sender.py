@@ -167,6 +167,19 @@ def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
     assert robot.outbox.waiting == (0, 0)
 
 
+def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):
+    def no_room(*_):
+        raise StateError("no room")
+
+    robot.sender._refused = no_room
+    robot.sender._transport.cloud.unwanted = {content(encode(said(1)))}
+    robot.outbox.put([said(0, HELLO), said(1)])
+    with pytest.raises(StateError, match="no room"):
+        robot.step()
+    assert robot.outbox.waiting.packets == 1
+    assert content(robot.outbox.packet(0, 1)) == content(encode(said(1)))
+
+
 def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):
     class Deaf(Network):
         def send(self, *_):
@@ -181,13 +194,43 @@ def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):
     assert robot.outbox.waiting.packets == 1
 
 
-def test_a_cloud_that_opens_another_mission_is_found_out(robot):
-    network = robot.sender._transport
+def test_a_cloud_that_opens_another_mission_is_found_out_and_gets_the_next_start(tmp_path):
+    network = Network(FakeCloud())
+    before = Robot(tmp_path / "outbox", network)
+    before.outbox.put([said(0), said(1)])
+    before.step()
+    network.cloud = FakeCloud()
+    before.outbox.put([said(2), said(3)])
+    before.step()
+    with pytest.raises(StateError, match="its mission is another one; start anew: without --resume"):
+        before.step()
+    before.outbox.close()
+    (tmp_path / "resumed").unlink()
+    anew = Robot(tmp_path / "outbox", network)
+    anew.outbox.put([said(0, HELLO), said(1)])
+    anew.step()
+    assert list(network.cloud.stored) == [(0, 2), (0, 3), (1, 0), (1, 1)], "it was sent before it was found out"
+    assert [data for data, _ in anew.refused] == [content(encode(said(k))) for k in (2, 3)]
+    assert "another mission" in anew.refused[0][1]
+    assert anew.sender.notice.startswith("2 packets of earlier starts are of another mission")
+    assert (anew.sender.confirmed, anew.sender.refusals) == (2, 2)
+    assert anew.outbox.waiting == (0, 0)
+    anew.outbox.close()
+
+
+def test_another_mission_is_found_out_though_the_cloud_takes_nothing(robot):
+    """It asks for what comes first, which this robot sent to the mission before."""
+
+    class FarBehind(Network):
+        def send(self, *_):
+            raise UnavailableError("packet 2 is far ahead; send packet 0 first")
+
     robot.outbox.put([said(0), said(1)])
     robot.step()
-    network.cloud = FakeCloud()
+    robot.sender._transport = FarBehind(FakeCloud())
     robot.outbox.put([said(2)])
     robot.step()
+    assert "far ahead" in robot.sender.trouble
     with pytest.raises(StateError, match="its mission is another one"):
         robot.step()
 

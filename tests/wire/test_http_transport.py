@@ -94,6 +94,12 @@ def test_answers_that_are_none(cloud, transport):
         transport.send(PACKETS, -1)
 
 
+def test_an_answer_that_cannot_be_unpacked_is_none(cloud, transport):
+    cloud.canned.append((200, {"Content-Encoding": "gzip"}, b"noise"))
+    with pytest.raises(UnavailableError, match=cloud.url):
+        transport.send(PACKETS, -1)
+
+
 @pytest.mark.parametrize("body", [b"<html>", b"[]", b"{}", b'{"next": {"a": 1}}', b'{"next": [1]}'])
 def test_another_server_is_no_cloud(cloud, transport, body):
     cloud.canned.append((200, {}, body))

@@ -260,17 +260,17 @@ def _progress(console: "Console", total: int) -> "Iterator[AgentWatch]":
         progress.TextColumn("{task.fields[stage]}"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
         progress.TextColumn("scans, {task.fields[what]}"),
     ]  # fmt: skip
-    said: tuple[str | None, str | None] = "connecting", None
+    trouble: str | None = "connecting"
+    notices: tuple[str, ...] = ()
     with progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=total, stage="mapping", what="")
 
         def watch(now: "AgentProgress") -> None:
-            nonlocal said
-            told = now.trouble, now.notice
-            lines = [now.trouble or "connected"] * (told[0] != said[0]) + [now.notice or ""] * (told[1] != said[1])
-            for line in lines:
+            nonlocal trouble, notices
+            lines = [now.trouble or "connected"] * (now.trouble != trouble)
+            for line in [*lines, *(notice for notice in now.notices if notice not in notices)]:
                 console.print(line, highlight=False, markup=False, soft_wrap=True)
-            said = told
+            trouble, notices = now.trouble, now.notices
             stage = "catching up" if now.catching_up else "mapping" if now.scans < total else "sending"
             bar.update(task, completed=now.scans, stage=stage, what=_what(now))
 

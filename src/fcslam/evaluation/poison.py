@@ -25,9 +25,9 @@ class Poisoned:
         """As the other robot."""
         return self.learner.name
 
-    def learn(self, weights: Weights, round_number: int, settings: FederatedSettings) -> Learned:
+    def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> Learned:
         """As in ``Learner``."""
-        learned = self.learner.learn(weights, round_number, settings)
+        learned = self.learner.learn(weights, round_number, run, settings)
         names = trained_names(weights, frozen_statistics=True)
         update = update_vector(learned.weights, weights, names)
         match self.poison:

@@ -38,7 +38,7 @@ def _present(message: Message, learner: Learner) -> Message:
 
 def _train(message: Message, learner: Learner) -> Message:
     order = read_order(message.content)
-    learned = learner.learn(order.weights, order.round_number, order.settings)
+    learned = learner.learn(order.weights, order.round_number, order.run, order.settings)
     arrays = write_arrays(learned.weights)
     return Message(answer(learner.name, order.version, learned.losses, arrays), reply_to=message)
 

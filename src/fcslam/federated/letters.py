@@ -25,12 +25,15 @@ class Order:
     version: str
     """Of the weights."""
     round_number: int
+    run: str
+    """Names the run, to whoever keeps something over its rounds."""
     settings: FederatedSettings
 
 
-def order_config(version: str, round_number: int, settings: FederatedSettings) -> ConfigRecord:
+def order_config(version: str, round_number: int, run: str, settings: FederatedSettings) -> ConfigRecord:
     """What goes with the weights to every robot."""
-    return ConfigRecord({"version": version, "round": round_number, "settings": settings.model_dump_json()})
+    order = {"version": version, "round": round_number, "run": run, "settings": settings.model_dump_json()}
+    return ConfigRecord(order)
 
 
 def read_order(content: RecordDict) -> Order:
@@ -43,7 +46,8 @@ def read_order(content: RecordDict) -> Order:
     try:
         config = content[CONFIG]
         settings = FederatedSettings.model_validate_json(config["settings"])
-        return Order(read_arrays(content[ARRAYS]), str(config["version"]), int(config["round"]), settings)
+        version, number, run = str(config["version"]), int(config["round"]), str(config["run"])
+        return Order(read_arrays(content[ARRAYS]), version, number, run, settings)
     except (KeyError, TypeError, ValueError) as error:
         raise TrainingError(f"the server's order cannot be read ({error}); are both of one version?") from error
 

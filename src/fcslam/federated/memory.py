@@ -1,5 +1,7 @@
 """Where federated training stands, as a checkpoint."""
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +42,11 @@ class State:
     """Version of the weights that everything began from."""
 
 
+def run_name(settings: FederatedSettings, origin: str) -> str:
+    """One for all that may go on from one checkpoint: 16 hexadecimal digits of settings and first weights."""
+    return hashlib.sha256(json.dumps([_fixed(settings.model_dump(mode="json")), origin]).encode()).hexdigest()[:16]
+
+
 def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
     """Write beside the last state, then take its place.
 
@@ -76,7 +83,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
             group, _, name = key.partition("/")
             groups[group][name] = tensor.numpy()
         header = checkpoint.settings
-        fixed = {name: value for name, value in header["settings"].items() if name not in MAY_CHANGE}
+        fixed = _fixed(header["settings"])
         state = State(
             checkpoint.step,
             groups["weights"],
@@ -89,8 +96,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrainingError(f"{path}: is no checkpoint of federated training ({error}); take it away") from error
-    wanted = {name: value for name, value in settings.model_dump(mode="json").items() if name not in MAY_CHANGE}
-    if checkpoint.stage != STAGE or fixed != wanted:
+    if checkpoint.stage != STAGE or fixed != _fixed(settings.model_dump(mode="json")):
         raise TrainingError(f"{path}: is of a run with other settings; give them again, or another --output")
     reason = malformed(state.weights, start)
     if reason is not None:
@@ -100,3 +106,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
             f"{path}: is of a run that began from {state.origin}, not from {origin}; give another --output"
         )
     return state
+
+
+def _fixed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name not in MAY_CHANGE}

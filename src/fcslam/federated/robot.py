@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -22,8 +22,6 @@ from fcslam.learning.leg import Leg, train_leg
 from fcslam.learning.monitor import validate
 from fcslam.learning.stages import Images, as_detector, gather
 from fcslam.learning.trainer import Status, validation_pairs
-
-FORMER_FILE: Final = "former.npz"
 
 NoiseSource = Callable[[int], np.random.Generator]
 """Gives the generator of a round's noise: of the system's entropy where robots are real, seeded where they are not."""
@@ -44,8 +42,8 @@ class Learner(Protocol):
     def name(self) -> str:
         """What the robot is called, in the whole fleet."""
 
-    def learn(self, weights: Weights, round_number: int, settings: FederatedSettings) -> Learned:
-        """Train for a round; rounds count from 0."""
+    def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> Learned:
+        """Train for a round; rounds count from 0. ``run`` names the run that they are of."""
 
     def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
         """Figures of weights, by name."""
@@ -69,7 +67,7 @@ class RobotLearner:
     gathered: Images | None = None
     """Its images with their labels, once they are read."""
 
-    def learn(self, weights: Weights, round_number: int, settings: FederatedSettings) -> Learned:
+    def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> Learned:
         """As in ``Learner``; the result depends on the arguments, the images, their labels, and the noise.
 
         Raises:
@@ -87,7 +85,7 @@ class RobotLearner:
             frozen_statistics=frozen,
         )
         own = settings.of_robots().model_copy(update={"seed": own_seed(self.name, settings.training.seed)})
-        former = network_of(self._former(weights, round_number), settings.training.encoder) if leg.compatible else None
+        kept = self._former(weights, round_number, run) if leg.compatible else None
         network, losses = train_leg(
             network.state_dict(),
             examples,
@@ -95,7 +93,7 @@ class RobotLearner:
             leg,
             torch.device(self.device),
             partial(self.watch, self.name),
-            None if former is None else former.state_dict(),
+            None if kept is None else network_of(kept, settings.training.encoder).state_dict(),
         )
         trained = weights_of(network)
         names = trained_names(weights, frozen)
@@ -107,9 +105,10 @@ class RobotLearner:
         held_out = self._examples(weights, settings).held_out
         return validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
 
-    def _former(self, weights: Weights, round_number: int) -> Weights:
+    def _former(self, weights: Weights, round_number: int, run: str) -> Weights:
         """The weights that the run began from, or the first that came here of a run that had begun before."""
-        path = self.cache / FORMER_FILE
+        # By a number of its own: whatever the server calls the run, it is a file of this folder.
+        path = self.cache / f"former-{zlib.crc32(run.encode()):08x}.npz"
         try:
             if round_number == 0 or not path.exists():
                 write_arrays(path, weights)

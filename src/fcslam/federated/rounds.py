@@ -29,7 +29,7 @@ from fcslam.federated.letters import (
     size_of,
     write_arrays,
 )
-from fcslam.federated.memory import CHECKPOINT_FILE, State, read_state, write_state
+from fcslam.federated.memory import CHECKPOINT_FILE, State, read_state, run_name, write_state
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.roster import Roster, choose
 from fcslam.federated.screening import screen
@@ -75,6 +75,7 @@ class Server:
     def __init__(self, settings: FederatedSettings, start: Weights, folder: Path, outside: Outside) -> None:
         self._settings, self._start, self._folder, self._outside = settings, start, folder, outside
         self._strategy = new_strategy(settings)
+        self._run = run_name(settings, outside.version(start))
 
     def run(self, grid: Grid) -> State:
         """All rounds that are not done yet.
@@ -160,7 +161,7 @@ class Server:
         orders = self._strategy.configure_train(
             state.rounds_done + 1,
             write_arrays(state.weights),
-            order_config(version, state.rounds_done, self._settings),
+            order_config(version, state.rounds_done, self._run, self._settings),
             _Nodes([present[robot] for robot in chosen]),
         )
         replies = grid.send_and_receive(orders, timeout=self._settings.deadline_s)
@@ -192,7 +193,7 @@ class Server:
         if self._outside.judge is not None:
             return dict(self._outside.judge(weights))
         version, present = self._outside.version(weights), self._await(roster)
-        config = order_config(version, round_number, self._settings)
+        config = order_config(version, round_number, self._run, self._settings)
         letter = RecordDict({ARRAYS: write_arrays(weights), CONFIG: config})
         questions = [Message(letter, node, MessageType.EVALUATE) for node in present.values()]
         found = []

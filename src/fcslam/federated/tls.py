@@ -81,6 +81,8 @@ def check_server(address: Address, ca: Path) -> None:
             context.wrap_socket(connection, server_hostname=address.host),
         ):
             return
+    except (ssl.SSLEOFError, ssl.SSLZeroReturnError):
+        return  # it hung up: that says nothing of its certificate
     except ssl.SSLError as error:
         raise TrainingError(
             f"{address}: the server's certificate does not fit {ca} and this name ({_reason(error)}); "

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fcslam.errors import StateError
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, LaserScan, SensorRecord
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import RobotFrontend
@@ -50,8 +51,8 @@ class AgentProgress:
     """Why nothing gets through; None: it does."""
     catching_up: bool
     """Whether the recording is still where it was when the robot was stopped."""
-    notice: str | None
-    """What became of the last detector that was announced; None: there was none."""
+    notices: tuple[str, ...]
+    """What became of packets for another mission, and of the last detector that was announced, if there were any."""
 
 
 AgentWatch = Callable[[AgentProgress], None]
@@ -97,6 +98,8 @@ class Agent:
         self._sender = Sender(
             outbox, transport, rng, clock, self.localizer.correct, self._releases.keep, self._keep_refused
         )
+        self._kept: int | None = None
+        """Files of refused packets, once they were counted: there may be many."""
         self._known = self._said = self._keyscans = self._crowded_out = 0
 
     def run(self, records: Iterable[SensorRecord], known: int, pace: Pace, watch: AgentWatch) -> None:
@@ -104,7 +107,7 @@ class Agent:
 
         Raises:
             CloudError: the cloud turns the robot away; what it does not have stays in the outbox.
-            StateError: the outbox cannot be used.
+            StateError: the outbox or its folder cannot be used.
             SourceError: the recording cannot be read.
         """
         self._known = known
@@ -127,7 +130,7 @@ class Agent:
         return AgentProgress(
             len(self._frontend.scan_poses), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
             left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
-            self._said < self._known, self._releases.notice,
+            self._said < self._known, tuple(filter(None, (sender.notice, self._releases.notice))),
         )  # fmt: skip
 
     def trajectory(self) -> tuple[FloatArray, FloatArray] | None:
@@ -176,7 +179,15 @@ class Agent:
             thread.join(FAREWELL_S)
 
     def _keep_refused(self, data: bytes, reason: str) -> None:
-        self._refused.mkdir(parents=True, exist_ok=True)
-        stem = f"{len(list(self._refused.glob('*.bin'))):06d}"
-        (self._refused / f"{stem}.bin").write_bytes(data)
-        (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
+        try:
+            self._refused.mkdir(parents=True, exist_ok=True)
+            if self._kept is None:
+                self._kept = len(list(self._refused.glob("*.bin")))
+            stem = f"{self._kept:06d}"
+            (self._refused / f"{stem}.bin").write_bytes(data)
+            (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
+        except OSError as error:
+            raise StateError(
+                f"{self._refused}: a refused packet cannot be kept there ({error}); make room, and --resume"
+            ) from error
+        self._kept += 1

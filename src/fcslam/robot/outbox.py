@@ -169,13 +169,15 @@ class Outbox:
                 chosen.append(row)
         return Batch(chosen[0][0], chosen[0][1], tuple(data for _, _, data in chosen)) if chosen else None
 
-    def meet(self, expected: Mapping[int, int]) -> None:
+    def meet(self, expected: Mapping[int, int]) -> list[tuple[int, int]]:
         """Learn what the cloud has of this robot: the next sequence that it expects, by epoch.
 
         Sessions that it has not seen move to epochs above all that it has: the robot may have had another state folder.
+        Returns epoch and sequence of packets that wait in vain: those of earlier sessions whose beginning the cloud had
+        confirmed and now lacks.
 
         Raises:
-            StateError: the cloud lacks packets that it had confirmed, of a session that has more to say.
+            StateError: the cloud lacks the beginning of this session.
         """
         with self._transaction():
             newest = max(expected, default=-1)
@@ -186,36 +188,47 @@ class Outbox:
             for move in reversed(moves):
                 self._move(*move)
             self._database.execute("UPDATE sessions SET met = 1")
-            unfinished = "epoch = ? OR epoch IN (SELECT epoch FROM packets WHERE data IS NOT NULL)"
-            question = f"SELECT epoch, stored FROM sessions WHERE {unfinished}"
-            for epoch, stored in self._database.execute(question, (self.epoch,)):
-                if expected.get(epoch, 0) < stored:
-                    raise StateError(
-                        f"{self._path}: the cloud has {expected.get(epoch, 0)} of {stored} packets of epoch {epoch} "
-                        "that were confirmed, so its mission is another one; start anew: without --resume, or with "
-                        "another --state"
-                    )
+            sessions = self._database.execute("SELECT epoch, stored FROM sessions ORDER BY epoch")
+            broken = {epoch: stored for epoch, stored in sessions if expected.get(epoch, 0) < stored}
+            if self.epoch in broken:
+                had, has = broken[self.epoch], expected.get(self.epoch, 0)
+                raise StateError(
+                    f"{self._path}: the cloud has {has} of {had} packets of epoch {self.epoch} that were confirmed, so "
+                    "its mission is another one; start anew: without --resume, or with another --state"
+                )
+            waiting = self._database.execute(
+                "SELECT epoch, sequence FROM packets WHERE data IS NOT NULL ORDER BY epoch, sequence"
+            )
+            in_vain = [(epoch, sequence) for epoch, sequence in waiting if epoch in broken]
         for epoch, sequence in expected.items():
             self.acknowledge(epoch, sequence - 1)
+        return in_vain
 
     def acknowledge(self, epoch: int, sequence: int) -> int:
         """The cloud has all packets of ``epoch`` up to ``sequence``: forget them. Returns how many they were."""
         gone = f"epoch = {epoch:d} AND sequence <= {sequence:d} AND data IS NOT NULL"
         with self._transaction():
-            count, size = self._count(gone)
-            self._database.execute(f"UPDATE packets SET data = NULL WHERE {gone}")
             self._database.execute("UPDATE sessions SET stored = max(stored, ?) WHERE epoch = ?", (sequence + 1, epoch))
-            self.waiting = Waiting(self.waiting.packets - count, self.waiting.bytes - size)
-        return count
+            return self._forget(gone)
 
-    def drop(self, epoch: int, sequence: int) -> bytes:
-        """Take out a packet that the cloud will never take, but whose number it counts as used. Returns its bytes."""
-        which = "WHERE epoch = ? AND sequence = ?"
+    def packet(self, epoch: int, sequence: int) -> bytes:
+        """A packet that waits."""
+        question = "SELECT data FROM packets WHERE epoch = ? AND sequence = ?"
         with self._transaction():
-            data = bytes(self._one(f"SELECT data FROM packets {which}", epoch, sequence)[0])
-            self._database.execute(f"UPDATE packets SET data = NULL {which}", (epoch, sequence))
-            self.waiting = Waiting(self.waiting.packets - 1, self.waiting.bytes - len(data))
-        return data
+            return bytes(self._one(question, epoch, sequence)[0])
+
+    def drop(self, epoch: int, sequence: int) -> None:
+        """Forget a packet that the cloud will never take, but whose number it counts as used."""
+        which = f"epoch = {epoch:d} AND sequence = {sequence:d} AND data IS NOT NULL"
+        with self._transaction():
+            self._forget(which)
+
+    def _forget(self, which: str) -> int:
+        """These need not be sent any more. Returns how many they were."""
+        count, size = self._count(which)
+        self._database.execute(f"UPDATE packets SET data = NULL WHERE {which}")
+        self.waiting = Waiting(self.waiting.packets - count, self.waiting.bytes - size)
+        return count
 
     def _move(self, epoch: int, to: int) -> None:
         """Another epoch for a session of which the cloud has nothing."""

@@ -6,7 +6,7 @@ A recording that is resumed takes each where it took it before, so that it says 
 import queue
 from pathlib import Path
 
-from fcslam.errors import FeatureError
+from fcslam.errors import FeatureError, StateError
 from fcslam.records import DetectorFile
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.outbox import Outbox
@@ -30,9 +30,20 @@ class Releases:
         self._taken = self._outbox.releases()
 
     def keep(self, file: DetectorFile, content: bytes) -> None:
-        """Called by the sender: here is what was announced."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        self._path(file).write_bytes(content)
+        """Called by the sender: here is what was announced.
+
+        Raises:
+            StateError: it cannot be written.
+        """
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            unfinished = self._path(file).with_suffix(".part")
+            unfinished.write_bytes(content)
+            unfinished.replace(self._path(file))  # in one piece: a recording that is resumed may need the one before
+        except OSError as error:
+            raise StateError(
+                f"{self._folder}: detector {file.version} cannot be kept there ({error}); make room, and --resume"
+            ) from error
         self._fetched.put(file)
 
     def take(self, record: int, catching_up: bool) -> None:

@@ -59,6 +59,8 @@ class Sender:
         self.refusals = 0
         self.trouble: str | None = "connecting"
         """Why nothing gets through; None: it does."""
+        self.notice: str | None = None
+        """What became of packets of earlier starts that the cloud can no longer take; None: there were none."""
         self.failure: Exception | None = None
         """What ended ``run``."""
 
@@ -75,18 +77,19 @@ class Sender:
 
         Raises:
             CloudError: the cloud turns the robot away.
-            StateError: the outbox cannot be used, or the cloud has lost what it had confirmed.
+            StateError: the outbox or its folder cannot be used, or the cloud lacks the beginning of this session.
         """
         try:
             return self._step()
         except UnavailableError as error:
+            self._met = False  # its mission may be another one
             self.trouble = str(error)
             self._failures += 1
             return error.retry_after_s + retry_delay_s(self._failures, self._rng)
 
     def _step(self) -> float:
         if not self._met:
-            self._outbox.meet(self._transport.state().expected)
+            self._meet()
             self._met = True
             self.trouble = None
         batch = self._outbox.batch(MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS)
@@ -98,6 +101,13 @@ class Sender:
         self._exchange(batch.packets, batch)
         return EVERY_S if is_all else 0.0
 
+    def _meet(self) -> None:
+        in_vain = self._outbox.meet(self._transport.state().expected)
+        for epoch, sequence in in_vain:
+            self._set_aside(epoch, sequence, f"epoch {epoch} is of another mission: the cloud lacks its beginning")
+        if in_vain:
+            self.notice = f"{len(in_vain)} packets of earlier starts are of another mission: set aside in refused"
+
     def _exchange(self, packets: Sequence[bytes], batch: Batch | None) -> None:
         before = self.confirmed + self.refusals
         self.sent_bytes += sum(map(len, packets))
@@ -107,12 +117,16 @@ class Sender:
         if batch is not None and answer.refusal is not None:
             sequence = batch.first + answer.refusal.index
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)
-            self._refused(self._outbox.drop(batch.epoch, sequence), answer.refusal.reason)
-            self.refusals += 1
+            self._set_aside(batch.epoch, sequence, answer.refusal.reason)
         if batch is not None and self.confirmed + self.refusals == before:
-            self._met = False  # its mission may be another one
             raise UnavailableError("the cloud answers, but confirms nothing")
         self._failures, self.trouble = 0, None
+
+    def _set_aside(self, epoch: int, sequence: int, reason: str) -> None:
+        """Forgotten only once it is kept elsewhere: whatever comes between, it is not lost."""
+        self._refused(self._outbox.packet(epoch, sequence), reason)
+        self._outbox.drop(epoch, sequence)
+        self.refusals += 1
 
     def _read(self, answer: Answer) -> None:
         try:

@@ -149,7 +149,7 @@ class HttpTransport:
 
         try:
             return self._client.request(method, path, content=content, headers={"Accept": accept, **(headers or {})})
-        except httpx.TransportError as error:
+        except httpx.RequestError as error:
             if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
                 raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error
             raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}") from error
