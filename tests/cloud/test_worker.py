@@ -242,3 +242,29 @@ def test_more_robots_join_a_mission_that_was_finished(cloud, tmp_path):
     together.put(packets)
     assert late.pose_graph_g2o == together.finalize().pose_graph_g2o
     together.store.close()
+
+
+@pytest.mark.parametrize(("step_m", "kept"), [(1e6, 1), (1e5, 3)])
+def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same(cloud, step_m, kept):
+    far = np.cumsum(np.full((13, 3), (step_m, 0.0, 0.0)), axis=0)
+    cloud.put(stream("c", far, start_s=0.0))
+    run = cloud.finalize()
+    assert "m from the start" in cloud.store.refusals("c")[0][2]
+    assert {t.robot: len(t.stamps) for t in run.trajectories} == {"c": kept}
+    assert cloud.folder.live.exists()
+
+
+def test_a_result_or_live_map_that_fails_stops_nothing(cloud, monkeypatch, caplog):
+    def broken(self, *_, **__):
+        raise ValueError("a pose is not finite")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Worker, "_run", broken)
+        cloud.put(two_robots())
+        number = cloud.store.ask_to_finalize()
+        cloud.work()
+    assert cloud.store.finalization(number).failure == "a pose is not finite"
+    assert "the live map stays as it was: ValueError" in caplog.text
+    cloud.now += 1000.0
+    assert len(cloud.finalize().trajectories) == 2
+    assert cloud.folder.live.exists()

@@ -29,7 +29,7 @@ from fcslam.cloud.sessions import session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cloud.store import Finalization, MissionStore, SessionCorrection, StoredPacket
 from fcslam.config import dump
-from fcslam.errors import FcslamError, OutputError, PacketError
+from fcslam.errors import PacketError
 from fcslam.runs import Metric, Run, write_run
 
 CONFIG = "config"
@@ -129,8 +129,9 @@ class Worker:
         name = str(asked.number)
         try:
             write_run(self._run(self._fleet.finalize()), self._folder.run(name), force=True)
-        except FcslamError as error:
-            self._store.answer(asked.number, None, str(error))
+        except Exception as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
+            _log.exception("result %s failed", name)
+            self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:
             self._store.answer(asked.number, name)
         self._published = -1
@@ -141,11 +142,10 @@ class Worker:
         now = self._clock()
         if self._published == self._turn or self._turn < self._resumed_at or now < self._publish_at:
             return False
-        run = self._run(self._fleet.estimate(), with_local_maps=False)
         try:
-            self._folder.publish(run)
-        except OutputError as error:
-            _log.error("the live map stays as it was: %s", error)  # packets matter more, and the disk may be freed
+            self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False))
+        except Exception as error:  # packets matter more, and the disk may be freed
+            _log.error("the live map stays as it was: %s: %s", type(error).__name__, error)
             self._publish_at = now + PAUSE_S
             return False
         self._published = self._turn
