@@ -156,9 +156,10 @@ class MissionStore:
         """Packets that have a turn."""
         return int(self._database.value("SELECT ifnull(max(turn) + 1, 0) FROM packets"))
 
-    def waiting_count(self) -> int:
-        """Packets without a turn: one before them is missing."""
-        return int(self._database.value("SELECT count(*) FROM packets WHERE turn IS NULL"))
+    def waiting_count(self, robot: str | None = None) -> int:
+        """Packets of one robot or of all without a turn: one before them is missing."""
+        statement = "SELECT count(*) FROM packets WHERE turn IS NULL AND (?1 IS NULL OR robot = ?1)"
+        return int(self._database.value(statement, (robot,)))
 
     def refuse(self, turn: int, reason: str) -> None:
         """The packet of this turn does not fit what its robot sent before."""
