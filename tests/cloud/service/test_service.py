@@ -164,6 +164,8 @@ def test_a_veto_parts_what_only_it_held_together(mapped):
     assert len(get(mapped, "maps").json()) == 2
     for wrong in ({"robot_i": "a", "robot_j": "x"}, {"robot_i": "a"}, {"robot_i": "a", "robot_j": "b", "stamp_i": 1.0}):
         assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == 400
+    assert "b+x" in mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+x"}).text
+    assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+1"}).status_code == 201
 
 
 def test_missions_are_begun_opened_and_rest_as_they_were(mapped):
@@ -177,6 +179,8 @@ def test_missions_are_begun_opened_and_rest_as_they_were(mapped):
     assert get(mapped, "fleet").json()["packets"] == len(A) + len(B)
     mapped.ask("POST", f"{API}/missions/next/open", "boss")
     assert get(mapped, "fleet").json()["packets"] == 5
+    long = mapped.ask("POST", f"{API}/missions", "boss", json={"name": "x" * 70_000})
+    assert (long.status_code, "over" in long.json()["error"]) == (413, True)
     for wrong in ("next", "../x", "", ".hidden"):
         assert mapped.ask("POST", f"{API}/missions", "boss", json={"name": wrong}).status_code in (400, 409)
     assert mapped.ask("POST", f"{API}/missions/none/open", "boss").status_code == 404

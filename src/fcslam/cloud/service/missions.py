@@ -13,6 +13,7 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.database import told
 from fcslam.cloud.service.authentication import Role
+from fcslam.cloud.service.limits import json_body, read_json
 from fcslam.cloud.service.robots import Name
 from fcslam.cloud.service.state import ServiceState
 from fcslam.cloud.store import check_mission
@@ -43,9 +44,10 @@ def mission_router(state: ServiceState) -> APIRouter:
         """All missions, and which one is open."""
         return {"open": state.mission.folder.name, "missions": state.missions.names}
 
-    @router.post("/missions", status_code=201, dependencies=as_admin)
-    async def create_mission(mission: NewMission) -> dict[str, Any]:
+    @router.post("/missions", status_code=201, dependencies=as_admin, openapi_extra=json_body(NewMission))
+    async def create_mission(request: Request) -> dict[str, Any]:
         """Begin a mission and open it."""
+        mission = await read_json(request, NewMission)
         async with changing:
             await run_in_threadpool(state.missions.create, mission.name)
         return list_missions()
