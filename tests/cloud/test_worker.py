@@ -254,6 +254,19 @@ def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same
     assert cloud.folder.live.exists()
 
 
+def test_corrections_number_maps_as_the_live_run_does(cloud):
+    alone = stream("c", POSES, start_s=-500.0)
+    cloud.put(in_order([*alone, *two_robots()]))
+    run = cloud.finalize()
+    assert {t.robot: t.map_index for t in run.trajectories} == {"a": 0, "b": 0, "c": 1}
+    cloud.restart()
+    cloud.work()
+    cloud.put(stream("d", POSES, start_s=2000.0))
+    cloud.work()
+    told = {robot: cloud.store.correction(robot, 0).correction.map_index for robot in "abcd"}
+    assert told == {"a": 0, "b": 0, "c": 1, "d": 2}
+
+
 def test_a_result_or_live_map_that_fails_stops_nothing(cloud, monkeypatch, caplog):
     def broken(self, *_, **__):
         raise ValueError("a pose is not finite")
