@@ -129,7 +129,9 @@ class Worker:
         name = str(asked.number)
         try:
             write_run(self._run(self._fleet.finalize()), self._folder.run(name), force=True)
-        except Exception as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
+        except (
+            Exception
+        ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
             _log.exception("result %s failed", name)
             self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:
