@@ -8,11 +8,13 @@ import pytest
 from cloud.scripted import LASER
 from cloud.service.desk import POSES, A, B, Desk, put_detector
 
+from fcslam.cloud import intake
 from fcslam.cloud.store import MissionStore
 from fcslam.errors import ServiceError
 from fcslam.features.detector import SHIPPED_NETWORK
 from fcslam.records import Channel, Correction
 from fcslam.runs import open_run
+from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
 from fcslam.wire.packets import encode
@@ -88,6 +90,25 @@ def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
     assert desk.ask("POST", f"{API}/robots/b/packets", "b", content=b"").status_code == 200
     desk.now += int(response.headers["Retry-After"])
     assert desk.ask("POST", PACKETS, "a", content=b"").status_code == 200
+
+
+def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk, monkeypatch):
+    """A place of 2,048 keypoints at one point, whose descriptors are what is most to be expected: a few bytes."""
+
+    def unread(*_):
+        raise AssertionError("it is unpacked")
+
+    def batch(first, count):
+        numbers = range(first, first + count)
+        body = {"number": 0, "channel": 1, "count": 2048, "detector_version": "test-1"}
+        return [pb.Packet(version=1, robot="a", sequence=k, place=body).SerializeToString() for k in numbers]
+
+    assert sum(map(len, batch(0, 100))) < 4000
+    monkeypatch.setattr(intake, "decode", unread)
+    assert desk.send("a", batch(0, 100)).status_code == 413
+    monkeypatch.undo()
+    statuses = [desk.send("a", batch(0, 5)).status_code for _ in range(9)]
+    assert (statuses[0], statuses[-1]) == (400, 429)
 
 
 def test_a_full_disk_is_507_and_nothing_is_acknowledged(desk):

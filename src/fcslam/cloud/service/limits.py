@@ -27,6 +27,11 @@ class RateLimit:
         self._level: dict[str, tuple[float, float]] = {}
         """What is left in each bucket, and when that was."""
 
+    @property
+    def largest(self) -> int:
+        """Bytes that a request may have at all."""
+        return int(self._burst - REQUEST_BYTES)
+
     def wait_s(self, robot: str, size: int) -> float:
         """Count a request of ``size`` bytes; if it is over the limit, how long to wait, and it is not counted."""
         now = self._clock()
