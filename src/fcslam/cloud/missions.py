@@ -149,11 +149,17 @@ class Missions:
 
     def _opened(self, name: str) -> OpenMission:
         folder = self.folder(name)
-        folder.path.mkdir(parents=True, exist_ok=True)
+        with told(folder.path):
+            folder.path.mkdir(parents=True, exist_ok=True)
         mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._launch, self.detectors)
         staging = self._open_file.with_name(".open.partial")
-        staging.write_text(name + "\n", encoding="utf-8")
-        staging.replace(self._open_file)
+        try:
+            with told(self._open_file):
+                staging.write_text(name + "\n", encoding="utf-8")
+                staging.replace(self._open_file)
+        except BaseException:
+            mission.close()
+            raise
         return mission
 
 
