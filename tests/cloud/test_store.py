@@ -1,6 +1,8 @@
 """What is stored is there once, as it came, whatever the order; its turns follow the numbers of each session."""
 
+import os
 import sqlite3
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -150,6 +152,25 @@ def test_an_export_is_the_mission_and_nothing_else_is(store, tmp_path):
     copy.close()
     with pytest.raises(StoreError):
         store.export(tmp_path / "out.sqlite")
+
+
+def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypatch):
+    store.put([packet()], 0.0)
+    link = os.link
+
+    def meanwhile(*paths):
+        storing = threading.Thread(target=store.put, args=([packet(sequence=1)], 0.0), daemon=True)
+        storing.start()
+        storing.join(20.0)
+        assert not storing.is_alive()
+        link(*paths)
+
+    monkeypatch.setattr(os, "link", meanwhile)
+    store.export(tmp_path / "out.sqlite")
+    assert store.turn_count() == 2
+    copy = MissionStore(tmp_path / "out.sqlite")
+    assert copy.turn_count() == 1
+    copy.close()
 
 
 @pytest.mark.parametrize("harm", ["text", "trigger", "view", "version", "torn"])

@@ -230,7 +230,7 @@ class MissionStore:
         return [Veto(i, j, None if stamp_i is None else (stamp_i, stamp_j)) for i, j, stamp_i, stamp_j in rows]
 
     def ask_to_finalize(self) -> int:
-        """Ask for the result of all that is stored now; returns the number of the request."""
+        """Ask for the result of all that has a turn now; returns the number of the request."""
         with self._database.transaction() as database:
             database.execute(
                 "INSERT INTO finalizations (turns, vetoes)"
