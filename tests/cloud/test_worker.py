@@ -1,5 +1,10 @@
 """The worker: what it makes of a store is what the mission makes of the recordings, whatever happens on the way."""
 
+import fcntl
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 from cloud.scripted import closures, rectangle, stream
@@ -175,6 +180,35 @@ def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkey
     run = cloud.finalize()
     assert len(run.trajectories) == 1
     assert "ZeroDivisionError" in cloud.store.refusals("a")[0][2]
+
+
+def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch):
+    cloud.put(stream("a", POSES, start_s=0.0))
+
+    def hungry(self, data):
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(cloud.worker._fleet), "receive", hungry)
+        with pytest.raises(MemoryError):
+            cloud.work()
+    assert cloud.store.refusals("a") == []
+    cloud.restart()
+    assert len(cloud.finalize().trajectories[0].stamps) == len(POSES)
+
+
+def test_a_worker_waits_until_the_one_before_is_gone(cloud):
+    command = [sys.executable, "-m", "fcslam.cloud.worker", str(cloud.folder.path)]
+    cloud.put(stream("a", POSES, start_s=0.0))
+    with cloud.folder.worker_lock.open("w") as before:
+        fcntl.flock(before, fcntl.LOCK_EX)
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            time.sleep(3.0)
+            assert cloud.store.applied() == 0
+            fcntl.flock(before, fcntl.LOCK_UN)
+            assert b"live" in process.stdout.readline()
+            process.stdin.close()
+            assert process.wait(60) == 0
 
 
 def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):

@@ -10,6 +10,7 @@ A byte on stdin says that there is something to do, its end that the service is 
 every change of the live run folder and for every answered request.
 """
 
+import fcntl
 import gc
 import json
 import logging
@@ -20,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import IO
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.folder import MissionFolder
@@ -99,6 +101,8 @@ class Worker:
                 self._fleet.receive(packet.data)
             except PacketError as error:
                 self._store.refuse(self._turn, str(error))
+            except MemoryError:
+                raise  # the machine's fault, not the packet's: the next worker tries again
             except Exception as error:
                 # Nobody knows what it left behind: the next worker begins anew and without it.
                 self._store.refuse(self._turn, f"the cloud failed on it: {type(error).__name__}: {error}")
@@ -173,11 +177,23 @@ def main(arguments: Sequence[str]) -> int:
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     folder = MissionFolder(Path(arguments[0]))
+    alone = _alone(folder)
     worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print)
     while True:
         wait_s = 0.0 if worker.step() else worker.wait_s()
         if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
+            alone.close()
             return 0
+
+
+def _alone(folder: MissionFolder) -> IO[str]:
+    """Wait until no other worker has this mission: one whose service was killed may still be at its last step.
+
+    The lock is this worker's until the file is closed.
+    """
+    file = folder.worker_lock.open("w")
+    fcntl.flock(file, fcntl.LOCK_EX)
+    return file
 
 
 def _print(event: str, number: int) -> None:
