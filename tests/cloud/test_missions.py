@@ -48,3 +48,21 @@ def test_a_mission_that_cannot_be_opened_leaves_no_worker_and_the_other_one_open
     missions.open("next")
     assert missions.open_mission.folder.name == "next"
     assert [worker.stopped for worker in workers] == [True, True, False]
+
+
+def test_what_was_left_half_done_is_swept_away_and_the_rest_is_not(tmp_path):
+    root = tmp_path / "data"
+    left = [root / ".importx1", root / ".exportx2", root / "detectors" / ".stagingx3"]
+    kept = [root / "detectors" / "lost+found", root / "missions" / "old"]
+    for folder in (*left, *kept):
+        folder.mkdir(parents=True)
+        (folder / "network.onnx").write_text("x")
+    (kept[0] / "announced").write_text("v1")
+    (kept[1] / ".import.partial").write_text("half")
+    missions = Missions(root, CloudConfig(), lambda: 0.0, lambda: 1e9, Launched)
+    assert not any(folder.exists() for folder in left)
+    assert all((folder / "network.onnx").exists() for folder in kept)
+    assert not (kept[1] / ".import.partial").exists()
+    assert missions.detectors.versions() == []
+    assert missions.detectors.announced() == {}
+    missions.close()
