@@ -173,7 +173,7 @@ def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypa
     copy.close()
 
 
-@pytest.mark.parametrize("harm", ["text", "trigger", "view", "version", "torn"])
+@pytest.mark.parametrize("harm", ["text", "trigger", "view", "version", "torn", "kind", "channel", "none", "config"])
 def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
     path = tmp_path / "out.sqlite"
     store.put([packet(sequence=k, data=bytes(4000)) for k in range(20)], 0.0)
@@ -189,6 +189,10 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
             "trigger": "CREATE TRIGGER t AFTER INSERT ON vetoes BEGIN DELETE FROM packets; END",
             "view": "CREATE VIEW v AS SELECT 1",
             "version": "PRAGMA user_version=99",
+            "kind": "UPDATE packets SET kind = 'rumour' WHERE sequence = 3",
+            "channel": "UPDATE packets SET channel = 'smell' WHERE sequence = 3",
+            "none": "UPDATE packets SET kind = NULL WHERE sequence = 3",
+            "config": "INSERT INTO facts VALUES ('config', '{\"seed\": \"x\"}')",
         }[harm])  # fmt: skip
         connection.commit()
         connection.close()

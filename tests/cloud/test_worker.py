@@ -12,8 +12,8 @@ from small_fleet import in_order
 
 from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cloud.store import MissionStore, StoredPacket
-from fcslam.cloud.worker import CONFIG, Worker
+from fcslam.cloud.store import CONFIG, MissionStore, StoredPacket
+from fcslam.cloud.worker import Worker
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import ClosureStatus, Veto
 from fcslam.robot.frontend import RobotFrontend

@@ -11,9 +11,8 @@ from fcslam.cloud.detectors import STAGING, DetectorShelf
 from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.intake import Intake
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cloud.store import MissionStore
+from fcslam.cloud.store import CONFIG, MissionStore
 from fcslam.cloud.supervisor import RunningWorker
-from fcslam.cloud.worker import CONFIG
 from fcslam.errors import ServiceError
 from fcslam.wire.checks import check_name
 

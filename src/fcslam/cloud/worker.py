@@ -29,13 +29,10 @@ from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import session_name
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cloud.store import Finalization, MissionStore, SessionCorrection, StoredPacket
+from fcslam.cloud.store import CONFIG, Finalization, MissionStore, SessionCorrection, StoredPacket
 from fcslam.config import dump
 from fcslam.errors import PacketError
 from fcslam.runs import Metric, Run, write_run
-
-CONFIG = "config"
-"""A fact of the store: the mission's configuration."""
 
 AT_ONCE = 64
 """Packets between two looks at what else there is to do."""

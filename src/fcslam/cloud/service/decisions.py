@@ -32,7 +32,7 @@ def decision_router(state: ServiceState) -> APIRouter:
 
     @router.post("/finalize")
     async def finalize() -> dict[str, Any]:
-        """The result of all that has come in without a gap, as a run folder of the service; answers when it is there."""
+        """The result of what has come in without a gap, as a run folder of the service; answers when it is there."""
         mission = state.mission
         number = await run_in_threadpool(mission.store.ask_to_finalize)
         mission.worker.ring()
