@@ -14,7 +14,7 @@ from fcslam.cloud.store import MissionStore, SessionCorrection
 from fcslam.errors import PacketConflictError, PacketError
 from fcslam.records import Correction, frozen
 from fcslam.wire.batches import read_batch, write_batch
-from fcslam.wire.messages import Acknowledgement, Packet
+from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
 
 PACKETS = stream("a", rectangle(9), start_s=0.0)
@@ -140,6 +140,21 @@ def test_a_packet_far_ahead_has_to_wait_for_those_before_it(desk, monkeypatch):
         desk.take(DATA[4])
     assert desk.take(DATA[3]) == []
     assert desk.store.waiting_count() == 1
+
+
+def test_packets_that_wait_for_one_before_them_keep_out_neither_it_nor_other_robots(desk, monkeypatch):
+    monkeypatch.setattr(module, "LONGEST_QUEUE", 20)
+    monkeypatch.setattr(module, "MOST_EARLY", 6)
+    in_epoch = [encode(replace(p, epoch=1)) for p in PACKETS[1:9] if not isinstance(p.body, Hello)]
+    desk.take(*DATA[1:5])
+    desk.take(*in_epoch[:2])
+    for data in (DATA[5:6], in_epoch[2:3]):
+        with pytest.raises(BusyError, match="send packet 0 of epoch"):
+            desk.take(*data)
+    other = [encode(packet) for packet in stream("b", rectangle(9), start_s=0.0)]
+    assert desk.take(*other[:5], robot="b") == [Acknowledgement("b", 0, 4)]
+    assert desk.take(DATA[0])[0] == Acknowledgement("a", 0, 4)
+    assert desk.take(DATA[5])[0] == Acknowledgement("a", 0, 5)
 
 
 @pytest.mark.parametrize("name", ["a+1", "a+12"])

@@ -1,6 +1,8 @@
 """What is stored is there once, as it came, whatever the order; its turns follow the numbers of each session."""
 
+import os
 import sqlite3
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -152,7 +154,26 @@ def test_an_export_is_the_mission_and_nothing_else_is(store, tmp_path):
         store.export(tmp_path / "out.sqlite")
 
 
-@pytest.mark.parametrize("harm", ["text", "trigger", "view", "version", "torn"])
+def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypatch):
+    store.put([packet()], 0.0)
+    link = os.link
+
+    def meanwhile(*paths):
+        storing = threading.Thread(target=store.put, args=([packet(sequence=1)], 0.0), daemon=True)
+        storing.start()
+        storing.join(20.0)
+        assert not storing.is_alive()
+        link(*paths)
+
+    monkeypatch.setattr(os, "link", meanwhile)
+    store.export(tmp_path / "out.sqlite")
+    assert store.turn_count() == 2
+    copy = MissionStore(tmp_path / "out.sqlite")
+    assert copy.turn_count() == 1
+    copy.close()
+
+
+@pytest.mark.parametrize("harm", ["text", "trigger", "view", "version", "torn", "kind", "channel", "none", "config"])
 def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
     path = tmp_path / "out.sqlite"
     store.put([packet(sequence=k, data=bytes(4000)) for k in range(20)], 0.0)
@@ -168,6 +189,10 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
             "trigger": "CREATE TRIGGER t AFTER INSERT ON vetoes BEGIN DELETE FROM packets; END",
             "view": "CREATE VIEW v AS SELECT 1",
             "version": "PRAGMA user_version=99",
+            "kind": "UPDATE packets SET kind = 'rumour' WHERE sequence = 3",
+            "channel": "UPDATE packets SET channel = 'smell' WHERE sequence = 3",
+            "none": "UPDATE packets SET kind = NULL WHERE sequence = 3",
+            "config": "INSERT INTO facts VALUES ('config', '{\"seed\": \"x\"}')",
         }[harm])  # fmt: skip
         connection.commit()
         connection.close()

@@ -1,5 +1,10 @@
 """The worker: what it makes of a store is what the mission makes of the recordings, whatever happens on the way."""
 
+import fcntl
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 from cloud.scripted import closures, rectangle, stream
@@ -7,8 +12,8 @@ from small_fleet import in_order
 
 from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cloud.store import MissionStore, StoredPacket
-from fcslam.cloud.worker import CONFIG, Worker
+from fcslam.cloud.store import CONFIG, MissionStore, StoredPacket
+from fcslam.cloud.worker import Worker
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import ClosureStatus, Veto
 from fcslam.robot.frontend import RobotFrontend
@@ -177,6 +182,35 @@ def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkey
     assert "ZeroDivisionError" in cloud.store.refusals("a")[0][2]
 
 
+def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch):
+    cloud.put(stream("a", POSES, start_s=0.0))
+
+    def hungry(self, data):
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(cloud.worker._fleet), "receive", hungry)
+        with pytest.raises(MemoryError):
+            cloud.work()
+    assert cloud.store.refusals("a") == []
+    cloud.restart()
+    assert len(cloud.finalize().trajectories[0].stamps) == len(POSES)
+
+
+def test_a_worker_waits_until_the_one_before_is_gone(cloud):
+    command = [sys.executable, "-m", "fcslam.cloud.worker", str(cloud.folder.path)]
+    cloud.put(stream("a", POSES, start_s=0.0))
+    with cloud.folder.worker_lock.open("w") as before:
+        fcntl.flock(before, fcntl.LOCK_EX)
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            time.sleep(3.0)
+            assert cloud.store.applied() == 0
+            fcntl.flock(before, fcntl.LOCK_UN)
+            assert b"live" in process.stdout.readline()
+            process.stdin.close()
+            assert process.wait(60) == 0
+
+
 def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
     cloud.put(two_robots())
     assert {t.map_index for t in cloud.finalize().trajectories} == {0}
@@ -242,3 +276,42 @@ def test_more_robots_join_a_mission_that_was_finished(cloud, tmp_path):
     together.put(packets)
     assert late.pose_graph_g2o == together.finalize().pose_graph_g2o
     together.store.close()
+
+
+@pytest.mark.parametrize(("step_m", "kept"), [(1e6, 1), (1e5, 3)])
+def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same(cloud, step_m, kept):
+    far = np.cumsum(np.full((13, 3), (step_m, 0.0, 0.0)), axis=0)
+    cloud.put(stream("c", far, start_s=0.0))
+    run = cloud.finalize()
+    assert "m from the start" in cloud.store.refusals("c")[0][2]
+    assert {t.robot: len(t.stamps) for t in run.trajectories} == {"c": kept}
+    assert cloud.folder.live.exists()
+
+
+def test_corrections_number_maps_as_the_live_run_does(cloud):
+    alone = stream("c", POSES, start_s=-500.0)
+    cloud.put(in_order([*alone, *two_robots()]))
+    run = cloud.finalize()
+    assert {t.robot: t.map_index for t in run.trajectories} == {"a": 0, "b": 0, "c": 1}
+    cloud.restart()
+    cloud.work()
+    cloud.put(stream("d", POSES, start_s=2000.0))
+    cloud.work()
+    told = {robot: cloud.store.correction(robot, 0).correction.map_index for robot in "abcd"}
+    assert told == {"a": 0, "b": 0, "c": 1, "d": 2}
+
+
+def test_a_result_or_live_map_that_fails_stops_nothing(cloud, monkeypatch, caplog):
+    def broken(self, *_, **__):
+        raise ValueError("a pose is not finite")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Worker, "_run", broken)
+        cloud.put(two_robots())
+        number = cloud.store.ask_to_finalize()
+        cloud.work()
+    assert cloud.store.finalization(number).failure == "a pose is not finite"
+    assert "the live map stays as it was: ValueError" in caplog.text
+    cloud.now += 1000.0
+    assert len(cloud.finalize().trajectories) == 2
+    assert cloud.folder.live.exists()

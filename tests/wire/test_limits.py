@@ -1,5 +1,6 @@
 """Every limit, on the way in and on the way out."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -57,7 +58,9 @@ REFUSED_BODIES = [
     (hello(angle_min_rad=NAN), "first beam"),
     (hello(angle_min_rad=6.3), "first beam"),
     (hello(angle_increment_rad=0.0), "do not turn"),
-    (hello(angle_increment_rad=NAN), "over a full turn"),
+    (hello(angle_increment_rad=NAN), "do not turn"),
+    (hello(angle_increment_rad=math.inf), "more than a full turn"),
+    (hello(beam_count=1, angle_increment_rad=-6.3), "more than a full turn"),
     (hello(angle_increment_rad=-0.036), "over a full turn"),
     (hello(max_range_m=0.0), "maximum range"),
     (hello(max_range_m=1000.1), "maximum range"),

@@ -12,7 +12,7 @@ from fcslam.errors import PacketError
 from fcslam.records import Channel, Constraint, Keyscan, Place
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.messages import Kind, Packet
-from fcslam.wire.packets import Label, decode, encode, read_label
+from fcslam.wire.packets import Label, decode, encode, read_label, unpacked_size
 
 
 @settings(max_examples=200)
@@ -37,6 +37,16 @@ def test_keypoints_travel_in_ascending_order_and_their_descriptors_with_them():
     rows = [(*point, bytes(code)) for point, code in zip(keypoints.tolist(), codes, strict=True)]
     received = [(*point, bytes(code)) for point, code in zip(body.keypoints.tolist(), body.descriptors, strict=True)]
     assert received == sorted(rows, key=lambda row: row[:2]), "those at one point stay in their order"
+
+
+@given(packets())
+def test_a_packet_counts_for_what_it_unpacks_to(sent):
+    data, body = encode(sent), sent.body
+    plain = 2 * len(body.ranges_m) if isinstance(body, Keyscan) else 0
+    if isinstance(body, Place):
+        plain = 2 * body.keypoints.size + body.descriptors.size
+    assert len(data) + plain <= unpacked_size(data) <= len(data) + 1.1 * plain
+    assert unpacked_size(data + b"!") == len(data) + 1
 
 
 @given(packets())

@@ -8,6 +8,8 @@ from fcslam.features.release import file_of
 from fcslam.records import Channel, DetectorFile
 
 LONGEST_FILE_BYTES = 64 * 2**20
+STAGING = ".staging"
+"""How folders are called of networks that are not taken in yet."""
 _ANNOUNCED = "announced"
 """Beside the files of a channel: the version that robots are told of."""
 
@@ -19,8 +21,9 @@ class DetectorShelf:
         self._root = root
         self._lock = threading.Lock()
         self._announced = {
-            Channel(path.parent.name): file_of(self.path(Channel(path.parent.name), path.read_text(encoding="utf-8")))
-            for path in sorted(root.glob(f"*/{_ANNOUNCED}"))
+            channel: file_of(self.path(channel, told.read_text(encoding="utf-8")))
+            for channel in Channel
+            if (told := root / channel / _ANNOUNCED).is_file()
         }
 
     def path(self, channel: Channel, version: str) -> Path:
@@ -29,7 +32,9 @@ class DetectorShelf:
 
     def versions(self) -> list[tuple[str, str]]:
         """Channel and version of every file."""
-        return [(path.parent.name, path.stem) for path in sorted(self._root.glob("*/*.onnx"))]
+        return [
+            (channel, path.stem) for channel in sorted(Channel) for path in sorted(self._root.glob(f"{channel}/*.onnx"))
+        ]
 
     def announced(self) -> dict[Channel, DetectorFile]:
         """What robots are told to take, by channel."""
@@ -43,14 +48,15 @@ class DetectorShelf:
             FeatureError: it is no network that this fcslam runs.
         """
         self._root.mkdir(parents=True, exist_ok=True)
-        with self._lock, tempfile.TemporaryDirectory(dir=self._root, prefix=".staging") as folder:
+        with tempfile.TemporaryDirectory(dir=self._root, prefix=STAGING) as folder:
             staging = Path(folder) / "network.onnx"
             staging.write_bytes(content)
-            file = file_of(staging)
+            file = file_of(staging)  # loads the network: robots that ask what is announced do not wait for that
             place = self.path(file.channel, file.version)
             place.parent.mkdir(exist_ok=True)
-            staging.replace(place)
-            staging.write_text(file.version, encoding="utf-8")
-            staging.replace(place.parent / _ANNOUNCED)
-            self._announced[file.channel] = file
+            with self._lock:
+                staging.replace(place)
+                staging.write_text(file.version, encoding="utf-8")
+                staging.replace(place.parent / _ANNOUNCED)
+                self._announced[file.channel] = file
         return file

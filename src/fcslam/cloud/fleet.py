@@ -14,7 +14,7 @@ from pydantic import Field
 from fcslam.cloud.joining import first_estimate, judge
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger, Entry
-from fcslam.cloud.result import FleetResult, Fusion, conclude
+from fcslam.cloud.result import FleetResult, Fusion, conclude, map_indices
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.robots import RobotStore
 from fcslam.cloud.sessions import in_session, session_name
@@ -165,7 +165,8 @@ class Fleet:
 
     def corrections(self) -> tuple[Correction, ...]:
         """Where every session's odometry lies in its map, as believed now."""
-        return tuple(self._correction(session) for session in self._store.robots)
+        index = map_indices(self._maps)
+        return tuple(self._correction(session, index[session]) for session in self._store.robots)
 
     def vocabularies(self) -> tuple[VocabularyState, ...]:
         """What is known of every kind of words."""
@@ -372,15 +373,14 @@ class Fleet:
         robot, epoch, session = packet.robot, packet.epoch, session_name(packet.robot, packet.epoch)
         bodies: list[Acknowledgement | Correction | Release] = [Acknowledgement(robot, epoch, packet.sequence)]
         if isinstance(packet.body, Place) and self._graph.keyscan_count(session):
-            bodies.append(replace(self._correction(session), robot=robot))
+            bodies.append(replace(self._correction(session, map_indices(self._maps)[session]), robot=robot))
         if isinstance(packet.body, Hello | Place):
             bodies += [Release(robot, file) for file in self._newer_detectors(session)]
         first = self._store.number_replies(session, len(bodies))
         return [encode(Packet(robot, epoch, first + k, packet.time, body)) for k, body in enumerate(bodies)]
 
-    def _correction(self, session: str) -> Correction:
-        index = next(k for k, robots in enumerate(self._maps) if session in robots)
-        return Correction(session, self._version, index, frozen(self._graph.T_map_odom(session)))
+    def _correction(self, session: str, map_index: int) -> Correction:
+        return Correction(session, self._version, map_index, frozen(self._graph.T_map_odom(session)))
 
     def _newer_detectors(self, session: str) -> list[DetectorFile]:
         """Of the channels that the robot has."""

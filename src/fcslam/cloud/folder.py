@@ -4,6 +4,7 @@ detectors/<channel>/<version>.onnx   networks that robots may fetch
 missions/<name>/mission.sqlite       what was received: all that must not be lost
                 live/                the run folder of what is believed now
                 runs/<number>/       the run folders that were asked for
+                worker.lock          held by the mission's worker
 open                                 name of the open mission
 lock                                 held by the service that uses the folder
 """
@@ -36,6 +37,11 @@ class MissionFolder:
     def live(self) -> Path:
         """The run folder of what is believed now: a link, so it is the old one or the new one, and always whole."""
         return self.path / "live"
+
+    @property
+    def worker_lock(self) -> Path:
+        """Held by the mission's worker."""
+        return self.path / "worker.lock"
 
     def run(self, name: str) -> Path:
         """A run folder that was asked for."""

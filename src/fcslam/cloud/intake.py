@@ -15,7 +15,9 @@ from fcslam.wire.packets import decode, encode, read_label, read_number
 LEASE_S = 30.0
 """So long after an agent's last request its robot is its own."""
 LONGEST_QUEUE = 50_000
-"""Packets that have not taken effect: more are not taken in before some have."""
+"""Packets that have a turn and have not taken effect: more are not taken in before some have."""
+MOST_EARLY = 20_000
+"""Packets of one robot that wait for one before them, in all its sessions."""
 FURTHEST_AHEAD = 20_000
 """Numbers after the first missing packet of a session: what is further ahead has to wait for it."""
 RETRY_AFTER_S = 2
@@ -101,7 +103,7 @@ class Intake:
             self._leases[robot] = agent, now
 
     def _make_room(self, robot: str, packets: Sequence[StoredPacket]) -> None:
-        queue = self._store.turn_count() - self._store.applied() + self._store.waiting_count()
+        queue = self._store.turn_count() - self._store.applied()
         if queue > LONGEST_QUEUE:
             raise BusyError(f"{queue} packets have not taken effect yet; send these again later")
         expected = {session.epoch: session.next for session in self._store.sessions(robot)}
@@ -109,6 +111,13 @@ class Intake:
             first = expected.get(packet.epoch, 0)
             if packet.sequence > first + FURTHEST_AHEAD:
                 raise BusyError(f"{robot}: packet {packet.sequence} is far ahead; send packet {first} first")
+        early = _early(packets, expected)
+        if early and self._store.waiting_count(robot) + len(early) > MOST_EARLY:
+            epoch = early[0].epoch
+            raise BusyError(
+                f"{robot}: over {MOST_EARLY} packets wait for one before them; "
+                f"send packet {expected.get(epoch, 0)} of epoch {epoch} first"
+            )
 
     def _answer(self, robot: str, epochs: Sequence[int], known_correction: int) -> bytes:
         told: list[tuple[int, float, Body]] = []
@@ -146,6 +155,19 @@ def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], Re
                 packets.append(StoredPacket(*number, 0.0, None, None, data, str(error)))
             return packets, RefusedPacketError(str(error), index)
     return packets, None
+
+
+def _early(packets: Sequence[StoredPacket], expected: Mapping[int, int]) -> list[StoredPacket]:
+    """Those that do not follow on what is stored without a gap; ``expected`` next numbers by epoch."""
+    ahead = dict(expected)
+    early: list[StoredPacket] = []
+    for packet in sorted(packets, key=lambda packet: packet.sequence):
+        following = ahead.get(packet.epoch, 0)
+        if packet.sequence > following:
+            early.append(packet)
+        else:
+            ahead[packet.epoch] = max(following, packet.sequence + 1)
+    return early
 
 
 def _read(robot: str, data: bytes) -> StoredPacket:

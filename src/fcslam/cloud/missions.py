@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import IO
 
 from fcslam.cloud.database import told
-from fcslam.cloud.detectors import DetectorShelf
+from fcslam.cloud.detectors import STAGING, DetectorShelf
 from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.intake import Intake
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cloud.store import MissionStore
+from fcslam.cloud.store import CONFIG, MissionStore
 from fcslam.cloud.supervisor import RunningWorker
-from fcslam.cloud.worker import CONFIG
 from fcslam.errors import ServiceError
 from fcslam.wire.checks import check_name
 
 FIRST = "mission"
 """Name of the mission that is open when there was none."""
-
+IMPORT, EXPORT = ".import", ".export"
+"""How folders are called of missions on their way in and out."""
 
 Launch = Callable[[MissionFolder], RunningWorker]
 """Starts the worker of a mission."""
@@ -61,6 +61,7 @@ class Missions:
         self.root = root
         self._config, self._clock, self._wall_clock, self._launch = config, clock, wall_clock, launch
         self._lock = _locked(root)
+        _sweep(root)
         self.detectors = DetectorShelf(root / "detectors")
         named = self._open_file.read_text(encoding="utf-8").strip() if self._open_file.exists() else FIRST
         self.open_mission = self._opened(named)
@@ -132,7 +133,7 @@ class Missions:
         folder = self.folder(name)
         if folder.store.exists():
             raise ServiceError(f"mission '{name}' is there already; choose another name")
-        staging = folder.path / ".import.partial"
+        staging = folder.path / f"{IMPORT}.partial"
         with told(staging):
             folder.path.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, staging)
@@ -149,12 +150,27 @@ class Missions:
 
     def _opened(self, name: str) -> OpenMission:
         folder = self.folder(name)
-        folder.path.mkdir(parents=True, exist_ok=True)
+        with told(folder.path):
+            folder.path.mkdir(parents=True, exist_ok=True)
         mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._launch, self.detectors)
         staging = self._open_file.with_name(".open.partial")
-        staging.write_text(name + "\n", encoding="utf-8")
-        staging.replace(self._open_file)
+        try:
+            with told(self._open_file):
+                staging.write_text(name + "\n", encoding="utf-8")
+                staging.replace(self._open_file)
+        except BaseException:
+            mission.close()
+            raise
         return mission
+
+
+def _sweep(root: Path) -> None:
+    """Remove what a service left half done that was killed; nobody else uses the folder."""
+    left = [*root.glob(f"{IMPORT}*"), *root.glob(f"{EXPORT}*"), *(root / "detectors").glob(f"{STAGING}*")]
+    for path in left:
+        shutil.rmtree(path, ignore_errors=True)
+    for path in root.glob(f"missions/*/{IMPORT}.partial"):
+        path.unlink(missing_ok=True)
 
 
 def _locked(root: Path) -> IO[str]:

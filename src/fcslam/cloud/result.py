@@ -52,10 +52,15 @@ class Fusion:
     """In the order in which they were found, with their verdicts."""
 
 
+def map_indices(maps: Sequence[Sequence[str]]) -> dict[str, int]:
+    """Number of each robot's map: the map of most robots is 0, and of two as large the one that started first."""
+    by_size = sorted(maps, key=lambda robots: -len(robots))
+    return {robot: k for k, robots in enumerate(by_size) for robot in robots}
+
+
 def conclude(store: RobotStore, graph: JointGraph, ledger: ClosureLedger, fusion: Fusion, version: int) -> FleetResult:
-    """Collect the result; the map of most robots is the first."""
-    by_size = sorted(fusion.maps, key=lambda robots: -len(robots))
-    index = {robot: k for k, robots in enumerate(by_size) for robot in robots}
+    """Collect the result."""
+    index = map_indices(fusion.maps)
     robots = tuple(
         MappedRobot(
             robot,

@@ -1,10 +1,16 @@
 """What the cloud keeps of each robot's session: its packets in order, its laser, its keyscans."""
 
+import math
 from collections.abc import Iterator, Mapping
 
 from fcslam.errors import PacketError
-from fcslam.records import Channel, Constraint, Keyscan, KeyscanId, LaserModel, Place
+from fcslam.geometry import se2
+from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, Place
+from fcslam.wire.limits import MAXIMUM_COORDINATE_M
 from fcslam.wire.messages import Hello, Packet
+
+FARTHEST_M = MAXIMUM_COORDINATE_M / 4.0
+"""Of a robot from its start. What joining and optimising maps adds fits between this and what a packet can tell."""
 
 
 class RobotStore:
@@ -22,6 +28,8 @@ class RobotStore:
         self._keyscans: dict[str, list[Keyscan]] = {}
         self._connected: dict[str, int] = {}
         """Keyscans that motions tie to the first; only they are known to others."""
+        self._T_odom_base: dict[str, FloatArray] = {}
+        """Where the motions lead to, from the first keyscan."""
         self._announced: dict[str, set[tuple[Channel, str]]] = {}
         """Detectors that each robot has said it describes places with, of all its hellos."""
         self._places: set[tuple[KeyscanId, Channel, str]] = set()
@@ -114,11 +122,16 @@ class RobotStore:
         """The motion that leads to the newest keyscan.
 
         Raises:
-            PacketError: it does not, or the keyscan has one already.
+            PacketError: it does not, the keyscan has one already, or it leads out of all bounds.
         """
         robot, connected = motion.robot, self._connected.get(motion.robot, 0)
         if connected == len(self._keyscans.get(robot, ())) or (motion.i, motion.j) != (connected - 1, connected):
             raise PacketError(f"{robot}: motion {motion.i} to {motion.j} does not lead to a new keyscan")
+        before = self._T_odom_base.get(robot)
+        T_odom_base = motion.T_i_j if before is None else se2.compose(before, motion.T_i_j)
+        if not math.hypot(T_odom_base[0], T_odom_base[1]) <= FARTHEST_M:
+            raise PacketError(f"{robot}: motion {motion.i} to {motion.j} leads over {FARTHEST_M:g} m from the start")
+        self._T_odom_base[robot] = T_odom_base
         self._connected[robot] = connected + 1
 
     def add_place(self, place: Place) -> None:

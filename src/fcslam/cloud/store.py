@@ -7,11 +7,13 @@ a session that of their numbers. A packet has no turn while one before it is mis
 
 import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from fcslam.cloud.database import Database, check_file
-from fcslam.errors import PacketConflictError
+from fcslam.cloud.database import Database, check_file, told
+from fcslam.cloud.settings import CloudConfig
+from fcslam.errors import PacketConflictError, StoreError
 from fcslam.records import Channel, Correction, Veto, frozen
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Kind
@@ -19,6 +21,8 @@ from fcslam.wire.packets import Label
 
 APPLIED = "applied"
 """A fact: how many turns have taken effect."""
+CONFIG = "config"
+"""A fact: the mission's configuration."""
 
 _VERSION = 1
 
@@ -156,9 +160,10 @@ class MissionStore:
         """Packets that have a turn."""
         return int(self._database.value("SELECT ifnull(max(turn) + 1, 0) FROM packets"))
 
-    def waiting_count(self) -> int:
-        """Packets without a turn: one before them is missing."""
-        return int(self._database.value("SELECT count(*) FROM packets WHERE turn IS NULL"))
+    def waiting_count(self, robot: str | None = None) -> int:
+        """Packets of one robot or of all without a turn: one before them is missing."""
+        statement = "SELECT count(*) FROM packets WHERE turn IS NULL AND (?1 IS NULL OR robot = ?1)"
+        return int(self._database.value(statement, (robot,)))
 
     def refuse(self, turn: int, reason: str) -> None:
         """The packet of this turn does not fit what its robot sent before."""
@@ -195,14 +200,14 @@ class MissionStore:
         """So many turns have taken effect; corrections that changed by them get a new version."""
         with self._database.transaction() as database:
             _remember(database, APPLIED, str(turns))
-            for told in corrections:
-                pose = told.correction.T_map_odom.tolist()
+            for correction in corrections:
+                pose = correction.correction.T_map_odom.tolist()
                 database.execute(
                     "INSERT INTO corrections SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7"
                     " FROM corrections WHERE true ON CONFLICT (robot, epoch) DO UPDATE SET version = excluded.version,"
                     " time = excluded.time, map_index = excluded.map_index, x = excluded.x, y = excluded.y,"
                     " theta = excluded.theta WHERE (map_index, x, y, theta) IS NOT (?4, ?5, ?6, ?7)",
-                    (told.robot, told.epoch, told.time, told.correction.map_index, *pose),
+                    (correction.robot, correction.epoch, correction.time, correction.correction.map_index, *pose),
                 )
 
     def applied(self) -> int:
@@ -229,7 +234,7 @@ class MissionStore:
         return [Veto(i, j, None if stamp_i is None else (stamp_i, stamp_j)) for i, j, stamp_i, stamp_j in rows]
 
     def ask_to_finalize(self) -> int:
-        """Ask for the result of all that is stored now; returns the number of the request."""
+        """Ask for the result of all that has a turn now; returns the number of the request."""
         with self._database.transaction() as database:
             database.execute(
                 "INSERT INTO finalizations (turns, vetoes)"
@@ -292,6 +297,17 @@ def check_mission(path: Path) -> None:
         StoreError: it is not what ``MissionStore.export`` writes.
     """
     check_file(path, _SCHEMA, _VERSION)
+    with told(path), closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found:
+        labels = found.execute("SELECT DISTINCT kind, channel, refusal IS NULL FROM packets").fetchall()
+        facts = dict(found.execute("SELECT name, value FROM facts").fetchall())
+    try:
+        for kind, channel, counts in labels:
+            if counts or kind is not None:
+                Label("", Kind(kind), None if channel is None else Channel(channel))
+        CloudConfig.model_validate_json(facts.get(CONFIG, "{}"))
+        int(facts.get(APPLIED, "0"))
+    except ValueError as error:
+        raise StoreError(f"{path}: {' '.join(str(error).split())}") from error
 
 
 def _remember(database: sqlite3.Connection, name: str, value: str) -> None:

@@ -2,10 +2,12 @@
 
 import json
 import logging
+import os
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Protocol
 
 from fcslam.cloud.folder import MissionFolder
@@ -42,8 +44,12 @@ _log = logging.getLogger(__name__)
 class Supervisor:
     """One worker at a time, until ``stop``."""
 
-    def __init__(self, folder: MissionFolder, clock: Callable[[], float], listen: Listen) -> None:
-        self._command: Sequence[str] = (sys.executable, "-m", "fcslam.cloud.worker", str(folder.path))
+    def __init__(
+        self, folder: MissionFolder, clock: Callable[[], float], listen: Listen,
+        command: Sequence[str] = (sys.executable, "-m", "fcslam.cloud.worker"),
+    ) -> None:  # fmt: skip
+        """``command`` starts a worker when the mission's folder is added to it."""
+        self._command = (*command, str(folder.path))
         self._clock, self._listen = clock, listen
         self._stopping = threading.Event()
         self._lock = threading.Lock()
@@ -67,44 +73,60 @@ class Supervisor:
         """Tell the worker that there is something to do."""
         with self._lock:
             if self._process is not None and self._process.stdin is not None:
-                try:
+                # One that is gone is followed by one that looks for itself, and one that has not read its rings yet
+                # (the pipe is full) knows that there is something.
+                with suppress(OSError, ValueError):
                     self._process.stdin.write(b"\n")
-                    self._process.stdin.flush()
-                except OSError:
-                    return  # it is gone, and the next one looks for itself
 
     def stop(self) -> None:
         """Let the worker end what it is doing, and wait for that."""
         self._stopping.set()
         with self._lock:
-            if self._process is not None and self._process.stdin is not None:
-                self._process.stdin.close()
+            self._end_input()
         self._thread.join()
 
     def _run(self) -> None:
         pause_s = 0.5
         while not self._stopping.is_set():
             began = self._clock()
-            code = self._watch_one()
+            try:
+                ended = f"ended with code {self._watch_one()}"
+            except Exception as error:  # no program, no memory for it: that may pass
+                ended = f"could not be run ({type(error).__name__}: {error})"
             if self._stopping.is_set():
                 return
             pause_s = 0.5 if self._clock() - began > STEADY_S else min(2.0 * pause_s, LONGEST_PAUSE_S)
-            _log.error("the worker ended with code %s; another one starts in %.0f s", code, pause_s)
+            _log.error("the worker %s; another one starts in %.0f s", ended, pause_s)
             self._stopping.wait(pause_s)
 
     def _watch_one(self) -> int:
         """Start a worker and pass on what it says, until it ends."""
-        with subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        # Unbuffered: what a dead worker did not read must not turn up when the pipe is closed.
+        with subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0) as process:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            os.set_blocking(process.stdin.fileno(), False)
             with self._lock:
                 self._process = process
                 self._starts += 1
-                if self._stopping.is_set() and process.stdin is not None:
-                    process.stdin.close()
-            assert process.stdout is not None
-            for line in process.stdout:
-                told = json.loads(line)
-                self._listen(told["event"], told["number"])
-            code = process.wait()
-            with self._lock:
-                self._process = None
-        return code
+                if self._stopping.is_set():
+                    self._end_input()
+            try:
+                for line in process.stdout:
+                    self._pass_on(line)
+                return process.wait()
+            finally:
+                with self._lock:
+                    self._process = None
+
+    def _pass_on(self, line: bytes) -> None:
+        try:
+            told = json.loads(line)
+            self._listen(str(told["event"]), int(told["number"]))
+        except (ValueError, TypeError, KeyError):
+            _log.error("the worker says what nobody understands: %.200r", line)
+
+    def _end_input(self) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()

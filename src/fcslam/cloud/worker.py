@@ -10,6 +10,7 @@ A byte on stdin says that there is something to do, its end that the service is 
 every change of the live run folder and for every answered request.
 """
 
+import fcntl
 import gc
 import json
 import logging
@@ -20,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import IO
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.folder import MissionFolder
@@ -27,13 +29,10 @@ from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import session_name
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cloud.store import Finalization, MissionStore, SessionCorrection, StoredPacket
+from fcslam.cloud.store import CONFIG, Finalization, MissionStore, SessionCorrection, StoredPacket
 from fcslam.config import dump
-from fcslam.errors import FcslamError, OutputError, PacketError
+from fcslam.errors import PacketError
 from fcslam.runs import Metric, Run, write_run
-
-CONFIG = "config"
-"""A fact of the store: the mission's configuration."""
 
 AT_ONCE = 64
 """Packets between two looks at what else there is to do."""
@@ -99,6 +98,8 @@ class Worker:
                 self._fleet.receive(packet.data)
             except PacketError as error:
                 self._store.refuse(self._turn, str(error))
+            except MemoryError:
+                raise  # the machine's fault, not the packet's: the next worker tries again
             except Exception as error:
                 # Nobody knows what it left behind: the next worker begins anew and without it.
                 self._store.refuse(self._turn, f"the cloud failed on it: {type(error).__name__}: {error}")
@@ -129,8 +130,11 @@ class Worker:
         name = str(asked.number)
         try:
             write_run(self._run(self._fleet.finalize()), self._folder.run(name), force=True)
-        except FcslamError as error:
-            self._store.answer(asked.number, None, str(error))
+        except (
+            Exception
+        ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
+            _log.exception("result %s failed", name)
+            self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:
             self._store.answer(asked.number, name)
         self._published = -1
@@ -141,11 +145,10 @@ class Worker:
         now = self._clock()
         if self._published == self._turn or self._turn < self._resumed_at or now < self._publish_at:
             return False
-        run = self._run(self._fleet.estimate(), with_local_maps=False)
         try:
-            self._folder.publish(run)
-        except OutputError as error:
-            _log.error("the live map stays as it was: %s", error)  # packets matter more, and the disk may be freed
+            self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False))
+        except Exception as error:  # packets matter more, and the disk may be freed
+            _log.error("the live map stays as it was: %s: %s", type(error).__name__, error)
             self._publish_at = now + PAUSE_S
             return False
         self._published = self._turn
@@ -171,11 +174,23 @@ def main(arguments: Sequence[str]) -> int:
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     folder = MissionFolder(Path(arguments[0]))
+    alone = _alone(folder)
     worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print)
     while True:
         wait_s = 0.0 if worker.step() else worker.wait_s()
         if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
+            alone.close()
             return 0
+
+
+def _alone(folder: MissionFolder) -> IO[str]:
+    """Wait until no other worker has this mission: one whose service was killed may still be at its last step.
+
+    The lock is this worker's until the file is closed.
+    """
+    file = folder.worker_lock.open("w")
+    fcntl.flock(file, fcntl.LOCK_EX)
+    return file
 
 
 def _print(event: str, number: int) -> None:

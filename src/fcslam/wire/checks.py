@@ -67,7 +67,8 @@ def _check_hello(hello: Hello, packet: Packet) -> None:
 def _check_laser(laser: LaserModel) -> None:
     _require(0 < laser.beam_count <= MAXIMUM_BEAMS, f"laser: {laser.beam_count} beams, not in 1..{MAXIMUM_BEAMS}")
     _require(abs(laser.angle_min_rad) <= FULL_TURN_RAD, "laser: first beam is not within a full turn")
-    _require(laser.angle_increment_rad != 0.0, "laser: beams do not turn")
+    turns = 0.0 < abs(laser.angle_increment_rad) <= FULL_TURN_RAD
+    _require(turns, "laser: beams do not turn, or by more than a full turn")
     span = abs(laser.angle_increment_rad) * laser.beam_count
     # a full turn may be closed by one beam twice, and drivers round the increment
     _require(span <= 1.01 * FULL_TURN_RAD + abs(laser.angle_increment_rad), "laser: beams cover over a full turn")

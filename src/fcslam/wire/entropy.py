@@ -32,13 +32,13 @@ _MOST_DIGITS: Final = 20
 CONTEXTS_OF_NUMBER: Final = 2 * _MOST_DIGITS + 2
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def writer(size: int) -> tuple[Coder, Bytes]:
     """A coder that writes at most ``size`` bytes, and where it writes them."""
     return np.array([0, 0, 0xFFFFFFFF, 0, 0, size]), np.zeros(size, np.uint8)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def reader(data: Bytes) -> Coder:
     """A coder that reads ``data``."""
     coder = np.array([1, 0, 0xFFFFFFFF, 0, 0, len(data)])
@@ -47,7 +47,7 @@ def reader(data: Bytes) -> Coder:
     return coder
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def fresh_model(contexts: int) -> Model:
     """A model that knows nothing yet."""
     model = np.zeros((contexts, 2), np.int64)
@@ -55,7 +55,7 @@ def fresh_model(contexts: int) -> Model:
     return model
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def code_bit(coder: Coder, data: Bytes, probability: int, bit: int) -> int:
     """One bit that is 1 with ``probability`` in 1/65536, between 1 and 65535."""
     middle = coder[_LOW] + (((coder[_HIGH] - coder[_LOW]) * probability) >> 16)
@@ -75,7 +75,7 @@ def code_bit(coder: Coder, data: Bytes, probability: int, bit: int) -> int:
     return bit
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def code_learnt(coder: Coder, data: Bytes, model: Model, context: int, bit: int) -> int:
     """One bit by the probability that its context has had so far."""
     probability, seen = model[context]
@@ -85,7 +85,7 @@ def code_learnt(coder: Coder, data: Bytes, model: Model, context: int, bit: int)
     return bit
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def code_number(coder: Coder, data: Bytes, model: Model, context: int, value: int) -> int:
     """A number in [0, 2^20), in ``CONTEXTS_OF_NUMBER`` contexts: Elias' gamma code, whose first bits are learnt."""
     value += 1
@@ -103,14 +103,14 @@ def code_number(coder: Coder, data: Bytes, model: Model, context: int, value: in
     return result - 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def code_signed(coder: Coder, data: Bytes, model: Model, context: int, value: int) -> int:
     """A number in (-2^19, 2^19): 0, -1, 1, -2, 2 ... as 0, 1, 2, 3, 4 ..."""
     number = code_number(coder, data, model, context, (value << 1) ^ (value >> 63))
     return int((number >> 1) ^ -(number & 1))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def written(coder: Coder, data: Bytes) -> int:
     """End the stream: how many bytes it has, or -1 if it has more than there was room for."""
     if coder[_LOW] > 0:
@@ -118,7 +118,7 @@ def written(coder: Coder, data: Bytes) -> int:
     return int(coder[_NUMBER]) if coder[_NUMBER] <= coder[_SIZE] else -1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def is_at_end(coder: Coder, data: Bytes) -> bool:
     """Whether the stream that was read has this end and no other."""
     ending = coder[_HIGH] >> 24 << 24 if coder[_LOW] > 0 else 0
@@ -126,14 +126,14 @@ def is_at_end(coder: Coder, data: Bytes) -> bool:
     return bool(shortest and coder[_NUMBER] == ending and coder[_POSITION] - 4 >= len(data) - 1)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _next_byte(coder: Coder, data: Bytes) -> None:
     byte = np.int64(data[coder[_POSITION]]) if coder[_POSITION] < coder[_SIZE] else np.int64(0)
     coder[_NUMBER] = (coder[_NUMBER] & 0xFFFFFF) << 8 | byte
     coder[_POSITION] += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _put_byte(coder: Coder, data: Bytes, byte: int) -> None:
     if coder[_POSITION] < coder[_SIZE]:
         data[coder[_POSITION]] = byte

@@ -5,11 +5,20 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import Channel
+from fcslam.records import CODE_BYTES, Channel
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
-from fcslam.wire.limits import MAXIMUM_PACKET_BYTES, MAXIMUM_SEQUENCE, PROTOCOL_VERSION
+from fcslam.wire.limits import (
+    BYTES_PER_AXIS,
+    BYTES_PER_RANGE,
+    KEYPOINT_AXES,
+    MAXIMUM_BEAMS,
+    MAXIMUM_KEYPOINTS,
+    MAXIMUM_PACKET_BYTES,
+    MAXIMUM_SEQUENCE,
+    PROTOCOL_VERSION,
+)
 from fcslam.wire.messages import Kind, Packet
 
 
@@ -75,6 +84,24 @@ def read_label(data: bytes) -> Label:
     message, kind = _parse(data)
     check_name(message.robot, "robot")
     return Label(message.robot, kind, read_channel(message.place.channel) if kind is Kind.PLACE else None)
+
+
+def unpacked_size(data: bytes) -> int:
+    """Bytes of a packet with its streams unpacked, as its counts tell them without the cost of reading its body.
+
+    What a robot may ask for is measured by it: a stream of few bytes may take as long to read as a long one. What is
+    no packet has the size that it has; its reader refuses it before it unpacks anything.
+    """
+    try:
+        message, kind = _parse(data)
+    except PacketError:
+        return len(data)
+    if kind is Kind.KEYSCAN:
+        return len(data) + BYTES_PER_RANGE * min(message.keyscan.count, MAXIMUM_BEAMS)
+    if kind is Kind.PLACE:
+        axes = max(KEYPOINT_AXES.values())
+        return len(data) + (BYTES_PER_AXIS * axes + CODE_BYTES) * min(message.place.count, MAXIMUM_KEYPOINTS)
+    return len(data)
 
 
 def read_number(data: bytes) -> tuple[str, int, int] | None:

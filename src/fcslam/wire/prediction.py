@@ -52,7 +52,7 @@ PROBABILITIES: Final = frozen(
 """Of a one in 1/65536, by z from the least to the largest."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def code_descriptors(
     coder: Coder,
     data: Bytes,
@@ -75,7 +75,7 @@ def code_descriptors(
             _add(expected, own[b], bits[i, b])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def nearest_before(keypoints: NDArray[np.int64], i: int) -> int:
     """Which of the ``keypoints`` (N, axes) before keypoint i > 0 is the nearest to it; of several the first."""
     nearest, least = 0, np.int64(1) << 62
@@ -89,7 +89,7 @@ def nearest_before(keypoints: NDArray[np.int64], i: int) -> int:
     return nearest
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add(expected: NDArray[np.int32], weights: NDArray[np.int32], bit: int) -> None:
     """Over all of them: what was expected of the bits before does not matter any more, and this way it is fastest."""
     if bit:

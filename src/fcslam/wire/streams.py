@@ -132,7 +132,7 @@ def _unpack(data: bytes, plain: int, what: str, code: Callable[..., None], *cont
         raise PacketError(f"{what}: the stream is cut off or goes on after its end")
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
     """Each range: whether there is one, which the beam before tells; its difference from the last one that was."""
     model = fresh_model(2 + CONTEXTS_OF_NUMBER)
@@ -146,7 +146,7 @@ def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
             codes[k] = last if last > 0 else _REFUSED
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
     """The grid of each axis, then each keypoint's differences from the one before, in steps of the grid."""
     axes = codes.shape[1]
@@ -166,7 +166,7 @@ def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None
         codes[k] = codes[k - 1] + steps * grid
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _common_divisor(values: NDArray[np.int64]) -> int:
     """Of all differences; 0 if there are none."""
     divisor = np.int64(0)

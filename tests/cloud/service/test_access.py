@@ -1,5 +1,6 @@
 """Every route, taken from the application itself: who has no right to it gets nothing and changes nothing."""
 
+import asyncio
 import hashlib
 import sqlite3
 from urllib.parse import quote
@@ -75,6 +76,29 @@ def test_who_has_no_right_gets_nothing_and_changes_nothing(desk, routes, who):
         refused += 1
     assert refused > (0 if who == "boss" else 5)
     assert content(desk) == before
+
+
+def test_nothing_is_read_of_a_body_before_it_is_known_who_sends_it(desk, routes):
+    async def receive():
+        raise AssertionError("the body is read")
+
+    async def ask(method, path):
+        answers = []
+
+        async def send(message):
+            answers.append(message)
+
+        scope = {
+            "type": "http", "method": method, "path": path, "raw_path": path.encode(), "query_string": b"name=x",
+            "headers": [(b"content-type", b"application/json"), (b"content-length", b"1000000000000")],
+            "http_version": "1.1", "scheme": "http", "root_path": "",
+        }  # fmt: skip
+        await desk.app(scope, receive, send)
+        return answers[0]["status"]
+
+    posts = [path.format(**VALUES) for method, path, _ in routes if method == "POST"]
+    assert len(posts) >= 7
+    assert {path: asyncio.run(ask("POST", path)) for path in posts} == dict.fromkeys(posts, 401)
 
 
 @pytest.mark.parametrize("who", ["a", "eye", "boss"])

@@ -8,11 +8,13 @@ import pytest
 from cloud.scripted import LASER
 from cloud.service.desk import POSES, A, B, Desk, put_detector
 
+from fcslam.cloud import intake
 from fcslam.cloud.store import MissionStore
 from fcslam.errors import ServiceError
 from fcslam.features.detector import SHIPPED_NETWORK
 from fcslam.records import Channel, Correction
 from fcslam.runs import open_run
+from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
 from fcslam.wire.packets import encode
@@ -90,6 +92,25 @@ def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
     assert desk.ask("POST", PACKETS, "a", content=b"").status_code == 200
 
 
+def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk, monkeypatch):
+    """A place of 2,048 keypoints at one point, whose descriptors are what is most to be expected: a few bytes."""
+
+    def unread(*_):
+        raise AssertionError("it is unpacked")
+
+    def batch(first, count):
+        numbers = range(first, first + count)
+        body = {"number": 0, "channel": 1, "count": 2048, "detector_version": "test-1"}
+        return [pb.Packet(version=1, robot="a", sequence=k, place=body).SerializeToString() for k in numbers]
+
+    assert sum(map(len, batch(0, 100))) < 4000
+    monkeypatch.setattr(intake, "decode", unread)
+    assert desk.send("a", batch(0, 100)).status_code == 413
+    monkeypatch.undo()
+    statuses = [desk.send("a", batch(0, 5)).status_code for _ in range(9)]
+    assert (statuses[0], statuses[-1]) == (400, 429)
+
+
 def test_a_full_disk_is_507_and_nothing_is_acknowledged(desk):
     desk.told(desk.send("a", A[:3]))
     database = desk.state.mission.store._database
@@ -164,6 +185,8 @@ def test_a_veto_parts_what_only_it_held_together(mapped):
     assert len(get(mapped, "maps").json()) == 2
     for wrong in ({"robot_i": "a", "robot_j": "x"}, {"robot_i": "a"}, {"robot_i": "a", "robot_j": "b", "stamp_i": 1.0}):
         assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == 400
+    assert "b+x" in mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+x"}).text
+    assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+1"}).status_code == 201
 
 
 def test_missions_are_begun_opened_and_rest_as_they_were(mapped):
@@ -177,6 +200,8 @@ def test_missions_are_begun_opened_and_rest_as_they_were(mapped):
     assert get(mapped, "fleet").json()["packets"] == len(A) + len(B)
     mapped.ask("POST", f"{API}/missions/next/open", "boss")
     assert get(mapped, "fleet").json()["packets"] == 5
+    long = mapped.ask("POST", f"{API}/missions", "boss", json={"name": "x" * 70_000})
+    assert (long.status_code, "over" in long.json()["error"]) == (413, True)
     for wrong in ("next", "../x", "", ".hidden"):
         assert mapped.ask("POST", f"{API}/missions", "boss", json={"name": wrong}).status_code in (400, 409)
     assert mapped.ask("POST", f"{API}/missions/none/open", "boss").status_code == 404

@@ -8,8 +8,9 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.detectors import LONGEST_FILE_BYTES
 from fcslam.cloud.service.authentication import Role
-from fcslam.cloud.service.limits import read_body
+from fcslam.cloud.service.limits import json_body, read_body, read_json
 from fcslam.cloud.service.state import ServiceState
+from fcslam.cloud.sessions import robot_of
 from fcslam.config import Settings
 from fcslam.records import Veto
 
@@ -31,7 +32,7 @@ def decision_router(state: ServiceState) -> APIRouter:
 
     @router.post("/finalize")
     async def finalize() -> dict[str, Any]:
-        """The result of all that is stored now, as a run folder on the service's machine; answers when it is there."""
+        """The result of what has come in without a gap, as a run folder of the service; answers when it is there."""
         mission = state.mission
         number = await run_in_threadpool(mission.store.ask_to_finalize)
         mission.worker.ring()
@@ -44,20 +45,10 @@ def decision_router(state: ServiceState) -> APIRouter:
             await asyncio.sleep(LOOK_EVERY_S)
         raise HTTPException(503, "the mission was closed; the result will be there when it is open again")
 
-    @router.post("/vetoes", status_code=201)
-    def veto(told: NewVeto) -> dict[str, int]:
+    @router.post("/vetoes", status_code=201, openapi_extra=json_body(NewVeto))
+    async def veto(request: Request) -> dict[str, int]:
         """From now on these closures count for nothing."""
-        if (told.stamp_i is None) != (told.stamp_j is None):
-            raise HTTPException(400, "two stamps or none are needed")
-        stamps = None if told.stamp_i is None or told.stamp_j is None else (told.stamp_i, told.stamp_j)
-        mission = state.mission
-        known = {robot.robot for robot in mission.store.sessions()}
-        unknown = [name for name in (told.robot_i, told.robot_j) if name.partition("+")[0] not in known]
-        if unknown:
-            raise HTTPException(400, f"there is no robot '{unknown[0]}'; there are {', '.join(sorted(known))}")
-        mission.store.veto(Veto(told.robot_i, told.robot_j, stamps))
-        mission.worker.ring()
-        return {"vetoes": len(mission.store.vetoes())}
+        return await run_in_threadpool(_veto, state, await read_json(request, NewVeto))
 
     @router.post("/detectors", status_code=201)
     async def announce_detector(request: Request) -> dict[str, str]:
@@ -67,3 +58,17 @@ def decision_router(state: ServiceState) -> APIRouter:
         return {"channel": file.channel, "version": file.version}
 
     return router
+
+
+def _veto(state: ServiceState, told: NewVeto) -> dict[str, int]:
+    if (told.stamp_i is None) != (told.stamp_j is None):
+        raise HTTPException(400, "two stamps or none are needed")
+    stamps = None if told.stamp_i is None or told.stamp_j is None else (told.stamp_i, told.stamp_j)
+    mission = state.mission
+    known = {robot.robot for robot in mission.store.sessions()}
+    unknown = [name for name in (told.robot_i, told.robot_j) if robot_of(name) not in known]
+    if unknown:
+        raise HTTPException(400, f"there is no robot '{unknown[0]}'; there are {', '.join(sorted(known))}")
+    mission.store.veto(Veto(told.robot_i, told.robot_j, stamps))
+    mission.worker.ring()
+    return {"vetoes": len(mission.store.vetoes())}

@@ -1,14 +1,20 @@
 """How much one robot may ask for."""
 
 from collections.abc import Callable
+from typing import Any, TypeVar
 
 from fastapi import HTTPException, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
 
 BYTES_PER_S = 8.0 * 2**20
 """A thousand times what a robot sends while it drives: so fast it may send what an outage kept back."""
 BURST_BYTES = 32.0 * 2**20
 REQUEST_BYTES = 16.0 * 2**10
 """What a request costs besides its bytes."""
+LONGEST_JSON_BYTES = 64 * 2**10
+
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 class RateLimit:
@@ -20,6 +26,11 @@ class RateLimit:
         self._clock, self._rate, self._burst = clock, bytes_per_s, burst
         self._level: dict[str, tuple[float, float]] = {}
         """What is left in each bucket, and when that was."""
+
+    @property
+    def largest(self) -> int:
+        """Bytes that a request may have at all."""
+        return int(self._burst - REQUEST_BYTES)
 
     def wait_s(self, robot: str, size: int) -> float:
         """Count a request of ``size`` bytes; if it is over the limit, how long to wait, and it is not counted."""
@@ -44,3 +55,21 @@ async def read_body(request: Request, longest: int) -> bytes:
         if len(body) > longest:
             raise too_long
     return bytes(body)
+
+
+async def read_json(request: Request, model: type[_Model]) -> _Model:
+    """A request's body as ``model``. For handlers: FastAPI itself would read it all before it asks who sends it.
+
+    Refuses: 413 (HTTPException) over 64 KiB, 400 (RequestValidationError) what is no such thing.
+    """
+    body = await read_body(request, LONGEST_JSON_BYTES)
+    try:
+        return model.model_validate_json(body)
+    except ValidationError as error:
+        found = error.errors(include_url=False, include_context=False, include_input=False)
+        raise RequestValidationError([{**one, "loc": ("body", *one["loc"])} for one in found]) from error
+
+
+def json_body(model: type[BaseModel]) -> dict[str, Any]:
+    """What OpenAPI is told of a body that ``read_json`` reads."""
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": model.model_json_schema()}}}}

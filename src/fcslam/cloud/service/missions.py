@@ -12,7 +12,9 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.database import told
+from fcslam.cloud.missions import EXPORT, IMPORT
 from fcslam.cloud.service.authentication import Role
+from fcslam.cloud.service.limits import json_body, read_json
 from fcslam.cloud.service.robots import Name
 from fcslam.cloud.service.state import ServiceState
 from fcslam.cloud.store import check_mission
@@ -43,9 +45,10 @@ def mission_router(state: ServiceState) -> APIRouter:
         """All missions, and which one is open."""
         return {"open": state.mission.folder.name, "missions": state.missions.names}
 
-    @router.post("/missions", status_code=201, dependencies=as_admin)
-    async def create_mission(mission: NewMission) -> dict[str, Any]:
+    @router.post("/missions", status_code=201, dependencies=as_admin, openapi_extra=json_body(NewMission))
+    async def create_mission(request: Request) -> dict[str, Any]:
         """Begin a mission and open it."""
+        mission = await read_json(request, NewMission)
         async with changing:
             await run_in_threadpool(state.missions.create, mission.name)
         return list_missions()
@@ -53,7 +56,7 @@ def mission_router(state: ServiceState) -> APIRouter:
     @router.post("/missions/import", status_code=201, dependencies=as_admin)
     async def import_mission(request: Request, name: Annotated[MissionName, Query()]) -> dict[str, Any]:
         """Make a mission of a file that an export gave; the open one stays open."""
-        with tempfile.TemporaryDirectory(dir=state.missions.root, prefix=".import") as folder:
+        with tempfile.TemporaryDirectory(dir=state.missions.root, prefix=IMPORT) as folder:
             path = Path(folder) / "mission.sqlite"
             await _receive(request, path)
             try:
@@ -78,7 +81,7 @@ def mission_router(state: ServiceState) -> APIRouter:
         """A mission as one file."""
         if name not in state.missions.names:
             raise HTTPException(404, f"there is no mission '{name}'")
-        folder = tempfile.TemporaryDirectory(dir=state.missions.root, prefix=".export")
+        folder = tempfile.TemporaryDirectory(dir=state.missions.root, prefix=EXPORT)
         path = Path(folder.name) / f"{name}.sqlite"
         try:
             await run_in_threadpool(state.missions.export, name, path)

@@ -10,8 +10,9 @@ from fcslam.cloud.service.authentication import Role
 from fcslam.cloud.service.limits import read_body
 from fcslam.cloud.service.state import ServiceState
 from fcslam.records import NAME, Channel
-from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE
+from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
+from fcslam.wire.packets import unpacked_size
 
 Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 
@@ -37,7 +38,10 @@ def robot_router(state: ServiceState) -> APIRouter:
     ) -> Response:
         """Store a batch of packets; the answer acknowledges what is on disk."""
         body = await read_body(request, MAXIMUM_BATCH_BYTES)
-        wait_s = state.rate.wait_s(robot, len(body))
+        size = await run_in_threadpool(_unpacked_size, body)
+        if size > state.rate.largest:
+            raise HTTPException(413, f"the batch unpacks to {size} bytes; send fewer packets at once")
+        wait_s = state.rate.wait_s(robot, size)
         if wait_s > 0.0:
             raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
         mission = state.mission
@@ -70,3 +74,12 @@ def robot_router(state: ServiceState) -> APIRouter:
         return FileResponse(path, media_type="application/octet-stream")
 
     return router
+
+
+def _unpacked_size(body: bytes) -> int:
+    """What a batch counts in its robot's rate: it takes time to unpack, however short it travels.
+
+    Raises:
+        PacketError: it is no batch.
+    """
+    return sum(LENGTH.size + unpacked_size(packet) for packet in read_batch(body))
