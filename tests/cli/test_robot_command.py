@@ -83,14 +83,11 @@ def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, cap
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_robot_says_what_is_left_and_goes_on_later(log, cloud, tmp_path, number):
-    command = [sys.executable, "-c", "import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"]
+    # What runs in the background of a shell ignores SIGINT.
+    heeds = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{heeds}; import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"]
     nowhere = ["robot", str(log), "--state", str(tmp_path), "--speed", "2", "--server"]
-
-    def heed() -> None:
-        signal.signal(number, signal.SIG_DFL)  # what runs in the background of a shell ignores SIGINT
-
-    started = [*command, *nowhere, "http://127.0.0.1:9"]
-    with subprocess.Popen(started, stderr=subprocess.PIPE, text=True, preexec_fn=heed) as robot:
+    with subprocess.Popen([*command, *nowhere, "http://127.0.0.1:9"], stderr=subprocess.PIPE, text=True) as robot:
         assert "127.0.0.1:9" in robot.stderr.readline()
         robot.send_signal(number)
         err = robot.stderr.read()
