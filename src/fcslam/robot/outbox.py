@@ -39,7 +39,7 @@ CREATE TABLE IF NOT EXISTS releases (
 CREATE INDEX IF NOT EXISTS waiting ON packets (epoch, sequence) WHERE data IS NOT NULL;
 """
 # ordinal: the front end's own count; sequence: the number on the wire, NULL of a packet that never travels;
-# data: NULL once it need not be sent; met: the cloud has confirmed that the epoch is this session's;
+# data: NULL once it need not be sent; met: the cloud has confirmed that the epoch belongs to this start;
 # stored: packets of the epoch, from its first, that the cloud has confirmed.
 
 
@@ -116,7 +116,7 @@ class Outbox:
         return self.waiting.bytes >= self._limit_bytes
 
     def put(self, packets: Iterable[Packet]) -> int:
-        """Take the front end's next packets of this session; what it said before it was resumed counts once.
+        """Take the front end's next packets of this epoch; what it said before it was resumed counts once.
 
         Returns how many places were left out because too much waits: the map loses chances to close loops, but no
         part of its chain.
@@ -177,7 +177,7 @@ class Outbox:
         confirmed and now lacks.
 
         Raises:
-            StateError: the cloud lacks the beginning of this session.
+            StateError: the cloud lacks the beginning of this epoch.
         """
         with self._transaction():
             newest = max(expected, default=-1)

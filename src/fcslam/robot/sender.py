@@ -77,7 +77,7 @@ class Sender:
 
         Raises:
             CloudError: the cloud turns the robot away.
-            StateError: the outbox or its folder cannot be used, or the cloud lacks the beginning of this session.
+            StateError: the outbox or its folder cannot be used, or the cloud lacks the beginning of this epoch.
         """
         try:
             return self._step()
