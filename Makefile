@@ -10,9 +10,13 @@ GL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
 HAS_GL := $(BIN)/python -c "from fcslam.simulation.engine import gl_context; gl_context(16, 16).free()" 2>/dev/null
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire::http::Timeout=20 -o Acquire::Retries=1
+# torch's build for processors is a tenth of the size of the one that PyPI has.
+TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+HAS_LEARNING := $(BIN)/python -c "import flwr, onnx, torch" 2>/dev/null
 BENCHMARKS := $(filter-out benchmarks/common.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl demo test test-system check bench proto
+.PHONY: help install gl learning demo test test-system check bench proto
 .DEFAULT_GOAL := help
 
 help:
@@ -22,6 +26,7 @@ help:
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings only if FCSLAM_DATA names their folder"
 	@echo "make install      .venv alone; EXTRAS=dev,train,federated,sim,foxglove for more"
+	@echo "make learning     torch and Flower, for training the detector, if they can be had"
 	@echo "make gl           the GL library of the simulated cameras, if it may be installed without a question"
 	@echo "make proto        generate the wire format's Python code anew"
 
@@ -30,7 +35,7 @@ install: $(INSTALLED)
 $(INSTALLED): pyproject.toml constraints.txt
 	@echo "Installing fcslam[$(EXTRAS)] into $(VENV); the first time takes about a minute."
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
+	@$(PIP) -e ".[$(EXTRAS)]"
 	@touch $@
 
 # Never fails: without a GL library there are LiDARs.
@@ -43,7 +48,15 @@ gl: $(INSTALLED)
 	    $(HAS_GL) || echo "No GL library, so no cameras. To have them: sudo apt-get install $(GL_PACKAGES)"; \
 	fi
 
-demo: gl
+# Never fails: without torch and Flower the demo leaves training out, and the tests of it are skipped.
+learning: $(INSTALLED)
+	@if ! $(HAS_LEARNING); then \
+	    echo "Installing torch and Flower into $(VENV), for training the detector; this takes about a minute."; \
+	    { $(PIP) $(TORCH_CPU) && $(PIP) -e ".[$(EXTRAS),federated]"; } 2>/dev/null || true; \
+	    $(HAS_LEARNING) || echo "No torch or no Flower, so no training. To have them: make install EXTRAS=$(EXTRAS),federated"; \
+	fi
+
+demo: gl learning
 	@$(BIN)/fcslam demo --output $(DEMO) $$($(HAS_GL) || echo --no-camera)
 
 test: $(INSTALLED)

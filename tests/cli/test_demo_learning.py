@@ -37,7 +37,7 @@ def test_without_the_libraries_one_line_says_how_to_get_them(tmp_path, monkeypat
     assert config == MissionConfig(seed=1)
     (line,) = said.splitlines()
     assert "torch and flwr are not installed" in line
-    assert "make demo EXTRAS=dev,federated" in line
+    assert "pip install 'fcslam[federated]'" in line
     assert not (tmp_path / "learning").exists()
 
 
