@@ -43,13 +43,15 @@ def test_a_robot_hears_what_is_stored_and_where_it_is(mapped):
     known = {"Fcslam-Correction": str(told[1].version)}
     assert mapped.told(mapped.send("b", [], **known)) == told[:1]
     state = mapped.ask("GET", f"{API}/robots/b/state", "b").json()
-    assert state == {"robot": "b", "epoch": 0, "next": {"0": len(B)}, "correction": told[1].version, "map": 0}
+    assert state == {
+        "robot": "b", "epoch": 0, "next": {"0": len(B)}, "correction": told[1].version, "map": 0, "refused": [],
+    }  # fmt: skip
     assert mapped.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
 
 
 def test_a_robot_that_is_not_known_has_nothing_stored(desk):
     state = desk.ask("GET", f"{API}/robots/a/state", "a").json()
-    assert state == {"robot": "a", "epoch": None, "next": {}, "correction": -1, "map": None}
+    assert state == {"robot": "a", "epoch": None, "next": {}, "correction": -1, "map": None, "refused": []}
     assert desk.told(desk.send("a", [])) == []
 
 
@@ -183,8 +185,12 @@ def test_a_result_is_a_run_folder(mapped):
 def test_a_veto_parts_what_only_it_held_together(mapped):
     assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b"}).status_code == 201
     assert len(get(mapped, "maps").json()) == 2
-    for wrong in ({"robot_i": "a", "robot_j": "x"}, {"robot_i": "a"}, {"robot_i": "a", "robot_j": "b", "stamp_i": 1.0}):
-        assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == 400
+    both = {"robot_i": "a", "robot_j": "b"}
+    for wrong, status in (
+        ({"robot_i": "a", "robot_j": "x"}, 404), ({"robot_i": "a"}, 400), ({**both, "stamps": [1.0]}, 400),
+        ({**both, "stamps": [1.0, None]}, 400), ({"robot_i": "a", "robot_j": ""}, 400), ({**both, "more": 1}, 400),
+    ):  # fmt: skip
+        assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == status
     assert "b+x" in mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+x"}).text
     assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+1"}).status_code == 201
 

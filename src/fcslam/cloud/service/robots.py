@@ -2,10 +2,11 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, HTTPException, Path, Request
+from fastapi import APIRouter, Header, HTTPException, Path, Request
 from fastapi.responses import FileResponse, Response
 from starlette.concurrency import run_in_threadpool
 
+from fcslam.cloud.service.answers import PacketProblem, PacketRefusal, RobotState, content, refusals
 from fcslam.cloud.service.authentication import Role
 from fcslam.cloud.service.limits import read_body
 from fcslam.cloud.service.state import ServiceState
@@ -14,21 +15,23 @@ from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_T
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.packets import unpacked_size
 
+NETWORK = "application/octet-stream"
+"""Media type of a detector's file."""
 Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 
 
 def robot_router(state: ServiceState) -> APIRouter:
     """Packets in, acknowledgements and corrections out; detectors."""
-    router = APIRouter(tags=["robots"])
-    as_robot = Depends(state.require(Role.ROBOT))
-    content = {MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}
+    router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
+    as_robot = state.require(Role.ROBOT)
+    taken = {status: {**told, "model": PacketProblem} for status, told in refusals(400, 409).items()}
 
     @router.post(
         "/robots/{robot}/packets",
-        dependencies=[as_robot],
+        dependencies=as_robot,
         response_class=Response,
-        responses={200: {"content": content}},
-        openapi_extra={"requestBody": {"content": content}},
+        responses={**refusals(413, 429, 507), **taken, 200: content(MEDIA_TYPE)},
+        openapi_extra={"requestBody": content(MEDIA_TYPE)},
     )
     async def send_packets(
         request: Request,
@@ -50,30 +53,44 @@ def robot_router(state: ServiceState) -> APIRouter:
         state.measures.count(answer.packets, answer.batch, robot)
         return Response(answer.batch, media_type=MEDIA_TYPE)
 
-    @router.get("/robots/{robot}/state", dependencies=[as_robot])
-    def get_state(robot: Name) -> dict[str, object]:
-        """Where a robot that starts again goes on: by epoch, the number of the first packet that is missing."""
+    @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
+    def get_state(robot: Name) -> RobotState:
+        """Where a robot that starts again goes on, and which of its packets were refused."""
         store = state.mission.store
         sessions = store.sessions(robot)
         newest = sessions[-1].epoch if sessions else None
         correction = None if newest is None else store.correction(robot, newest)
-        return {
-            "robot": robot,
-            "epoch": newest,
-            "next": {str(session.epoch): session.next for session in sessions},
-            "correction": correction.correction.version if correction else -1,
-            "map": correction.correction.map_index if correction else None,
-        }
+        return RobotState(
+            robot=robot,
+            epoch=newest,
+            next={str(session.epoch): session.next for session in sessions},
+            correction=correction.correction.version if correction else -1,
+            map=correction.correction.map_index if correction else None,
+            refused=refused_packets(state, robot),
+        )
 
-    @router.get("/detectors/{channel}/{version}", dependencies=[Depends(state.require(*Role))])
+    @router.get(
+        "/detectors/{channel}/{version}",
+        dependencies=state.require(*Role),
+        response_class=Response,
+        responses={**refusals(404), 200: content(NETWORK)},
+    )
     def get_detector(channel: Channel, version: Name) -> FileResponse:
         """The network of a detector version."""
         path = state.detectors.path(channel, version)
         if not path.is_file():
             raise HTTPException(404, f"there is no {channel} detector '{version}'")
-        return FileResponse(path, media_type="application/octet-stream")
+        return FileResponse(path, media_type=NETWORK)
 
     return router
+
+
+def refused_packets(state: ServiceState, robot: str) -> list[PacketRefusal]:
+    """Packets of a robot that count for nothing."""
+    return [
+        PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
+        for epoch, sequence, reason in state.mission.store.refusals(robot)
+    ]
 
 
 def _unpacked_size(body: bytes) -> int:

@@ -1,9 +1,10 @@
 """What all parts of the HTTP service share."""
 
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
-from fastapi import HTTPException, Request
+from fastapi import Depends, HTTPException, Request, Security
+from fastapi.params import Depends as Dependency
+from fastapi.security import HTTPBearer
 
 from fcslam.cloud.detectors import DetectorShelf
 from fcslam.cloud.missions import Missions, OpenMission
@@ -11,6 +12,8 @@ from fcslam.cloud.service.authentication import Authenticator, Role
 from fcslam.cloud.service.events import EventStream
 from fcslam.cloud.service.limits import RateLimit
 from fcslam.cloud.service.measures import Measures
+
+_BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
 
 
 @dataclass(slots=True)
@@ -35,8 +38,8 @@ class ServiceState:
         """Networks that robots may fetch."""
         return self.missions.detectors
 
-    def require(self, *roles: Role) -> Callable[[Request], Awaitable[None]]:
-        """A dependency: whoever asks has a token of one of the roles; a robot's is good for that robot alone.
+    def require(self, *roles: Role) -> list[Dependency]:
+        """Dependencies of a route: whoever asks has one of the roles, and a robot that of itself alone.
 
         Refuses (HTTPException): 401 without a token that is known, 403 with another one's, 429 too many requests.
         """
@@ -57,4 +60,5 @@ class ServiceState:
             if entry.role is Role.ROBOT and robot not in (None, entry.name):
                 raise HTTPException(403, f"the token of robot '{entry.name}' is not good for robot '{robot}'")
 
-        return check
+        # the second one tells OpenAPI of tokens, and does nothing else
+        return [Depends(check)] if self.authenticator.is_open else [Depends(check), Security(_BEARER)]
