@@ -8,15 +8,18 @@ from fastapi import APIRouter, FastAPI, Request, Response
 
 import fcslam
 from fcslam.cloud.service.decisions import decision_router
-from fcslam.cloud.service.missions import mission_router
+from fcslam.cloud.service.missions import file_router, mission_router
 from fcslam.cloud.service.operations import operations_router
 from fcslam.cloud.service.problems import add_handlers
-from fcslam.cloud.service.robots import robot_router
+from fcslam.cloud.service.robots import network_router, robot_router
 from fcslam.cloud.service.state import ServiceState
 from fcslam.cloud.service.viewers import fleet_router, map_router
 from fcslam.cloud.service.watching import event_router
 
 PREFIX = "/api/v1"
+ROUTERS = (
+    robot_router, network_router, fleet_router, map_router, mission_router, file_router, decision_router, event_router,
+)  # fmt: skip
 
 
 class Service(FastAPI):
@@ -49,7 +52,7 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
         lifespan=lifespan,
     )
     add_handlers(app)
-    for make in (robot_router, fleet_router, map_router, mission_router, decision_router, event_router):
+    for make in ROUTERS:
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(operations_router(state))
     for router in more:

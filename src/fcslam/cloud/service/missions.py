@@ -1,6 +1,5 @@
 """Missions: begin, open, take away, bring in."""
 
-import asyncio
 import tempfile
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -38,15 +37,14 @@ class NewMission(Settings):
 
 
 def mission_router(state: ServiceState) -> APIRouter:
-    """All missions of the service."""
+    """All missions of the service, and which one is open."""
     router = APIRouter(tags=["missions"], responses=refusals(401, 403, 503))
     as_admin = state.require(Role.ADMIN)
-    changing = asyncio.Lock()
 
     @router.get("/missions", dependencies=state.require(Role.VIEWER, Role.ADMIN))
     def list_missions() -> MissionList:
         """All missions, and which one is open."""
-        return MissionList(open=state.mission.folder.name, missions=state.missions.names)
+        return _missions(state)
 
     @router.post(
         "/missions",
@@ -58,14 +56,29 @@ def mission_router(state: ServiceState) -> APIRouter:
     async def create_mission(request: Request) -> MissionList:
         """Begin a mission and open it."""
         mission = await read_json(request, NewMission)
-        async with changing:
+        async with state.changing:
             await run_in_threadpool(state.missions.create, mission.name)
-        return list_missions()
+        return _missions(state)
+
+    @router.post("/missions/{name}/open", dependencies=as_admin, responses=refusals(400, 404, 507))
+    async def open_mission(name: Name) -> MissionList:
+        """Let robots' packets go to this mission from now on."""
+        if name not in state.missions.names:
+            raise HTTPException(404, f"there is no mission '{name}'")
+        async with state.changing:
+            await run_in_threadpool(state.missions.open, name)
+        return _missions(state)
+
+    return router
+
+
+def file_router(state: ServiceState) -> APIRouter:
+    """Missions as files."""
+    router = APIRouter(tags=["missions"], dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503))
 
     @router.post(
         "/missions/import",
         status_code=201,
-        dependencies=as_admin,
         openapi_extra={"requestBody": {"required": True, **content(FILE)}},
         responses=refusals(400, 409, 413, 507),
     )
@@ -78,22 +91,12 @@ def mission_router(state: ServiceState) -> APIRouter:
                 await run_in_threadpool(check_mission, path)
             except StoreError as error:
                 raise HTTPException(400, f"what was sent is no exported mission ({error})") from error
-            async with changing:
+            async with state.changing:
                 await run_in_threadpool(state.missions.take_in, name, path)
-        return list_missions()
-
-    @router.post("/missions/{name}/open", dependencies=as_admin, responses=refusals(400, 404, 507))
-    async def open_mission(name: Name) -> MissionList:
-        """Let robots' packets go to this mission from now on."""
-        if name not in state.missions.names:
-            raise HTTPException(404, f"there is no mission '{name}'")
-        async with changing:
-            await run_in_threadpool(state.missions.open, name)
-        return list_missions()
+        return _missions(state)
 
     @router.get(
         "/missions/{name}/export",
-        dependencies=as_admin,
         response_class=Response,
         responses={**refusals(400, 404, 507), 200: content(FILE)},
     )
@@ -112,6 +115,10 @@ def mission_router(state: ServiceState) -> APIRouter:
         return StreamingResponse(_content(path, folder), media_type=FILE, headers=headers)
 
     return router
+
+
+def _missions(state: ServiceState) -> MissionList:
+    return MissionList(open=state.mission.folder.name, missions=state.missions.names)
 
 
 async def _receive(request: Request, path: Path) -> None:

@@ -21,7 +21,7 @@ Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 
 
 def robot_router(state: ServiceState) -> APIRouter:
-    """Packets in, acknowledgements and corrections out; detectors."""
+    """Packets in, acknowledgements and corrections out."""
     router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
     as_robot = state.require(Role.ROBOT)
     taken = {status: {**told, "model": PacketProblem} for status, told in refusals(400, 409).items()}
@@ -68,6 +68,13 @@ def robot_router(state: ServiceState) -> APIRouter:
             map=correction.correction.map_index if correction else None,
             refused=refused_packets(state, robot),
         )
+
+    return router
+
+
+def network_router(state: ServiceState) -> APIRouter:
+    """Detectors for robots."""
+    router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
 
     @router.get(
         "/detectors/{channel}/{version}",

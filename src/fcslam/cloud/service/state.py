@@ -1,5 +1,6 @@
 """What all parts of the HTTP service share."""
 
+import asyncio
 from dataclasses import dataclass, field
 
 from fastapi import Depends, HTTPException, Request, Security
@@ -27,6 +28,8 @@ class ServiceState:
     measures: Measures = field(default_factory=Measures)
     closing: bool = False
     """Nothing new is begun any more."""
+    changing: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """Whoever has it may begin, open and bring in missions."""
 
     @property
     def mission(self) -> OpenMission:
