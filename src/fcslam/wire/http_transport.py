@@ -82,23 +82,29 @@ class BatchTransport(Protocol):
 class HttpTransport:
     """One connection to one cloud for one robot; docs/howto-robot.md says what it makes of which answer."""
 
-    def __init__(self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None) -> None:
+    def __init__(
+        self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None,
+        own: tuple[Path, Path] | None = None,
+    ) -> None:  # fmt: skip
         """``agent`` tells two processes apart that go by one name; ``ca`` is a PEM file, the system's if not given.
 
+        ``own``: PEM files of the robot's certificate and its key, which it shows instead of a token.
+
         Raises:
-            CloudError: ``url`` is none, or would show the token to the network; ``ca`` cannot be read.
+            CloudError: ``url`` is none, or would show the token to the network; ``ca`` or ``own`` cannot be read.
         """
         import httpx
 
-        _check_url(url, token)
+        _check_url(url, token, own)
         self._url = url.rstrip("/")
+        self._has_own = own is not None
         self._robot = quote(robot, safe="")
         headers = {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE}
         self._client = httpx.Client(
             base_url=f"{self._url}/api/v1/",
             headers=headers | ({"Authorization": f"Bearer {token}"} if token else {}),
             timeout=httpx.Timeout(ANSWER_TIMEOUT_S, connect=CONNECT_TIMEOUT_S),
-            verify=_trust(ca),
+            verify=_trust(ca, own),
             trust_env=False,
         )
 
@@ -152,7 +158,13 @@ class HttpTransport:
         except httpx.RequestError as error:
             if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
                 raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error
-            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}") from error
+            # A cloud that does not believe a certificate hangs up, as TLS 1.3 has it, without a word that gets here.
+            hint = (
+                "; if that stays, it does not trust this robot's certificate"
+                if self._has_own and isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError)
+                else ""
+            )
+            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{hint}") from error
 
     def _require(self, response: "httpx.Response", status: int) -> None:
         """Turn any other answer into an error."""
@@ -180,12 +192,14 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _check_url(url: str, token: str | None) -> None:
+def _check_url(url: str, token: str | None, own: tuple[Path, Path] | None) -> None:
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise CloudError(f"{url!r} is no address of a cloud; give one as https://cloud.example:8443")
     if token and parts.scheme == "http" and not _is_loopback(parts.hostname):
         raise CloudError(f"{url}: a token would be readable on its way; use https")
+    if own and parts.scheme == "http":
+        raise CloudError(f"{url}: nobody is shown a certificate there; use https")
 
 
 def _is_loopback(host: str) -> bool:
@@ -195,8 +209,14 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _trust(ca: Path | None) -> ssl.SSLContext:
+def _trust(ca: Path | None, own: tuple[Path, Path] | None) -> ssl.SSLContext:
     try:
-        return ssl.create_default_context(cafile=None if ca is None else str(ca))
+        context = ssl.create_default_context(cafile=None if ca is None else str(ca))
     except (OSError, ssl.SSLError) as error:
         raise CloudError(f"{ca}: no certificate authority can be read ({error}); give a PEM file") from error
+    if own is not None:
+        try:
+            context.load_cert_chain(*own)
+        except (OSError, ssl.SSLError) as error:
+            raise CloudError(f"{own[0]}, {own[1]}: no certificate with its key ({error}); give PEM files") from error
+    return context

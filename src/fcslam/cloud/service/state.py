@@ -52,16 +52,19 @@ class ServiceState:
                 raise HTTPException(503, "the service is stopping; try again")
             if self.authenticator.is_open:
                 return
-            entry = self.authenticator.who(request.headers.get("authorization"))
-            if entry is None:
+            tls = request.scope.get("extensions", {}).get("tls", {})
+            who = self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
+            if who is None:
                 headers = {"WWW-Authenticate": "Bearer"}
-                raise HTTPException(401, "no token, or an unknown one; send Authorization: Bearer TOKEN", headers)
-            if entry.role not in roles:
+                raise HTTPException(
+                    401, "no known token and no robot's certificate; send Authorization: Bearer TOKEN", headers
+                )
+            if who.role not in roles:
                 needed = " or ".join(roles)
-                raise HTTPException(403, f"the token of '{entry.name}' is a {entry.role}'s; this takes {needed}'s")
+                raise HTTPException(403, f"'{who.name}' is a {who.role}; this is for a {needed}")
             robot = request.path_params.get("robot")
-            if entry.role is Role.ROBOT and robot not in (None, entry.name):
-                raise HTTPException(403, f"the token of robot '{entry.name}' is not good for robot '{robot}'")
+            if who.role is Role.ROBOT and robot not in (None, who.name):
+                raise HTTPException(403, f"robot '{who.name}' does not speak for robot '{robot}'")
 
         # the second one tells OpenAPI of tokens, and does nothing else
         return [Depends(check)] if self.authenticator.is_open else [Depends(check), Security(_BEARER)]
