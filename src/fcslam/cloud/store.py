@@ -24,7 +24,7 @@ APPLIED = "applied"
 CONFIG = "config"
 """A fact: the mission's configuration."""
 
-_VERSION = 1
+_VERSION = 2
 
 _SCHEMA = """
 CREATE TABLE packets (
@@ -33,6 +33,7 @@ CREATE TABLE packets (
     refusal TEXT, turn INTEGER UNIQUE, data BLOB NOT NULL,
     PRIMARY KEY (robot, epoch, sequence)
 ) STRICT;
+CREATE INDEX refusals ON packets (robot, epoch, sequence) WHERE refusal IS NOT NULL;
 CREATE INDEX hellos ON packets (robot, epoch, sequence) WHERE kind = 'hello';
 CREATE TABLE sessions (
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, next INTEGER NOT NULL, PRIMARY KEY (robot, epoch)
@@ -179,6 +180,12 @@ class MissionStore:
                 f"SELECT {columns} FROM packets WHERE {where} ORDER BY epoch, sequence", (robot,)
             )
         ]
+
+    def refusal_count(self, robot: str) -> int:
+        """How many packets of a robot were refused."""
+        return int(
+            self._database.value("SELECT count(*) FROM packets WHERE robot = ? AND refusal IS NOT NULL", (robot,))
+        )
 
     def sessions(self, robot: str | None = None) -> list[Session]:
         """Sessions of one robot or of all, by robot and epoch."""

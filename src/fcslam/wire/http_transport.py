@@ -3,14 +3,14 @@
 import ipaddress
 import ssl
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import quote, urlsplit
 
-from fcslam.errors import CloudError, PacketError, UnavailableError
+from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
 from fcslam.records import Channel
-from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch, write_batch
+from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, REFUSED_HEADER, read_batch, write_batch
 
 if TYPE_CHECKING:
     import httpx
@@ -39,6 +39,8 @@ class Answer:
     packets: tuple[bytes, ...] = ()
     """Encoded packets from the cloud."""
     refusal: Refusal | None = None
+    refused: int = 0
+    """How many of the robot's packets count for nothing by now; some were found out after they were stored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,8 @@ class CloudState:
 
     expected: Mapping[int, int]
     """The next sequence that it expects, by epoch."""
+    refused: Mapping[tuple[int, int], str] = field(default_factory=dict)
+    """Why packets count for nothing, by epoch and sequence."""
 
 
 class BatchTransport(Protocol):
@@ -67,6 +71,7 @@ class BatchTransport(Protocol):
 
         Raises:
             UnavailableError: no answer came, or the cloud is busy.
+            OversizeError: it takes no batch of this size.
             CloudError: it turns this robot away.
         """
 
@@ -117,10 +122,12 @@ class HttpTransport:
         response = self._ask("GET", f"robots/{self._robot}/state", accept="application/json")
         self._require(response, 200)
         try:
-            expected = {int(epoch): int(sequence) for epoch, sequence in response.json()["next"].items()}
+            told = response.json()
+            expected = {int(epoch): int(sequence) for epoch, sequence in told["next"].items()}
+            refused = {(int(one["epoch"]), int(one["sequence"])): str(one["reason"]) for one in told["refused"]}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise CloudError(f"{self._url}: answers, but not as a cloud of fcslam; give its address") from error
-        return CloudState(expected)
+        return CloudState(expected, refused)
 
     def send(self, packets: Sequence[bytes], correction: int) -> Answer:
         """As in BatchTransport."""
@@ -137,8 +144,8 @@ class HttpTransport:
             raise UnavailableError(self._reason(response))  # the batch went astray on its way
         self._require(response, 200)
         try:
-            return Answer(tuple(read_batch(response.content)))
-        except PacketError as error:
+            return Answer(tuple(read_batch(response.content)), refused=int(response.headers.get(REFUSED_HEADER, 0)))
+        except (PacketError, ValueError) as error:
             raise UnavailableError(f"{self._url}: the answer is broken ({error})") from error
 
     def detector(self, channel: Channel, version: str) -> bytes:
@@ -176,7 +183,7 @@ class HttpTransport:
         is_other_agent = code == 409 and "index" not in _detail(response)  # it may be gone soon
         if code in _LATER or is_other_agent:
             raise UnavailableError(self._reason(response), wait_s)
-        raise CloudError(self._reason(response))
+        raise (OversizeError if code == 413 else CloudError)(self._reason(response))
 
     def _reason(self, response: "httpx.Response") -> str:
         said = _detail(response).get("error") or response.reason_phrase

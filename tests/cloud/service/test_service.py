@@ -12,12 +12,12 @@ from fcslam.cloud import intake
 from fcslam.cloud.store import MissionStore
 from fcslam.errors import ServiceError
 from fcslam.features.detector import SHIPPED_NETWORK
-from fcslam.records import Channel, Correction
+from fcslam.records import Channel, Correction, Keyscan
 from fcslam.runs import open_run
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
-from fcslam.wire.packets import encode
+from fcslam.wire.packets import decode, encode, readdress
 
 API = "/api/v1"
 PACKETS = f"{API}/robots/a/packets"
@@ -65,6 +65,17 @@ def test_a_refused_packet_has_an_index_and_a_reason(desk, data, status):
     assert response.json()["index"] == 1
     assert response.json()["error"]
     assert desk.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": 1}
+
+
+def test_what_the_worker_refuses_later_is_told_with_every_answer_and_why_on_asking(desk):
+    assert desk.send("a", A[:9]).headers["Fcslam-Refused"] == "0"
+    again = next(k for k, data in enumerate(A) if isinstance(decode(data).body, Keyscan))
+    desk.told(desk.send("a", [readdress(A[again], 0, 9)]))
+    assert desk.send("a", []).headers["Fcslam-Refused"] == "1"
+    (refused,) = desk.ask("GET", f"{API}/robots/a/state", "a").json()["refused"]
+    assert (refused["epoch"], refused["sequence"], "keyscan" in refused["reason"]) == (0, 9, True)
+    assert get(desk, "robots/a").json()["refused"] == [refused]
+    assert desk.send("b", B[:2]).headers["Fcslam-Refused"] == "0", "it is not its own"
 
 
 def test_a_second_agent_is_refused(desk):

@@ -11,12 +11,17 @@ from fcslam.cloud.service.authentication import Role
 from fcslam.cloud.service.limits import read_body
 from fcslam.cloud.service.state import ServiceState
 from fcslam.records import NAME, Channel
-from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, read_batch
+from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, REFUSED_HEADER, read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.packets import unpacked_size
 
 NETWORK = "application/octet-stream"
 """Media type of a detector's file."""
+_REFUSED = {
+    REFUSED_HEADER: {
+        "schema": {"type": "integer", "minimum": 0}, "required": True, "description": "packets that count for nothing",
+    }
+}  # fmt: skip
 Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 
 
@@ -30,7 +35,7 @@ def robot_router(state: ServiceState) -> APIRouter:
         "/robots/{robot}/packets",
         dependencies=as_robot,
         response_class=Response,
-        responses={**refusals(413, 429, 507), **taken, 200: content(MEDIA_TYPE)},
+        responses={**refusals(413, 429, 507), **taken, 200: {**content(MEDIA_TYPE), "headers": _REFUSED}},
         openapi_extra={"requestBody": content(MEDIA_TYPE)},
     )
     async def send_packets(
@@ -51,7 +56,7 @@ def robot_router(state: ServiceState) -> APIRouter:
         answer = await run_in_threadpool(mission.intake.take, robot, agent, body, correction)
         mission.worker.ring()
         state.measures.count(answer.packets, answer.batch, robot)
-        return Response(answer.batch, media_type=MEDIA_TYPE)
+        return Response(answer.batch, media_type=MEDIA_TYPE, headers={REFUSED_HEADER: str(answer.refused)})
 
     @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
     def get_state(robot: Name) -> RobotState:
