@@ -288,6 +288,19 @@ class MissionStore:
                 refused += Traffic(packets, size)
         return Ledger(accepted, refused)
 
+    def arrived(self, after: int, limit: int) -> list[tuple[int, str, Kind | None, Channel | None, Traffic]]:
+        """What came in after a row of the file (0: all), at most ``limit`` packets.
+
+        Last row, robot, kind, channel and traffic of each of its parts; refused packets count, too.
+        """
+        chosen = "SELECT rowid, robot, kind, channel, length(data) AS size FROM packets WHERE rowid > ? ORDER BY rowid"
+        parts = "max(rowid), robot, kind, channel, count(*), sum(size)"
+        statement = f"SELECT {parts} FROM ({chosen} LIMIT ?) GROUP BY robot, kind, channel"
+        return [
+            (row, robot, kind and Kind(kind), channel and Channel(channel), Traffic(count, size))
+            for row, robot, kind, channel, count, size in self._database.rows(statement, (after, limit))
+        ]
+
     def export(self, path: Path) -> None:
         """Write the mission as one new file.
 

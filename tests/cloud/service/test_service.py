@@ -9,6 +9,7 @@ from cloud.scripted import LASER
 from cloud.service.desk import POSES, A, B, Desk, put_detector
 
 from fcslam.cloud import intake
+from fcslam.cloud.service import measures
 from fcslam.cloud.store import MissionStore
 from fcslam.errors import ServiceError
 from fcslam.features.detector import SHIPPED_NETWORK
@@ -258,14 +259,44 @@ def test_two_services_do_not_share_a_folder(desk):
         Desk(desk.state.missions.root)
 
 
+def measured(desk):
+    text = get(desk, "../../metrics").text
+    told = (line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+    return {name: float(value) for name, value in told}
+
+
+def uplink(desk, robot):
+    """Bytes of one robot, by the measures."""
+    lines = measured(desk).items()
+    return sum(value for name, value in lines if name.startswith("fcslam_bytes_total{") and f'robot="{robot}"' in name)
+
+
 def test_measures_say_what_came_in(mapped):
-    text = get(mapped, "../../metrics").text
-    lines = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
-    assert float(lines['fcslam_packets_total{channel="lidar",kind="place",robot="a"}']) > 0
-    total = sum(float(v) for k, v in lines.items() if k.startswith("fcslam_bytes_total{") and 'robot="a"' in k)
-    assert total == sum(map(len, A))
-    assert float(lines["fcslam_packets_stored"]) == len(A) + len(B)
-    assert float(lines["fcslam_packets_queued"]) == 0
+    lines = measured(mapped)
+    assert lines['fcslam_packets_total{channel="lidar",kind="place",mission="mission",robot="a"}'] > 0
+    assert uplink(mapped, "a") == sum(map(len, A))
+    assert lines["fcslam_packets_stored"] == len(A) + len(B)
+    assert lines["fcslam_packets_queued"] == 0
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 10_000])
+def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, scripted, monkeypatch, at_once):
+    monkeypatch.setattr(measures, "_AT_ONCE", at_once)
+    scripted()
+    with Desk(tmp_path / "data") as desk:
+        desk.told(desk.send("a", A[:5]))
+        before = uplink(desk, "a")
+        desk.told(desk.send("a", A[3:9]))
+        assert (before, uplink(desk, "a")) == (sum(map(len, A[:5])), sum(map(len, A[:9]))), "again is not new"
+        assert desk.send("a", [A[9][:-1]]).status_code == 400
+        refused = uplink(desk, "a")
+    with Desk(tmp_path / "data") as again:
+        assert uplink(again, "a") == refused >= before
+        again.told(again.send("b", B[:4]))
+        assert (uplink(again, "a"), uplink(again, "b")) == (refused, sum(map(len, B[:4])))
+        again.ask("POST", f"{API}/missions", "boss", json={"name": "next"})
+        again.told(again.send("a", A[:2]))
+        assert uplink(again, "a") == refused + sum(map(len, A[:2])), "missions are told apart, and none is forgotten"
 
 
 def test_the_interface_describes_itself(desk):
