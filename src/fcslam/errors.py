@@ -13,6 +13,7 @@ FcslamError
 │   ├── StoreError        a mission cannot be kept or read: the disk is full, the file is broken or something else
 │   ├── StateError        a robot's state folder cannot be used
 │   └── CloudError        the cloud turns a robot away: its token, its name or what it sends
+│       └── OversizeError     it takes nothing so large at once
 ├── PacketError           bytes received are not a packet that may be trusted
 │   └── PacketConflictError   two different packets have one number
 └── UnavailableError      the cloud cannot be reached or is busy: try again
@@ -61,6 +62,10 @@ class StateError(InputError):
 
 class CloudError(InputError):
     """The cloud turns a robot away, and will again: its token, its name, its certificate, or what it sends."""
+
+
+class OversizeError(CloudError):
+    """The cloud, or what stands before it, takes no request of this size; a smaller one may pass."""
 
 
 class UnavailableError(FcslamError):

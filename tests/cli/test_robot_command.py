@@ -62,6 +62,11 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
         (["--name", "r+2"], "how a later start of 'r' is called"),
         (["--name", "r/2"], "is no name"),
         (["--token-file", "nowhere"], "no token can be read"),
+        (["--certificate", "nowhere"], "--certificate and --key belong together"),
+        (
+            ["--server", "https://localhost", "--certificate", "no.pem", "--key", "no.key"],
+            "no certificate with its key",
+        ),
         (["--state", "/dev/null/state"], "cannot be made"),
         (["--ca", "nowhere"], "no certificate authority"),
     ],

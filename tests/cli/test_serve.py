@@ -36,11 +36,15 @@ def token(folder, name):
 
 
 def test_secrets_are_their_owners_alone_and_the_cloud_knows_hashes_only(credentials):
-    for name in ("ca.key", "cloud.key", "tokens/robot_1", "tokens/boss"):
+    for name in ("ca.key", "cloud.key", "robots/robot_1.key", "tokens/robot_1", "tokens/boss"):
         assert stat.S_IMODE((credentials / name).stat().st_mode) == 0o600
     text = (credentials / "tokens.yaml").read_text()
     assert token(credentials, "robot_1") not in text
     assert [entry["name"] for entry in yaml.safe_load(text)["tokens"]] == ["robot_1", "robot_2", "robot_3", "boss"]
+
+
+def test_only_robots_have_certificates_of_their_own(credentials):
+    assert {path.stem for path in (credentials / "robots").glob("*.pem")} == {"robot_1", "robot_2", "robot_3"}
 
 
 def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials):
@@ -65,6 +69,7 @@ def test_names_that_cannot_be_are_refused(tmp_path, wrong, capsys):
         (["--host", "::"], "--insecure"),
         (["--tls-key", "k.pem"], "belong together"),
         (["--tls-key", "no.pem", "--tls-certificate", "no.pem"], "no.pem"),
+        (["--client-ca", "ca.pem"], "--tls-certificate"),
         (["--tokens", "no.yaml"], "no.yaml"),
         (["--config", "no.yaml"], "no.yaml"),
         (["--host", "256.1.1.1", "--insecure"], "256.1.1.1"),
@@ -154,7 +159,8 @@ def test_killed_at_any_moment_a_service_loses_nothing_and_finds_the_same(tmp_pat
 def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, credentials):
     mine = in_order(p for p in packets if p.robot == "robot_1")[:40]
     tls = ["--tls-certificate", str(credentials / "cloud.pem"), "--tls-key", str(credentials / "cloud.key")]
-    service = Service(tmp_path / "data", "--tokens", str(credentials / "tokens.yaml"), *tls)
+    asked = ["--tokens", str(credentials / "tokens.yaml"), "--client-ca", str(credentials / "ca.pem")]
+    service = Service(tmp_path / "data", *asked, *tls)
     trusted = ssl.create_default_context(cafile=str(credentials / "ca.pem"))
     bearer = {"Authorization": f"Bearer {token(credentials, 'robot_1')}"}
     with httpx.Client(base_url=service.url, verify=trusted, timeout=60.0) as client:
@@ -164,6 +170,10 @@ def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, crede
         assert client.get(f"{API}/fleet", headers=bearer).status_code == 403
         boss = {"Authorization": f"Bearer {token(credentials, 'boss')}"}
         assert client.get(f"{API}/fleet", headers=boss).json()["packets"] == 40
+    trusted.load_cert_chain(credentials / "robots" / "robot_2.pem", credentials / "robots" / "robot_2.key")
+    with httpx.Client(base_url=service.url, verify=trusted, timeout=60.0) as client:
+        assert client.get(f"{API}/robots/robot_2/state").status_code == 200, "it has shown its certificate"
+        assert client.get(f"{API}/robots/robot_1/state").status_code == 403
     with httpx.Client(base_url=service.url, timeout=60.0) as client, pytest.raises(httpx.ConnectError):
         client.get("/healthz")
     service.stop()

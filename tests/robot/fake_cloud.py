@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 from wire.examples import CLOSURE, CORRECTION, HELLO, packet
 
-from fcslam.errors import CloudError, UnavailableError
+from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import DetectorFile
 from fcslam.wire.http_transport import Answer, CloudState, Refusal
 from fcslam.wire.messages import Acknowledgement, Release
@@ -25,8 +25,10 @@ class FakeCloud:
     correction: int = -1
     unwanted: set[bytes] = field(default_factory=set)
     """Contents of packets that it will never take."""
-    refused: set[tuple[int, int]] = field(default_factory=set)
-    """Their numbers, which are used up."""
+    refused: dict[tuple[int, int], str] = field(default_factory=dict)
+    """Their numbers, which are used up, and why."""
+    most: int = 1024
+    """Packets that it takes at once."""
 
     releases: dict[DetectorFile, bytes] = field(default_factory=dict)
     """Detectors that it announces all the time, and their contents; one without cannot be had."""
@@ -40,8 +42,8 @@ class FakeCloud:
         return content
 
     def state(self):
-        epochs = {epoch for epoch, _ in self.stored}
-        return CloudState({epoch: self.next(epoch) for epoch in epochs})
+        epochs = {epoch for epoch, _ in (*self.stored, *self.refused)}
+        return CloudState({epoch: self.next(epoch) for epoch in epochs}, dict(self.refused))
 
     def next(self, epoch):
         sequence = 0
@@ -50,11 +52,13 @@ class FakeCloud:
         return sequence
 
     def send(self, packets, correction):
+        if len(packets) > self.most:
+            raise OversizeError("too much")
         for index, data in enumerate(packets):
             sent = decode(data)
             key = sent.epoch, sent.sequence
             if content(data) in self.unwanted:
-                self.refused.add(key)
+                self.refused[key] = "unwanted"
                 return Answer(refusal=Refusal(index, "unwanted"))
             assert self.stored.setdefault(key, data) == data, "two packets of one number"
         epoch = decode(packets[0]).epoch if packets else max((e for e, _ in self.stored), default=0)
@@ -65,7 +69,7 @@ class FakeCloud:
         answer += [encode(packet(Release("alice", file))) for file in self.releases]
         if self.correction > correction:
             answer.append(encode(replace(packet(replace(CORRECTION, version=self.correction)), epoch=epoch)))
-        return Answer(tuple(answer))
+        return Answer(tuple(answer), refused=len(self.refused))
 
 
 class Network:

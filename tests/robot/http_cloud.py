@@ -9,7 +9,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 from robot.fake_cloud import FakeCloud
 
-from fcslam.wire.batches import CORRECTION_HEADER, MEDIA_TYPE, read_batch, write_batch
+from fcslam.wire.batches import CORRECTION_HEADER, MEDIA_TYPE, REFUSED_HEADER, read_batch, write_batch
 
 
 class HttpCloud:
@@ -27,13 +27,15 @@ class HttpCloud:
         if self.canned:
             return self.canned.popleft()
         if path.endswith("/state"):
-            epochs = self.cloud.state().expected
-            return 200, {}, json.dumps({"next": epochs, "correction": -1, "map": None}).encode()
+            state = self.cloud.state()
+            refused = [{"epoch": e, "sequence": s, "reason": why} for (e, s), why in state.refused.items()]
+            return 200, {}, json.dumps({"next": state.expected, "refused": refused}).encode()
         answer = self.cloud.send(read_batch(body), int(headers.get(CORRECTION_HEADER, -1)))
         if answer.refusal is not None:
             detail = {"error": answer.refusal.reason, "index": answer.refusal.index}
             return 400, {}, json.dumps(detail).encode()
-        return 200, {"Content-Type": MEDIA_TYPE}, write_batch(answer.packets)
+        headers = {"Content-Type": MEDIA_TYPE, REFUSED_HEADER: str(answer.refused)}
+        return 200, headers, write_batch(answer.packets)
 
 
 @contextmanager

@@ -89,6 +89,7 @@ class Deliveries(RuleBasedStateMachine):
         self.outbox = Outbox(self.path, "alice", LIMIT)
         assert self.outbox.begin("r", resume=True) == len(self.said)
         self.outbox.meet({0: self.cloud} if self.cloud else {})
+        self.outbox.acknowledge(0, self.cloud - 1)
         assert self.outbox.put(self.said) == 0
 
     @invariant()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from robot.fake_cloud import FakeCloud, Network, content, said
 from wire.examples import HELLO, LIDAR_PLACE, RELEASE
 
-from fcslam.errors import CloudError, StateError, UnavailableError
+from fcslam.errors import CloudError, OversizeError, StateError, UnavailableError
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import ASK_AFTER_S, EVERY_S, LONGEST_RETRY_S, Sender, retry_delay_s
 from fcslam.wire.http_transport import Answer
@@ -23,13 +23,14 @@ class Robot:
     def __init__(self, path, network):
         self.now = 0.0
         self.corrections, self.kept, self.refused = [], [], []
+        self.aside = self.refused.append
         self.outbox = Outbox(path, "alice", 10**9)
         self.known = self.outbox.begin("r", resume=path.with_name("resumed").exists())
         path.with_name("resumed").touch()
         self.sender = Sender(
             self.outbox, network, np.random.default_rng(0), lambda: self.now, self.corrections.append,
             lambda file, content: self.kept.append((file, content)),
-            lambda data, reason: self.refused.append((content(data), reason)),
+            lambda data, reason: self.aside((content(data), reason)),
         )  # fmt: skip
 
     def step(self):
@@ -54,15 +55,21 @@ MOMENTS = st.one_of(
 
 
 @settings(max_examples=60)
-@given(st.lists(MOMENTS, max_size=40), st.integers(1, 7))
-def test_every_packet_arrives_once_and_in_order(tmp_path_factory, moments, large):
-    """Requests and answers lost, cut, repeated or refused for now; the robot killed and resumed at any moment."""
+@given(st.lists(MOMENTS, max_size=40), st.integers(1, 7), st.sets(st.integers(0, 40), max_size=5))
+def test_every_packet_arrives_once_and_in_order(tmp_path_factory, moments, large, unwanted):
+    """Requests and answers lost, cut, repeated or refused for now; the robot killed and resumed at any moment.
+
+    What the cloud does not want is set aside, whatever became of the answer that said so.
+    """
     network = Network(FakeCloud())
     path = tmp_path_factory.mktemp("robot") / "outbox"
-    robot, packets = Robot(path, network), []
+    robot, packets, refused = Robot(path, network), [], []
+    robot.aside = refused.append
     for what, argument in moments:
         if what == "say":
-            new = [said(len(packets) + k, LIDAR_PLACE if k % large == 0 else HELLO) for k in range(argument)]
+            numbers = range(len(packets), len(packets) + argument)
+            new = [said(k, LIDAR_PLACE if k % large == 0 else HELLO, time=2000.0 + k) for k in numbers]
+            network.cloud.unwanted |= {content(encode(packet)) for packet in new if packet.sequence in unwanted}
             robot.outbox.put(new)
             packets += new
         elif what == "fault":
@@ -70,13 +77,17 @@ def test_every_packet_arrives_once_and_in_order(tmp_path_factory, moments, large
         elif what == "die":
             robot.outbox.close()
             robot = Robot(path, network)
+            robot.aside = refused.append
             assert robot.outbox.put(packets) == 0
         robot.step()
-    for _ in range(len(network.faults) + 3):
+    for _ in range(2 * len(network.faults) + 2 * len(unwanted) + 3):
         robot.step()
     stored = network.cloud.stored
-    assert list(stored) == [(0, k) for k in range(len(packets))]
-    assert [content(data) for data in stored.values()] == [content(data) for data in map(encode, packets)]
+    contents = {(0, packet.sequence): content(encode(packet)) for packet in packets}
+    wanted = {key: data for key, data in contents.items() if key[1] not in unwanted}
+    assert list(stored) == list(wanted)
+    assert [content(data) for data in stored.values()] == list(wanted.values())
+    assert sorted(data for data, _ in refused) == sorted(network.cloud.unwanted)
     assert robot.outbox.waiting == (0, 0)
     robot.outbox.close()
 
@@ -178,6 +189,57 @@ def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):
         robot.step()
     assert robot.outbox.waiting.packets == 1
     assert content(robot.outbox.packet(0, 1)) == content(encode(said(1)))
+
+
+def test_what_was_refused_in_an_answer_that_was_lost_is_set_aside(robot):
+    packets = [said(k, time=2000.0 + k) for k in range(3)]
+    network = robot.sender._transport
+    network.cloud.unwanted = {content(encode(packets[1]))}
+    robot.outbox.put(packets)
+    network.faults = ["none", "answer lost"]
+    robot.step()
+    assert (robot.refused, robot.outbox.waiting.packets) == ([], 3)
+    for _ in range(2):
+        robot.step()
+    assert robot.refused == [(content(encode(packets[1])), "unwanted")]
+    assert (robot.sender.confirmed, robot.sender.refusals) == (2, 1)
+    assert "1; the last is packet 1 of start 0: unwanted" in robot.sender.refused_notice
+
+
+def test_what_the_cloud_refuses_after_it_confirmed_it_is_told(robot):
+    network = robot.sender._transport
+    robot.outbox.put([said(k) for k in range(3)])
+    robot.step()
+    assert robot.sender.refused_notice is None
+    network.cloud.refused[0, 1] = "no such keyscan"
+    robot.outbox.put([said(3)])
+    before = network.requests
+    robot.step()
+    assert "packet 1 of start 0: no such keyscan" in robot.sender.refused_notice
+    assert network.requests == before + 2, "the batch, and what became of the packets"
+    robot.outbox.put([said(4)])
+    robot.step()
+    assert network.requests == before + 3, "what is known is not asked for again"
+    assert robot.refused == []
+
+
+@pytest.mark.parametrize("most", [1, 3, 7])
+def test_a_batch_that_is_too_large_is_sent_in_parts(robot, most):
+    network = robot.sender._transport
+    network.cloud.most = most
+    robot.outbox.put([said(k, LIDAR_PLACE) for k in range(20)])
+    for _ in range(30):
+        robot.step()
+    assert list(network.cloud.stored) == [(0, k) for k in range(20)]
+    assert robot.outbox.waiting == (0, 0)
+
+
+def test_a_single_packet_that_is_too_large_is_told(robot):
+    robot.sender._transport.cloud.most = 0
+    robot.outbox.put([said(0)])
+    with pytest.raises(OversizeError):
+        robot.step()
+    assert robot.outbox.waiting.packets == 1
 
 
 def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):

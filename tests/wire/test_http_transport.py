@@ -8,7 +8,7 @@ from robot.fake_cloud import said
 from robot.http_cloud import serving
 from wire.examples import LIDAR_PLACE
 
-from fcslam.errors import CloudError, UnavailableError
+from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import Channel
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch
 from fcslam.wire.http_transport import Answer, HttpTransport, Refusal
@@ -48,6 +48,18 @@ def test_a_batch_and_what_comes_back(cloud, transport):
     }  # fmt: skip
     assert transport.state().expected == {0: 2}
     assert cloud.requests[-1][:2] == ("GET", "/api/v1/robots/r%201%2B2/state")
+
+
+def test_what_the_cloud_refused_is_heard_of(cloud, transport):
+    cloud.cloud.refused[0, 1] = "no such keyscan"
+    assert transport.send(PACKETS[:1], -1).refused == 1
+    assert transport.state().refused == {(0, 1): "no such keyscan"}
+
+
+def test_a_batch_that_is_too_large_is_an_error_of_its_own(cloud, transport):
+    cloud.canned.append(error(413, "too long"))
+    with pytest.raises(OversizeError, match=r"too long \(413\)"):
+        transport.send(PACKETS, -1)
 
 
 def test_asking_for_what_is_new_sends_no_bytes(cloud, transport):
@@ -100,7 +112,9 @@ def test_an_answer_that_cannot_be_unpacked_is_none(cloud, transport):
         transport.send(PACKETS, -1)
 
 
-@pytest.mark.parametrize("body", [b"<html>", b"[]", b"{}", b'{"next": {"a": 1}}', b'{"next": [1]}'])
+@pytest.mark.parametrize(
+    "body", [b"<html>", b"[]", b"{}", b'{"next": {}}', b'{"next": {"a": 1}, "refused": []}', b'{"next": [1]}']
+)
 def test_another_server_is_no_cloud(cloud, transport, body):
     cloud.canned.append((200, {}, body))
     with pytest.raises(CloudError, match="not as a cloud of fcslam"):

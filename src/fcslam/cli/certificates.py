@@ -12,11 +12,13 @@ def certificates(
     host: Annotated[
         list[str] | None, typer.Option(help="Name or address by which the cloud is reached; may be given again.")
     ] = None,
-    robot: Annotated[list[str] | None, typer.Option(help="A robot to make a token for; may be given again.")] = None,
+    robot: Annotated[
+        list[str] | None, typer.Option(help="A robot to make a token and a certificate for; may be given again.")
+    ] = None,
     viewer: Annotated[list[str] | None, typer.Option(help="Somebody who may see everything.")] = None,
     admin: Annotated[list[str] | None, typer.Option(help="Somebody who may decide about missions.")] = None,
 ) -> None:
-    """Make a certificate authority, the cloud's certificate, and tokens for robots and people."""
+    """Make a certificate authority, certificates of the cloud and of robots, and tokens for robots and people."""
     import datetime
 
     from fcslam.cloud.credentials import make_credentials
@@ -40,3 +42,6 @@ def certificates(
     typer.echo(f"for the cloud: {output / 'cloud.pem'}, {output / 'cloud.key'}, {output / 'tokens.yaml'}")
     for name, role in names:
         typer.echo(f"for {role} {name}: {output / 'tokens' / name}")
+        if role is Role.ROBOT:
+            stem = output / "robots" / name
+            typer.echo(f"or, instead of the token, where the cloud is given --client-ca: {stem}.pem, {stem}.key")

@@ -61,6 +61,11 @@ Ca = Annotated[
         help="PEM file of who signed the cloud's certificate; the system's if not given.", rich_help_panel=_NETWORK
     ),
 ]
+Certificate = Annotated[
+    Path | None,
+    typer.Option(help="PEM file of the robot's certificate, shown instead of a token.", rich_help_panel=_NETWORK),
+]
+Key = Annotated[Path | None, typer.Option(help="PEM file of its private key.", rich_help_panel=_NETWORK)]
 BudgetKbps = Annotated[
     float | None,
     typer.Option(
@@ -102,6 +107,8 @@ def robot(
     ] = None,
     token_file: TokenFile = None,
     ca: Ca = None,
+    certificate: Certificate = None,
+    key: Key = None,
     budget_kbps: BudgetKbps = None,
     outbox_mb: OutboxMb = 256.0,
     scan_topic: ScanTopic = None,
@@ -120,11 +127,11 @@ def robot(
     argument = source if name is None else f"{name}={source}"
     recording = open_recording(argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
     _check_name(recording.name)
-    token = _token(token_file)
+    token, own = _token(token_file), _own(certificate, key)
     survey = recording.survey()
     console = Console(stderr=True)
     show_notes(console, survey.notes)
-    with _agent(recording.name, settings, server, state, token, ca, outbox_mb, budget_kbps) as (agent, outbox):
+    with _agent(recording.name, settings, server, state, token, ca, own, outbox_mb, budget_kbps) as (agent, outbox):
         known = outbox.begin(_fingerprint(recording.name, survey, settings, budget_kbps), resume)
         try:
             with _interruptible(), _progress(console, survey.scan_count) as watch:
@@ -146,6 +153,7 @@ def _agent(
     state: Path,
     token: str | None,
     ca: Path | None,
+    own: tuple[Path, Path] | None,
     outbox_mb: float,
     budget_kbps: float | None,
 ) -> "Iterator[tuple[Agent, Outbox]]":
@@ -169,7 +177,7 @@ def _agent(
     budget = None if budget_kbps is None else Budget(1e3 * budget_kbps)
     with (
         closing(Outbox(state / "outbox.sqlite", name, int(outbox_mb * 1e6))) as outbox,
-        closing(HttpTransport(server, name, outbox.agent, token, ca)) as transport,
+        closing(HttpTransport(server, name, outbox.agent, token, ca, own)) as transport,
     ):
         yield Agent(frontend, outbox, transport, state, rng, time.monotonic, time.sleep, budget), outbox
 
@@ -223,6 +231,14 @@ def _token(path: Path | None) -> str | None:
     if not token or not token.isprintable() or " " in token:
         raise InputError(f"{path}: holds no token; it should be one word")
     return token
+
+
+def _own(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:
+    from fcslam.errors import InputError
+
+    if (certificate is None) != (key is None):
+        raise InputError("--certificate and --key belong together; give both or none")
+    return None if certificate is None or key is None else (certificate, key)
 
 
 def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kbps: float | None) -> str:

@@ -9,6 +9,10 @@ import typer
 if TYPE_CHECKING:
     import socket
 
+    import uvicorn
+    from fastapi import FastAPI
+
+    from fcslam.cloud.service.authentication import Authenticator
     from fcslam.cloud.service.state import ServiceState
     from fcslam.cloud.settings import CloudConfig
 
@@ -30,6 +34,10 @@ def serve(
         Path | None, typer.Option(help="Certificate of this service (PEM).", rich_help_panel=_TLS)
     ] = None,
     tls_key: Annotated[Path | None, typer.Option(help="Its private key (PEM).", rich_help_panel=_TLS)] = None,
+    client_ca: Annotated[
+        Path | None,
+        typer.Option(help="Who signs robots' certificates (PEM): they need no token.", rich_help_panel=_TLS),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Configuration of new missions; see `fcslam config dump`.")
     ] = None,
@@ -38,32 +46,16 @@ def serve(
     """Take in what robots send, map it, and show the map; runs until it is stopped."""
     import logging
 
-    import uvicorn
-
     from fcslam.cloud.service.app import create_app
     from fcslam.errors import ServiceError
 
-    if (tls_certificate is None) != (tls_key is None):
-        raise ServiceError("--tls-certificate and --tls-key belong together; give both or none")
-    if tokens is None and not insecure and not _is_loopback(host):
+    if tokens is None and client_ca is None and not insecure and not _is_loopback(host):
         raise ServiceError(f"anybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
-    _check_tls(tls_certificate, tls_key)
+    _check_tls(tls_certificate, tls_key, client_ca)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with _listen(host, port) as listening:
-        state = _state(data, tokens, _cloud_config(config))
-        server = uvicorn.Server(
-            uvicorn.Config(
-                create_app(state, docs=docs),
-                ssl_certfile=tls_certificate,
-                ssl_keyfile=tls_key,
-                log_level="warning",
-                ws="none",
-                server_header=False,
-                timeout_graceful_shutdown=10,
-                h11_max_incomplete_event_size=64 * 1024,
-                limit_concurrency=512,
-            )
-        )
+        state = _state(data, _authenticator(tokens, client_ca), _cloud_config(config))
+        server = _server(create_app(state, docs=docs), tls_certificate, tls_key, client_ca)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
         shown = f"[{address}]" if ":" in address else address
@@ -71,17 +63,48 @@ def serve(
         server.run(sockets=[listening])
 
 
-def _state(data: Path, tokens: Path | None, config: "CloudConfig") -> "ServiceState":
+def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_ca: Path | None) -> "uvicorn.Server":
+    import ssl
+
+    import uvicorn
+
+    from fcslam.cloud.service.tls import CertifiedProtocol
+
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http=CertifiedProtocol,
+            ssl_certfile=certificate,
+            ssl_keyfile=key,
+            ssl_ca_certs=None if client_ca is None else str(client_ca),
+            ssl_cert_reqs=ssl.CERT_NONE if client_ca is None else ssl.CERT_OPTIONAL,
+            log_level="warning",
+            ws="none",
+            server_header=False,
+            timeout_graceful_shutdown=10,
+            h11_max_incomplete_event_size=64 * 1024,
+            limit_concurrency=512,
+        )
+    )
+
+
+def _authenticator(tokens: Path | None, client_ca: Path | None) -> "Authenticator":
+    from fcslam.cloud.service.authentication import Authenticator, read_tokens
+
+    if tokens is None:
+        return Authenticator(None if client_ca is None else ())
+    return Authenticator(read_tokens(tokens))
+
+
+def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig") -> "ServiceState":
     import time
 
     from fcslam.cloud.missions import Missions
-    from fcslam.cloud.service.authentication import Authenticator, read_tokens
     from fcslam.cloud.service.events import EventStream
     from fcslam.cloud.service.limits import RateLimit
     from fcslam.cloud.service.state import ServiceState
     from fcslam.cloud.supervisor import Supervisor
 
-    authenticator = Authenticator(None if tokens is None else read_tokens(tokens))
     events = EventStream()
     missions = Missions(
         data, config, time.monotonic, time.time, lambda folder: Supervisor(folder, time.monotonic, events.publish)
@@ -105,17 +128,28 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _check_tls(certificate: Path | None, key: Path | None) -> None:
+def _check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> None:
     import ssl
 
     from fcslam.errors import ServiceError
 
+    if (certificate is None) != (key is None):
+        raise ServiceError("--tls-certificate and --tls-key belong together; give both or none")
     if certificate is None or key is None:
+        if client_ca is not None:
+            raise ServiceError("--client-ca is for a service with TLS; give --tls-certificate and --tls-key")
         return
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
-        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+        context.load_cert_chain(certificate, key)
     except (OSError, ssl.SSLError) as error:
         raise ServiceError(f"{certificate}, {key}: no certificate with its key ({error})") from error
+    if client_ca is None:
+        return
+    try:
+        context.load_verify_locations(client_ca)
+    except (OSError, ssl.SSLError) as error:
+        raise ServiceError(f"{client_ca}: no certificate authority can be read ({error})") from error
 
 
 def _listen(host: str, port: int) -> "socket.socket":

@@ -4,6 +4,7 @@ ca.pem, ca.key          the authority; robots and viewers get ca.pem
 cloud.pem, cloud.key    the cloud's certificate
 tokens.yaml             name, role and SHA-256 of every token: for the cloud
 tokens/<name>           the token itself: for whoever is named
+robots/<name>.pem, .key a robot's certificate, instead of a token
 """
 
 import datetime
@@ -23,28 +24,35 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from fcslam.cloud.service.authentication import Role, TokenEntry, TokensFile, read_tokens
 from fcslam.errors import OutputError
 
-AUTHORITY_DAYS, CLOUD_DAYS = 3650, 397
+AUTHORITY_DAYS, LEAF_DAYS = 3650, 397
 """Clients believe no server certificate that holds for longer."""
 TOKEN_BYTES = 32
 
+Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
+
 
 def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Role], now: datetime.datetime) -> None:
-    """Make what is missing: the authority and tokens that are there stay; the cloud's certificate is made anew.
+    """Make what is missing: the authority and tokens that are there stay; certificates of the cloud and of the robots
+    in ``names`` are made anew.
 
     Raises:
         OutputError: the folder cannot be used, or what is in it cannot be read.
         ConfigError: the tokens file in it is broken.
     """
     try:
-        (folder / "tokens").mkdir(parents=True, exist_ok=True)
-        authority, key = _authority(folder, now)
-        _make_cloud(folder, hosts, authority, key, now)
+        for part in ("tokens", "robots"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        authority = _authority(folder, now)
+        served = [_host(host) for host in dict.fromkeys([*hosts, "localhost", "127.0.0.1", "::1"])]
+        _make_leaf(folder / "cloud", "fcslam cloud", ExtendedKeyUsageOID.SERVER_AUTH, served, authority, now)
+        for name in (name for name, role in names.items() if role is Role.ROBOT):
+            _make_leaf(folder / "robots" / name, name, ExtendedKeyUsageOID.CLIENT_AUTH, (), authority, now)
         _add_tokens(folder, names)
     except (OSError, ValueError) as error:
         raise OutputError(f"{folder}: cannot keep credentials there ({error}); name a new folder") from error
 
 
-def _authority(folder: Path, now: datetime.datetime) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+def _authority(folder: Path, now: datetime.datetime) -> Authority:
     """The authority of the folder, made if there is none."""
     if (folder / "ca.key").exists():
         found = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), None)
@@ -57,30 +65,27 @@ def _authority(folder: Path, now: datetime.datetime) -> tuple[x509.Certificate, 
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     usage = dict.fromkeys(_USAGES, False) | {"key_cert_sign": True, "crl_sign": True}
     certificate = builder.add_extension(x509.KeyUsage(**usage), critical=True).sign(key, hashes.SHA256())
-    _write_pair(folder, "ca", certificate, key)
+    _write_pair(folder / "ca", certificate, key)
     return certificate, key
 
 
-def _make_cloud(
-    folder: Path,
-    hosts: Sequence[str],
-    authority: x509.Certificate,
-    authority_key: ec.EllipticCurvePrivateKey,
-    now: datetime.datetime,
-) -> None:
-    """The cloud's certificate: good for the hosts, and for this machine's own address."""
+def _make_leaf(
+    stem: Path, common_name: str, purpose: x509.ObjectIdentifier, hosts: Sequence[x509.GeneralName],
+    authority: Authority, now: datetime.datetime,
+) -> None:  # fmt: skip
+    """A certificate of the authority's, good for one purpose; that of a host names it."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fcslam cloud")])
-    builder = _builder(name, authority.subject, key, now, CLOUD_DAYS)
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+    builder = _builder(name, authority[0].subject, key, now, LEAF_DAYS)
     builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
     usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True}
     builder = builder.add_extension(x509.KeyUsage(**usage), critical=True)
-    builder = builder.add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
-    names = [_host(host) for host in dict.fromkeys([*hosts, "localhost", "127.0.0.1", "::1"])]
-    builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key())
-    certificate = builder.add_extension(signer, critical=False).sign(authority_key, hashes.SHA256())
-    _write_pair(folder, "cloud", certificate, key)
+    builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+    if hosts:
+        builder = builder.add_extension(x509.SubjectAlternativeName(hosts), critical=False)
+    signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority[1].public_key())
+    certificate = builder.add_extension(signer, critical=False).sign(authority[1], hashes.SHA256())
+    _write_pair(stem, certificate, key)
 
 
 _USAGES = (
@@ -120,10 +125,12 @@ def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
     _write(path, yaml.safe_dump(content, sort_keys=False).encode(), secret=False)
 
 
-def _write_pair(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
+def _write_pair(stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
     form, encryption = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    _write(folder / f"{name}.key", key.private_bytes(serialization.Encoding.PEM, form, encryption), secret=True)
-    _write(folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM), secret=False)
+    _write(
+        stem.with_name(f"{stem.name}.key"), key.private_bytes(serialization.Encoding.PEM, form, encryption), secret=True
+    )
+    _write(stem.with_name(f"{stem.name}.pem"), certificate.public_bytes(serialization.Encoding.PEM), secret=False)
 
 
 def _write(path: Path, content: bytes, secret: bool) -> None:

@@ -41,12 +41,12 @@ class RefusedPacketError(FcslamError):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What goes back to a robot, and what came in."""
+    """What goes back to a robot."""
 
     batch: bytes
     """Acknowledgements and, if they are news, a correction and detectors."""
-    packets: tuple[StoredPacket, ...]
-    """What the batch held; all of it is on disk."""
+    refused: int
+    """How many of the robot's packets count for nothing, those that the worker refused later included."""
 
 
 class Intake:
@@ -84,7 +84,8 @@ class Intake:
         if refusal:
             raise refusal
         epochs = sorted({packet.epoch for packet in packets}) or [s.epoch for s in self._store.sessions(robot)[-1:]]
-        return Answer(self._answer(robot, epochs, known_correction), tuple(packets))
+        answer = self._answer(robot, epochs, known_correction)
+        return Answer(answer, self._store.refusal_count(robot))
 
     def last_heard_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never since the service started."""

@@ -24,7 +24,7 @@ APPLIED = "applied"
 CONFIG = "config"
 """A fact: the mission's configuration."""
 
-_VERSION = 1
+_VERSION = 2
 
 _SCHEMA = """
 CREATE TABLE packets (
@@ -33,6 +33,7 @@ CREATE TABLE packets (
     refusal TEXT, turn INTEGER UNIQUE, data BLOB NOT NULL,
     PRIMARY KEY (robot, epoch, sequence)
 ) STRICT;
+CREATE INDEX refusals ON packets (robot, epoch, sequence) WHERE refusal IS NOT NULL;
 CREATE INDEX hellos ON packets (robot, epoch, sequence) WHERE kind = 'hello';
 CREATE TABLE sessions (
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, next INTEGER NOT NULL, PRIMARY KEY (robot, epoch)
@@ -180,6 +181,12 @@ class MissionStore:
             )
         ]
 
+    def refusal_count(self, robot: str) -> int:
+        """How many packets of a robot were refused."""
+        return int(
+            self._database.value("SELECT count(*) FROM packets WHERE robot = ? AND refusal IS NOT NULL", (robot,))
+        )
+
     def sessions(self, robot: str | None = None) -> list[Session]:
         """Sessions of one robot or of all, by robot and epoch."""
         statement = "SELECT robot, epoch, next FROM sessions WHERE ?1 IS NULL OR robot = ?1 ORDER BY robot, epoch"
@@ -280,6 +287,19 @@ class MissionStore:
             else:
                 refused += Traffic(packets, size)
         return Ledger(accepted, refused)
+
+    def arrived(self, after: int, limit: int) -> list[tuple[int, str, Kind | None, Channel | None, Traffic]]:
+        """What came in after a row of the file (0: all), at most ``limit`` packets.
+
+        Last row, robot, kind, channel and traffic of each of its parts; refused packets count, too.
+        """
+        chosen = "SELECT rowid, robot, kind, channel, length(data) AS size FROM packets WHERE rowid > ? ORDER BY rowid"
+        parts = "max(rowid), robot, kind, channel, count(*), sum(size)"
+        statement = f"SELECT {parts} FROM ({chosen} LIMIT ?) GROUP BY robot, kind, channel"
+        return [
+            (row, robot, kind and Kind(kind), channel and Channel(channel), Traffic(count, size))
+            for row, robot, kind, channel, count, size in self._database.rows(statement, (after, limit))
+        ]
 
     def export(self, path: Path) -> None:
         """Write the mission as one new file.

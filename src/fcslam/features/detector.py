@@ -21,6 +21,7 @@ from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX, Logits, Probabilities, find_peaks, sample_codes, sample_logits
+from fcslam.features.onnx_runtime import load_onnx_runtime
 from fcslam.records import CODE_BYTES, NAME, Codes, frozen
 
 NETWORK_FORMAT: Final = "1"
@@ -195,9 +196,7 @@ def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
     except OSError as error:
         raise FeatureError(f"{path}: cannot read the network weights ({error}); name an .onnx file") from error
 
-    import onnxruntime
-
-    onnxruntime.disable_telemetry_events()
+    onnxruntime = load_onnx_runtime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 4  # what is wrong is raised

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from fcslam.errors import OutputError
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import NETWORK_FORMAT, GreyImage
+from fcslam.features.onnx_runtime import load_onnx_runtime
 from fcslam.learning.network import KeypointNetwork
 
 OPSET: Final = 17
@@ -87,6 +88,8 @@ def quantise(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
         OutputError: it cannot be written.
     """
     import onnx
+
+    load_onnx_runtime()
     from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
     graph = onnx.load(str(source))

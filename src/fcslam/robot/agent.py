@@ -52,7 +52,8 @@ class AgentProgress:
     catching_up: bool
     """Whether the recording is still where it was when the robot was stopped."""
     notices: tuple[str, ...]
-    """What became of packets for another mission, and of the last detector that was announced, if there were any."""
+    """What became of packets for another mission, what the cloud refused, and what became of the last detector that was
+    announced, if there were any."""
 
 
 AgentWatch = Callable[[AgentProgress], None]
@@ -126,11 +127,12 @@ class Agent:
     def progress(self) -> AgentProgress:
         """Where the robot is now."""
         sender = self._sender
+        notices = tuple(filter(None, (sender.notice, sender.refused_notice, self._releases.notice)))
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
             len(self._frontend.scan_poses), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
             left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
-            self._said < self._known, tuple(filter(None, (sender.notice, self._releases.notice))),
+            self._said < self._known, notices,
         )  # fmt: skip
 
     def trajectory(self) -> tuple[FloatArray, FloatArray] | None:

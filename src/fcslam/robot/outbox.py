@@ -199,10 +199,7 @@ class Outbox:
             waiting = self._database.execute(
                 "SELECT epoch, sequence FROM packets WHERE data IS NOT NULL ORDER BY epoch, sequence"
             )
-            in_vain = [(epoch, sequence) for epoch, sequence in waiting if epoch in broken]
-        for epoch, sequence in expected.items():
-            self.acknowledge(epoch, sequence - 1)
-        return in_vain
+            return [(epoch, sequence) for epoch, sequence in waiting if epoch in broken]
 
     def acknowledge(self, epoch: int, sequence: int) -> int:
         """The cloud has all packets of ``epoch`` up to ``sequence``: forget them. Returns how many they were."""
@@ -211,11 +208,12 @@ class Outbox:
             self._database.execute("UPDATE sessions SET stored = max(stored, ?) WHERE epoch = ?", (sequence + 1, epoch))
             return self._forget(gone)
 
-    def packet(self, epoch: int, sequence: int) -> bytes:
-        """A packet that waits."""
-        question = "SELECT data FROM packets WHERE epoch = ? AND sequence = ?"
+    def packet(self, epoch: int, sequence: int) -> bytes | None:
+        """A packet that waits; None if it does not."""
+        question = "SELECT data FROM packets WHERE epoch = ? AND sequence = ? AND data IS NOT NULL"
         with self._transaction():
-            return bytes(self._one(question, epoch, sequence)[0])
+            row = self._one(question, epoch, sequence)
+        return None if row is None else bytes(row[0])
 
     def drop(self, epoch: int, sequence: int) -> None:
         """Forget a packet that the cloud will never take, but whose number it counts as used."""

@@ -6,10 +6,10 @@ from contextlib import suppress
 
 import numpy as np
 
-from fcslam.errors import CloudError, PacketError, UnavailableError
+from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
 from fcslam.records import Correction, DetectorFile
 from fcslam.robot.outbox import Batch, Outbox
-from fcslam.wire.http_transport import Answer, BatchTransport
+from fcslam.wire.http_transport import Answer, BatchTransport, CloudState
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import Acknowledgement, Release
 from fcslam.wire.packets import decode
@@ -47,6 +47,10 @@ class Sender:
         self._keep = keep
         self._refused = refused
         self._met = False
+        self._most = MAXIMUM_BATCH_PACKETS
+        """In a batch."""
+        self._refused_there = 0
+        """How many packets the cloud has refused as far as this robot has heard."""
         self._known: set[DetectorFile] = set()
         """Detectors that were fetched, or cannot be."""
         self._correction = -1
@@ -61,6 +65,8 @@ class Sender:
         """Why nothing gets through; None: it does."""
         self.notice: str | None = None
         """What became of packets of earlier starts that the cloud can no longer take; None: there were none."""
+        self.refused_notice: str | None = None
+        """What the cloud says that it refused, some of it after it had confirmed it; None: nothing."""
         self.failure: Exception | None = None
         """What ended ``run``."""
 
@@ -92,21 +98,41 @@ class Sender:
             self._meet()
             self._met = True
             self.trouble = None
-        batch = self._outbox.batch(MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS)
+        batch = self._outbox.batch(MAXIMUM_BATCH_BYTES, self._most)
         if batch is None:
             if self._clock() - self._last_answer_s >= ASK_AFTER_S:
                 self._exchange((), None)
             return EVERY_S
         is_all = len(batch.packets) >= self._outbox.waiting.packets
-        self._exchange(batch.packets, batch)
+        try:
+            self._exchange(batch.packets, batch)
+        except OversizeError:
+            if len(batch.packets) == 1:
+                raise
+            self._most = len(batch.packets) // 2
+            return 0.0
         return EVERY_S if is_all else 0.0
 
     def _meet(self) -> None:
-        in_vain = self._outbox.meet(self._transport.state().expected)
+        state = self._transport.state()
+        in_vain = self._outbox.meet(state.expected)
         for epoch, sequence in in_vain:
             self._set_aside(epoch, sequence, f"epoch {epoch} is of another mission: the cloud lacks its beginning")
         if in_vain:
             self.notice = f"{len(in_vain)} packets of earlier starts are of another mission: set aside in refused"
+        self._hear(state)
+        for epoch, sequence in state.expected.items():
+            self.confirmed += self._outbox.acknowledge(epoch, sequence - 1)
+
+    def _hear(self, state: CloudState) -> None:
+        """Of refusals: one whose answer was lost, and what was found out after it was confirmed, is heard of here."""
+        for (epoch, sequence), reason in state.refused.items():
+            self._set_aside(epoch, sequence, reason)
+            self.refused_notice = (
+                f"packets of this robot that the cloud refused: {len(state.refused)}; the last is packet {sequence} of "
+                f"start {epoch}: {reason}"
+            )
+        self._refused_there = len(state.refused)
 
     def _exchange(self, packets: Sequence[bytes], batch: Batch | None) -> None:
         before = self.confirmed + self.refusals
@@ -118,13 +144,18 @@ class Sender:
             sequence = batch.first + answer.refusal.index
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)
             self._set_aside(batch.epoch, sequence, answer.refusal.reason)
+        if answer.refusal is None and answer.refused != self._refused_there:
+            self._hear(self._transport.state())
         if batch is not None and self.confirmed + self.refusals == before:
             raise UnavailableError("the cloud answers, but confirms nothing")
         self._failures, self.trouble = 0, None
 
     def _set_aside(self, epoch: int, sequence: int, reason: str) -> None:
-        """Forgotten only once it is kept elsewhere: whatever comes between, it is not lost."""
-        self._refused(self._outbox.packet(epoch, sequence), reason)
+        """One that waits is forgotten only once it is kept elsewhere: whatever comes between, it is not lost."""
+        data = self._outbox.packet(epoch, sequence)
+        if data is None:
+            return
+        self._refused(data, reason)
         self._outbox.drop(epoch, sequence)
         self.refusals += 1
 

@@ -13,6 +13,9 @@ CORRECTION_HEADER = "Fcslam-Correction"
 AGENT_HEADER = "Fcslam-Agent"
 """128 random bits in hexadecimal: tells two agents apart that go by one name."""
 
+REFUSED_HEADER = "Fcslam-Refused"
+"""In an answer: how many of the robot's packets count for nothing."""
+
 LENGTH = struct.Struct(">I")
 """Length of the packet that follows: 4 bytes, big endian."""
 

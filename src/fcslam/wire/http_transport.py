@@ -3,14 +3,14 @@
 import ipaddress
 import ssl
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import quote, urlsplit
 
-from fcslam.errors import CloudError, PacketError, UnavailableError
+from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
 from fcslam.records import Channel
-from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch, write_batch
+from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, REFUSED_HEADER, read_batch, write_batch
 
 if TYPE_CHECKING:
     import httpx
@@ -39,6 +39,8 @@ class Answer:
     packets: tuple[bytes, ...] = ()
     """Encoded packets from the cloud."""
     refusal: Refusal | None = None
+    refused: int = 0
+    """How many of the robot's packets count for nothing by now; some were found out after they were stored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,8 @@ class CloudState:
 
     expected: Mapping[int, int]
     """The next sequence that it expects, by epoch."""
+    refused: Mapping[tuple[int, int], str] = field(default_factory=dict)
+    """Why packets count for nothing, by epoch and sequence."""
 
 
 class BatchTransport(Protocol):
@@ -67,6 +71,7 @@ class BatchTransport(Protocol):
 
         Raises:
             UnavailableError: no answer came, or the cloud is busy.
+            OversizeError: it takes no batch of this size.
             CloudError: it turns this robot away.
         """
 
@@ -82,23 +87,29 @@ class BatchTransport(Protocol):
 class HttpTransport:
     """One connection to one cloud for one robot; docs/howto-robot.md says what it makes of which answer."""
 
-    def __init__(self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None) -> None:
+    def __init__(
+        self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None,
+        own: tuple[Path, Path] | None = None,
+    ) -> None:  # fmt: skip
         """``agent`` tells two processes apart that go by one name; ``ca`` is a PEM file, the system's if not given.
 
+        ``own``: PEM files of the robot's certificate and its key, which it shows instead of a token.
+
         Raises:
-            CloudError: ``url`` is none, or would show the token to the network; ``ca`` cannot be read.
+            CloudError: ``url`` is none, or would show the token to the network; ``ca`` or ``own`` cannot be read.
         """
         import httpx
 
-        _check_url(url, token)
+        _check_url(url, token, own)
         self._url = url.rstrip("/")
+        self._has_own = own is not None
         self._robot = quote(robot, safe="")
         headers = {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE}
         self._client = httpx.Client(
             base_url=f"{self._url}/api/v1/",
             headers=headers | ({"Authorization": f"Bearer {token}"} if token else {}),
             timeout=httpx.Timeout(ANSWER_TIMEOUT_S, connect=CONNECT_TIMEOUT_S),
-            verify=_trust(ca),
+            verify=_trust(ca, own),
             trust_env=False,
         )
 
@@ -111,10 +122,12 @@ class HttpTransport:
         response = self._ask("GET", f"robots/{self._robot}/state", accept="application/json")
         self._require(response, 200)
         try:
-            expected = {int(epoch): int(sequence) for epoch, sequence in response.json()["next"].items()}
+            told = response.json()
+            expected = {int(epoch): int(sequence) for epoch, sequence in told["next"].items()}
+            refused = {(int(one["epoch"]), int(one["sequence"])): str(one["reason"]) for one in told["refused"]}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise CloudError(f"{self._url}: answers, but not as a cloud of fcslam; give its address") from error
-        return CloudState(expected)
+        return CloudState(expected, refused)
 
     def send(self, packets: Sequence[bytes], correction: int) -> Answer:
         """As in BatchTransport."""
@@ -131,8 +144,8 @@ class HttpTransport:
             raise UnavailableError(self._reason(response))  # the batch went astray on its way
         self._require(response, 200)
         try:
-            return Answer(tuple(read_batch(response.content)))
-        except PacketError as error:
+            return Answer(tuple(read_batch(response.content)), refused=int(response.headers.get(REFUSED_HEADER, 0)))
+        except (PacketError, ValueError) as error:
             raise UnavailableError(f"{self._url}: the answer is broken ({error})") from error
 
     def detector(self, channel: Channel, version: str) -> bytes:
@@ -152,7 +165,13 @@ class HttpTransport:
         except httpx.RequestError as error:
             if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
                 raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error
-            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}") from error
+            # A cloud that does not believe a certificate hangs up, as TLS 1.3 has it, without a word that gets here.
+            hint = (
+                "; if that stays, it does not trust this robot's certificate"
+                if self._has_own and isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError)
+                else ""
+            )
+            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{hint}") from error
 
     def _require(self, response: "httpx.Response", status: int) -> None:
         """Turn any other answer into an error."""
@@ -164,7 +183,7 @@ class HttpTransport:
         is_other_agent = code == 409 and "index" not in _detail(response)  # it may be gone soon
         if code in _LATER or is_other_agent:
             raise UnavailableError(self._reason(response), wait_s)
-        raise CloudError(self._reason(response))
+        raise (OversizeError if code == 413 else CloudError)(self._reason(response))
 
     def _reason(self, response: "httpx.Response") -> str:
         said = _detail(response).get("error") or response.reason_phrase
@@ -180,12 +199,14 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _check_url(url: str, token: str | None) -> None:
+def _check_url(url: str, token: str | None, own: tuple[Path, Path] | None) -> None:
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise CloudError(f"{url!r} is no address of a cloud; give one as https://cloud.example:8443")
     if token and parts.scheme == "http" and not _is_loopback(parts.hostname):
         raise CloudError(f"{url}: a token would be readable on its way; use https")
+    if own and parts.scheme == "http":
+        raise CloudError(f"{url}: nobody is shown a certificate there; use https")
 
 
 def _is_loopback(host: str) -> bool:
@@ -195,8 +216,14 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _trust(ca: Path | None) -> ssl.SSLContext:
+def _trust(ca: Path | None, own: tuple[Path, Path] | None) -> ssl.SSLContext:
     try:
-        return ssl.create_default_context(cafile=None if ca is None else str(ca))
+        context = ssl.create_default_context(cafile=None if ca is None else str(ca))
     except (OSError, ssl.SSLError) as error:
         raise CloudError(f"{ca}: no certificate authority can be read ({error}); give a PEM file") from error
+    if own is not None:
+        try:
+            context.load_cert_chain(*own)
+        except (OSError, ssl.SSLError) as error:
+            raise CloudError(f"{own[0]}, {own[1]}: no certificate with its key ({error}); give PEM files") from error
+    return context

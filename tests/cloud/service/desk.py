@@ -65,7 +65,8 @@ class InlineWorker:
 class Desk:
     """The service, and requests to it as one of ``TOKENS`` or as nobody."""
 
-    def __init__(self, root: Path, tokens: Sequence[TokenEntry] | None = tuple(ENTRIES)) -> None:
+    def __init__(self, root: Path, tokens: Sequence[TokenEntry] | None = tuple(ENTRIES), **options: object) -> None:
+        """``options`` of uvicorn."""
         self.now = 0.0
         missions = Missions(root, CloudConfig(), lambda: self.now, lambda: 1e9, InlineWorker)
         self.state = ServiceState(
@@ -73,7 +74,7 @@ class Desk:
         )
         self.app = create_app(self.state)
         self._listening = socket.create_server(("127.0.0.1", 0))
-        self._server = uvicorn.Server(uvicorn.Config(self.app, log_level="critical", ws="none"))
+        self._server = uvicorn.Server(uvicorn.Config(self.app, log_level="critical", ws="none", **options))
         self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [self._listening]})
         port = self._listening.getsockname()[1]
         self.client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0)

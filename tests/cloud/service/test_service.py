@@ -9,15 +9,16 @@ from cloud.scripted import LASER
 from cloud.service.desk import POSES, A, B, Desk, put_detector
 
 from fcslam.cloud import intake
+from fcslam.cloud.service import measures
 from fcslam.cloud.store import MissionStore
 from fcslam.errors import ServiceError
 from fcslam.features.detector import SHIPPED_NETWORK
-from fcslam.records import Channel, Correction
+from fcslam.records import Channel, Correction, Keyscan
 from fcslam.runs import open_run
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
-from fcslam.wire.packets import encode
+from fcslam.wire.packets import decode, encode, readdress
 
 API = "/api/v1"
 PACKETS = f"{API}/robots/a/packets"
@@ -43,13 +44,15 @@ def test_a_robot_hears_what_is_stored_and_where_it_is(mapped):
     known = {"Fcslam-Correction": str(told[1].version)}
     assert mapped.told(mapped.send("b", [], **known)) == told[:1]
     state = mapped.ask("GET", f"{API}/robots/b/state", "b").json()
-    assert state == {"robot": "b", "epoch": 0, "next": {"0": len(B)}, "correction": told[1].version, "map": 0}
+    assert state == {
+        "robot": "b", "epoch": 0, "next": {"0": len(B)}, "correction": told[1].version, "map": 0, "refused": [],
+    }  # fmt: skip
     assert mapped.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
 
 
 def test_a_robot_that_is_not_known_has_nothing_stored(desk):
     state = desk.ask("GET", f"{API}/robots/a/state", "a").json()
-    assert state == {"robot": "a", "epoch": None, "next": {}, "correction": -1, "map": None}
+    assert state == {"robot": "a", "epoch": None, "next": {}, "correction": -1, "map": None, "refused": []}
     assert desk.told(desk.send("a", [])) == []
 
 
@@ -63,6 +66,17 @@ def test_a_refused_packet_has_an_index_and_a_reason(desk, data, status):
     assert response.json()["index"] == 1
     assert response.json()["error"]
     assert desk.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": 1}
+
+
+def test_what_the_worker_refuses_later_is_told_with_every_answer_and_why_on_asking(desk):
+    assert desk.send("a", A[:9]).headers["Fcslam-Refused"] == "0"
+    again = next(k for k, data in enumerate(A) if isinstance(decode(data).body, Keyscan))
+    desk.told(desk.send("a", [readdress(A[again], 0, 9)]))
+    assert desk.send("a", []).headers["Fcslam-Refused"] == "1"
+    (refused,) = desk.ask("GET", f"{API}/robots/a/state", "a").json()["refused"]
+    assert (refused["epoch"], refused["sequence"], "keyscan" in refused["reason"]) == (0, 9, True)
+    assert get(desk, "robots/a").json()["refused"] == [refused]
+    assert desk.send("b", B[:2]).headers["Fcslam-Refused"] == "0", "it is not its own"
 
 
 def test_a_second_agent_is_refused(desk):
@@ -183,8 +197,12 @@ def test_a_result_is_a_run_folder(mapped):
 def test_a_veto_parts_what_only_it_held_together(mapped):
     assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b"}).status_code == 201
     assert len(get(mapped, "maps").json()) == 2
-    for wrong in ({"robot_i": "a", "robot_j": "x"}, {"robot_i": "a"}, {"robot_i": "a", "robot_j": "b", "stamp_i": 1.0}):
-        assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == 400
+    both = {"robot_i": "a", "robot_j": "b"}
+    for wrong, status in (
+        ({"robot_i": "a", "robot_j": "x"}, 404), ({"robot_i": "a"}, 400), ({**both, "stamps": [1.0]}, 400),
+        ({**both, "stamps": [1.0, None]}, 400), ({"robot_i": "a", "robot_j": ""}, 400), ({**both, "more": 1}, 400),
+    ):  # fmt: skip
+        assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == status
     assert "b+x" in mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+x"}).text
     assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+1"}).status_code == 201
 
@@ -241,14 +259,44 @@ def test_two_services_do_not_share_a_folder(desk):
         Desk(desk.state.missions.root)
 
 
+def measured(desk):
+    text = get(desk, "../../metrics").text
+    told = (line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+    return {name: float(value) for name, value in told}
+
+
+def uplink(desk, robot):
+    """Bytes of one robot, by the measures."""
+    lines = measured(desk).items()
+    return sum(value for name, value in lines if name.startswith("fcslam_bytes_total{") and f'robot="{robot}"' in name)
+
+
 def test_measures_say_what_came_in(mapped):
-    text = get(mapped, "../../metrics").text
-    lines = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
-    assert float(lines['fcslam_packets_total{channel="lidar",kind="place",robot="a"}']) > 0
-    total = sum(float(v) for k, v in lines.items() if k.startswith("fcslam_bytes_total{") and 'robot="a"' in k)
-    assert total == sum(map(len, A))
-    assert float(lines["fcslam_packets_stored"]) == len(A) + len(B)
-    assert float(lines["fcslam_packets_queued"]) == 0
+    lines = measured(mapped)
+    assert lines['fcslam_packets_total{channel="lidar",kind="place",mission="mission",robot="a"}'] > 0
+    assert uplink(mapped, "a") == sum(map(len, A))
+    assert lines["fcslam_packets_stored"] == len(A) + len(B)
+    assert lines["fcslam_packets_queued"] == 0
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 10_000])
+def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, scripted, monkeypatch, at_once):
+    monkeypatch.setattr(measures, "_AT_ONCE", at_once)
+    scripted()
+    with Desk(tmp_path / "data") as desk:
+        desk.told(desk.send("a", A[:5]))
+        before = uplink(desk, "a")
+        desk.told(desk.send("a", A[3:9]))
+        assert (before, uplink(desk, "a")) == (sum(map(len, A[:5])), sum(map(len, A[:9]))), "again is not new"
+        assert desk.send("a", [A[9][:-1]]).status_code == 400
+        refused = uplink(desk, "a")
+    with Desk(tmp_path / "data") as again:
+        assert uplink(again, "a") == refused >= before
+        again.told(again.send("b", B[:4]))
+        assert (uplink(again, "a"), uplink(again, "b")) == (refused, sum(map(len, B[:4])))
+        again.ask("POST", f"{API}/missions", "boss", json={"name": "next"})
+        again.told(again.send("a", A[:2]))
+        assert uplink(again, "a") == refused + sum(map(len, A[:2])), "missions are told apart, and none is forgotten"
 
 
 def test_the_interface_describes_itself(desk):

@@ -2,20 +2,37 @@
 
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
+from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
 
 import fcslam
 from fcslam.cloud.service.decisions import decision_router
-from fcslam.cloud.service.missions import mission_router
+from fcslam.cloud.service.missions import file_router, mission_router
 from fcslam.cloud.service.operations import operations_router
 from fcslam.cloud.service.problems import add_handlers
-from fcslam.cloud.service.robots import robot_router
+from fcslam.cloud.service.robots import network_router, robot_router
 from fcslam.cloud.service.state import ServiceState
 from fcslam.cloud.service.viewers import fleet_router, map_router
 from fcslam.cloud.service.watching import event_router
 
 PREFIX = "/api/v1"
+ROUTERS = (
+    robot_router, network_router, fleet_router, map_router, mission_router, file_router, decision_router, event_router,
+)  # fmt: skip
+
+
+class Service(FastAPI):
+    """Describes what it does: FastAPI adds to every route a refusal that this service words otherwise."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The interface, in OpenAPI 3.1."""
+        described = super().openapi()
+        for operation in (one for path in described["paths"].values() for one in path.values()):
+            operation["responses"].pop("422", None)
+        for unused in ("HTTPValidationError", "ValidationError"):
+            described["components"]["schemas"].pop(unused, None)
+        return described
 
 
 def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool = False) -> FastAPI:
@@ -27,7 +44,7 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
         state.closing = True
         state.missions.close()
 
-    app = FastAPI(
+    app = Service(
         title="fcslam",
         version=fcslam.__version__,
         docs_url="/docs" if docs else None,
@@ -35,7 +52,7 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
         lifespan=lifespan,
     )
     add_handlers(app)
-    for make in (robot_router, fleet_router, map_router, mission_router, decision_router, event_router):
+    for make in ROUTERS:
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(operations_router(state))
     for router in more:

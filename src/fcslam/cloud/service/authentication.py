@@ -1,16 +1,21 @@
-"""Who may ask for what: bearer tokens, of which the service knows the SHA-256 only."""
+"""Who may ask for what: by bearer tokens, of which the service knows the SHA-256 only, or by a robot's certificate."""
 
 import hashlib
 import hmac
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
+from typing import NamedTuple
 
+from cryptography import x509
+from cryptography.x509.oid import NameOID
 from pydantic import Field
 
+from fcslam.cloud.sessions import check_robot
 from fcslam.config import Settings, load
-from fcslam.errors import ServiceError
+from fcslam.errors import PacketError, ServiceError
 from fcslam.records import NAME
+from fcslam.wire.checks import check_name
 
 
 class Role(StrEnum):
@@ -22,6 +27,13 @@ class Role(StrEnum):
     """Reads everything."""
     ADMIN = "admin"
     """Reads everything, and decides about missions."""
+
+
+class Identity(NamedTuple):
+    """Who asks."""
+
+    name: str
+    role: Role
 
 
 class TokenEntry(Settings):
@@ -50,15 +62,34 @@ class Authenticator:
         """Whether nobody is asked for a token."""
         return self._tokens is None
 
-    def who(self, authorization: str | None) -> TokenEntry | None:
-        """Whose token an ``Authorization`` header has; None if it is nobody's. Takes as long for each."""
+    def who(self, authorization: str | None, certificate: str | None = None) -> Identity | None:
+        """Whose token an ``Authorization`` header has, or whose certificate there is without one; None if nobody's.
+
+        ``certificate``: the name (RFC 4514) in one whose signature was checked.
+        """
+        return self._by_token(authorization) if authorization or certificate is None else _by_name(certificate)
+
+    def _by_token(self, authorization: str | None) -> Identity | None:
+        """Takes as long for each."""
         scheme, _, token = (authorization or "").partition(" ")
         digest = hashlib.sha256(token.strip().encode("utf-8", "surrogateescape")).hexdigest()
         found = None
         for entry in self._tokens or ():
             if hmac.compare_digest(entry.sha256, digest) and scheme.lower() == "bearer":
-                found = entry
+                found = Identity(entry.name, entry.role)
         return found
+
+
+def _by_name(certificate: str) -> Identity | None:
+    """The robot that a certificate's common name names."""
+    try:
+        names = x509.Name.from_rfc4514_string(certificate).get_attributes_for_oid(NameOID.COMMON_NAME)
+        name = str(names[0].value) if len(names) == 1 else ""
+        check_name(name, "robot")
+        check_robot(name)
+    except (PacketError, ValueError):
+        return None
+    return Identity(name, Role.ROBOT)
 
 
 def read_tokens(path: Path) -> tuple[TokenEntry, ...]:

@@ -7,6 +7,8 @@ from fastapi import HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
+from fcslam.cloud.service.answers import content
+
 BYTES_PER_S = 8.0 * 2**20
 """A thousand times what a robot sends while it drives: so fast it may send what an outage kept back."""
 BURST_BYTES = 32.0 * 2**20
@@ -72,4 +74,4 @@ async def read_json(request: Request, model: type[_Model]) -> _Model:
 
 def json_body(model: type[BaseModel]) -> dict[str, Any]:
     """What OpenAPI is told of a body that ``read_json`` reads."""
-    return {"requestBody": {"required": True, "content": {"application/json": {"schema": model.model_json_schema()}}}}
+    return {"requestBody": {"required": True, **content("application/json", model=model.model_json_schema())}}

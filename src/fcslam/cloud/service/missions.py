@@ -1,18 +1,18 @@
 """Missions: begin, open, take away, bring in."""
 
-import asyncio
 import tempfile
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from fastapi import APIRouter, Depends, HTTPException, Query, Request
-from fastapi.responses import StreamingResponse
+from fastapi import APIRouter, HTTPException, Query, Request
+from fastapi.responses import Response, StreamingResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.database import told
 from fcslam.cloud.missions import EXPORT, IMPORT
+from fcslam.cloud.service.answers import MissionList, content, refusals
 from fcslam.cloud.service.authentication import Role
 from fcslam.cloud.service.limits import json_body, read_json
 from fcslam.cloud.service.robots import Name
@@ -22,6 +22,8 @@ from fcslam.config import Settings
 from fcslam.errors import StoreError
 from fcslam.records import NAME
 
+FILE = "application/vnd.sqlite3"
+"""Media type of an exported mission."""
 CHUNK_BYTES = 2**20
 LONGEST_IMPORT_BYTES = 64 * 2**30
 
@@ -35,26 +37,52 @@ class NewMission(Settings):
 
 
 def mission_router(state: ServiceState) -> APIRouter:
-    """All missions of the service."""
-    router = APIRouter(tags=["missions"])
-    as_admin = [Depends(state.require(Role.ADMIN))]
-    changing = asyncio.Lock()
+    """All missions of the service, and which one is open."""
+    router = APIRouter(tags=["missions"], responses=refusals(401, 403, 503))
+    as_admin = state.require(Role.ADMIN)
 
-    @router.get("/missions", dependencies=[Depends(state.require(Role.VIEWER, Role.ADMIN))])
-    def list_missions() -> dict[str, Any]:
+    @router.get("/missions", dependencies=state.require(Role.VIEWER, Role.ADMIN))
+    def list_missions() -> MissionList:
         """All missions, and which one is open."""
-        return {"open": state.mission.folder.name, "missions": state.missions.names}
+        return _missions(state)
 
-    @router.post("/missions", status_code=201, dependencies=as_admin, openapi_extra=json_body(NewMission))
-    async def create_mission(request: Request) -> dict[str, Any]:
+    @router.post(
+        "/missions",
+        status_code=201,
+        dependencies=as_admin,
+        openapi_extra=json_body(NewMission),
+        responses=refusals(400, 409, 413, 507),
+    )
+    async def create_mission(request: Request) -> MissionList:
         """Begin a mission and open it."""
         mission = await read_json(request, NewMission)
-        async with changing:
+        async with state.changing:
             await run_in_threadpool(state.missions.create, mission.name)
-        return list_missions()
+        return _missions(state)
 
-    @router.post("/missions/import", status_code=201, dependencies=as_admin)
-    async def import_mission(request: Request, name: Annotated[MissionName, Query()]) -> dict[str, Any]:
+    @router.post("/missions/{name}/open", dependencies=as_admin, responses=refusals(400, 404, 507))
+    async def open_mission(name: Name) -> MissionList:
+        """Let robots' packets go to this mission from now on."""
+        if name not in state.missions.names:
+            raise HTTPException(404, f"there is no mission '{name}'")
+        async with state.changing:
+            await run_in_threadpool(state.missions.open, name)
+        return _missions(state)
+
+    return router
+
+
+def file_router(state: ServiceState) -> APIRouter:
+    """Missions as files."""
+    router = APIRouter(tags=["missions"], dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503))
+
+    @router.post(
+        "/missions/import",
+        status_code=201,
+        openapi_extra={"requestBody": {"required": True, **content(FILE)}},
+        responses=refusals(400, 409, 413, 507),
+    )
+    async def import_mission(request: Request, name: Annotated[MissionName, Query()]) -> MissionList:
         """Make a mission of a file that an export gave; the open one stays open."""
         with tempfile.TemporaryDirectory(dir=state.missions.root, prefix=IMPORT) as folder:
             path = Path(folder) / "mission.sqlite"
@@ -63,20 +91,15 @@ def mission_router(state: ServiceState) -> APIRouter:
                 await run_in_threadpool(check_mission, path)
             except StoreError as error:
                 raise HTTPException(400, f"what was sent is no exported mission ({error})") from error
-            async with changing:
+            async with state.changing:
                 await run_in_threadpool(state.missions.take_in, name, path)
-        return list_missions()
+        return _missions(state)
 
-    @router.post("/missions/{name}/open", dependencies=as_admin)
-    async def open_mission(name: Name) -> dict[str, Any]:
-        """Let robots' packets go to this mission from now on."""
-        if name not in state.missions.names:
-            raise HTTPException(404, f"there is no mission '{name}'")
-        async with changing:
-            await run_in_threadpool(state.missions.open, name)
-        return list_missions()
-
-    @router.get("/missions/{name}/export", dependencies=as_admin)
+    @router.get(
+        "/missions/{name}/export",
+        response_class=Response,
+        responses={**refusals(400, 404, 507), 200: content(FILE)},
+    )
     async def export_mission(name: Name) -> StreamingResponse:
         """A mission as one file."""
         if name not in state.missions.names:
@@ -89,9 +112,13 @@ def mission_router(state: ServiceState) -> APIRouter:
             folder.cleanup()
             raise
         headers = {"Content-Disposition": f'attachment; filename="{name}.sqlite"'}
-        return StreamingResponse(_content(path, folder), media_type="application/vnd.sqlite3", headers=headers)
+        return StreamingResponse(_content(path, folder), media_type=FILE, headers=headers)
 
     return router
+
+
+def _missions(state: ServiceState) -> MissionList:
+    return MissionList(open=state.mission.folder.name, missions=state.missions.names)
 
 
 async def _receive(request: Request, path: Path) -> None:

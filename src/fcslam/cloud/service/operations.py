@@ -1,11 +1,11 @@
 """What keeps a service running asks: is it well, and how much does it do."""
 
-from fastapi import APIRouter, Depends
-from fastapi.responses import JSONResponse, Response
+from fastapi import APIRouter, HTTPException
+from fastapi.responses import Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
+from fcslam.cloud.service.answers import Health, content, refusals
 from fcslam.cloud.service.authentication import Role
-from fcslam.cloud.service.problems import problem
 from fcslam.cloud.service.state import ServiceState
 from fcslam.errors import StoreError
 
@@ -14,20 +14,25 @@ def operations_router(state: ServiceState) -> APIRouter:
     """Health, for everybody; measures, for viewers."""
     router = APIRouter(tags=["operations"])
 
-    @router.get("/healthz")
-    def get_health() -> JSONResponse:
+    @router.get("/healthz", responses=refusals(503))
+    def get_health() -> Health:
         """200 while packets are taken in and the worker runs, 503 otherwise."""
         try:
             state.mission.store.turn_count()
-        except StoreError:
-            return problem(503, "the mission cannot be read")
+        except StoreError as error:
+            raise HTTPException(503, "the mission cannot be read") from error
         if state.closing:
-            return problem(503, "the service is stopping")
+            raise HTTPException(503, "the service is stopping")
         if state.mission.worker.pid is None:
-            return problem(503, "packets are taken in, but the worker is down")
-        return JSONResponse({"status": "ok"})
+            raise HTTPException(503, "packets are taken in, but the worker is down")
+        return Health()
 
-    @router.get("/metrics", dependencies=[Depends(state.require(Role.VIEWER, Role.ADMIN))])
+    @router.get(
+        "/metrics",
+        dependencies=state.require(Role.VIEWER, Role.ADMIN),
+        response_class=Response,
+        responses={**refusals(401, 403, 503, 507), 200: content("text/plain")},
+    )
     def get_metrics() -> Response:
         """Measures in Prometheus's text format."""
         return Response(state.measures.text(state.mission), media_type=CONTENT_TYPE_LATEST)

@@ -2,33 +2,41 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, HTTPException, Path, Request
+from fastapi import APIRouter, Header, HTTPException, Path, Request
 from fastapi.responses import FileResponse, Response
 from starlette.concurrency import run_in_threadpool
 
+from fcslam.cloud.service.answers import PacketProblem, PacketRefusal, RobotState, content, refusals
 from fcslam.cloud.service.authentication import Role
 from fcslam.cloud.service.limits import read_body
 from fcslam.cloud.service.state import ServiceState
 from fcslam.records import NAME, Channel
-from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, read_batch
+from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, REFUSED_HEADER, read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.packets import unpacked_size
 
+NETWORK = "application/octet-stream"
+"""Media type of a detector's file."""
+_REFUSED = {
+    REFUSED_HEADER: {
+        "schema": {"type": "integer", "minimum": 0}, "required": True, "description": "packets that count for nothing",
+    }
+}  # fmt: skip
 Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 
 
 def robot_router(state: ServiceState) -> APIRouter:
-    """Packets in, acknowledgements and corrections out; detectors."""
-    router = APIRouter(tags=["robots"])
-    as_robot = Depends(state.require(Role.ROBOT))
-    content = {MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}
+    """Packets in, acknowledgements and corrections out."""
+    router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
+    as_robot = state.require(Role.ROBOT)
+    taken = {status: {**told, "model": PacketProblem} for status, told in refusals(400, 409).items()}
 
     @router.post(
         "/robots/{robot}/packets",
-        dependencies=[as_robot],
+        dependencies=as_robot,
         response_class=Response,
-        responses={200: {"content": content}},
-        openapi_extra={"requestBody": {"content": content}},
+        responses={**refusals(413, 429, 507), **taken, 200: {**content(MEDIA_TYPE), "headers": _REFUSED}},
+        openapi_extra={"requestBody": content(MEDIA_TYPE)},
     )
     async def send_packets(
         request: Request,
@@ -47,33 +55,54 @@ def robot_router(state: ServiceState) -> APIRouter:
         mission = state.mission
         answer = await run_in_threadpool(mission.intake.take, robot, agent, body, correction)
         mission.worker.ring()
-        state.measures.count(answer.packets, answer.batch, robot)
-        return Response(answer.batch, media_type=MEDIA_TYPE)
+        state.measures.answer(robot, len(answer.batch))
+        return Response(answer.batch, media_type=MEDIA_TYPE, headers={REFUSED_HEADER: str(answer.refused)})
 
-    @router.get("/robots/{robot}/state", dependencies=[as_robot])
-    def get_state(robot: Name) -> dict[str, object]:
-        """Where a robot that starts again goes on: by epoch, the number of the first packet that is missing."""
+    @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
+    def get_state(robot: Name) -> RobotState:
+        """Where a robot that starts again goes on, and which of its packets were refused."""
         store = state.mission.store
         sessions = store.sessions(robot)
         newest = sessions[-1].epoch if sessions else None
         correction = None if newest is None else store.correction(robot, newest)
-        return {
-            "robot": robot,
-            "epoch": newest,
-            "next": {str(session.epoch): session.next for session in sessions},
-            "correction": correction.correction.version if correction else -1,
-            "map": correction.correction.map_index if correction else None,
-        }
+        return RobotState(
+            robot=robot,
+            epoch=newest,
+            next={str(session.epoch): session.next for session in sessions},
+            correction=correction.correction.version if correction else -1,
+            map=correction.correction.map_index if correction else None,
+            refused=refused_packets(state, robot),
+        )
 
-    @router.get("/detectors/{channel}/{version}", dependencies=[Depends(state.require(*Role))])
+    return router
+
+
+def network_router(state: ServiceState) -> APIRouter:
+    """Detectors for robots."""
+    router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
+
+    @router.get(
+        "/detectors/{channel}/{version}",
+        dependencies=state.require(*Role),
+        response_class=Response,
+        responses={**refusals(404), 200: content(NETWORK)},
+    )
     def get_detector(channel: Channel, version: Name) -> FileResponse:
         """The network of a detector version."""
         path = state.detectors.path(channel, version)
         if not path.is_file():
             raise HTTPException(404, f"there is no {channel} detector '{version}'")
-        return FileResponse(path, media_type="application/octet-stream")
+        return FileResponse(path, media_type=NETWORK)
 
     return router
+
+
+def refused_packets(state: ServiceState, robot: str) -> list[PacketRefusal]:
+    """Packets of a robot that count for nothing."""
+    return [
+        PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
+        for epoch, sequence, reason in state.mission.store.refusals(robot)
+    ]
 
 
 def _unpacked_size(body: bytes) -> int:

@@ -1,9 +1,11 @@
 """What all parts of the HTTP service share."""
 
-from collections.abc import Awaitable, Callable
+import asyncio
 from dataclasses import dataclass, field
 
-from fastapi import HTTPException, Request
+from fastapi import Depends, HTTPException, Request, Security
+from fastapi.params import Depends as Dependency
+from fastapi.security import HTTPBearer
 
 from fcslam.cloud.detectors import DetectorShelf
 from fcslam.cloud.missions import Missions, OpenMission
@@ -11,6 +13,8 @@ from fcslam.cloud.service.authentication import Authenticator, Role
 from fcslam.cloud.service.events import EventStream
 from fcslam.cloud.service.limits import RateLimit
 from fcslam.cloud.service.measures import Measures
+
+_BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
 
 
 @dataclass(slots=True)
@@ -24,6 +28,8 @@ class ServiceState:
     measures: Measures = field(default_factory=Measures)
     closing: bool = False
     """Nothing new is begun any more."""
+    changing: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """Whoever has it may begin, open and bring in missions."""
 
     @property
     def mission(self) -> OpenMission:
@@ -35,8 +41,8 @@ class ServiceState:
         """Networks that robots may fetch."""
         return self.missions.detectors
 
-    def require(self, *roles: Role) -> Callable[[Request], Awaitable[None]]:
-        """A dependency: whoever asks has a token of one of the roles; a robot's is good for that robot alone.
+    def require(self, *roles: Role) -> list[Dependency]:
+        """Dependencies of a route: whoever asks has one of the roles, and a robot that of itself alone.
 
         Refuses (HTTPException): 401 without a token that is known, 403 with another one's, 429 too many requests.
         """
@@ -46,15 +52,19 @@ class ServiceState:
                 raise HTTPException(503, "the service is stopping; try again")
             if self.authenticator.is_open:
                 return
-            entry = self.authenticator.who(request.headers.get("authorization"))
-            if entry is None:
+            tls = request.scope.get("extensions", {}).get("tls", {})
+            who = self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
+            if who is None:
                 headers = {"WWW-Authenticate": "Bearer"}
-                raise HTTPException(401, "no token, or an unknown one; send Authorization: Bearer TOKEN", headers)
-            if entry.role not in roles:
+                raise HTTPException(
+                    401, "no known token and no robot's certificate; send Authorization: Bearer TOKEN", headers
+                )
+            if who.role not in roles:
                 needed = " or ".join(roles)
-                raise HTTPException(403, f"the token of '{entry.name}' is a {entry.role}'s; this takes {needed}'s")
+                raise HTTPException(403, f"'{who.name}' is a {who.role}; this is for a {needed}")
             robot = request.path_params.get("robot")
-            if entry.role is Role.ROBOT and robot not in (None, entry.name):
-                raise HTTPException(403, f"the token of robot '{entry.name}' is not good for robot '{robot}'")
+            if who.role is Role.ROBOT and robot not in (None, who.name):
+                raise HTTPException(403, f"robot '{who.name}' does not speak for robot '{robot}'")
 
-        return check
+        # the second one tells OpenAPI of tokens, and does nothing else
+        return [Depends(check)] if self.authenticator.is_open else [Depends(check), Security(_BEARER)]

@@ -1,0 +1,167 @@
+"""What the service answers, as OpenAPI describes it: nothing else is ever sent."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.records import Channel, ClosureStatus
+
+Pose = Annotated[list[float], Field(min_length=3, max_length=3, description="x and y in metres, theta in radians")]
+
+
+class Problem(Settings):
+    """Why a request is refused."""
+
+    error: str = Field(description="what, where, what to do: one line")
+
+
+class PacketProblem(Settings):
+    """Why a batch is refused, and from which of its packets on."""
+
+    error: str = Field(description="what, where, what to do: one line")
+    index: int | None = Field(None, description="of the refused packet; those before it are stored")
+
+
+class Health(Settings):
+    """The service is well."""
+
+    status: Literal["ok"] = "ok"
+
+
+class PacketRefusal(Settings):
+    """A packet that counts for nothing; its number is used up."""
+
+    epoch: int
+    sequence: int
+    reason: str
+
+
+class RobotState(Settings):
+    """Where a robot that starts again goes on."""
+
+    robot: str
+    epoch: int | None = Field(description="the newest that is known")
+    next: dict[str, int] = Field(description="by epoch, number of the first packet that is missing")
+    correction: int = Field(description="version of the newest one; -1: none")
+    map: int | None
+    refused: list[PacketRefusal]
+
+
+class FleetSummary(Settings):
+    """Counts."""
+
+    mission: str
+    packets: int
+    applied: int = Field(description="packets that have taken effect")
+    waiting: int = Field(description="packets after one that is missing")
+    robots: list[str]
+    maps: int
+    metrics: dict[str, float | None]
+
+
+class RobotSession(Settings):
+    """One start of a robot with odometry at zero."""
+
+    robot: str
+    session: str
+    epoch: int
+    packets: int
+    map: int | None
+    path_length_m: float
+    keyscans: int
+    T_map_base: Pose | None
+    T_map_odom: Pose | None
+    correction: int = Field(description="version of the newest one; -1: none")
+    last_heard_s: float | None = Field(description="seconds since the robot's last batch")
+
+
+class RobotSummary(Settings):
+    """One robot's sessions, and packets of it that were refused."""
+
+    robot: str
+    sessions: list[RobotSession]
+    refused: list[PacketRefusal]
+
+
+class Closure(Settings):
+    """As in closures.csv."""
+
+    robot_i: str
+    stamp_i: float
+    robot_j: str
+    stamp_j: float
+    channel: Channel
+    similarity: float
+    T_i_j: Pose
+    status: ClosureStatus
+    reason: str
+
+
+class MapSummary(Settings):
+    """Which robots share a map."""
+
+    map: int
+    robots: list[str]
+
+
+class DetectorVersion(Settings):
+    """A network that robots may fetch."""
+
+    channel: Channel
+    version: str
+
+
+class DetectorSummary(DetectorVersion):
+    """And whether they are told to."""
+
+    announced: bool
+
+
+class MissionList(Settings):
+    """All missions, and which one is open."""
+
+    open: str
+    missions: list[str]
+
+
+class Finalized(Settings):
+    """A result."""
+
+    number: int
+    run: str = Field(description="run folder, on the service's machine")
+
+
+class VetoCount(Settings):
+    """How many vetoes there are now."""
+
+    vetoes: int
+
+
+_SECONDS = {"schema": {"type": "integer", "minimum": 0}, "required": True, "description": "seconds"}
+_REFUSALS: dict[int, dict[str, Any]] = {
+    400: {"description": "what was sent is wrong"},
+    401: {
+        "description": "no known token, no certificate of a robot",
+        "headers": {"WWW-Authenticate": {"schema": {"type": "string"}, "required": True}},
+    },
+    403: {"description": "it is another role's, or another robot's"},
+    404: {"description": "it is not there"},
+    409: {"description": "it does not go together with what is there"},
+    413: {"description": "too long"},
+    429: {"description": "too much at once", "headers": {"Retry-After": _SECONDS}},
+    500: {"description": "the cloud failed on it"},
+    503: {"description": "not now: the service stops, or has no worker"},
+    507: {"description": "the disk is full or broken"},
+}
+
+
+def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """What OpenAPI is told of these answers."""
+    return {status: {"model": Problem, **_REFUSALS[status]} for status in statuses}
+
+
+def content(*media_types: str, model: dict[str, Any] | None = None) -> dict[str, Any]:
+    """What OpenAPI is told of a body or an answer: bytes, if no schema is given."""
+    schema = model or {"type": "string", "format": "binary"}
+    return {"content": {media_type: {"schema": schema} for media_type in media_types}}
