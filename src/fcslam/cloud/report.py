@@ -122,7 +122,7 @@ def _map_files(result: FleetResult, trajectories: Sequence[RobotTrajectory], gri
     for k in sorted({robot.map_index for robot in result.robots}):
         members = [robot for robot in result.robots if robot.map_index == k]
         stem = "map" if k == 0 else f"map_{k}"
-        fused = _fuse(members, grid)
+        fused = fuse_members(members, grid)
         drawn = {t.robot: t.T_map_base for t in trajectories if t.map_index == k}
         files[f"{stem}.pgm"] = pgm_bytes(fused)
         files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
@@ -130,7 +130,8 @@ def _map_files(result: FleetResult, trajectories: Sequence[RobotTrajectory], gri
     return files
 
 
-def _fuse(members: Sequence[MappedRobot], grid: OccupancyConfig) -> FusedMap:
+def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> FusedMap:
+    """One map of robots that share it."""
     keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
     poses: FloatArray = np.concatenate([robot.T_map_base for robot in members])
     return fuse(keyscans, poses, {robot.robot: robot.laser for robot in members}, grid)
