@@ -2,8 +2,8 @@
 
     python benchmarks/lifelong.py [--sessions 12] [--path 60]
 
-A simulated robot (LiDAR, 360 beams at 5 Hz) drives one building session after session, each with odometry that begins at
-zero and from another start; before each further one a tenth of the rooms' furniture moves. Its front end runs
+A simulated robot (LiDAR, 360 beams at 5 Hz) drives one building session after session, each with odometry that begins
+at zero and from another start; before each further one a tenth of the rooms' furniture moves. Its front end runs
 beforehand, and what it sends goes into a mission's store as the service keeps it. Then the packets take effect in a
 fleet that reads them from there, in a process of its own, as in a worker that starts again: once as the configuration
 has it, once with nothing ever forgotten. After each session:
@@ -96,35 +96,42 @@ def record(place: Path, sessions: int, path_m: float, seed: int) -> None:
 def live(place: Path, sessions: int, path_m: float, seed: int, most_nearby: int | None) -> tuple[list[tuple], str]:
     """One row after each session, and what the end took."""
     from fcslam.cloud.fleet import Fleet
+    from fcslam.cloud.journal import StoredJournal
     from fcslam.cloud.store import MissionStore
     from fcslam.mission import MissionConfig
-    from fcslam.records import ClosureStatus
 
     warm_up()
-    config, store = MissionConfig(), MissionStore(place / "mission.sqlite")
-    matcher = config.fleet.matcher
-    matcher = matcher.model_copy(update={} if most_nearby is None else {"most_nearby": most_nearby})
-    fleet, drivers = Fleet(config.fleet.model_copy(update={"matcher": matcher}), config.seed), robots(sessions, path_m, seed)
+    config, store, drivers = MissionConfig(), MissionStore(place / "mission.sqlite"), robots(sessions, path_m, seed)
+    matcher = config.fleet.matcher.model_copy(update={} if most_nearby is None else {"most_nearby": most_nearby})
+    settings = config.fleet.model_copy(update={"matcher": matcher})
+    fleet = Fleet(settings, config.seed, StoredJournal(store.packet))
     rows, turn, before_mb = [], 0, resident_mb()
     for epoch in range(sessions):
         with Watches().on() as watches:
             first, began = turn, time.process_time()
             turn = take_session(fleet, store, epoch, turn, watches)
             spent_s = time.process_time() - began
-        result = fleet.estimate()
-        poses = sum(len(robot.T_map_base) for robot in result.robots)
-        held = sum(len(robot.keyscans) for robot in result.robots)
-        counts = sum(closure.status is ClosureStatus.ACCEPTED for closure in result.closures)
-        places = sum(state.places for state in fleet.vocabularies())
-        quality = against_truth(result, drivers[: epoch + 1], config.map)
-        del result
-        rows.append((epoch + 1, turn, resident_mb() - before_mb, places, held, poses, counts, mean(watches.place.spent_s),
-                     mean(watches.quick.spent_s), 1e3 * spent_s / (turn - first), *quality))  # fmt: skip
+        memory_mb = resident_mb() - before_mb
+        costs = mean(watches.place.spent_s), mean(watches.quick.spent_s), 1e3 * spent_s / (turn - first)
+        rows.append((epoch + 1, turn, memory_mb, *state(fleet, drivers[: epoch + 1], config.map, costs)))
     began = time.process_time()
     result = fleet.finalize()
-    spent_s = time.process_time() - began
+    spent_s, memory_mb = time.process_time() - began, peak_mb() - before_mb
     maps, rmse_m, f1 = against_truth(result, drivers, config.map)
-    return rows, f"End: {maps} map(s), RMSE {rmse_m:.3f} m, F1 {f1:.3f}, {spent_s:.1f} s of CPU, at most {peak_mb() - before_mb:.0f} MB."
+    end = f"{maps} map(s), RMSE {rmse_m:.3f} m, F1 {f1:.3f}, {spent_s:.1f} s of CPU, at most {memory_mb:.0f} MB"
+    return rows, f"End, of {turn:,} packets: {end}."
+
+
+def state(fleet: Any, drivers: list[Any], grid: Any, costs: tuple[float, ...]) -> tuple:
+    """What the fleet holds, what it spent, and how good its live map is."""
+    from fcslam.records import ClosureStatus
+
+    result = fleet.estimate()
+    places = sum(state.places for state in fleet.vocabularies())
+    held = sum(len(robot.keyscans) for robot in result.robots)
+    poses = sum(len(robot.T_map_base) for robot in result.robots)
+    closures = sum(closure.status is ClosureStatus.ACCEPTED for closure in result.closures)
+    return places, held, poses, closures, *costs, *against_truth(result, drivers, grid)
 
 
 def take_session(fleet: Any, store: Any, epoch: int, turn: int, watches: Watches) -> int:
