@@ -32,9 +32,9 @@ class MatcherConfig(Settings):
         default=100_000, gt=0, description="places kept of one channel; of more the oldest are forgotten"
     )
     most_nearby: int = Field(
-        default=32, gt=0, description="places kept of one robot and channel this close; of more the oldest goes"
+        default=12, gt=0, description="places kept of one robot and channel in a square; of more the oldest goes"
     )
-    nearby_m: float = Field(default=2.0, gt=0.0, description="how close that is, in a map")
+    nearby_m: float = Field(default=2.0, gt=0.0, description="side of these squares, in a map")
     doubts: int = Field(
         default=2, ge=0, description="places of robots in the same map that are compared wherever the map puts them"
     )
