@@ -10,12 +10,14 @@ from small_fleet import feed, fingerprint, in_order, map_of
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.cloud.fusion import fuse
+from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.map_files import Occupancy
 from fcslam.metrics.grid import LabelledGrid, grid_agreement
 from fcslam.metrics.trajectory import align, position_errors
 from fcslam.places.matcher import MatcherConfig
-from fcslam.records import Channel, Place
+from fcslam.records import Channel, Place, Veto
+from fcslam.runs import open_run, write_run
 from fcslam.simulation.truth import true_map
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
@@ -140,3 +142,22 @@ def test_the_map_of_many_sessions_is_no_worse_than_that_of_few(forgetful, packet
     errors_whole, f1_whole = surfaces(whole, drawn, SESSIONS)
     assert errors_many.max() < max(errors_few.max(), errors_whole.max(), 0.03)
     assert f1_many > min(f1_few, f1_whole) - 0.02
+
+
+def test_a_session_of_which_everything_was_forgotten_still_has_its_trajectory_and_empty_maps(packets, tmp_path):
+    """Parted from the sessions that made it forget by a veto, it has a map of its own with nothing in it."""
+    fleet = feed(Fleet(ONE_A_SQUARE, 0), packets)
+    empty = next(robot.robot for robot in fleet.estimate().robots if not robot.keyscans)
+    others = [robot.robot for robot in fleet.estimate().robots if robot.robot != empty]
+    for other in others:
+        fleet.veto(Veto(empty, other))
+    result = fleet.estimate()
+    tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+    write_run(run_of(result, tracks, [], "", OccupancyConfig()), tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    (alone,) = [trajectory for trajectory in run.trajectories if trajectory.robot == empty]
+    assert [t.robot for t in run.trajectories if t.map_index == alone.map_index] == [empty]
+    assert len(alone.stamps) == len(tracks[empty].stamps) > 0
+    assert run.map_files[f"map_{alone.map_index}.pgm"].startswith(b"P5")
+    whole = {robot.robot: robot for robot in fleet.finalize().robots}[empty]
+    assert whole.keyscans, "the veto known from the beginning, others made it forget nothing"
