@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cloud.scripted import closures, motion, rectangle, stream
+from hypothesis import given
+from hypothesis import strategies as st
 from small_fleet import feed, fingerprint, in_order, map_of
 
+from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
-from fcslam.records import ConstraintKind, Correction, KeyscanId
+from fcslam.records import NAME, ConstraintKind, Correction, KeyscanId
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 
@@ -101,3 +104,8 @@ def test_the_estimate_on_the_way_is_the_result_where_nothing_is_in_doubt(scripte
     for live, final in zip(estimate.robots, result.robots, strict=True):
         assert np.allclose(live.T_map_base, final.T_map_base, atol=1e-6)
         assert np.allclose(live.T_local_base, final.T_local_base, atol=1e-6)
+
+
+@given(st.from_regex(NAME, fullmatch=True).filter(lambda name: robot_of(name) == name), st.integers(0, 10**6))
+def test_a_sessions_name_tells_robot_and_epoch(robot, epoch):
+    assert robot_and_epoch(session_name(robot, epoch)) == (robot, epoch)

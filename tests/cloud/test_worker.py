@@ -1,9 +1,11 @@
 """The worker: what it makes of a store is what the mission makes of the recordings, whatever happens on the way."""
 
 import fcntl
+import gc
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from fcslam.records import ClosureStatus, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.sources import open_source
+from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, read_label
 
 POSES = rectangle(29)
@@ -276,6 +279,34 @@ def test_more_robots_join_a_mission_that_was_finished(cloud, tmp_path):
     together.put(packets)
     assert late.pose_graph_g2o == together.finalize().pose_graph_g2o
     together.store.close()
+
+
+def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scripted):
+    scripted(closures(("a", POSES), ("a+1", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)]))
+    first, again = stream("a", POSES, start_s=0.0), stream("a", POSES, start_s=600_000.0)
+    cloud.put(first)
+    assert {t.robot: t.map_index for t in cloud.finalize().trajectories} == {"a": 0}
+    cloud.restart()
+    hello = replace(again[0], epoch=1, body=replace(again[0].body, epoch=1))
+    cloud.put([hello, *(replace(packet, epoch=1) for packet in again[1:])])
+    run = cloud.finalize()
+    assert {t.robot: t.map_index for t in run.trajectories} == {"a": 0, "a+1": 0}
+    assert {"map.pgm", "map.yaml", "map.png"} == set(run.map_files)
+
+
+def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
+    """What is replayed in the end is read from the store again."""
+
+    def in_memory():
+        gc.collect()
+        return sum(isinstance(each, Packet) for each in gc.get_objects())
+
+    cloud.put(two_robots())
+    before = in_memory()
+    first = cloud.finalize()
+    assert in_memory() == before
+    assert cloud.finalize().pose_graph_g2o == first.pose_graph_g2o
+    assert in_memory() == before
 
 
 @pytest.mark.parametrize(("step_m", "kept"), [(1e6, 1), (1e5, 3)])

@@ -1,4 +1,6 @@
-"""Forgetting by area: bounded however long a robot drives, and nobody else's places go."""
+"""Forgetting by area: bounded however long a robot drives, and no area is forgotten."""
+
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -7,34 +9,39 @@ from hypothesis import strategies as st
 
 from fcslam.places.thinning import crowded_out
 
-ways = st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), max_size=60)
+coordinates = st.floats(-4.0, 4.0)
+ways = st.lists(st.tuples(coordinates, coordinates), max_size=60)
 
 
-@given(ways, st.integers(1, 4), st.sampled_from([0.0, 1.0, 2.0, 3.5]))
-def test_no_disc_of_half_the_radius_ever_holds_more(way, most, radius_m):
+def driven(way, side_m, most):
+    """Numbers of the places that are kept at the end of the way."""
     kept = []
-    for place in enumerate(way):
-        kept.append(place)
-        positions = np.array([position for _, position in kept], float)
-        near = [k for k, p in enumerate(positions) if np.hypot(*(p - positions[-1])) <= radius_m]
-        gone = crowded_out(positions, radius_m, most).tolist()
-        assert gone == near[: max(len(near) - most, 0)]
-        assert len(kept) - 1 not in gone, "the newest stays"
-        kept = [each for k, each in enumerate(kept) if k not in gone]
-        positions = np.array([position for _, position in kept], float)
-        for centre in positions:
-            assert (np.hypot(*(positions - centre).T) <= radius_m / 2).sum() <= most
+    for number in range(len(way)):
+        kept.append(number)
+        gone = crowded_out(np.array([way[k] for k in kept], float), side_m, most).tolist()
+        kept = [k for row, k in enumerate(kept) if row not in gone]
+    return kept
 
 
-def test_a_robot_that_drives_its_rounds_for_ever_keeps_the_newest():
-    kept = []
-    for k in range(1000):
-        kept.append((k, (10.0 * np.cos(0.1 * k), 10.0 * np.sin(0.1 * k))))
-        gone = crowded_out(np.array([position for _, position in kept]), 2.0, 6)
-        kept = [each for row, each in enumerate(kept) if row not in gone]
-    assert len(kept) <= 6 * 63
-    assert len(kept) < 200
-    assert min(k for k, _ in kept) > 800
+@given(ways, st.integers(1, 4), st.sampled_from([0.7, 1.0, 2.0, 20.0]))
+def test_every_square_keeps_its_newest_and_never_more(way, most, side_m):
+    squares = defaultdict(list)
+    for number, (x, y) in enumerate(way):
+        squares[x // side_m, y // side_m].append(number)
+    assert driven(way, side_m, most) == sorted(k for numbers in squares.values() for k in numbers[-most:])
+
+
+def test_a_robot_that_drives_its_rounds_for_ever_keeps_places_of_the_whole_round():
+    way = [(10.0 * np.cos(0.1 * k), 10.0 * np.sin(0.1 * k)) for k in range(1000)]
+    kept = driven(way, 2.0, 6)
+    assert len(kept) < 300
+    assert {(way[k][0] // 2, way[k][1] // 2) for k in kept} == {(x // 2, y // 2) for x, y in way}
+
+
+def test_a_robot_that_sweeps_a_floor_lane_by_lane_keeps_all_of_the_floor():
+    way = [(float(x), 0.25 * lane) for lane in range(80) for x in (range(10) if lane % 2 else range(9, -1, -1))]
+    kept = driven(way, 2.0, 1)
+    assert {(way[k][0] // 2, way[k][1] // 2) for k in kept} == {(x, y) for x in range(5) for y in range(10)}
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

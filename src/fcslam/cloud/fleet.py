@@ -6,6 +6,7 @@ arrives later may still revoke it. ``finalize`` depends on the set of packets on
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -13,14 +14,16 @@ from pydantic import Field
 
 from fcslam.cloud.joining import first_estimate, judge
 from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.journal import Journal
 from fcslam.cloud.ledger import ClosureLedger, Entry
 from fcslam.cloud.result import FleetResult, Fusion, conclude, map_indices
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.robots import RobotStore
-from fcslam.cloud.sessions import in_session, session_name
+from fcslam.cloud.sessions import in_session, robot_of, session_name
 from fcslam.cloud.strategy import FusionStrategy
 from fcslam.cloud.submaps import SubmapShelf
 from fcslam.cloud.verdict import reconsider
+from fcslam.cloud.visits import Visit, visits_near
 from fcslam.config import Settings
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
@@ -85,9 +88,11 @@ MORE_DOUBTS = 1.1
 class Fleet:
     """Receives packets; matches, verifies, joins, optimises."""
 
-    def __init__(self, config: FleetConfig, seed: int) -> None:
+    def __init__(self, config: FleetConfig, seed: int, journal: Journal | None = None) -> None:
+        """``journal`` keeps packets as they came, to be replayed; by default memory does."""
         self._config = config
         self._seed = seed
+        self._journal = {} if journal is None else journal
         self._store = RobotStore()
         self._graph = JointGraph()
         self._ledger = ClosureLedger()
@@ -117,6 +122,8 @@ class Fleet:
         """
         packet = decode(data)
         ours = in_session(packet)
+        if not self._store.knows(ours):
+            self._journal[ours.robot, ours.sequence] = data
         self._admit(ours, self._store.admit(ours))
         return self._replies(packet)
 
@@ -136,7 +143,8 @@ class Fleet:
             replay.veto(veto)
         for robot, sequence in sorted(self._store.skipped):
             replay._admit(None, replay._store.skip(robot, sequence))
-        for packet in self._store.canonical():
+        for number in self._store.canonical():
+            packet = in_session(decode(self._journal[number]))
             replay._admit(packet, replay._store.admit(packet))
         return replay._conclude()
 
@@ -231,7 +239,7 @@ class Fleet:
 
     def _add_place(self, place: Place) -> None:
         """Match a place (Algorithm 1), judge what it brings, join maps, optimise."""
-        if self._config.join_maps:
+        if self._config.join_maps and self._store.hold(place):
             words = place.channel, place.detector_version
             matcher = self._matcher(words)
             matches = matcher.match(place, self._predicted(place), self._is_stranger(place.id.robot))
@@ -248,35 +256,38 @@ class Fleet:
             self._reconsider()
 
     def _thin(self, words: _Words, robot: str) -> None:
-        """Forget a robot's oldest places where it has very many."""
-        settings, matcher = self._config.matcher, self._matchers[words]
-        if len(self._places[words, robot]) <= settings.most_nearby:
+        """Forget the oldest places of a robot's sessions in one map where it has very many."""
+        settings, matcher, mates = self._config.matcher, self._matchers[words], self._map_of(robot)
+        if len(matcher) <= settings.most_nearby:
             return
-        ids = self._places[words, robot] = [i for i in self._places[words, robot] if i in matcher]
+        sessions = {session for session in mates if robot_of(session) == robot_of(robot)}
+        ids = [i for i in matcher if i.robot in sessions]
         positions = np.array([self._graph.pose(i)[:2] for i in ids])
-        for row in reversed(crowded_out(positions, settings.nearby_m, settings.most_nearby)):
-            matcher.forget(ids.pop(row))
+        for row in crowded_out(positions, settings.nearby_m, settings.most_nearby):
+            matcher.forget(ids[row])
+
+    def _forget(self, place: Place) -> None:
+        """Let go of what only a place that is never compared again needs."""
+        self._places[(place.channel, place.detector_version), place.id.robot].remove(place.id)
+        self._submaps.drop(place)
+        self._store.release(place)
 
     def _matcher(self, words: _Words) -> PlaceMatcher:
         if words not in self._matchers:
             rng = np.random.default_rng(self._seed)
-            self._matchers[words] = PlaceMatcher(self._config.matcher, self._submaps.of, rng)
+            self._matchers[words] = PlaceMatcher(self._config.matcher, self._submaps.of, rng, self._forget)
         return self._matchers[words]
 
     def _predicted(self, place: Place) -> dict[KeyscanId, FloatArray]:
-        """T_i_j of the nearest place of each visit of the robots in the same map."""
+        """T_i_j of the nearest places of other sessions in the same map, one of a visit, so many of a robot."""
         pose, words = self._graph.pose(place.id), (place.channel, place.detector_version)
-        near: dict[KeyscanId, FloatArray] = {}
-        for robot in self._map_of(place.id.robot):
-            ids = self._places.get((words, robot), []) if robot != place.id.robot else []
-            anchors = np.array([self._graph.pose(i) for i in ids]).reshape(-1, 3)
-            distance = np.hypot(anchors[:, 0] - pose[0], anchors[:, 1] - pose[1])
-            close = np.flatnonzero(distance < self._config.sight_m)
-            visits = np.split(close, np.flatnonzero(np.diff(close) > 1) + 1) if len(close) else []
-            best = sorted((int(v[np.argmin(distance[v])]) for v in visits), key=lambda k: float(distance[k]))
-            for k in best[: self._config.near_visits]:
-                near[ids[k]] = se2.between(anchors[k], pose)
-        return near
+        visits: dict[str, list[Visit]] = {}
+        for session in self._map_of(place.id.robot):
+            ids = self._places.get((words, session), []) if session != place.id.robot else []
+            poses = np.array([self._graph.pose(i) for i in ids]).reshape(-1, 3)
+            visits.setdefault(robot_of(session), []).extend(visits_near(ids, poses, pose[:2], self._config.sight_m))
+        nearest = (sorted(found, key=itemgetter(0))[: self._config.near_visits] for found in visits.values())
+        return {i: se2.between(self._graph.pose(i), pose) for found in nearest for _, i in found}
 
     def _is_stranger(self, robot: str) -> Callable[[KeyscanId], bool]:
         """Whether a place belongs to a robot in another map than ``robot``."""

@@ -39,8 +39,8 @@ class Track:
 
 def keyscan_track(robot: MappedRobot) -> Track:
     """What the cloud knows of a robot's scans: the keyscans alone."""
-    count = len(robot.keyscans)
-    return Track(np.array([keyscan.stamp for keyscan in robot.keyscans]), np.arange(count), np.zeros((count, 3)))
+    count = len(robot.stamps)
+    return Track(robot.stamps, np.arange(count), np.zeros((count, 3)))
 
 
 def run_of(
@@ -101,7 +101,7 @@ def _link_metrics(link: str, traffic: Mapping[str, Traffic], tracks: Mapping[str
 
 def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> LocalMap:
     """What the robot would have mapped had it been alone."""
-    fused = fuse(robot.keyscans, robot.T_local_base, {robot.robot: robot.laser}, grid)
+    fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.laser}, grid)
     name = f"{robot.robot}.pgm"
     return LocalMap(
         robot.robot, track.stamps, track.laid_on(robot.T_local_base), pgm_bytes(fused), map_yaml(fused, name)
@@ -111,7 +111,7 @@ def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> Local
 def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> ClosureRow:
     i, j = closure.i, closure.j
     return ClosureRow(
-        i.robot, mapped[i.robot].keyscans[i.number].stamp, j.robot, mapped[j.robot].keyscans[j.number].stamp,
+        i.robot, float(mapped[i.robot].stamps[i.number]), j.robot, float(mapped[j.robot].stamps[j.number]),
         closure.channel, closure.similarity, closure.T_i_j, closure.status, closure.reason,
     )  # fmt: skip
 
@@ -122,7 +122,7 @@ def _map_files(result: FleetResult, trajectories: Sequence[RobotTrajectory], gri
     for k in sorted({robot.map_index for robot in result.robots}):
         members = [robot for robot in result.robots if robot.map_index == k]
         stem = "map" if k == 0 else f"map_{k}"
-        fused = _fuse(members, grid)
+        fused = fuse_members(members, grid)
         drawn = {t.robot: t.T_map_base for t in trajectories if t.map_index == k}
         files[f"{stem}.pgm"] = pgm_bytes(fused)
         files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
@@ -130,9 +130,10 @@ def _map_files(result: FleetResult, trajectories: Sequence[RobotTrajectory], gri
     return files
 
 
-def _fuse(members: Sequence[MappedRobot], grid: OccupancyConfig) -> FusedMap:
+def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> FusedMap:
+    """One map of robots that share it."""
     keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
-    poses: FloatArray = np.concatenate([robot.T_map_base for robot in members])
+    poses: FloatArray = np.concatenate([robot.T_map_base[robot.numbers()] for robot in members])
     return fuse(keyscans, poses, {robot.robot: robot.laser for robot in members}, grid)
 
 
@@ -152,7 +153,7 @@ def _counts(result: FleetResult) -> list[Metric]:
     return [
         Metric("robots", len(result.robots), "1"),
         Metric("maps", len({robot.map_index for robot in result.robots}), "1"),
-        Metric("keyscans", sum(len(robot.keyscans) for robot in result.robots), "1"),
+        Metric("keyscans", sum(len(robot.stamps) for robot in result.robots), "1"),
         Metric("intra_robot_closures_accepted", within.count(ClosureStatus.ACCEPTED), "1"),
         Metric("intra_robot_closures_revoked", within.count(ClosureStatus.REVOKED), "1"),
         *(Metric(f"inter_robot_closures_{status}", between.count(status), "1") for status in ClosureStatus),

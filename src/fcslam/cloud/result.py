@@ -3,6 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger
 from fcslam.cloud.robots import RobotStore
@@ -17,13 +20,20 @@ class MappedRobot:
     robot: str
     map_index: int
     """0 is the map of most robots."""
+    stamps: FloatArray
+    """Of its keyscans, shape (N,)."""
     keyscans: tuple[Keyscan, ...]
+    """Those that the map is made of, ascending; places with many newer ones around them have let go of theirs."""
     T_map_base: FloatArray
-    """Of each keyscan, in the frame of its map, shape (N, 3)."""
+    """Of each stamp, in the frame of its map, shape (N, 3)."""
     T_local_base: FloatArray
-    """Of each keyscan, in the robot's own map, which its own measurements alone made, shape (N, 3); the origin is its
+    """Of each stamp, in the robot's own map, which its own measurements alone made, shape (N, 3); the origin is its
     first keyscan."""
     laser: LaserModel
+
+    def numbers(self) -> NDArray[np.int64]:
+        """Rows of ``keyscans`` in stamps and poses, ascending."""
+        return np.array([keyscan.id.number for keyscan in self.keyscans], np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +75,7 @@ def conclude(store: RobotStore, graph: JointGraph, ledger: ClosureLedger, fusion
         MappedRobot(
             robot,
             index[robot],
+            frozen(store.stamps(robot)),
             store.keyscans(robot),
             fusion.T_map_base[robot],
             fusion.T_local_base[robot],

@@ -21,8 +21,13 @@ def session_name(robot: str, epoch: int) -> str:
 
 def robot_of(session: str) -> str:
     """The robot whose session has this name."""
+    return robot_and_epoch(session)[0]
+
+
+def robot_and_epoch(session: str) -> tuple[str, int]:
+    """What ``session_name`` made the name of."""
     named = _SESSION.fullmatch(session)
-    return named[1] if named else session
+    return (named[1], int(named[2])) if named else (session, 0)
 
 
 def check_robot(robot: str) -> None:

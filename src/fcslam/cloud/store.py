@@ -157,6 +157,12 @@ class MissionStore:
             )
         ]
 
+    def packet(self, robot: str, epoch: int, sequence: int) -> bytes:
+        """A packet that is stored, as it came."""
+        where = "robot = ? AND epoch = ? AND sequence = ?"
+        data: bytes = self._database.value(f"SELECT data FROM packets WHERE {where}", (robot, epoch, sequence))
+        return data
+
     def turn_count(self) -> int:
         """Packets that have a turn."""
         return int(self._database.value("SELECT ifnull(max(turn) + 1, 0) FROM packets"))

@@ -28,6 +28,10 @@ class SubmapShelf:
         self._submaps[key] = submap  # newest last
         return submap
 
+    def drop(self, place: Place) -> None:
+        """Make room: the submap around this place is hardly asked for again."""
+        self._submaps.pop((place.id, place.channel), None)
+
     def _build(self, place: Place) -> Submap:
         robot = place.id.robot
         laser, anchor = self._store.laser(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]

@@ -25,6 +25,7 @@ from typing import IO
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.folder import MissionFolder
+from fcslam.cloud.journal import StoredJournal
 from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import session_name
@@ -56,7 +57,7 @@ class Worker:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._tell = folder, store, clock, tell
-        self._fleet = Fleet(self._config.fleet, self._config.seed)
+        self._fleet = Fleet(self._config.fleet, self._config.seed, StoredJournal(store.packet))
         self._turn = self._vetoes = 0
         self._resumed_at = store.applied()
         """Turns that took effect before a restart: what they bring is known already."""

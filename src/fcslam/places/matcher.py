@@ -4,7 +4,7 @@ Words propose while the fleet is large, every place does while it is small, and 
 nearness does. A proposal is a rigid motion; the submaps laid on each other by it decide.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,9 +32,9 @@ class MatcherConfig(Settings):
         default=100_000, gt=0, description="places kept of one channel; of more the oldest are forgotten"
     )
     most_nearby: int = Field(
-        default=1000, gt=0, description="places kept of one robot and channel this close; of more the oldest goes"
+        default=12, gt=0, description="places kept of one robot and channel in a square; of more the oldest goes"
     )
-    nearby_m: float = Field(default=2.0, gt=0.0, description="how close that is, in the robot's map")
+    nearby_m: float = Field(default=2.0, gt=0.0, description="side of these squares, in a map")
     doubts: int = Field(
         default=2, ge=0, description="places of robots in the same map that are compared wherever the map puts them"
     )
@@ -67,9 +67,17 @@ class PlaceMatch:
 class PlaceMatcher:
     """All places of one channel and detector version, and the vocabulary that follows them."""
 
-    def __init__(self, config: MatcherConfig, submap_of: Callable[[Place], Submap], rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        config: MatcherConfig,
+        submap_of: Callable[[Place], Submap],
+        rng: np.random.Generator,
+        forgotten: Callable[[Place], None] = lambda _: None,
+    ) -> None:
+        """``forgotten`` is told of every place that is never compared again."""
         self._config = config
         self._submap_of = submap_of
+        self._forgotten = forgotten
         self._places: dict[KeyscanId, Place] = {}
         self._index: PlaceIndex[KeyscanId] = PlaceIndex(config.vocabulary, rng)
         self._backlog: list[Place] = []
@@ -84,6 +92,10 @@ class PlaceMatcher:
 
     def __contains__(self, place: KeyscanId) -> bool:
         return place in self._places
+
+    def __iter__(self) -> Iterator[KeyscanId]:
+        """The oldest first."""
+        return iter(self._places)
 
     def match(
         self, place: Place, predicted: Mapping[KeyscanId, FloatArray], strangers: Callable[[KeyscanId], bool]
@@ -117,11 +129,12 @@ class PlaceMatcher:
         Raises:
             KeyError: it is not stored.
         """
-        del self._places[place]
+        gone = self._places.pop(place)
         if place in self._index:
             self._index.forget(place)
         else:
             self._backlog = [stored for stored in self._backlog if stored.id != place]
+        self._forgotten(gone)
 
     def _forget_oldest(self) -> None:
         """Bounds the memory: a fleet that goes on for ever keeps its newest places."""

@@ -6,15 +6,17 @@ from numpy.typing import NDArray
 from fcslam.records import FloatArray
 
 
-def crowded_out(positions_m: FloatArray, radius_m: float, most: int) -> NDArray[np.int64]:
-    """All but the newest ``most`` places within ``radius_m`` of the newest one, which is one of them.
+def crowded_out(positions_m: FloatArray, side_m: float, most: int) -> NDArray[np.int64]:
+    """All but the newest ``most`` places in the square of the newest one, which is one of them.
 
-    Asked after every new place, no disc of half the radius ever holds more than ``most``: as long as places stay where
-    they are, memory is bounded by the area that a robot drives in and not by how long it drives.
+    Asked after every new place, each square keeps its newest ``most`` places, and all of them if they are fewer: as
+    long as places stay where they are, memory is bounded by the area that a robot drives in and not by how long it
+    drives, and no area loses its last place. Squares tell that, and discs around the newest place would not: on its
+    way a robot would sweep away what it had stored behind it.
 
     Args:
         positions_m: shape (N, 2), the oldest first, the newest last.
-        radius_m: places on the rim are within it.
+        side_m: of the squares, which lie side by side from the origin.
         most: 1 or more, so that the newest always stays.
 
     Returns:
@@ -22,6 +24,5 @@ def crowded_out(positions_m: FloatArray, radius_m: float, most: int) -> NDArray[
     """
     if len(positions_m) <= most:
         return np.empty(0, np.int64)
-    offsets = positions_m - positions_m[-1]
-    near = np.flatnonzero(np.hypot(offsets[:, 0], offsets[:, 1]) <= radius_m)
-    return near[:-most]
+    squares = np.floor(positions_m / side_m)
+    return np.flatnonzero((squares == squares[-1]).all(axis=1))[:-most]

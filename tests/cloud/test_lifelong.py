@@ -1,0 +1,163 @@
+"""A robot that comes back again and again: what is forgotten, what never is, and that the map does not suffer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_fleet
+from cloud.test_sessions import started_again
+from small_fleet import feed, fingerprint, in_order, map_of
+
+from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fusion import fuse
+from fcslam.cloud.report import keyscan_track, run_of
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.map_files import Occupancy
+from fcslam.metrics.grid import LabelledGrid, grid_agreement
+from fcslam.metrics.trajectory import align, position_errors
+from fcslam.places.matcher import MatcherConfig
+from fcslam.records import Channel, Place, Veto
+from fcslam.runs import open_run, write_run
+from fcslam.simulation.truth import true_map
+from fcslam.wire.messages import Hello, Packet
+from fcslam.wire.packets import encode
+
+SESSIONS, BETWEEN_S = 4, 1000.0
+ONE_A_SQUARE = FleetConfig(matcher=MatcherConfig(most_nearby=1, nearby_m=6.0))
+NEVER_FORGETS = FleetConfig(matcher=MatcherConfig(most_nearby=10**6))
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return small_fleet.draw(SESSIONS, path_length_m=30.0, seed=1)
+
+
+@pytest.fixture(scope="module")
+def sessions(drawn):
+    """What one robot sends that comes back an hour later, and again."""
+    sent = []
+    for epoch, robot in enumerate(drawn.robots):
+        later = replace(robot, stamps=robot.stamps + epoch * BETWEEN_S)
+        sent.append(started_again(small_fleet.sent_by(later, "a"), epoch))
+    return sent
+
+
+@pytest.fixture(scope="module")
+def packets(sessions):
+    return in_order(packet for session in sessions for packet in session)
+
+
+@pytest.fixture(scope="module")
+def forgetful(packets):
+    return feed(Fleet(ONE_A_SQUARE, 0), packets)
+
+
+def places_of(sessions):
+    """First and last keyscan of every place that was sent, by its session's name and number."""
+    return {
+        (f"a+{epoch}" if epoch else "a", packet.body.id.number): (packet.body.first, packet.body.last)
+        for epoch, session in enumerate(sessions)
+        for packet in session
+        if isinstance(packet.body, Place)
+    }
+
+
+def test_a_keyscan_is_held_as_long_as_a_place_needs_it_and_no_longer(forgetful, sessions):
+    (matcher,) = forgetful._matchers.values()
+    places = places_of(sessions)
+    needed, named = set(), set()
+    for (session, number), (first, last) in places.items():
+        numbers = {(session, k) for k in range(first, last + 1)}
+        named |= numbers
+        needed |= numbers if (session, number) in matcher else set()
+    held = {tuple(k.id) for robot in forgetful.estimate().robots for k in robot.keyscans}
+    everything = {(robot.robot, k) for robot in forgetful.estimate().robots for k in range(len(robot.stamps))}
+    assert len(matcher) < 0.75 * len(places)
+    assert held == everything - (named - needed)
+    assert held != everything
+
+
+def test_the_result_is_a_function_of_the_set_of_packets_whatever_was_forgotten(forgetful, packets, sessions):
+    expected = forgetful.finalize()
+    kept = [[k.id for k in robot.keyscans] for robot in expected.robots]
+    shuffled = [packets[k] for k in np.random.default_rng(5).permutation(len(packets))]
+    for arrived in (shuffled, [packet for session in reversed(sessions) for packet in session]):
+        result = feed(Fleet(ONE_A_SQUARE, 0), arrived).finalize()
+        assert fingerprint(result) == fingerprint(expected)
+        assert [[k.id for k in robot.keyscans] for robot in result.robots] == kept
+
+
+def test_poses_and_stamps_of_all_keyscans_stay(forgetful, sessions):
+    for robot in forgetful.finalize().robots:
+        assert len(robot.stamps) == len(robot.T_map_base) == len(robot.T_local_base)
+        assert np.all(np.diff(robot.stamps) > 0)
+        assert [robot.stamps[k.id.number] for k in robot.keyscans] == [k.stamp for k in robot.keyscans]
+
+
+def test_a_place_described_anew_after_its_keyscans_have_gone_changes_nothing(packets, sessions):
+    fleet = feed(Fleet(ONE_A_SQUARE, 0), packets)
+    before, last = fleet.estimate(), sessions[0][-1]
+    hello = sessions[0][0].body
+    assert isinstance(hello, Hello)
+    gone = next(
+        p.body
+        for p in sessions[0]
+        if isinstance(p.body, Place) and len(fleet._store.keyscans("a", p.body.first, p.body.last)) == 0
+    )
+    anew = replace(hello, detector_versions={Channel.LIDAR: "another"}), replace(gone, detector_version="another")
+    for number, body in enumerate(anew, last.sequence + 1):
+        fleet.receive(encode(Packet("a", 0, number, packets[-1].time, body)))
+    after = fleet.estimate()
+    assert after.closures == before.closures
+    assert len(fleet.finalize().robots) == SESSIONS
+
+
+def surfaces(result, drawn, count):
+    """Errors of all keyscans in metres, and F1 of the map, of the first ``count`` sessions."""
+    robots = [robot for robot in result.robots if robot.map_index == 0]
+    true = [
+        small_fleet.truth_at(driver, robot.stamps - epoch * BETWEEN_S)
+        for epoch, (driver, robot) in enumerate(zip(drawn.robots, robots, strict=False))
+    ]
+    T_truth_map = align(np.concatenate(true), np.concatenate([robot.T_map_base for robot in robots]))
+    errors = position_errors(T_truth_map, np.concatenate(true), np.concatenate([r.T_map_base for r in robots]))
+    keyscans = [keyscan for robot in robots for keyscan in robot.keyscans]
+    poses = np.concatenate([robot.T_map_base[robot.numbers()] for robot in robots])
+    fused = fuse(keyscans, poses, {robot.robot: robot.laser for robot in robots}, OccupancyConfig())
+    truth = true_map(replace(drawn, robots=drawn.robots[:count]))
+    return errors, grid_agreement(labelled(fused), labelled(truth), T_truth_map).f1
+
+
+def labelled(seen):
+    corner = np.array([*seen.origin_xy, 0.0])
+    return LabelledGrid(seen.cells == Occupancy.OCCUPIED, seen.cells == Occupancy.FREE, seen.resolution_m, corner)
+
+
+def test_the_map_of_many_sessions_is_no_worse_than_that_of_few(forgetful, packets, sessions, drawn):
+    few = feed(Fleet(ONE_A_SQUARE, 0), in_order(packet for session in sessions[:2] for packet in session)).finalize()
+    many, whole = forgetful.finalize(), feed(Fleet(NEVER_FORGETS, 0), packets).finalize()
+    assert set(map_of(few).values()) == set(map_of(many).values()) == {0}
+    errors_few, f1_few = surfaces(few, drawn, 2)
+    errors_many, f1_many = surfaces(many, drawn, SESSIONS)
+    errors_whole, f1_whole = surfaces(whole, drawn, SESSIONS)
+    assert errors_many.max() < max(errors_few.max(), errors_whole.max(), 0.03)
+    assert f1_many > min(f1_few, f1_whole) - 0.02
+
+
+def test_a_session_of_which_everything_was_forgotten_still_has_its_trajectory_and_empty_maps(packets, tmp_path):
+    """Parted from the sessions that made it forget by a veto, it has a map of its own with nothing in it."""
+    fleet = feed(Fleet(ONE_A_SQUARE, 0), packets)
+    empty = next(robot.robot for robot in fleet.estimate().robots if not robot.keyscans)
+    others = [robot.robot for robot in fleet.estimate().robots if robot.robot != empty]
+    for other in others:
+        fleet.veto(Veto(empty, other))
+    result = fleet.estimate()
+    tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+    write_run(run_of(result, tracks, [], "", OccupancyConfig()), tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    (alone,) = [trajectory for trajectory in run.trajectories if trajectory.robot == empty]
+    assert [t.robot for t in run.trajectories if t.map_index == alone.map_index] == [empty]
+    assert len(alone.stamps) == len(tracks[empty].stamps) > 0
+    assert run.map_files[f"map_{alone.map_index}.pgm"].startswith(b"P5")
+    whole = {robot.robot: robot for robot in fleet.finalize().robots}[empty]
+    assert whole.keyscans, "the veto known from the beginning, others made it forget nothing"
