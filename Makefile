@@ -10,7 +10,7 @@ GL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
 HAS_GL := $(BIN)/python -c "from fcslam.simulation.engine import gl_context; gl_context(16, 16).free()" 2>/dev/null
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire::http::Timeout=20 -o Acquire::Retries=1
-BENCHMARKS := $(filter-out benchmarks/common.py,$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py,$(wildcard benchmarks/*.py))
 
 .PHONY: help install gl demo test test-system check bench proto
 .DEFAULT_GOAL := help

@@ -9,31 +9,25 @@ for what is five minutes of the recording. Processes are killed (SIGKILL) at ran
 server's disk is full for a while; the robots' clocks are minutes apart.
 
 After each scenario the result is asked for and compared with what `fcslam map` makes of the same recordings in one
-process: accepted closures, pose graph (largest difference of any number), bytes of the map, packets that count.
+process: closures (all lines of closures.csv), pose graph (largest difference of any number), bytes of the map, poses at
+keyscans, packets that count.
 """
 
 import asyncio
-import json
-import os
-import resource
-import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import common
 import numpy as np
+from processes import PATIENCE_S, Process, cloud, compare, finalize, start_robot, wait_for, yes
 
 ROBOTS, PATH_M, SPEED = 3, 60.0, 5.0
 MANY_ROBOTS, MANY_PATH_M = 20, 12.0
@@ -42,9 +36,6 @@ OUTAGE_S = 300.0
 SKEW_S = 240.0
 LATE_S = 3.0
 """Up to so much later a request arrives for the second time."""
-FULL_BYTES = 4096
-PATIENCE_S = 600.0
-"""A scenario that takes longer has failed."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +77,12 @@ SCENARIOS = {
     "disk full": Scenario(disk_full=True),
     "clocks apart": Scenario(skewed=True),
     "20 robots": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M),
+    "20 robots, server killed": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M, server_kills=6),
 }
 
-UPLINK = ("hello", "keyscan", "constraint", "place")
 COLUMNS = {"scenario": "", "robots": "", "packets": ",.0f", "lost": ".0f", "twice": ".0f", "closures": "",
-           "the same": "", "graph off by": ".1e", "map the same": "", "requests": ",.0f", "disturbed": ",.0f",
-           "turned away": ",.0f", "kills": "", "s": ".0f", "passed": ""}  # fmt: skip
+           "the same": "", "graph off by": ".1e", "map the same": "", "poses the same": "", "requests": ",.0f",
+           "disturbed": ",.0f", "turned away": ",.0f", "kills": "", "s": ".0f", "passed": ""}  # fmt: skip
 
 
 def main() -> None:
@@ -196,6 +187,7 @@ class Proxy:
 
     async def _pass_on(self, request: bytes) -> bytes | None:
         """The answer; None: the connection breaks."""
+        self._weigh("up", request)
         scenario, (lost, answer_lost, cut, twice, late) = self._scenario, self._rng.random(5)
         self.counts["requests"] += 1
         disturbed = not self.is_open or lost < scenario.lost or answer_lost < scenario.lost or cut < scenario.cut
@@ -212,7 +204,14 @@ class Proxy:
             task.add_done_callback(self._late.discard)
         answer = await self._ask(request)
         self.counts["turned away"] += answer is not None and not answer.startswith(b"HTTP/1.1 200")
+        self._weigh("down", answer or b"")
         return None if answer_lost < scenario.lost else answer
+
+    def _weigh(self, direction: str, message: bytes) -> None:
+        """Count its bytes: HTTP's own, and what it carries."""
+        carried = len(message.partition(b"\r\n\r\n")[2])
+        self.counts[f"{direction}, HTTP"] += len(message) - carried
+        self.counts[f"{direction}, carried"] += carried
 
     async def _once_more(self, request: bytes, after_s: float) -> None:
         await asyncio.sleep(after_s)
@@ -237,52 +236,6 @@ async def http_message(reader: asyncio.StreamReader) -> bytes:
     return head + await reader.readexactly(int(lengths[0]) if lengths else 0)
 
 
-class Process:
-    """A command that can be killed and started again."""
-
-    def __init__(self, arguments: Sequence[object], log: Path) -> None:
-        self._arguments = [sys.executable, "-c", common._COMMAND, *map(str, arguments)]
-        self.log = log
-        self.kills = 0
-        self.start()
-
-    def start(self) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(Path(common.fcslam.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-        with self.log.open("ab") as output:
-            self.process = subprocess.Popen(self._arguments, env=environment, stdout=output, stderr=output)
-
-    def kill_and_start(self) -> None:
-        """Without a word; one that is done rests."""
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-            self.kills += 1
-            self.start()
-
-    def kill_children(self) -> None:
-        """What it has started; it is expected to start them again."""
-        threads = Path(f"/proc/{self.process.pid}/task").glob("*/children")
-        for child in " ".join(path.read_text(encoding="ascii") for path in threads).split():
-            with suppress(ProcessLookupError):
-                os.kill(int(child), signal.SIGKILL)
-                self.kills += 1
-
-    def ended(self) -> bool:
-        """Whether it is done; that it failed ends the script."""
-        code = self.process.poll()
-        if code:
-            sys.exit(f"{' '.join(self._arguments[3:])} ended with {code}:\n{self.log.read_text()[-3000:]}")
-        return code == 0
-
-    def fill_disk(self) -> None:
-        """No file may become larger than a few kB: what SQLite writes next fails as on a full disk."""
-        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (FULL_BYTES, resource.RLIM_INFINITY))
-
-    def empty_disk(self) -> None:
-        unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
-        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, unlimited)
-
-
 def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
     """One scenario from empty folders to the compared result; a row without its name."""
     place.mkdir()
@@ -291,7 +244,7 @@ def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
     began = time.perf_counter()
     with cloud(place) as (server, port):
         proxy = Proxy(scenario, port, rng)
-        robots = [robot(log, proxy.port, place, chosen.speed) for log in logs]
+        robots = [start_robot(log, proxy.port, place, chosen.speed) for log in logs]
         disturb(scenario, server, robots, proxy, duration_s / chosen.speed, OUTAGE_S / chosen.speed, rng)
         wait_for(port, server)  # the last kill may have been a moment ago
         run = finalize(port)
@@ -301,49 +254,14 @@ def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
     elapsed_s = time.perf_counter() - began
     return (
         len(logs),
-        *compared[:-1],
+        *compared,
         proxy.counts["requests"],
         proxy.counts["disturbed"],
         proxy.counts["turned away"],
         kills,
         elapsed_s,
-        compared[-1],
+        yes(compared.passed),
     )
-
-
-@contextmanager
-def cloud(place: Path) -> Iterator[tuple[Process, int]]:
-    """A server on a port of its own."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    server = Process(("serve", "--data", place / "cloud", "--host", "127.0.0.1", "--port", port), place / "server.log")
-    wait_for(port, server)
-    try:
-        yield server, port
-    finally:
-        server.process.send_signal(signal.SIGTERM)
-        server.process.wait(PATIENCE_S)
-
-
-def wait_for(port: int, server: Process) -> None:
-    """Until the server answers."""
-    until = time.monotonic() + PATIENCE_S
-    while time.monotonic() < until:
-        if server.ended():
-            sys.exit("the server ended")
-        with suppress(OSError):
-            urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5).close()
-            return
-        time.sleep(0.2)
-    sys.exit("the server does not answer")
-
-
-def robot(log: Path, port: int, place: Path, speed: float) -> Process:
-    state = place / "state" / log.stem
-    url = f"http://127.0.0.1:{port}"
-    arguments = ("robot", log, "--server", url, "--state", state, "--speed", speed, "--resume")
-    return Process(arguments, place / f"{log.stem}.log")
 
 
 def disturb(
@@ -373,51 +291,6 @@ def disturb(
             sys.exit(f"robots are not done after {PATIENCE_S} s; see {robots[0].log.parent}")
         server.ended()
         time.sleep(0.05)
-
-
-def compare(run: Path, reference: Path) -> tuple:
-    """Packets that count, lost and twice, accepted closures and whether they are the same, graph, map, verdict."""
-    ours, theirs = common.metrics(run), common.metrics(reference)
-    kinds = [name for name in theirs if name.endswith("_packets") and name.split("_")[0] in UPLINK]
-    more = [ours[name] - theirs[name] for name in kinds]
-    closures, expected = accepted(run), accepted(reference)
-    off = graph_difference(run, reference)
-    same_map = maps(run) == maps(reference)
-    lost, twice = sum(max(0.0, -n) for n in more), sum(max(0.0, n) for n in more)
-    passed = closures == expected and off <= 1e-9 and same_map and lost == twice == 0.0
-    same = ["yes" if is_same else "NO" for is_same in (closures == expected, same_map, passed)]
-    return sum(ours[name] for name in kinds), lost, twice, len(closures), same[0], off, *same[1:]
-
-
-def maps(run: Path) -> dict[str, bytes]:
-    """Every map of the run, byte for byte."""
-    return {path.name: path.read_bytes() for path in run.glob("map*.pgm")}
-
-
-def accepted(run: Path) -> list[str]:
-    lines = (run / "closures.csv").read_text(encoding="utf-8").splitlines()
-    return [line for line in lines[1:] if line.split(",")[9] == "accepted"]
-
-
-def graph_difference(run: Path, reference: Path) -> float:
-    """Largest difference of any number of the two graphs; infinite if they have not the same lines."""
-    graphs = [(folder / "pose_graph.g2o").read_text(encoding="utf-8").split() for folder in (run, reference)]
-    if len(graphs[0]) != len(graphs[1]):
-        return float("inf")
-    largest = 0.0
-    for ours, theirs in zip(*graphs, strict=True):
-        if ours != theirs:
-            try:
-                largest = max(largest, abs(float(ours) - float(theirs)))
-            except ValueError:
-                return float("inf")
-    return largest
-
-
-def finalize(port: int) -> Path:
-    """Ask for the result of all packets, and wait for its run folder."""
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/v1/finalize", data=b"", timeout=PATIENCE_S) as answer:
-        return Path(json.load(answer)["run"])
 
 
 if __name__ == "__main__":

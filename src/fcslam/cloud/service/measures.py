@@ -6,6 +6,8 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, generate_latest
 
 from fcslam.cloud.missions import OpenMission
 from fcslam.cloud.store import StoredPacket
+from fcslam.wire.batches import read_batch
+from fcslam.wire.packets import read_label
 
 
 class Measures:
@@ -16,7 +18,9 @@ class Measures:
         labels = ("robot", "kind", "channel")
         self._packets = Counter("fcslam_packets", "Packets taken in", labels, registry=self._registry)
         self._bytes = Counter("fcslam_bytes", "Bytes of packets taken in", labels, registry=self._registry)
-        self._answered = Counter("fcslam_answer_bytes", "Bytes sent to a robot", ("robot",), registry=self._registry)
+        self._answered = Counter(
+            "fcslam_answer_bytes", "Bytes of packets sent to a robot", ("robot", "kind"), registry=self._registry
+        )
         self._refused = Counter("fcslam_refusals", "Requests refused, by status", ("status",), registry=self._registry)
         self._turns = Gauge("fcslam_packets_stored", "Packets of the open mission", registry=self._registry)
         self._queue = Gauge("fcslam_packets_queued", "Packets without effect so far", registry=self._registry)
@@ -30,7 +34,8 @@ class Measures:
             labels = (packet.robot, packet.kind or "", packet.channel or "")
             self._packets.labels(*labels).inc()
             self._bytes.labels(*labels).inc(len(packet.data))
-        self._answered.labels(robot).inc(len(answer))
+        for data in read_batch(answer):
+            self._answered.labels(robot, read_label(data).kind).inc(len(data))
 
     def refuse(self, status: int) -> None:
         """A request was refused."""
