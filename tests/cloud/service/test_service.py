@@ -1,5 +1,6 @@
 """What the service answers: robots, viewers, administrators; and what it does not let happen."""
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +16,10 @@ from fcslam.features.detector import SHIPPED_NETWORK
 from fcslam.records import Channel, Correction
 from fcslam.runs import open_run
 from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.batches import read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
-from fcslam.wire.packets import encode
+from fcslam.wire.packets import decode, encode
 
 API = "/api/v1"
 PACKETS = f"{API}/robots/a/packets"
@@ -249,6 +251,22 @@ def test_measures_say_what_came_in(mapped):
     assert total == sum(map(len, A))
     assert float(lines["fcslam_packets_stored"]) == len(A) + len(B)
     assert float(lines["fcslam_packets_queued"]) == 0
+
+
+def test_measures_say_what_robots_were_told_by_kind(mapped):
+    def measured(kind):
+        line = f'fcslam_answer_bytes_total{{kind="{kind}",robot="a"}} '
+        found = [row for row in get(mapped, "../../metrics").text.splitlines() if row.startswith(line)]
+        return float(found[0].removeprefix(line)) if found else 0.0
+
+    before = [measured(kind) for kind in ("acknowledgement", "correction")]
+    told = [data for _ in range(3) for data in read_batch(mapped.send("a", A[-1:]).content)]
+    sizes = Counter()
+    for data in told:
+        sizes[type(decode(data).body)] += len(data)
+    after = [measured(kind) for kind in ("acknowledgement", "correction")]
+    assert [b - a for a, b in zip(before, after, strict=True)] == [sizes[Acknowledgement], sizes[Correction]]
+    assert all(sizes.values())
 
 
 def test_the_interface_describes_itself(desk):
