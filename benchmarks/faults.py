@@ -29,7 +29,7 @@ import common
 import numpy as np
 from processes import PATIENCE_S, Process, cloud, compare, finalize, start_robot, wait_for, yes
 
-ROBOTS, PATH_M, SPEED = 3, 60.0, 5.0
+ROBOTS, PATH_M, SPEED = 3, 60.0, 8.0
 MANY_ROBOTS, MANY_PATH_M = 20, 12.0
 OUTAGE_S = 300.0
 """Of the recording's time."""
