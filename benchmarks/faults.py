@@ -20,17 +20,17 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import common
 import numpy as np
-from processes import PATIENCE_S, Process, cloud, compare, finalize, start_robot, wait_for, yes
+from processes import PATIENCE_S, Process, cloud, compare, finalize, robot, wait_for, yes
 
 ROBOTS, PATH_M, SPEED = 3, 60.0, 8.0
-MANY_ROBOTS, MANY_PATH_M = 20, 12.0
+MANY_ROBOTS, MANY_PATH_M, MANY_SPEED = 20, 12.0, 2.0
 OUTAGE_S = 300.0
 """Of the recording's time."""
 SKEW_S = 240.0
@@ -62,6 +62,8 @@ class Scenario:
     """Each robot's clock is SKEW_S ahead of the one before."""
     robots: int = ROBOTS
     path_m: float = PATH_M
+    speed: float = SPEED
+    """So many times as fast as recorded."""
 
 
 SCENARIOS = {
@@ -76,8 +78,7 @@ SCENARIOS = {
     "all at once": Scenario(lost=0.1, cut=0.05, twice=0.3, delay_s=0.5, server_kills=2, robot_kills=3),
     "disk full": Scenario(disk_full=True),
     "clocks apart": Scenario(skewed=True),
-    "20 robots": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M),
-    "20 robots, server killed": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M, server_kills=6),
+    "20 robots, server killed": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M, speed=MANY_SPEED, server_kills=4),
 }
 
 COLUMNS = {"scenario": "", "robots": "", "packets": ",.0f", "lost": ".0f", "twice": ".0f", "closures": "",
@@ -90,7 +91,7 @@ def main() -> None:
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS))
     parser.add_argument("--robots", type=int, help=f"in each scenario ({ROBOTS}, and {MANY_ROBOTS} in the last one)")
     parser.add_argument("--path", type=float, help=f"of each robot, m ({PATH_M}, {MANY_PATH_M})")
-    parser.add_argument("--speed", type=float, default=SPEED, help="so many times as fast as recorded")
+    parser.add_argument("--speed", type=float, help=f"so many times as fast as recorded ({SPEED}, {MANY_SPEED})")
     parser.add_argument("--seed", type=int, default=1, help="of the fleet and of the faults")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
@@ -99,7 +100,7 @@ def main() -> None:
         worlds = Worlds(Path(place), chosen.seed)
         for name in chosen.scenarios:
             scenario = SCENARIOS[name]
-            changes = {"robots": chosen.robots, "path_m": chosen.path}
+            changes = {"robots": chosen.robots, "path_m": chosen.path, "speed": chosen.speed}
             scenario = replace(scenario, **{key: value for key, value in changes.items() if value is not None})
             rows.append((name, *play(scenario, worlds, Path(place) / name.replace(" ", "-"), chosen)))
             print(*rows[-1], flush=True)
@@ -136,11 +137,11 @@ class Worlds:
         lidar = LidarSettings(beams=180, rate_hz=3.0)
         settings = SimulationSettings(robots=scenario.robots, path_length_m=scenario.path_m, lidar=lidar, camera=None)
         logs, longest_s = [], 0.0
-        for number, robot in enumerate(simulate_fleet(settings, self._seed).robots):
-            logs.append(folder / f"{robot.name}.clf")
+        for number, driven in enumerate(simulate_fleet(settings, self._seed).robots):
+            logs.append(folder / f"{driven.name}.clf")
             skew_s = number * SKEW_S * scenario.skewed
-            write_carmen(logs[-1], (replace(scan, stamp=scan.stamp + skew_s) for scan in robot.scans()))
-            longest_s = max(longest_s, float(robot.stamps[-1] - robot.stamps[0]))
+            write_carmen(logs[-1], (replace(scan, stamp=scan.stamp + skew_s) for scan in driven.scans()))
+            longest_s = max(longest_s, float(driven.stamps[-1] - driven.stamps[0]))
         return logs, longest_s
 
 
@@ -242,14 +243,12 @@ def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
     rng = np.random.default_rng(chosen.seed)
     logs, reference, duration_s = worlds.get(scenario)
     began = time.perf_counter()
-    with cloud(place) as (server, port):
-        proxy = Proxy(scenario, port, rng)
-        robots = [start_robot(log, proxy.port, place, chosen.speed) for log in logs]
-        disturb(scenario, server, robots, proxy, duration_s / chosen.speed, OUTAGE_S / chosen.speed, rng)
+    with cloud(place) as (server, port), closing(Proxy(scenario, port, rng)) as proxy, ExitStack() as stack:
+        robots = [stack.enter_context(robot(log, proxy.port, place, scenario.speed)) for log in logs]
+        disturb(scenario, server, robots, proxy, duration_s / scenario.speed, rng)
         wait_for(port, server)  # the last kill may have been a moment ago
         run = finalize(port)
-        proxy.close()
-    kills = server.kills + sum(robot.kills for robot in robots)
+    kills = server.kills + sum(process.kills for process in robots)
     compared = compare(run, reference)
     elapsed_s = time.perf_counter() - began
     return (
@@ -265,13 +264,14 @@ def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
 
 
 def disturb(
-    scenario: Scenario, server: Process, robots: Sequence[Process], proxy: Proxy, play_s: float, outage_s: float,
+    scenario: Scenario, server: Process, robots: Sequence[Process], proxy: Proxy, play_s: float,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Let the scenario's events happen while the robots play, and wait until the server has all that they said."""
     events: list[tuple[float, Callable[[], None]]] = []
     if scenario.away:
-        events += [(play_s / 3.0, lambda: proxy.open(False)), (play_s / 3.0 + outage_s, lambda: proxy.open(True))]
+        back_s = play_s / 3.0 + OUTAGE_S / scenario.speed
+        events += [(play_s / 3.0, lambda: proxy.open(False)), (back_s, lambda: proxy.open(True))]
     if scenario.disk_full:
         events += [(play_s / 3.0, server.fill_disk), (play_s * 2.0 / 3.0, server.empty_disk)]
     events += [(at, server.kill_and_start) for at in rng.uniform(0.1, 1.1, scenario.server_kills) * play_s]
@@ -284,7 +284,7 @@ def disturb(
     while proxy.counts["requests"] < len(robots) and time.monotonic() - began < PATIENCE_S:
         time.sleep(0.05)  # starting takes long on a busy machine
     began = time.monotonic()
-    while events or not all(robot.ended() for robot in robots):
+    while events or not all(process.ended() for process in robots):
         if events and time.monotonic() - began >= events[0][0]:
             events.pop(0)[1]()
         if time.monotonic() - began > PATIENCE_S:

@@ -42,10 +42,14 @@ class Process:
     def kill_and_start(self) -> None:
         """Without a word; one that is done rests."""
         if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
+            self.kill()
             self.kills += 1
             self.start()
+
+    def kill(self) -> None:
+        """If it still runs: a script that fails leaves nobody behind."""
+        self.process.kill()
+        self.process.wait()
 
     def kill_children(self) -> None:
         """What it has started; it is expected to start them again."""
@@ -99,11 +103,17 @@ def wait_for(port: int, server: Process) -> None:
     sys.exit("the server does not answer")
 
 
-def start_robot(log: Path, port: int, place: Path, speed: object) -> Process:
+@contextmanager
+def robot(log: Path, port: int, place: Path, speed: object) -> Iterator[Process]:
+    """Plays a recording; goes on with it when it is started again."""
     state = place / "state" / log.stem
     url = f"http://127.0.0.1:{port}"
     arguments = ("robot", log, "--server", url, "--state", state, "--speed", speed, "--resume")
-    return Process(arguments, place / f"{log.stem}.log")
+    process = Process(arguments, place / f"{log.stem}.log")
+    try:
+        yield process
+    finally:
+        process.kill()
 
 
 class Compared(NamedTuple):

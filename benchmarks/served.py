@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import common
 import numpy as np
 from faults import Proxy, Scenario
-from processes import PATIENCE_S, Compared, cloud, compare, finalize, start_robot, yes
+from processes import PATIENCE_S, Compared, cloud, compare, finalize, robot, yes
 from prometheus_client.parser import text_string_to_metric_families
 
 from fcslam.sources import ScanRange, Source, open_source, split, write_recording
@@ -88,7 +88,7 @@ def main() -> None:
             for name, served in serve(played, 1, place / "at real speed").items():
                 same.append(same_row(name, "1", served))
                 seconds = {log.stem: open_source(log).survey().duration_s for log in played[name]}
-                wire += [(name, robot, s, *wire_row(robot, s, served)) for robot, s in seconds.items()]
+                wire += [(name, each, s, *wire_row(each, s, served)) for each, s in seconds.items()]
     report.table("The same as `fcslam map`", SAME, same)
     report.table("By robot and kind", KINDS, kinds)
     report.table("On the wire, at the speed of the recording", WIRE, wire)
@@ -108,8 +108,7 @@ def recorded(name: str, place: Path, fleet: Path | None) -> Iterator[Source]:
         if fleet is None:
             fleet = place / "fleet"
             common.run_fcslam("simulate", "--robots", 3, "--seed", SEED, "--output", fleet)
-        for robot in sorted(fleet.glob("robot_*")):
-            yield open_source(robot)
+        yield from map(open_source, sorted(fleet.glob("robot_*")))
 
 
 class Beginning:
@@ -153,9 +152,9 @@ def serve(fleets: Mapping[str, Sequence[Path]], speed: object, place: Path) -> d
             for log in logs:
                 proxy = stack.enter_context(closing(Proxy(Scenario(), ports[name], np.random.default_rng(0))))
                 proxies[name, log.stem] = proxy
-                robots.append(start_robot(log, proxy.port, place / name, speed))
+                robots.append(stack.enter_context(robot(log, proxy.port, place / name, speed)))
         until = time.monotonic() + PATIENCE_S
-        while not all(robot.ended() for robot in robots):
+        while not all(process.ended() for process in robots):
             if time.monotonic() > until:
                 sys.exit(f"robots are not done after {PATIENCE_S} s; see {place}")
             time.sleep(0.1)
@@ -164,7 +163,7 @@ def serve(fleets: Mapping[str, Sequence[Path]], speed: object, place: Path) -> d
     return {
         name: Served(
             compare(run, references[name]), sizes,
-            {robot: proxy.counts for (fleet, robot), proxy in proxies.items() if fleet == name}, wall_s,
+            {each: proxy.counts for (fleet, each), proxy in proxies.items() if fleet == name}, wall_s,
         )
         for name, (run, sizes) in found.items()
     }  # fmt: skip
@@ -192,10 +191,10 @@ def kind_row(source: Source, sizes: Counts) -> tuple:
     return source.name, seconds, *rates, sum(rates)
 
 
-def wire_row(robot: str, seconds: float, served: Served) -> tuple:
+def wire_row(name: str, seconds: float, served: Served) -> tuple:
     """Requests, kB/s up without and with HTTP, down by kind, without and with HTTP."""
-    up, down = ([served.bytes[robot, kind] / seconds / 1e3 for kind in kinds] for kinds in (UP, DOWN))
-    counts = served.wire[robot]
+    up, down = ([served.bytes[name, kind] / seconds / 1e3 for kind in kinds] for kinds in (UP, DOWN))
+    counts = served.wire[name]
     whole = [(counts[f"{way}, HTTP"] + counts[f"{way}, carried"]) / seconds / 1e3 for way in ("up", "down")]
     return counts["requests"], sum(up), whole[0], *down, sum(down), whole[1]
 
