@@ -1,11 +1,12 @@
 """What a byte budget costs: accuracy across robots against the bytes that each may send.
 
-    python benchmarks/byte_budget.py
+    FCSLAM_DATA=/path/to/data python benchmarks/byte_budget.py
 
 The logs cut into robots as elsewhere (README). Each robot's packets go through `fcslam.robot.budget`, as by `fcslam
-robot --budget-kBps`: hello, keyscans and constraints always travel, places are thinned to their strongest descriptors
-or left out. So a budget below what the chain takes is not kept; what was sent is stated. Errors are over the relations
-between different robots, of which those between robots in different maps cannot be used.
+robot --budget-kBps`, with shares of what the log's robots send on average when there is no budget: hello, keyscans and
+constraints always travel, places are thinned to their strongest descriptors or left out. So a budget below what the
+chain takes is not kept; what was sent is stated. Errors are over the relations between different robots, of which those
+between robots in different maps cannot be used.
 """
 
 import heapq
@@ -31,8 +32,8 @@ from fcslam.sources import open_source, split
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
-BUDGETS_KBPS = (float("inf"), 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
-COLUMNS = {"log": "", "budget, kB/s": "", "sent, kB/s a robot": ".2f", "places": "", "left out": "",
+SHARES = (0.8, 0.7, 0.6, 0.55, 0.5, 0.45)
+COLUMNS = {"log": "", "budget, kB/s": ".2f", "share": ".0%", "sent, kB/s a robot": ".2f", "places": "", "left out": "",
            "descriptors a place": ".0f", "closures between": "", "maps": "", "relations across robots": "",
            "mean, m": ".4f", "max, m": ".3f", "mean, deg": ".3f"}  # fmt: skip
 
@@ -40,15 +41,17 @@ COLUMNS = {"log": "", "budget, kB/s": "", "sent, kB/s a robot": ".2f", "places":
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--logs", nargs="+", choices=common.SPLITS, default=list(common.SPLITS))
-    parser.add_argument("--budgets", nargs="+", type=float, default=BUDGETS_KBPS, help="of a robot, kB/s; inf: none")
+    parser.add_argument("--shares", nargs="+", type=float, default=SHARES, help="of what is sent without a budget")
     chosen = parser.parse_args()
     folder = common.recordings(*common.slam_benchmark_files())
     report = common.Report(__file__, __doc__, chosen)
     rows = []
     for name in chosen.logs:
         robots = drive(common.log_path(folder, name), common.SPLITS[name])
-        for budget in chosen.budgets:
-            rows.append((name, *row(robots, budget, common.relations_path(folder, name))))
+        free_kbps = rate_kbps(robots)
+        for share in (float("inf"), *chosen.shares):
+            budget_kbps = share * free_kbps
+            rows.append((name, budget_kbps, share, *row(robots, budget_kbps, common.relations_path(folder, name))))
             print(*rows[-1], flush=True)
     report.table("Budgets", COLUMNS, rows)
     report.picture("Error across robots against bytes", draw(rows))
@@ -63,6 +66,12 @@ def drive(log: Path, parts: int) -> dict[str, tuple[RobotFrontend, list[Packet]]
         packets = [packet for record in source.records() for packet in frontend.process(record)]
         robots[source.name] = frontend, packets + frontend.finish()
     return robots
+
+
+def rate_kbps(robots: dict[str, tuple[RobotFrontend, list[Packet]]]) -> float:
+    """What a robot sends on average when there is no budget."""
+    sent = sum(len(encode(packet)) for _, packets in robots.values() for packet in packets)
+    return sent / sum(float(np.ptp(track(frontend).stamps)) for frontend, _ in robots.values()) / 1e3
 
 
 def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: float, relations: Path) -> tuple:
@@ -82,7 +91,7 @@ def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: floa
     places = [packet.body for stream in streams for packet in stream if isinstance(packet.body, Place)]
     closures = [c for c in result.closures if c.i.robot != c.j.robot and c.status is ClosureStatus.ACCEPTED]
     return (
-        f"{budget_kbps:g}", sent / seconds / 1e3, len(places),
+        sent / seconds / 1e3, len(places),
         sum(budget.left_out for budget in budgets.values()), mean(len(place.descriptors) for place in places),
         len(closures), len({robot.map_index for robot in result.robots}), f"{errors.used} of {errors.total}",
         errors.translation.mean, errors.translation.maximum, errors.rotation.mean,

@@ -9,42 +9,33 @@ for what is five minutes of the recording. Processes are killed (SIGKILL) at ran
 server's disk is full for a while; the robots' clocks are minutes apart.
 
 After each scenario the result is asked for and compared with what `fcslam map` makes of the same recordings in one
-process: accepted closures, pose graph (largest difference of any number), bytes of the map, packets that count.
+process: closures (all lines of closures.csv), pose graph (largest difference of any number), bytes of the map, poses at
+keyscans, packets that count.
 """
 
 import asyncio
-import json
-import os
-import resource
-import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import common
 import numpy as np
+from processes import PATIENCE_S, Process, cloud, compare, finalize, robot, wait_for, yes
 
-ROBOTS, PATH_M, SPEED = 3, 60.0, 5.0
-MANY_ROBOTS, MANY_PATH_M = 20, 12.0
+ROBOTS, PATH_M, SPEED = 3, 60.0, 8.0
+MANY_ROBOTS, MANY_PATH_M, MANY_SPEED = 20, 12.0, 2.0
 OUTAGE_S = 300.0
 """Of the recording's time."""
 SKEW_S = 240.0
 LATE_S = 3.0
 """Up to so much later a request arrives for the second time."""
-FULL_BYTES = 4096
-PATIENCE_S = 600.0
-"""A scenario that takes longer has failed."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +62,8 @@ class Scenario:
     """Each robot's clock is SKEW_S ahead of the one before."""
     robots: int = ROBOTS
     path_m: float = PATH_M
+    speed: float = SPEED
+    """So many times as fast as recorded."""
 
 
 SCENARIOS = {
@@ -85,13 +78,12 @@ SCENARIOS = {
     "all at once": Scenario(lost=0.1, cut=0.05, twice=0.3, delay_s=0.5, server_kills=2, robot_kills=3),
     "disk full": Scenario(disk_full=True),
     "clocks apart": Scenario(skewed=True),
-    "20 robots": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M),
+    "20 robots, server killed": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M, speed=MANY_SPEED, server_kills=4),
 }
 
-UPLINK = ("hello", "keyscan", "constraint", "place")
 COLUMNS = {"scenario": "", "robots": "", "packets": ",.0f", "lost": ".0f", "twice": ".0f", "closures": "",
-           "the same": "", "graph off by": ".1e", "map the same": "", "requests": ",.0f", "disturbed": ",.0f",
-           "turned away": ",.0f", "kills": "", "s": ".0f", "passed": ""}  # fmt: skip
+           "the same": "", "graph off by": ".1e", "map the same": "", "poses the same": "", "requests": ",.0f",
+           "disturbed": ",.0f", "turned away": ",.0f", "kills": "", "s": ".0f", "passed": ""}  # fmt: skip
 
 
 def main() -> None:
@@ -99,7 +91,7 @@ def main() -> None:
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS))
     parser.add_argument("--robots", type=int, help=f"in each scenario ({ROBOTS}, and {MANY_ROBOTS} in the last one)")
     parser.add_argument("--path", type=float, help=f"of each robot, m ({PATH_M}, {MANY_PATH_M})")
-    parser.add_argument("--speed", type=float, default=SPEED, help="so many times as fast as recorded")
+    parser.add_argument("--speed", type=float, help=f"so many times as fast as recorded ({SPEED}, {MANY_SPEED})")
     parser.add_argument("--seed", type=int, default=1, help="of the fleet and of the faults")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
@@ -108,7 +100,7 @@ def main() -> None:
         worlds = Worlds(Path(place), chosen.seed)
         for name in chosen.scenarios:
             scenario = SCENARIOS[name]
-            changes = {"robots": chosen.robots, "path_m": chosen.path}
+            changes = {"robots": chosen.robots, "path_m": chosen.path, "speed": chosen.speed}
             scenario = replace(scenario, **{key: value for key, value in changes.items() if value is not None})
             rows.append((name, *play(scenario, worlds, Path(place) / name.replace(" ", "-"), chosen)))
             print(*rows[-1], flush=True)
@@ -145,11 +137,11 @@ class Worlds:
         lidar = LidarSettings(beams=180, rate_hz=3.0)
         settings = SimulationSettings(robots=scenario.robots, path_length_m=scenario.path_m, lidar=lidar, camera=None)
         logs, longest_s = [], 0.0
-        for number, robot in enumerate(simulate_fleet(settings, self._seed).robots):
-            logs.append(folder / f"{robot.name}.clf")
+        for number, driven in enumerate(simulate_fleet(settings, self._seed).robots):
+            logs.append(folder / f"{driven.name}.clf")
             skew_s = number * SKEW_S * scenario.skewed
-            write_carmen(logs[-1], (replace(scan, stamp=scan.stamp + skew_s) for scan in robot.scans()))
-            longest_s = max(longest_s, float(robot.stamps[-1] - robot.stamps[0]))
+            write_carmen(logs[-1], (replace(scan, stamp=scan.stamp + skew_s) for scan in driven.scans()))
+            longest_s = max(longest_s, float(driven.stamps[-1] - driven.stamps[0]))
         return logs, longest_s
 
 
@@ -196,6 +188,7 @@ class Proxy:
 
     async def _pass_on(self, request: bytes) -> bytes | None:
         """The answer; None: the connection breaks."""
+        self._weigh("up", request)
         scenario, (lost, answer_lost, cut, twice, late) = self._scenario, self._rng.random(5)
         self.counts["requests"] += 1
         disturbed = not self.is_open or lost < scenario.lost or answer_lost < scenario.lost or cut < scenario.cut
@@ -212,7 +205,14 @@ class Proxy:
             task.add_done_callback(self._late.discard)
         answer = await self._ask(request)
         self.counts["turned away"] += answer is not None and not answer.startswith(b"HTTP/1.1 200")
+        self._weigh("down", answer or b"")
         return None if answer_lost < scenario.lost else answer
+
+    def _weigh(self, direction: str, message: bytes) -> None:
+        """Count its bytes: HTTP's own, and what it carries."""
+        carried = len(message.partition(b"\r\n\r\n")[2])
+        self.counts[f"{direction}, HTTP"] += len(message) - carried
+        self.counts[f"{direction}, carried"] += carried
 
     async def _once_more(self, request: bytes, after_s: float) -> None:
         await asyncio.sleep(after_s)
@@ -237,123 +237,41 @@ async def http_message(reader: asyncio.StreamReader) -> bytes:
     return head + await reader.readexactly(int(lengths[0]) if lengths else 0)
 
 
-class Process:
-    """A command that can be killed and started again."""
-
-    def __init__(self, arguments: Sequence[object], log: Path) -> None:
-        self._arguments = [sys.executable, "-c", common._COMMAND, *map(str, arguments)]
-        self.log = log
-        self.kills = 0
-        self.start()
-
-    def start(self) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(Path(common.fcslam.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-        with self.log.open("ab") as output:
-            self.process = subprocess.Popen(self._arguments, env=environment, stdout=output, stderr=output)
-
-    def kill_and_start(self) -> None:
-        """Without a word; one that is done rests."""
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-            self.kills += 1
-            self.start()
-
-    def kill_children(self) -> None:
-        """What it has started; it is expected to start them again."""
-        threads = Path(f"/proc/{self.process.pid}/task").glob("*/children")
-        for child in " ".join(path.read_text(encoding="ascii") for path in threads).split():
-            with suppress(ProcessLookupError):
-                os.kill(int(child), signal.SIGKILL)
-                self.kills += 1
-
-    def ended(self) -> bool:
-        """Whether it is done; that it failed ends the script."""
-        code = self.process.poll()
-        if code:
-            sys.exit(f"{' '.join(self._arguments[3:])} ended with {code}:\n{self.log.read_text()[-3000:]}")
-        return code == 0
-
-    def fill_disk(self) -> None:
-        """No file may become larger than a few kB: what SQLite writes next fails as on a full disk."""
-        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (FULL_BYTES, resource.RLIM_INFINITY))
-
-    def empty_disk(self) -> None:
-        unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
-        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, unlimited)
-
-
 def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
     """One scenario from empty folders to the compared result; a row without its name."""
     place.mkdir()
     rng = np.random.default_rng(chosen.seed)
     logs, reference, duration_s = worlds.get(scenario)
     began = time.perf_counter()
-    with cloud(place) as (server, port):
-        proxy = Proxy(scenario, port, rng)
-        robots = [robot(log, proxy.port, place, chosen.speed) for log in logs]
-        disturb(scenario, server, robots, proxy, duration_s / chosen.speed, OUTAGE_S / chosen.speed, rng)
+    with cloud(place) as (server, port), closing(Proxy(scenario, port, rng)) as proxy, ExitStack() as stack:
+        robots = [stack.enter_context(robot(log, proxy.port, place, scenario.speed)) for log in logs]
+        disturb(scenario, server, robots, proxy, duration_s / scenario.speed, rng)
         wait_for(port, server)  # the last kill may have been a moment ago
         run = finalize(port)
-        proxy.close()
-    kills = server.kills + sum(robot.kills for robot in robots)
+    kills = server.kills + sum(process.kills for process in robots)
     compared = compare(run, reference)
     elapsed_s = time.perf_counter() - began
     return (
         len(logs),
-        *compared[:-1],
+        *compared,
         proxy.counts["requests"],
         proxy.counts["disturbed"],
         proxy.counts["turned away"],
         kills,
         elapsed_s,
-        compared[-1],
+        yes(compared.passed),
     )
 
 
-@contextmanager
-def cloud(place: Path) -> Iterator[tuple[Process, int]]:
-    """A server on a port of its own."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    server = Process(("serve", "--data", place / "cloud", "--host", "127.0.0.1", "--port", port), place / "server.log")
-    wait_for(port, server)
-    try:
-        yield server, port
-    finally:
-        server.process.send_signal(signal.SIGTERM)
-        server.process.wait(PATIENCE_S)
-
-
-def wait_for(port: int, server: Process) -> None:
-    """Until the server answers."""
-    until = time.monotonic() + PATIENCE_S
-    while time.monotonic() < until:
-        if server.ended():
-            sys.exit("the server ended")
-        with suppress(OSError):
-            urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5).close()
-            return
-        time.sleep(0.2)
-    sys.exit("the server does not answer")
-
-
-def robot(log: Path, port: int, place: Path, speed: float) -> Process:
-    state = place / "state" / log.stem
-    url = f"http://127.0.0.1:{port}"
-    arguments = ("robot", log, "--server", url, "--state", state, "--speed", speed, "--resume")
-    return Process(arguments, place / f"{log.stem}.log")
-
-
 def disturb(
-    scenario: Scenario, server: Process, robots: Sequence[Process], proxy: Proxy, play_s: float, outage_s: float,
+    scenario: Scenario, server: Process, robots: Sequence[Process], proxy: Proxy, play_s: float,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Let the scenario's events happen while the robots play, and wait until the server has all that they said."""
     events: list[tuple[float, Callable[[], None]]] = []
     if scenario.away:
-        events += [(play_s / 3.0, lambda: proxy.open(False)), (play_s / 3.0 + outage_s, lambda: proxy.open(True))]
+        back_s = play_s / 3.0 + OUTAGE_S / scenario.speed
+        events += [(play_s / 3.0, lambda: proxy.open(False)), (back_s, lambda: proxy.open(True))]
     if scenario.disk_full:
         events += [(play_s / 3.0, server.fill_disk), (play_s * 2.0 / 3.0, server.empty_disk)]
     events += [(at, server.kill_and_start) for at in rng.uniform(0.1, 1.1, scenario.server_kills) * play_s]
@@ -366,58 +284,13 @@ def disturb(
     while proxy.counts["requests"] < len(robots) and time.monotonic() - began < PATIENCE_S:
         time.sleep(0.05)  # starting takes long on a busy machine
     began = time.monotonic()
-    while events or not all(robot.ended() for robot in robots):
+    while events or not all(process.ended() for process in robots):
         if events and time.monotonic() - began >= events[0][0]:
             events.pop(0)[1]()
         if time.monotonic() - began > PATIENCE_S:
             sys.exit(f"robots are not done after {PATIENCE_S} s; see {robots[0].log.parent}")
         server.ended()
         time.sleep(0.05)
-
-
-def compare(run: Path, reference: Path) -> tuple:
-    """Packets that count, lost and twice, accepted closures and whether they are the same, graph, map, verdict."""
-    ours, theirs = common.metrics(run), common.metrics(reference)
-    kinds = [name for name in theirs if name.endswith("_packets") and name.split("_")[0] in UPLINK]
-    more = [ours[name] - theirs[name] for name in kinds]
-    closures, expected = accepted(run), accepted(reference)
-    off = graph_difference(run, reference)
-    same_map = maps(run) == maps(reference)
-    lost, twice = sum(max(0.0, -n) for n in more), sum(max(0.0, n) for n in more)
-    passed = closures == expected and off <= 1e-9 and same_map and lost == twice == 0.0
-    same = ["yes" if is_same else "NO" for is_same in (closures == expected, same_map, passed)]
-    return sum(ours[name] for name in kinds), lost, twice, len(closures), same[0], off, *same[1:]
-
-
-def maps(run: Path) -> dict[str, bytes]:
-    """Every map of the run, byte for byte."""
-    return {path.name: path.read_bytes() for path in run.glob("map*.pgm")}
-
-
-def accepted(run: Path) -> list[str]:
-    lines = (run / "closures.csv").read_text(encoding="utf-8").splitlines()
-    return [line for line in lines[1:] if line.split(",")[9] == "accepted"]
-
-
-def graph_difference(run: Path, reference: Path) -> float:
-    """Largest difference of any number of the two graphs; infinite if they have not the same lines."""
-    graphs = [(folder / "pose_graph.g2o").read_text(encoding="utf-8").split() for folder in (run, reference)]
-    if len(graphs[0]) != len(graphs[1]):
-        return float("inf")
-    largest = 0.0
-    for ours, theirs in zip(*graphs, strict=True):
-        if ours != theirs:
-            try:
-                largest = max(largest, abs(float(ours) - float(theirs)))
-            except ValueError:
-                return float("inf")
-    return largest
-
-
-def finalize(port: int) -> Path:
-    """Ask for the result of all packets, and wait for its run folder."""
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/v1/finalize", data=b"", timeout=PATIENCE_S) as answer:
-        return Path(json.load(answer)["run"])
 
 
 if __name__ == "__main__":

@@ -20,7 +20,8 @@ from fcslam.mission import MissionConfig
 from fcslam.records import Channel
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem != "common")
+SHARED = ("common", "processes")
+SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 
 
 def load(path: Path):

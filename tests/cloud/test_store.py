@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.cloud.store import MissionStore, SessionCorrection, StoredPacket, check_mission
+from fcslam.cloud.store import NEWS_M, NEWS_RAD, MissionStore, SessionCorrection, StoredPacket, check_mission
 from fcslam.errors import PacketConflictError, StoreError
 from fcslam.records import Channel, Correction, Veto, frozen
 from fcslam.wire.messages import Kind
@@ -31,8 +31,8 @@ def store(tmp_path):
     store.close()
 
 
-def correction(robot, x, epoch=0):
-    return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, 0, frozen((x, 0.0, 0.0))))
+def correction(robot, x, epoch=0, y=0.0, theta=0.0, map_index=0):
+    return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, map_index, frozen((x, y, theta))))
 
 
 @given(batches=BATCHES)
@@ -127,6 +127,27 @@ def test_versions_of_corrections_grow_with_every_change_and_with_nothing_else(tm
     assert store.correction("a", 1) is None
     assert store.applied() == 5
     store.close()
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "theta"])
+def test_what_a_robot_believes_creeps_no_further_away_than_what_is_news(store, axis):
+    """Many steps, each too small to be told of, are told of when they have become news together."""
+    limit = NEWS_RAD if axis == "theta" else NEWS_M
+    versions = []
+    for step in range(100):
+        truth = {"x": 3.0, axis: -0.3 * limit * step}
+        store.progress(step, [correction("a", **truth)])
+        told = store.correction("a", 0).correction
+        assert np.abs(told.T_map_odom - correction("a", **truth).correction.T_map_odom).max() < limit
+        versions.append(told.version)
+    assert 20 < len(set(versions)) < 35
+    assert versions == sorted(versions)
+
+
+def test_another_map_is_news_wherever_it_lies(store):
+    for map_index in (0, 1):
+        store.progress(1, [correction("a", 1.0, map_index=map_index)])
+        assert store.correction("a", 0).correction.map_index == map_index
 
 
 def test_vetoes_and_requests_are_kept_in_their_order(store):

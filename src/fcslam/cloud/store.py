@@ -24,6 +24,10 @@ APPLIED = "applied"
 CONFIG = "config"
 """A fact: the mission's configuration."""
 
+NEWS_M, NEWS_RAD = 1e-3, 1e-5
+"""A correction that differs from the last one by less is none: 100 m from the origin of `odom` both are 1 mm. Without a
+closure it is the same but for rounding, and each robot would be told so with every answer."""
+
 _VERSION = 2
 
 _SCHEMA = """
@@ -210,17 +214,18 @@ class MissionStore:
         return hello
 
     def progress(self, turns: int, corrections: Sequence[SessionCorrection]) -> None:
-        """So many turns have taken effect; corrections that changed by them get a new version."""
+        """So many turns have taken effect; corrections that changed by ``NEWS_M`` or ``NEWS_RAD`` get a new version."""
         with self._database.transaction() as database:
             _remember(database, APPLIED, str(turns))
             for correction in corrections:
-                pose = correction.correction.T_map_odom.tolist()
+                news = correction.correction
                 database.execute(
                     "INSERT INTO corrections SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7"
                     " FROM corrections WHERE true ON CONFLICT (robot, epoch) DO UPDATE SET version = excluded.version,"
                     " time = excluded.time, map_index = excluded.map_index, x = excluded.x, y = excluded.y,"
-                    " theta = excluded.theta WHERE (map_index, x, y, theta) IS NOT (?4, ?5, ?6, ?7)",
-                    (correction.robot, correction.epoch, correction.time, correction.correction.map_index, *pose),
+                    " theta = excluded.theta WHERE map_index != ?4"
+                    f" OR max(abs(x - ?5), abs(y - ?6)) >= {NEWS_M} OR abs(theta - ?7) >= {NEWS_RAD}",
+                    (correction.robot, correction.epoch, correction.time, news.map_index, *news.T_map_odom.tolist()),
                 )
 
     def applied(self) -> int:

@@ -1,5 +1,6 @@
 """What the service answers: robots, viewers, administrators; and what it does not let happen."""
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from fcslam.features.detector import SHIPPED_NETWORK
 from fcslam.records import Channel, Correction, Keyscan
 from fcslam.runs import open_run
 from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.batches import read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
 from fcslam.wire.packets import decode, encode, readdress
@@ -297,6 +299,22 @@ def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, 
         again.ask("POST", f"{API}/missions", "boss", json={"name": "next"})
         again.told(again.send("a", A[:2]))
         assert uplink(again, "a") == refused + sum(map(len, A[:2])), "missions are told apart, and none is forgotten"
+
+
+def test_measures_say_what_robots_were_told_by_kind(mapped):
+    def measured(kind):
+        line = f'fcslam_answer_bytes_total{{kind="{kind}",robot="a"}} '
+        found = [row for row in get(mapped, "../../metrics").text.splitlines() if row.startswith(line)]
+        return float(found[0].removeprefix(line)) if found else 0.0
+
+    before = [measured(kind) for kind in ("acknowledgement", "correction")]
+    told = [data for _ in range(3) for data in read_batch(mapped.send("a", A[-1:]).content)]
+    sizes = Counter()
+    for data in told:
+        sizes[type(decode(data).body)] += len(data)
+    after = [measured(kind) for kind in ("acknowledgement", "correction")]
+    assert [b - a for a, b in zip(before, after, strict=True)] == [sizes[Acknowledgement], sizes[Correction]]
+    assert all(sizes.values())
 
 
 def test_the_interface_describes_itself(desk):

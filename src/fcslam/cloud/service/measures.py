@@ -9,7 +9,9 @@ from prometheus_client.core import CounterMetricFamily
 from prometheus_client.registry import Collector
 
 from fcslam.cloud.missions import OpenMission
+from fcslam.wire.batches import read_batch
 from fcslam.wire.ledger import Traffic
+from fcslam.wire.packets import read_label
 
 _AT_ONCE = 10_000
 """Packets counted while nobody else may use the mission's file."""
@@ -20,7 +22,9 @@ class Measures:
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
-        self._answered = Counter("fcslam_answer_bytes", "Bytes sent to a robot", ("robot",), registry=self._registry)
+        self._answered = Counter(
+            "fcslam_answer_bytes", "Bytes of packets sent to a robot", ("robot", "kind"), registry=self._registry
+        )
         self._refused = Counter("fcslam_refusals", "Requests refused, by status", ("status",), registry=self._registry)
         self._turns = Gauge("fcslam_packets_stored", "Packets of the open mission", registry=self._registry)
         self._queue = Gauge("fcslam_packets_queued", "Packets without effect so far", registry=self._registry)
@@ -30,9 +34,10 @@ class Measures:
         self._uplink = _Uplink()
         self._registry.register(self._uplink)
 
-    def answer(self, robot: str, size: int) -> None:
-        """A batch was taken in and answered by so many bytes."""
-        self._answered.labels(robot).inc(size)
+    def answer(self, robot: str, batch: bytes) -> None:
+        """A batch was taken in and answered by this one."""
+        for data in read_batch(batch):
+            self._answered.labels(robot, read_label(data).kind).inc(len(data))
 
     def refuse(self, status: int) -> None:
         """A request was refused."""

@@ -55,7 +55,7 @@ def robot_router(state: ServiceState) -> APIRouter:
         mission = state.mission
         answer = await run_in_threadpool(mission.intake.take, robot, agent, body, correction)
         mission.worker.ring()
-        state.measures.answer(robot, len(answer.batch))
+        state.measures.answer(robot, answer.batch)
         return Response(answer.batch, media_type=MEDIA_TYPE, headers={REFUSED_HEADER: str(answer.refused)})
 
     @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
