@@ -206,6 +206,7 @@ def test_a_worker_waits_until_the_one_before_is_gone(cloud):
             time.sleep(3.0)
             assert cloud.store.applied() == 0
             fcntl.flock(before, fcntl.LOCK_UN)
+            assert b"ready" in process.stdout.readline()
             assert b"live" in process.stdout.readline()
             process.stdin.close()
             assert process.wait(60) == 0

@@ -36,11 +36,13 @@ def serve(
     docs: Annotated[bool, typer.Option("--docs", help="Show the interface at /docs.")] = False,
 ) -> None:
     """Take in what robots send, map it, and show the map; runs until it is stopped."""
+    import gc
     import logging
 
     import uvicorn
 
     from fcslam.cloud.service.app import create_app
+    from fcslam.cloud.warmup import warm_up_decoding
     from fcslam.errors import ServiceError
 
     if (tls_certificate is None) != (tls_key is None):
@@ -51,6 +53,8 @@ def serve(
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with _listen(host, port) as listening:
         state = _state(data, tokens, _cloud_config(config))
+        warm_up_decoding()
+        gc.freeze()  # what is there now stays: looking through it again and again would keep packets waiting
         server = uvicorn.Server(
             uvicorn.Config(
                 create_app(state, docs=docs),

@@ -16,7 +16,7 @@ def operations_router(state: ServiceState) -> APIRouter:
 
     @router.get("/healthz")
     def get_health() -> JSONResponse:
-        """200 while packets are taken in and the worker runs, 503 otherwise."""
+        """200 while packets are taken in and the worker is ready for them, 503 otherwise."""
         try:
             state.mission.store.turn_count()
         except StoreError:
@@ -25,6 +25,8 @@ def operations_router(state: ServiceState) -> APIRouter:
             return problem(503, "the service is stopping")
         if state.mission.worker.pid is None:
             return problem(503, "packets are taken in, but the worker is down")
+        if not state.mission.worker.is_ready:
+            return problem(503, "packets are taken in, but the worker is starting")
         return JSONResponse({"status": "ok"})
 
     @router.get("/metrics", dependencies=[Depends(state.require(Role.VIEWER, Role.ADMIN))])
