@@ -4,10 +4,13 @@
 
 A simulated fleet (LiDAR, 360 beams at 10 Hz) is run through the robots' front ends beforehand. Then each robot's
 packets go to `fcslam serve` at the moments at which the robot had them, over a connection of its own, from one process
-that does nothing else. "Taken in": from sending a request to the answer that says that its packets are on disk. "In
-effect": from that answer until the process in which the fleet lives has matched, verified and solved what they bring,
-and a correction lies ready; seen by looking into the mission's file 20 times a second, which keeps nobody waiting.
-Memory: the most that the service and its worker held (VmHWM, added up). Server, worker and sender share the machine.
+that does nothing else. The simulated LiDARs all turn in step, real ones do not: each robot begins at a moment of its
+own within the first second, or, with `--in-step`, all at once.
+
+"Taken in": from sending a request to the answer that says that its packets are on disk. "In effect": from that answer
+until the process in which the fleet lives has matched, verified and solved what they bring, and a correction lies
+ready; seen by looking into the mission's file 20 times a second, which keeps nobody waiting. Memory: the most that the
+service and its worker held (VmHWM, added up). Server, worker and sender share the machine.
 CPU: user and system of each, all threads; the sender's is that of the robots' side, which a fleet has elsewhere.
 """
 
@@ -70,10 +73,13 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=ROBOTS)
     parser.add_argument("--path", type=float, default=PATH_M, help="of each robot, m")
     parser.add_argument("--seed", type=int, default=1, help="of the fleet")
+    parser.add_argument("--in-step", action="store_true", help="all robots begin in the same millisecond")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
     settings = SimulationSettings(robots=chosen.robots, path_length_m=chosen.path, camera=None)
-    agendas = {robot.name: _agenda(robot) for robot in simulate_fleet(settings, chosen.seed).robots}
+    begins_s = np.random.default_rng(chosen.seed).uniform(0.0, 0.0 if chosen.in_step else 1.0, chosen.robots)
+    robots = simulate_fleet(settings, chosen.seed).robots
+    agendas = {robot.name: _agenda(robot, begin_s) for robot, begin_s in zip(robots, begins_s, strict=True)}
     with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (server, port):
         began_s = time.process_time()
         mission = Path(place) / "cloud" / "missions" / FIRST / "mission.sqlite"
@@ -106,15 +112,15 @@ def main() -> None:
     report.write()
 
 
-def _agenda(robot: SimulatedRobot) -> list[Due]:
-    """What this robot sends, and when."""
+def _agenda(robot: SimulatedRobot, begin_s: float) -> list[Due]:
+    """What this robot sends, and when, if it begins at this time."""
     front = RobotFrontend(robot.name, MissionConfig().robot)
     agenda, began = [], None
     scans = list(robot.scans())
     for scan in scans:
         began = scan.stamp if began is None else began
-        agenda.append(_due(scan.stamp - began, front.process(scan)))
-    agenda.append(_due(scans[-1].stamp - began, front.finish()))
+        agenda.append(_due(begin_s + scan.stamp - began, front.process(scan)))
+    agenda.append(_due(begin_s + scans[-1].stamp - began, front.finish()))
     return [due for due in agenda if due.packets]
 
 
