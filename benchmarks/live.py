@@ -4,16 +4,23 @@
 
 A simulated fleet (LiDAR, 360 beams at 10 Hz) is run through the robots' front ends beforehand. Then each robot's
 packets go to `fcslam serve` at the moments at which the robot had them, over a connection of its own, from one process
-that does nothing else. "Taken in": from sending a request to the answer that says that its packets are on disk. "In
-effect": from that answer until the process in which the fleet lives has matched, verified and solved what they bring,
-and a correction lies ready; seen by asking the service's metrics 20 times a second. Memory: the most that the service
-and its worker held (VmHWM, added up). Server, worker and sender share the machine.
+that does nothing else. The simulated LiDARs all turn in step, real ones do not: each robot begins at a moment of its
+own within the first second, or, with `--in-step`, all at once.
+
+"Taken in": from sending a request to the answer that says that its packets are on disk. "In effect": from that answer
+until the process in which the fleet lives has matched, verified and solved what they bring, and a correction lies
+ready; seen by looking into the mission's file 20 times a second, which keeps nobody waiting. Memory: the most that the
+service and its worker held (VmHWM, added up). Server, worker and sender share the machine.
+CPU: user and system of each, all threads; the sender's is that of the robots' side, which a fleet has elsewhere.
 """
 
 import asyncio
+import os
+import sqlite3
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +29,7 @@ import httpx
 import numpy as np
 from faults import cloud, finalize
 
+from fcslam.cloud.missions import FIRST
 from fcslam.mission import MissionConfig
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.simulation.fleet import SimulatedRobot, SimulationSettings, simulate_fleet
@@ -53,11 +61,11 @@ class Sent(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What the service said of itself."""
+    """What was in the mission's file."""
 
     at_s: float
     stored: int
-    queued: int
+    applied: int
 
 
 def main() -> None:
@@ -65,13 +73,21 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=ROBOTS)
     parser.add_argument("--path", type=float, default=PATH_M, help="of each robot, m")
     parser.add_argument("--seed", type=int, default=1, help="of the fleet")
+    parser.add_argument("--in-step", action="store_true", help="all robots begin in the same millisecond")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
     settings = SimulationSettings(robots=chosen.robots, path_length_m=chosen.path, camera=None)
-    agendas = {robot.name: _agenda(robot) for robot in simulate_fleet(settings, chosen.seed).robots}
+    begins_s = np.random.default_rng(chosen.seed).uniform(0.0, 0.0 if chosen.in_step else 1.0, chosen.robots)
+    robots = simulate_fleet(settings, chosen.seed).robots
+    agendas = {robot.name: _agenda(robot, begin_s) for robot, begin_s in zip(robots, begins_s, strict=True)}
     with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (server, port):
-        sent, looks = asyncio.run(_play(agendas, f"http://127.0.0.1:{port}"))
-        memory_mb = sum(_peak_mb(pid) for pid in (server.process.pid, *_children(server.process.pid)))
+        began_s = time.process_time()
+        mission = Path(place) / "cloud" / "missions" / FIRST / "mission.sqlite"
+        sent, looks = asyncio.run(_play(agendas, f"http://127.0.0.1:{port}", mission))
+        sender_s = time.process_time() - began_s
+        worker = _children(server.process.pid)
+        memory_mb = sum(_peak_mb(pid) for pid in (server.process.pid, *worker))
+        cpu_s = _cpu_s(server.process.pid), sum(_cpu_s(pid) for pid in worker), sender_s
         run = finalize(port)
         closures, maps = common.metrics(run)["inter_robot_closures_accepted"], common.metrics(run)["maps"]
     places = [each for each in sent if each.has_place]
@@ -90,20 +106,21 @@ def main() -> None:
     report.say(
         f"{chosen.robots} robots for {duration_s:.0f} s: {packets:,} packets, {size / 1e6:.1f} MB, "
         f"{size / 1e3 / duration_s / chosen.robots:.2f} kB/s a robot; {memory_mb:,.0f} MB; "
+        f"CPU {cpu_s[0]:.0f} s of the service, {cpu_s[1]:.0f} s of its worker, {cpu_s[2]:.0f} s of the sender; "
         f"{closures:.0f} accepted closures between robots, {maps:.0f} map(s) in the end."
     )
     report.write()
 
 
-def _agenda(robot: SimulatedRobot) -> list[Due]:
-    """What this robot sends, and when."""
+def _agenda(robot: SimulatedRobot, begin_s: float) -> list[Due]:
+    """What this robot sends, and when, if it begins at this time."""
     front = RobotFrontend(robot.name, MissionConfig().robot)
     agenda, began = [], None
     scans = list(robot.scans())
     for scan in scans:
         began = scan.stamp if began is None else began
-        agenda.append(_due(scan.stamp - began, front.process(scan)))
-    agenda.append(_due(scans[-1].stamp - began, front.finish()))
+        agenda.append(_due(begin_s + scan.stamp - began, front.process(scan)))
+    agenda.append(_due(begin_s + scans[-1].stamp - began, front.finish()))
     return [due for due in agenda if due.packets]
 
 
@@ -113,16 +130,16 @@ def _due(at_s: float, packets: Sequence[object]) -> Due:
     )
 
 
-async def _play(agendas: dict[str, list[Due]], url: str) -> tuple[list[Sent], list[Look]]:
+async def _play(agendas: dict[str, list[Due]], url: str, mission: Path) -> tuple[list[Sent], list[Look]]:
     sent: list[Sent] = []
     looks: list[Look] = []
     began = time.perf_counter()
-    watching = asyncio.create_task(_watch(url, looks))
+    watching = asyncio.create_task(_watch(mission, looks))
     async with asyncio.TaskGroup() as group:
         for name, agenda in agendas.items():
             group.create_task(_robot(name, agenda, url, began, sent))
     all_sent = time.perf_counter()
-    while not (looks and looks[-1].at_s > all_sent and looks[-1].queued == 0):
+    while not (looks and looks[-1].at_s > all_sent and looks[-1].applied >= looks[-1].stored):
         if watching.done():
             watching.result()
         if time.perf_counter() - all_sent > EFFECTLESS_S:
@@ -143,13 +160,12 @@ async def _robot(name: str, agenda: list[Due], url: str, began: float, sent: lis
             sent.append(Sent(asked, time.perf_counter(), due.has_place))
 
 
-async def _watch(url: str, looks: list[Look]) -> None:
-    async with httpx.AsyncClient(base_url=url, timeout=60.0, trust_env=False) as client:
+async def _watch(mission: Path, looks: list[Look]) -> None:
+    with closing(sqlite3.connect(f"{mission.as_uri()}?mode=ro", uri=True)) as database:
         while True:
-            lines = (await client.get("/metrics")).text.splitlines()
-            values = {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines if line[0] != "#")}
-            stored, queued = (int(values[f"fcslam_packets_{name}"]) for name in ("stored", "queued"))
-            looks.append(Look(time.perf_counter(), stored, queued))
+            (stored,) = database.execute("SELECT ifnull(max(turn) + 1, 0) FROM packets").fetchone()
+            (applied,) = database.execute("SELECT ifnull(max(value), 0) FROM facts WHERE name = 'applied'").fetchone()
+            looks.append(Look(time.perf_counter(), stored, int(applied)))
             await asyncio.sleep(LOOK_EVERY_S)
 
 
@@ -157,7 +173,7 @@ def _effect(chosen: Sequence[Sent], looks: Sequence[Look]) -> list[float]:
     """For each request the time until as many packets had taken effect as were stored when it was answered."""
     at = np.array([look.at_s for look in looks])
     stored = np.maximum.accumulate([look.stored for look in looks])
-    applied = np.maximum.accumulate([look.stored - look.queued for look in looks])
+    applied = np.maximum.accumulate([look.applied for look in looks])
     latencies = []
     for each in chosen:
         seen = min(int(np.searchsorted(at, each.answered_s)), len(at) - 1)
@@ -174,6 +190,11 @@ def _spread(seconds: Sequence[float]) -> tuple[float, ...]:
 def _children(pid: int) -> list[int]:
     files = Path(f"/proc/{pid}/task").glob("*/children")
     return [int(child) for file in files for child in file.read_text(encoding="ascii").split()]
+
+
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _peak_mb(pid: int) -> float:

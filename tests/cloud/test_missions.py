@@ -10,7 +10,7 @@ from fcslam.errors import StoreError
 class Launched:
     """A worker that only counts."""
 
-    pid, starts = None, 1
+    pid, starts, is_ready = None, 1, False
 
     def __init__(self, folder):
         self.folder, self.stopped = folder, False

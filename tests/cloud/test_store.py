@@ -88,11 +88,11 @@ def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
     store = MissionStore(tmp_path / "mission.sqlite")
     store.put([packet()], 0.0)
     pages = store._database.value("PRAGMA page_count")
-    store._database.rows(f"PRAGMA max_page_count={pages + 2}")
+    store._database.share(lambda database: database.execute(f"PRAGMA max_page_count={pages + 2}"))
     with pytest.raises(StoreError, match="is the disk full"):
         store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
     assert store.turns(0, 10) == [packet()]
-    store._database.rows("PRAGMA max_page_count=100000")
+    store._database.share(lambda database: database.execute("PRAGMA max_page_count=100000"))
     store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
     assert store.turn_count() == 9
     store.close()

@@ -15,7 +15,7 @@ from small_fleet import in_order
 from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cloud.store import CONFIG, MissionStore, StoredPacket
-from fcslam.cloud.worker import Worker
+from fcslam.cloud.worker import AT_ONCE, Worker
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import ClosureStatus, Veto
 from fcslam.robot.frontend import RobotFrontend
@@ -185,6 +185,24 @@ def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkey
     assert "ZeroDivisionError" in cloud.store.refusals("a")[0][2]
 
 
+def test_corrections_leave_while_there_is_still_a_queue(cloud):
+    cloud.put(two_robots())
+    waiting = []
+    while cloud.store.applied() < cloud.store.turn_count():
+        cloud.worker.step()
+        if cloud.store.correction("a", 0) is not None:
+            waiting.append(cloud.store.turn_count() - cloud.store.applied())
+    assert waiting[0] > len(waiting) // 2, "most packets wait when the first correction is there"
+    assert waiting == list(range(waiting[0], -1, -1)), "a packet takes longer than a look here: each is a step"
+
+
+def test_a_quick_worker_looks_after_a_number_of_packets_all_the_same(cloud, monkeypatch):
+    cloud.put(two_robots())
+    monkeypatch.setattr(cloud.worker, "_clock", lambda: 0.0)
+    cloud.worker.step()
+    assert cloud.store.applied() == AT_ONCE < cloud.store.turn_count()
+
+
 def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch):
     cloud.put(stream("a", POSES, start_s=0.0))
 
@@ -209,6 +227,7 @@ def test_a_worker_waits_until_the_one_before_is_gone(cloud):
             time.sleep(3.0)
             assert cloud.store.applied() == 0
             fcntl.flock(before, fcntl.LOCK_UN)
+            assert b"ready" in process.stdout.readline()
             assert b"live" in process.stdout.readline()
             process.stdin.close()
             assert process.wait(60) == 0

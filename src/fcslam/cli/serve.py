@@ -44,9 +44,11 @@ def serve(
     docs: Annotated[bool, typer.Option("--docs", help="Show the interface at /docs.")] = False,
 ) -> None:
     """Take in what robots send, map it, and show the map; runs until it is stopped."""
+    import gc
     import logging
 
     from fcslam.cloud.service.app import create_app
+    from fcslam.cloud.warmup import warm_up_decoding
     from fcslam.errors import ServiceError
 
     if tokens is None and client_ca is None and not insecure and not _is_loopback(host):
@@ -55,6 +57,8 @@ def serve(
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with _listen(host, port) as listening:
         state = _state(data, _authenticator(tokens, client_ca), _cloud_config(config))
+        warm_up_decoding()
+        gc.freeze()  # what is there now stays: looking through it again and again would keep packets waiting
         server = _server(create_app(state, docs=docs), tls_certificate, tls_key, client_ca)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name

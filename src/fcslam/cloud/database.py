@@ -3,19 +3,34 @@
 import os
 import sqlite3
 import threading
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fcslam.errors import StoreError
 
 BUSY_S = 30.0
 """How long a writer waits for another process to finish."""
 
+_Result = TypeVar("_Result")
+
+
+@dataclass(slots=True, eq=False)
+class _Waiting:
+    """What a thread wants to be written."""
+
+    work: Callable[[sqlite3.Connection], Any]
+    result: Any = None
+    failure: BaseException | None = None
+    is_done: bool = False
+
 
 class Database:
-    """A file that several processes and threads may use; within a process one call waits for the other.
+    """A file that several processes and threads may use. Within a process one writer waits for the other, but nobody
+    who reads waits for a writer.
 
     Raises:
         StoreError: from every method: the disk is full or broken, and nothing has changed.
@@ -28,13 +43,13 @@ class Database:
             StoreError: it was made by something else, or cannot be used.
         """
         self._path = path
-        self._lock = threading.Lock()
+        self._lock, self._reading_lock, self._sharing_lock = threading.Lock(), threading.Lock(), threading.Lock()
+        self._waiting: deque[_Waiting] = deque()
         with told(path):
-            # Transactions begin where this module says so.
-            self._connection = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
             # What is acknowledged must outlast a loss of power: FULL.
-            for pragma in ("trusted_schema=OFF", "journal_mode=WAL", "synchronous=FULL"):
-                self._connection.execute(f"PRAGMA {pragma}")
+            self._connection = _connected(path, "journal_mode=WAL", "synchronous=FULL")
+            # A commit takes as long as the disk does. On a connection of their own readers see what was there before.
+            self._reading = _connected(path, "query_only=ON")
         with self.transaction() as connection:
             if not _shape(connection)[1]:
                 _make(connection, schema, version)
@@ -43,8 +58,9 @@ class Database:
 
     def close(self) -> None:
         """Let go of the file."""
-        with self._lock:
+        with self._lock, self._reading_lock:
             self._connection.close()
+            self._reading.close()
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
@@ -58,10 +74,42 @@ class Database:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
 
+    def share(self, work: Callable[[sqlite3.Connection], _Result]) -> _Result:
+        """As ``transaction`` with ``work`` in the block, but shared by all threads that would wait for the disk: one
+        commit is enough for them. Of works that share one transaction all happen or none.
+        """
+        mine = _Waiting(work)
+        self._waiting.append(mine)
+        with self._sharing_lock:
+            if not mine.is_done:
+                self._write_waiting()
+        if mine.failure is not None:
+            raise mine.failure
+        result: _Result = mine.result
+        return result
+
+    def _write_waiting(self) -> None:
+        together: list[_Waiting] = []
+        try:
+            with self.transaction() as connection:
+                together = self._taken()  # only now: with those who came while this waited for another writer
+                for one in together:
+                    one.result = one.work(connection)
+        except BaseException as error:  # what ends this thread must not leave the others without an answer
+            together = together or self._taken()
+            for one in together:
+                one.failure = error
+        finally:
+            for one in together:
+                one.is_done = True
+
+    def _taken(self) -> list[_Waiting]:
+        return [self._waiting.popleft() for _ in range(len(self._waiting))]
+
     def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
         """All rows that a query finds."""
-        with self._lock, told(self._path):
-            return self._connection.execute(statement, values).fetchall()
+        with self._reading_lock, told(self._path):
+            return self._reading.execute(statement, values).fetchall()
 
     def value(self, statement: str, values: Sequence[object] = ()) -> Any:
         """First column of the first row that a query finds; None if it finds none."""
@@ -98,6 +146,14 @@ def check_file(path: Path, schema: str, version: int) -> None:
             raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
         if found.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
             raise StoreError(f"{path}: broken")
+
+
+def _connected(path: Path, *pragmas: str) -> sqlite3.Connection:
+    # Transactions begin where this module says so.
+    connection = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+    for pragma in ("trusted_schema=OFF", *pragmas):
+        connection.execute(f"PRAGMA {pragma}")
+    return connection
 
 
 def _make(connection: sqlite3.Connection, schema: str, version: int) -> None:

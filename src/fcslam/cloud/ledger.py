@@ -32,6 +32,8 @@ class ClosureLedger:
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
+        self._between: dict[frozenset[str], list[Entry]] = {}
+        """Entries between two robots, by these: a large fleet asks for its pairs again and again."""
         self._confirmed: set[tuple[frozenset[KeyscanId], Channel]] = set()
         """Pairs of places between which geometry has confirmed a closure, with its channel."""
 
@@ -56,6 +58,8 @@ class ClosureLedger:
         )  # fmt: skip
         entry = Entry(closure, independent=not match.predicted)
         self._entries.append(entry)
+        if entry.is_between:
+            self._between.setdefault(frozenset((match.i.robot, match.j.robot)), []).append(entry)
         return entry
 
     def add_local(self, constraint: Constraint, edge: int) -> Entry:
@@ -71,12 +75,8 @@ class ClosureLedger:
 
     def evidence(self, a: str, b: str) -> list[Entry]:
         """What geometry confirms between two robots without having known how they lie, and nobody vetoed."""
-        pair = {a, b}
         return [
             entry
-            for entry in self._entries
-            if entry.independent
-            and not entry.vetoed
-            and entry.closure.status is not ClosureStatus.CANDIDATE
-            and {entry.closure.i.robot, entry.closure.j.robot} == pair
+            for entry in self._between.get(frozenset((a, b)), ())
+            if entry.independent and not entry.vetoed and entry.closure.status is not ClosureStatus.CANDIDATE
         ]

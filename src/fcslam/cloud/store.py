@@ -132,22 +132,14 @@ class MissionStore:
         Raises:
             PacketConflictError: another packet has the number of one of them; those before it are stored.
         """
-        conflict, new = None, 0
-        with self._database.transaction() as database:
-            for index, packet in enumerate(packets):
-                if _insert(database, packet, received_s):
-                    new += 1
-                elif not _is_there(database, packet):
-                    conflict = PacketConflictError(
-                        f"{packet.robot}: packet {packet.sequence} of epoch {packet.epoch} was stored before with "
-                        "other content; start the robot anew, in a new epoch",
-                        index,
-                    )
-                    break
-            for robot, epoch in dict.fromkeys((packet.robot, packet.epoch) for packet in packets):
-                _give_turns(database, robot, epoch)
-        if conflict:
-            raise conflict
+        new, conflict = self._database.share(lambda database: _put(database, packets, received_s))
+        if conflict is not None:
+            packet = packets[conflict]
+            raise PacketConflictError(
+                f"{packet.robot}: packet {packet.sequence} of epoch {packet.epoch} was stored before with "
+                "other content; start the robot anew, in a new epoch",
+                conflict,
+            )
         return new
 
     def turns(self, after: int, limit: int) -> list[StoredPacket]:
@@ -343,6 +335,20 @@ def check_mission(path: Path) -> None:
 
 def _remember(database: sqlite3.Connection, name: str, value: str) -> None:
     database.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, value))
+
+
+def _put(database: sqlite3.Connection, packets: Sequence[StoredPacket], received_s: float) -> tuple[int, int | None]:
+    """How many packets are new, and the index of the first that has another one's number: there it stops."""
+    conflict, new = None, 0
+    for index, packet in enumerate(packets):
+        if _insert(database, packet, received_s):
+            new += 1
+        elif not _is_there(database, packet):
+            conflict = index
+            break
+    for robot, epoch in dict.fromkeys((packet.robot, packet.epoch) for packet in packets):
+        _give_turns(database, robot, epoch)
+    return new, conflict
 
 
 def _insert(database: sqlite3.Connection, packet: StoredPacket, received_s: float) -> bool:

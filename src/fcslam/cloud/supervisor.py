@@ -16,6 +16,9 @@ LONGEST_PAUSE_S = 30.0
 STEADY_S = 60.0
 """A worker that lived so long did not die of what it found at its start."""
 
+READY = "ready"
+"""The event by which a worker says that it waits for packets now; it is for the supervisor alone."""
+
 Listen = Callable[[str, int], None]
 """Is told of a worker's events; from a thread of its own."""
 
@@ -30,6 +33,10 @@ class RunningWorker(Protocol):
     @property
     def starts(self) -> int:
         """How often it was started."""
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it runs and has all its code at hand."""
 
     def ring(self) -> None:
         """Tell it that there is something to do."""
@@ -55,6 +62,7 @@ class Supervisor:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._starts = 0
+        self._is_ready = False
         self._thread = threading.Thread(target=self._run, name=f"worker of {folder.name}", daemon=True)
         self._thread.start()
 
@@ -68,6 +76,11 @@ class Supervisor:
     def starts(self) -> int:
         """How often a worker was started."""
         return self._starts
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the worker runs and has said that it is ready."""
+        return self._is_ready and self.pid is not None
 
     def ring(self) -> None:
         """Tell the worker that there is something to do."""
@@ -107,7 +120,7 @@ class Supervisor:
             assert process.stdout is not None
             os.set_blocking(process.stdin.fileno(), False)
             with self._lock:
-                self._process = process
+                self._process, self._is_ready = process, False
                 self._starts += 1
                 if self._stopping.is_set():
                     self._end_input()
@@ -122,7 +135,11 @@ class Supervisor:
     def _pass_on(self, line: bytes) -> None:
         try:
             told = json.loads(line)
-            self._listen(str(told["event"]), int(told["number"]))
+            event, number = str(told["event"]), int(told["number"])
+            if event == READY:
+                self._is_ready = True
+            else:
+                self._listen(event, number)
         except (ValueError, TypeError, KeyError):
             _log.error("the worker says what nobody understands: %.200r", line)
 

@@ -6,8 +6,8 @@ and says nothing new before it is where it was.
 
     python -m fcslam.cloud.worker MISSION_FOLDER
 
-A byte on stdin says that there is something to do, its end that the service is gone. On stdout there is a line for
-every change of the live run folder and for every answered request.
+A byte on stdin says that there is something to do, its end that the service is gone. On stdout there is a line when it
+is ready, for every change of the live run folder and for every answered request.
 """
 
 import fcntl
@@ -31,12 +31,16 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.cloud.store import CONFIG, Finalization, MissionStore, SessionCorrection, StoredPacket
+from fcslam.cloud.supervisor import READY
+from fcslam.cloud.warmup import warm_up_fleet
 from fcslam.config import dump
 from fcslam.errors import PacketError
 from fcslam.runs import Metric, Run, write_run
 
 AT_ONCE = 64
-"""Packets between two looks at what else there is to do."""
+AT_ONCE_S = 0.25
+"""Packets, and about the time, between two looks at what else there is to do. Corrections leave in between, so a robot
+does not wait for its own while there is a queue."""
 LIVE_SHARE = 0.1
 """Of the worker's time, for the live run folder."""
 PAUSE_S = 30.0
@@ -84,10 +88,13 @@ class Worker:
         return bool(vetoes)
 
     def _take_packets(self) -> bool:
+        began = self._clock()
         packets = self._store.turns(self._turn, AT_ONCE)
         for packet in packets:
             self._take(packet)
             self._turn += 1
+            if self._clock() > began + AT_ONCE_S:
+                break
         if packets and self._turn > self._resumed_at:
             self._store.progress(self._turn, self._corrections())
         return bool(packets)
@@ -172,11 +179,13 @@ def main(arguments: Sequence[str]) -> int:
     # Who stops the service stops it first; its end ends stdin.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    warm_up_fleet()
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     folder = MissionFolder(Path(arguments[0]))
     alone = _alone(folder)
     worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print)
+    _print(READY, 0)
     while True:
         wait_s = 0.0 if worker.step() else worker.wait_s()
         if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):

@@ -40,6 +40,8 @@ class FactorCache:
         self.graph = graph
         self._trusted = gtsam.NonlinearFactorGraph()
         self._closures: list[tuple[int, int, Any, FloatArray]] = []
+        self._robust: dict[Loss, list[Any]] = {}
+        """Factors of the closures under losses that were asked for."""
         self._built = 0
 
     def squared(self, weights: FloatArray, poses: FloatArray) -> Any:
@@ -60,15 +62,21 @@ class FactorCache:
         if loss is Loss.SQUARED:
             return self.squared(kept.astype(np.float64), poses)
         self._update()
+        graph = gtsam.NonlinearFactorGraph(self._trusted)
+        for factor, keep in zip(self._closures_under(loss), kept.tolist(), strict=True):
+            if keep:
+                graph.push_back(factor)
+        self._anchor(graph, kept, poses)
+        return graph
+
+    def _closures_under(self, loss: Loss) -> list[Any]:
         estimators = gtsam.noiseModel.mEstimator
         huber = loss is Loss.HUBER
         estimator = estimators.Huber.Create(HUBER_WIDTH) if huber else estimators.Cauchy.Create(CAUCHY_WIDTH)
-        graph = gtsam.NonlinearFactorGraph(self._trusted)
-        for (i, j, measured, root), keep in zip(self._closures, kept.tolist(), strict=True):
-            if keep:
-                graph.push_back(_between(i, j, measured, gtsam.noiseModel.Robust.Create(estimator, _gaussian(root))))
-        self._anchor(graph, kept, poses)
-        return graph
+        built = self._robust.setdefault(loss, [])
+        for i, j, measured, root in self._closures[len(built) :]:
+            built.append(_between(i, j, measured, gtsam.noiseModel.Robust.Create(estimator, _gaussian(root))))
+        return built
 
     def _anchor(self, graph: Any, kept: NDArray[np.bool_], poses: FloatArray) -> None:
         """Hold the first variable of every component that the closures in ``kept`` leave."""

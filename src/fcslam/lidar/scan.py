@@ -45,8 +45,8 @@ class PointScan:
             keep = keep[np.linspace(0, len(keep) - 1, limit).astype(np.int64)]
         return self.only(keep)
 
-    def only(self, kept: NDArray[Any] | slice) -> "PointScan":
-        """The returns with these indices, in this slice, or where this mask is true."""
+    def only(self, kept: NDArray[Any]) -> "PointScan":
+        """The returns with these indices, or where this mask is true."""
         return PointScan(self.points[kept], self.normals[kept], self.solitary[kept], self.origin)
 
 

@@ -47,6 +47,7 @@ class InlineWorker:
 
     pid: int | None = 1
     starts = 1
+    is_ready = True
 
     def __init__(self, folder: MissionFolder) -> None:
         self._now = 0.0

@@ -141,8 +141,11 @@ def test_what_is_no_known_token_is_nobody(header):
     assert authenticator.who(f"Bearer {digest}") is None
 
 
-def test_health_needs_no_token_and_says_when_the_worker_is_down(desk):
+def test_health_needs_no_token_and_says_when_the_worker_is_starting_or_down(desk):
     assert desk.ask("GET", "/healthz").status_code == 200
+    desk.state.mission.worker.is_ready = False
+    assert desk.ask("GET", "/healthz").status_code == 503
+    desk.state.mission.worker.is_ready = True
     desk.state.mission.worker.pid = None
     assert desk.ask("GET", "/healthz").status_code == 503
 

@@ -130,11 +130,12 @@ def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk, monkey
 def test_a_full_disk_is_507_and_nothing_is_acknowledged(desk):
     desk.told(desk.send("a", A[:3]))
     database = desk.state.mission.store._database
-    database.rows(f"PRAGMA max_page_count={database.value('PRAGMA page_count')}")
+    pages = database.value("PRAGMA page_count")
+    database.share(lambda connection: connection.execute(f"PRAGMA max_page_count={pages}"))
     response = desk.send("a", A[3:])
     assert response.status_code == 507
     assert "full" in response.json()["error"]
-    database.rows("PRAGMA max_page_count=1000000")
+    database.share(lambda connection: connection.execute("PRAGMA max_page_count=1000000"))
     assert desk.told(desk.send("a", A[3:]))[0] == Acknowledgement("a", 0, len(A) - 1)
 
 

@@ -1,13 +1,15 @@
 """The ASGI application; what it needs is given to it."""
 
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
-from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import APIRouter, FastAPI
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import fcslam
 from fcslam.cloud.service.decisions import decision_router
+from fcslam.cloud.service.measures import Measures
 from fcslam.cloud.service.missions import file_router, mission_router
 from fcslam.cloud.service.operations import operations_router
 from fcslam.cloud.service.problems import add_handlers
@@ -57,12 +59,20 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
     app.include_router(operations_router(state))
     for router in more:
         app.include_router(router)
-
-    @app.middleware("http")
-    async def measure(request: Request, call: Callable[[Request], Awaitable[Response]]) -> Response:
-        response = await call(request)
-        if response.status_code >= 400:
-            state.measures.refuse(response.status_code)
-        return response
-
+    app.add_middleware(_RefusalCounter, measures=state.measures)
     return app
+
+
+class _RefusalCounter:
+    """Counts answers that refuse. Plain ASGI: a middleware of Starlette's own base runs a task for every request."""
+
+    def __init__(self, app: ASGIApp, measures: Measures) -> None:
+        self._app, self._measures = app, measures
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def watched(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] >= 400:
+                self._measures.refuse(message["status"])
+            await send(message)
+
+        await self._app(scope, receive, watched)

@@ -1,5 +1,6 @@
 """How much one robot may ask for."""
 
+import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -20,7 +21,7 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 
 class RateLimit:
-    """A bucket for each robot, which requests empty and time fills."""
+    """A bucket for each robot, which requests empty and time fills. Any thread may ask."""
 
     def __init__(
         self, clock: Callable[[], float], bytes_per_s: float = BYTES_PER_S, burst: float = BURST_BYTES
@@ -28,6 +29,7 @@ class RateLimit:
         self._clock, self._rate, self._burst = clock, bytes_per_s, burst
         self._level: dict[str, tuple[float, float]] = {}
         """What is left in each bucket, and when that was."""
+        self._lock = threading.Lock()
 
     @property
     def largest(self) -> int:
@@ -36,13 +38,14 @@ class RateLimit:
 
     def wait_s(self, robot: str, size: int) -> float:
         """Count a request of ``size`` bytes; if it is over the limit, how long to wait, and it is not counted."""
-        now = self._clock()
-        level, then = self._level.get(robot, (self._burst, now))
-        level = min(self._burst, level + (now - then) * self._rate) - REQUEST_BYTES - size
-        if level < 0.0:
-            return -level / self._rate
-        self._level[robot] = level, now
-        return 0.0
+        with self._lock:
+            now = self._clock()
+            level, then = self._level.get(robot, (self._burst, now))
+            level = min(self._burst, level + (now - then) * self._rate) - REQUEST_BYTES - size
+            if level < 0.0:
+                return -level / self._rate
+            self._level[robot] = level, now
+            return 0.0
 
 
 async def read_body(request: Request, longest: int) -> bytes:

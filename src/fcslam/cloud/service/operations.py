@@ -16,7 +16,7 @@ def operations_router(state: ServiceState) -> APIRouter:
 
     @router.get("/healthz", responses=refusals(503))
     def get_health() -> Health:
-        """200 while packets are taken in and the worker runs, 503 otherwise."""
+        """200 while packets are taken in and the worker is ready for them, 503 otherwise."""
         try:
             state.mission.store.turn_count()
         except StoreError as error:
@@ -25,6 +25,8 @@ def operations_router(state: ServiceState) -> APIRouter:
             raise HTTPException(503, "the service is stopping")
         if state.mission.worker.pid is None:
             raise HTTPException(503, "packets are taken in, but the worker is down")
+        if not state.mission.worker.is_ready:
+            raise HTTPException(503, "packets are taken in, but the worker is starting")
         return Health()
 
     @router.get(

@@ -6,9 +6,10 @@ from fastapi import APIRouter, Header, HTTPException, Path, Request
 from fastapi.responses import FileResponse, Response
 from starlette.concurrency import run_in_threadpool
 
+from fcslam.cloud.intake import Answer
 from fcslam.cloud.service.answers import PacketProblem, PacketRefusal, RobotState, content, refusals
 from fcslam.cloud.service.authentication import Role
-from fcslam.cloud.service.limits import read_body
+from fcslam.cloud.service.limits import RateLimit, read_body
 from fcslam.cloud.service.state import ServiceState
 from fcslam.records import NAME, Channel
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, REFUSED_HEADER, read_batch
@@ -46,14 +47,13 @@ def robot_router(state: ServiceState) -> APIRouter:
     ) -> Response:
         """Store a batch of packets; the answer acknowledges what is on disk."""
         body = await read_body(request, MAXIMUM_BATCH_BYTES)
-        size = await run_in_threadpool(_unpacked_size, body)
-        if size > state.rate.largest:
-            raise HTTPException(413, f"the batch unpacks to {size} bytes; send fewer packets at once")
-        wait_s = state.rate.wait_s(robot, size)
-        if wait_s > 0.0:
-            raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
         mission = state.mission
-        answer = await run_in_threadpool(mission.intake.take, robot, agent, body, correction)
+
+        def take() -> Answer:
+            _check_rate(state.rate, robot, body)
+            return mission.intake.take(robot, agent, body, correction)
+
+        answer = await run_in_threadpool(take)
         mission.worker.ring()
         state.measures.answer(robot, answer.batch)
         return Response(answer.batch, media_type=MEDIA_TYPE, headers={REFUSED_HEADER: str(answer.refused)})
@@ -103,6 +103,16 @@ def refused_packets(state: ServiceState, robot: str) -> list[PacketRefusal]:
         PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
         for epoch, sequence, reason in state.mission.store.refusals(robot)
     ]
+
+
+def _check_rate(rate: RateLimit, robot: str, body: bytes) -> None:
+    """Refuse (HTTPException 413, 429) more than the robot may send."""
+    size = _unpacked_size(body)
+    if size > rate.largest:
+        raise HTTPException(413, f"the batch unpacks to {size} bytes; send fewer packets at once")
+    wait_s = rate.wait_s(robot, size)
+    if wait_s > 0.0:
+        raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
 
 
 def _unpacked_size(body: bytes) -> int:

@@ -1,0 +1,118 @@
+"""Compiles, or loads from the cache, all code that packets will need, before the first one comes.
+
+Compiling takes half a minute on a machine that has never done it, loading a second or two: no packet should wait for
+that. Two made-up robots cross a made-up room; nothing of it reaches any mission.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.report import keyscan_track, run_of
+from fcslam.geometry import se2
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.places.matcher import MatcherConfig
+from fcslam.places.vocabulary import VocabularyConfig
+from fcslam.records import (
+    CODE_BYTES,
+    Channel,
+    Constraint,
+    ConstraintKind,
+    FloatArray,
+    Keyscan,
+    KeyscanId,
+    LaserModel,
+    Place,
+    frozen,
+)
+from fcslam.wire.limits import KEYPOINT_AXES
+from fcslam.wire.messages import Body, Hello, Packet
+from fcslam.wire.packets import decode, encode
+from fcslam.wire.quantisation import dequantise, quantise
+
+_WALLS = np.array([
+    (0.0, 0.0, 16.0, 0.0), (16.0, 0.0, 16.0, 9.0), (16.0, 9.0, 0.0, 9.0), (0.0, 9.0, 0.0, 0.0),
+    (4.0, 0.0, 4.0, 1.5), (7.0, 9.0, 8.5, 7.0), (12.0, 0.0, 12.5, 2.0), (13.0, 6.5, 16.0, 6.0),
+])  # fmt: skip
+"""x, y of both ends, metres."""
+_LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
+_STEP_M, _STEPS, _PLACE_EVERY, _AROUND = 0.4, 31, 3, 3
+_LANDMARKS = 120
+_DETECTOR = "made-up-1"
+_MOTION = np.diag((1e4, 1e4, 1e5))
+_CLOSURE_AFTER = 15
+"""Keyscans between the ends of a robot's own closure."""
+
+
+def warm_up_decoding() -> None:
+    """Make ready to take packets in: what the service does with them."""
+    for data in _packets():
+        decode(data)
+
+
+def warm_up_fleet() -> None:
+    """Make ready for all that the worker does: decode, match, verify, solve, decide, map."""
+    vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
+    fleet = Fleet(FleetConfig(matcher=MatcherConfig(small_fleet=0, vocabulary=vocabulary)), seed=0)
+    for data in _packets():
+        fleet.receive(data)
+    result = fleet.finalize()
+    tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+    run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False)
+
+
+def _packets() -> Iterator[bytes]:
+    """Two robots that cross the room in opposite directions, one after the other."""
+    rng = np.random.default_rng(0)
+    along = np.arange(_STEPS) * _STEP_M
+    there = np.column_stack((2.0 + along, np.full(_STEPS, 4.0), np.zeros(_STEPS)))
+    back = np.column_stack((14.0 - along, np.full(_STEPS, 4.5), np.full(_STEPS, np.pi)))
+    codes = rng.integers(0, 256, (_LANDMARKS, CODE_BYTES), dtype=np.uint8)
+    landmarks = rng.uniform((0.0, 0.0, 0.0), (16.0, 9.0, 2.0), (_LANDMARKS, 3))
+    for start_s, (robot, poses) in enumerate((("there", there), ("back", back))):
+        for number, body in enumerate(_bodies(robot, poses, landmarks, codes)):
+            yield encode(Packet(robot, 0, number, 100.0 * start_s + _STEPS, body))
+
+
+def _bodies(robot: str, poses: FloatArray, landmarks: FloatArray, codes: np.ndarray) -> Iterator[Body]:
+    yield Hello(robot, 0, _LASER, dict.fromkeys(Channel, _DETECTOR))
+    for k, pose in enumerate(poses):
+        yield Keyscan(KeyscanId(robot, k), float(k), dequantise(quantise(_ranges(pose))))
+        if k:
+            yield _constraint(robot, poses, k - 1, k, ConstraintKind.ODOMETRY)
+        anchor = k - _AROUND
+        if anchor >= _AROUND and anchor % _PLACE_EVERY == 0:
+            yield from (_place(robot, channel, anchor, poses[anchor], landmarks, codes) for channel in Channel)
+    yield _constraint(robot, poses, 0, _CLOSURE_AFTER, ConstraintKind.CLOSURE)
+
+
+def _constraint(robot: str, poses: FloatArray, i: int, j: int, kind: ConstraintKind) -> Constraint:
+    return Constraint(robot, i, j, kind, frozen(se2.between(poses[i], poses[j])), frozen(_MOTION))
+
+
+def _place(
+    robot: str, channel: Channel, anchor: int, pose: FloatArray, landmarks: FloatArray, codes: np.ndarray
+) -> Place:
+    seen = np.hypot(*(landmarks[:, :2] - pose[:2]).T) < 8.0
+    keypoints = np.column_stack((se2.transform(se2.inverse(pose), landmarks[seen, :2]), landmarks[seen, 2]))
+    return Place(
+        KeyscanId(robot, anchor), channel, _DETECTOR, anchor - _AROUND, anchor + _AROUND,
+        frozen(keypoints[:, : KEYPOINT_AXES[channel]], np.float32), frozen(codes[seen], np.uint8),
+    )  # fmt: skip
+
+
+def _ranges(pose: FloatArray) -> FloatArray:
+    """Distance to the nearest wall along every beam, shape (B,)."""
+    angles = pose[2] + _LASER.angles_rad()
+    beams = np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, np.newaxis]
+    starts, walls = _WALLS[:, :2] - pose[:2], _WALLS[:, 2:] - _WALLS[:, :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        facing = _cross(beams, walls)
+        distance, share = _cross(starts, walls) / facing, _cross(starts, beams) / facing
+    hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
+    return np.asarray(np.where(hit, distance, np.inf).min(axis=1))
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
