@@ -32,7 +32,7 @@ def store(tmp_path):
 
 
 def correction(robot, x, epoch=0):
-    return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, 0, frozen((x, 0.0, 0.0))))
+    return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, 0, frozen((x, 0.0, 0.0)), 0.25))
 
 
 @given(batches=BATCHES)

@@ -39,7 +39,8 @@ CREATE TABLE sessions (
 ) STRICT;
 CREATE TABLE corrections (
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, version INTEGER NOT NULL UNIQUE, time REAL NOT NULL,
-    map_index INTEGER NOT NULL, x REAL NOT NULL, y REAL NOT NULL, theta REAL NOT NULL, PRIMARY KEY (robot, epoch)
+    map_index INTEGER NOT NULL, x REAL NOT NULL, y REAL NOT NULL, theta REAL NOT NULL, quality REAL NOT NULL,
+    PRIMARY KEY (robot, epoch)
 ) STRICT;
 CREATE TABLE vetoes (
     number INTEGER PRIMARY KEY, robot_i TEXT NOT NULL, robot_j TEXT NOT NULL, stamp_i REAL, stamp_j REAL
@@ -201,13 +202,15 @@ class MissionStore:
         with self._database.transaction() as database:
             _remember(database, APPLIED, str(turns))
             for correction in corrections:
-                pose = correction.correction.T_map_odom.tolist()
+                told = correction.correction
+                row = (told.map_index, *told.T_map_odom.tolist(), told.quality)
                 database.execute(
-                    "INSERT INTO corrections SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7"
+                    "INSERT INTO corrections SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7, ?8"
                     " FROM corrections WHERE true ON CONFLICT (robot, epoch) DO UPDATE SET version = excluded.version,"
                     " time = excluded.time, map_index = excluded.map_index, x = excluded.x, y = excluded.y,"
-                    " theta = excluded.theta WHERE (map_index, x, y, theta) IS NOT (?4, ?5, ?6, ?7)",
-                    (correction.robot, correction.epoch, correction.time, correction.correction.map_index, *pose),
+                    " theta = excluded.theta, quality = excluded.quality"
+                    " WHERE (map_index, x, y, theta, quality) IS NOT (?4, ?5, ?6, ?7, ?8)",
+                    (correction.robot, correction.epoch, correction.time, *row),
                 )
 
     def applied(self) -> int:
@@ -216,10 +219,10 @@ class MissionStore:
 
     def correction(self, robot: str, epoch: int) -> SessionCorrection | None:
         """The newest correction of a session."""
-        columns = "time, version, map_index, x, y, theta"
+        columns = "time, version, map_index, quality, x, y, theta"
         statement = f"SELECT {columns} FROM corrections WHERE robot = ? AND epoch = ?"
-        for time, version, map_index, *pose in self._database.rows(statement, (robot, epoch)):
-            return SessionCorrection(robot, epoch, time, Correction(robot, version, map_index, frozen(pose)))
+        for time, version, map_index, quality, *pose in self._database.rows(statement, (robot, epoch)):
+            return SessionCorrection(robot, epoch, time, Correction(robot, version, map_index, frozen(pose), quality))
         return None
 
     def veto(self, veto: Veto) -> None:

@@ -13,10 +13,8 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.mapper import Mapper
-from fcslam.lidar.scan import point_scan
-from fcslam.lidar.submap import build_submap
 from fcslam.lidar.tracker import Sight
-from fcslam.lidar.verification import VerificationConfig, verify
+from fcslam.lidar.verification import verify
 from fcslam.records import FloatArray, LaserScan
 
 
@@ -26,14 +24,14 @@ class LostConfig(Settings):
     doubted: float = Field(
         default=0.8, ge=0, le=1, description="a scan that explains less of the known area is put by; 0: never lost"
     )
-    travel_m: float = Field(default=0.5, ge=0, description="travel over which scans in a row have to be doubted")
+    travel_m: float = Field(default=1.0, ge=0, description="travel over which scans in a row have to be doubted")
     fewest_scans: int = Field(default=5, ge=1, description="and how many at least")
     most_scans: int = Field(default=100, ge=1, description="with so many it is decided, however short the way")
     settled_m: float = Field(default=3.0, ge=0, description="who has mapped less of a way cannot be lost")
     explained: float = Field(
-        default=0.70, ge=0, le=1, description="lost: of the points in known area fewer lie on a surface"
+        default=0.50, ge=0, le=1, description="lost: of the points in known area fewer lie on a surface"
     )
-    violation: float = Field(default=0.10, ge=0, le=1, description="and more of them in free space")
+    violation: float = Field(default=0.30, ge=0, le=1, description="and more of them in free space")
     overlap: float = Field(default=0.25, ge=0, le=1, description="least share of points in known area to tell")
 
 
@@ -50,23 +48,27 @@ def is_enough(scans: Sequence[LaserScan], config: LostConfig) -> bool:
     return bool(far) or len(scans) >= config.most_scans
 
 
-def is_lost(
-    scans: Sequence[LaserScan], T_local_first: FloatArray, mapper: Mapper, config: LostConfig,
-    verification: VerificationConfig,
-) -> bool:  # fmt: skip
+def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, mapper: Mapper, config: LostConfig) -> bool:
     """Whether scans that the mapper has not processed show another place than its newest keyscans.
 
     Args:
-        scans: in a row; over so short a way odometry says how they lie to each other.
+        scans: in a row.
         T_local_first: where the first of them was taken, as the mapper's tracker sees it, shape (3,).
         mapper: of the robot.
         config: what tells two places apart.
-        verification: how the two submaps are aligned.
     """
-    seen, T_local_anchor = mapper.surroundings()
-    first = scans[0].T_odom_base
-    now = build_submap([(point_scan(s.ranges_m, s.laser), se2.between(first, s.T_odom_base)) for s in scans])
-    worse = verify(seen, now, se2.between(T_local_anchor, T_local_first), verification).worse
+    seen, T_local_seen = mapper.surroundings()
+    now, T_first_now = _mapped(scans, mapper).surroundings()
+    predicted = se2.between(T_local_seen, se2.compose(T_local_first, T_first_now))
+    worse = verify(seen, now, predicted, mapper.config.verification).worse
     return (
         worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
     )
+
+
+def _mapped(scans: Sequence[LaserScan], mapper: Mapper) -> Mapper:
+    """A mapper that starts with these scans."""
+    anew = Mapper(mapper.robot, mapper.config)
+    for scan in scans:
+        anew.process(scan)
+    return anew

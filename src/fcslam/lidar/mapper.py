@@ -83,7 +83,7 @@ class Mapper:
 
     def __init__(self, robot: str, config: LidarConfig) -> None:
         self.robot = robot
-        self._config = config
+        self.config = config
         self._tracker = ScanTracker(config.tracker)
         self._closer = LoopCloser(config.closing, config.search, config.verification)
         self._graph = PoseGraph()
@@ -119,7 +119,7 @@ class Mapper:
         """What the robot saw on the last ``submap_reach_m`` of its way, and ``T_local_base`` of the anchor, the newest
         keyscan."""
         anchor = self._local[-1]
-        first = bisect_left(self._travel, self._travel[-1] - self._config.keyscans.submap_reach_m)
+        first = bisect_left(self._travel, self._travel[-1] - self.config.keyscans.submap_reach_m)
         numbers = range(first, len(self._local))
         return build_submap([(self._points[k], se2.between(anchor, self._local[k])) for k in numbers]), anchor
 
@@ -142,7 +142,7 @@ class Mapper:
         if not self._local:
             return True
         motion = se2.between(self._local[-1], tracked.T_local_base)
-        gate = self._config.keyscans
+        gate = self.config.keyscans
         return bool(
             np.hypot(motion[0], motion[1]) >= gate.minimum_travel_distance_m
             or abs(motion[2]) >= gate.minimum_travel_heading_rad
@@ -181,7 +181,7 @@ class Mapper:
 
     def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
         """The next submap, once the robot is far enough past its anchor; closes loops to earlier ones."""
-        gate, travel = self._config.keyscans, self._travel
+        gate, travel = self.config.keyscans, self._travel
         anchor = bisect_left(travel, self._next_anchor_m)
         if anchor == len(travel) or (not at_end and travel[-1] < travel[anchor] + gate.submap_reach_m):
             return None

@@ -93,7 +93,7 @@ class RobotFrontend:
         scans = [record for record in self._put_by if isinstance(record, LaserScan)]
         if not is_enough(scans, config):
             return []
-        if not is_lost(scans, self._T_local_doubted, mapper, config, self._config.lidar.verification):
+        if not is_lost(scans, self._T_local_doubted, mapper, config):
             return self._go_on()
         rest = self._session.finish()
         self._view_finder.forget()
