@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import small_fleet
+from robot.kidnapping import drives, kidnapping
 
-from fcslam.geometry import se2
 from fcslam.lidar.lost import LostConfig
 from fcslam.records import Channel, Constraint, Keyscan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -18,34 +17,14 @@ ROBOT = RobotConfig(channels=LIDAR)
 BLIND = RobotConfig(channels=LIDAR, lost=LostConfig(doubted=0.0))
 
 
-@pytest.fixture(scope="module")
-def drives():
-    """Of two robots in one building."""
-    return [list(robot.scans()) for robot in small_fleet.draw(2, path_length_m=24.0, seed=2).robots]
-
-
-@pytest.fixture(scope="module")
-def kidnapped(drives):
-    """Scans of the one, then of the other, as wheels tell them that never left the floor; when it happened."""
-    before, after = drives[0][:80], drives[1]
-    last = before[-1]
-    after = [
-        replace(scan, stamp=last.stamp + scan.stamp - after[0].stamp + 0.3, T_odom_base=frozen(
-            se2.compose(last.T_odom_base, se2.between(after[0].T_odom_base, scan.T_odom_base))
-        ))
-        for scan in after[1:]
-    ]  # fmt: skip
-    return before + after, last.stamp
-
-
 def driven(records, config=ROBOT):
     robot = RobotFrontend("r", config)
     packets = [packet for record in records for packet in robot.process(record)]
     return robot, packets + robot.finish()
 
 
-def test_a_kidnapped_robot_begins_anew_where_it_was_put_down(kidnapped):
-    scans, moment = kidnapped
+def test_a_kidnapped_robot_begins_anew_where_it_was_put_down():
+    scans, moment = kidnapping()
     robot, packets = driven(scans)
     assert len(robot.tracks) == 2
     first, second = ([packet for packet in packets if packet.epoch == epoch] for epoch in (0, 1))
@@ -61,8 +40,8 @@ def test_a_kidnapped_robot_begins_anew_where_it_was_put_down(kidnapped):
     assert [pose.stamp for track in robot.tracks for pose in track] == [scan.stamp for scan in scans]
 
 
-def test_both_sessions_are_what_two_robots_would_have_said(kidnapped):
-    scans, moment = kidnapped
+def test_both_sessions_are_what_two_robots_would_have_said():
+    scans, moment = kidnapping()
     _, packets = driven(scans)
     cut = next(k for k, scan in enumerate(scans) if scan.stamp > moment)
     alone = [*driven(scans[:cut], BLIND)[1], *driven(scans[cut:], BLIND)[1]]
@@ -74,8 +53,8 @@ def replace_epoch(packet):
     return encode(replace(packet, epoch=0, body=body))
 
 
-def test_who_cannot_be_lost_ties_the_two_places_together(kidnapped):
-    scans, moment = kidnapped
+def test_who_cannot_be_lost_ties_the_two_places_together():
+    scans, moment = kidnapping()
     robot, packets = driven(scans, BLIND)
     assert len(robot.tracks) == 1
     stamps = {p.body.id.number: p.body.stamp for p in packets if isinstance(p.body, Keyscan)}
@@ -83,16 +62,16 @@ def test_who_cannot_be_lost_ties_the_two_places_together(kidnapped):
     assert any(stamps[motion.i] <= moment < stamps[motion.j] for motion in motions)
 
 
-def test_a_drive_without_surprises_says_the_same_whether_it_is_watched_or_not(drives):
-    for scans in drives:
+def test_a_drive_without_surprises_says_the_same_whether_it_is_watched_or_not():
+    for scans in drives():
         robot, watched = driven(scans)
         assert len(robot.tracks) == 1
         assert [encode(packet) for packet in watched] == [encode(packet) for packet in driven(scans, BLIND)[1]]
 
 
-def test_doubt_that_passes_leaves_no_trace(drives):
+def test_doubt_that_passes_leaves_no_trace():
     """Somebody stands before the laser for three scans."""
-    scans = list(drives[0])
+    scans = list(drives()[0])
     for k in range(100, 103):
         close = np.full_like(scans[k].ranges_m, 0.4)
         close[::2] = 0.9
@@ -105,8 +84,8 @@ def test_doubt_that_passes_leaves_no_trace(drives):
     assert [encode(packet) for packet in packets] == [encode(packet) for packet in driven(scans, BLIND)[1]]
 
 
-def test_a_recording_that_ends_in_doubt_is_whole(drives, kidnapped):
-    scans, moment = kidnapped
+def test_a_recording_that_ends_in_doubt_is_whole():
+    scans, moment = kidnapping()
     end = next(k for k, scan in enumerate(scans) if scan.stamp > moment) + 3
     robot, packets = driven(scans[:end])
     assert len(robot.scan_poses) == end

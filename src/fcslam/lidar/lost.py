@@ -61,9 +61,7 @@ def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, mapper: Mappe
     now, T_first_now = _mapped(scans, mapper).surroundings()
     predicted = se2.between(T_local_seen, se2.compose(T_local_first, T_first_now))
     worse = verify(seen, now, predicted, mapper.config.verification).worse
-    return (
-        worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
-    )
+    return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
 
 
 def _mapped(scans: Sequence[LaserScan], mapper: Mapper) -> Mapper:

@@ -70,7 +70,6 @@ class AgentProgress:
     notices: tuple[str, ...]
     """What became of packets for another mission, and of the last detector that was announced, if there were any."""
 
-
     @property
     def whereabouts(self) -> Whereabouts:
         """Whether the robot knows where it is, as far as it needed to find out."""
@@ -152,8 +151,8 @@ class Agent:
         sender = self._sender
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
-            sum(map(len, self._frontend.tracks)), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
-            left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, self.localizer.quality,
+            sum(map(len, self._frontend.tracks)), self._keyscans, self._outbox.waiting, sender.confirmed,
+            sender.sent_bytes, left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, self.localizer.quality,
             len(self._frontend.tracks) - 1, sender.trouble, self._said < self._known,
             tuple(filter(None, (sender.notice, self._releases.notice))),
         )  # fmt: skip

@@ -1,8 +1,8 @@
 """One robot: sensor records in, packets out. It knows no network and no other robot.
 
-While what the robot sees is doubtful (``fcslam.lidar.lost``), records are put by. Either they turn out to belong to what
-came before, and are processed as if nothing had been; or the robot is lost: its session ends where it last knew where it
-was, and a new one begins with them, as after a restart. So no motion that nobody measured enters a map.
+While what the robot sees is doubtful (``fcslam.lidar.lost``), records are put by. Either they turn out to belong to
+what came before, and are processed as if nothing had been; or the robot is lost: its session ends where it last knew
+where it was, and a new one begins with them, as after a restart. So no motion that nobody measured enters a map.
 """
 
 from dataclasses import replace

@@ -2,8 +2,8 @@
 
 A start of the robot is an epoch, and whenever it was lost on the way another one begins: the start's next part. The
 front end counts parts, and the packets of each; here they get the epoch and the sequence by which they travel, in the
-order in which they leave. A packet is forgotten once the cloud has stored it; a digest of it stays, by which a recording
-that is read again is known to say the same.
+order in which they leave. A packet is forgotten once the cloud has stored it; a digest of it stays, by which a
+recording that is read again is known to say the same.
 """
 
 import hashlib
@@ -40,9 +40,9 @@ CREATE TABLE IF NOT EXISTS releases (
 );
 CREATE INDEX IF NOT EXISTS waiting ON packets (epoch, sequence) WHERE data IS NOT NULL;
 """
-# part: the front end's own epoch, 0 where a start begins; ordinal: the front end's own count; sequence: the number on the wire, NULL of a packet that never travels;
-# data: NULL once it need not be sent; met: the cloud has confirmed that the epoch belongs to this start;
-# stored: packets of the epoch, from its first, that the cloud has confirmed.
+# part: the front end's own epoch, 0 where a start begins; ordinal: the front end's own count; sequence: the number on
+# the wire, NULL of a packet that never travels; data: NULL once it need not be sent; met: the cloud has confirmed that
+# the epoch belongs to this start; stored: packets of the epoch, from its first, that the cloud has confirmed.
 
 
 class Batch(NamedTuple):

@@ -37,8 +37,9 @@ class Sender:
         correct: Callable[[int, Correction], None], keep: Callable[[DetectorFile, bytes], None],
         refused: Callable[[bytes, str], None],
     ) -> None:  # fmt: skip
-        """Whom to tell, from where ``step`` is called: ``correct`` of the newest session's corrections and its epoch, ``keep`` of
-        detectors that were announced and fetched, ``refused`` of packets that the cloud will never take, and why."""
+        """Whom to tell, from where ``step`` is called: ``correct`` of the newest session's corrections and its
+        epoch, ``keep`` of detectors that were announced and fetched, ``refused`` of packets that the cloud will never
+        take, and why."""
         self._outbox = outbox
         self._transport = transport
         self._rng = rng
