@@ -152,8 +152,8 @@ class Agent:
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
             sum(map(len, self._frontend.tracks)), self._keyscans, self._outbox.waiting, sender.confirmed,
-            sender.sent_bytes, left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, self.localizer.quality,
-            len(self._frontend.tracks) - 1, sender.trouble, self._said < self._known,
+            sender.sent_bytes, left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s,
+            self.localizer.quality, len(self._frontend.tracks) - 1, sender.trouble, self._said < self._known,
             tuple(filter(None, (sender.notice, self._releases.notice))),
         )  # fmt: skip
 
