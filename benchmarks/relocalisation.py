@@ -95,12 +95,12 @@ def main() -> None:
     for building in chosen.buildings:
         for seed in chosen.seeds:
             drives = recorded(building, seed)
-            for drive in drives:
-                alarms += len(driven(drive, WATCHED)[0].tracks) - 1
-                hours += (drive.scans[-1].stamp - drive.scans[0].stamp) / 3600.0
+            calm = [driven(drive, WATCHED) for drive in drives]
+            alarms += sum(len(sessions) for _, sessions in calm)
+            hours += sum(drive.scans[-1].stamp - drive.scans[0].stamp for drive in drives) / 3600.0
             kidnapped, moment = kidnap(drives[1], drives[2], np.random.default_rng(seed))
             if moment:
-                rows.append(row(building, seed, drives[0], kidnapped, moment, told))
+                rows.append((building, seed, *row((drives[0], kidnapped), calm[0][0], moment, told)))
                 print(*rows[-1], flush=True)
     report.table("Summary", {"": "", "value": ".2f"}, summary(rows, alarms, hours))
     columns = {"corrections": "", "number": "", "quality 0": ".3f", **{f"over {q}": ".3f" for q in QUALITIES},
@@ -142,22 +142,22 @@ def kidnap(a: Drive, b: Drive, rng: np.random.Generator) -> tuple[Drive, int]:
     return Drive(a.name, a.scans[:half] + rest, np.vstack((a.T_building_base[:half], b.T_building_base[start:]))), half
 
 
-def driven(drive: Drive, config: RobotConfig) -> tuple[RobotFrontend, list[Packet], list[int]]:
-    """The robot, what it says, and the scans at which sessions began on the way."""
+def driven(drive: Drive, config: RobotConfig) -> tuple[list[Packet], list[int]]:
+    """What the robot says, and the scans at which sessions began on the way."""
     robot, packets, begun = RobotFrontend(drive.name, config), [], []
     for number, scan in enumerate(drive.scans):
         sessions = len(robot.tracks)
         packets += robot.process(scan)
         begun += [number] * (len(robot.tracks) - sessions)
-    return robot, packets + robot.finish(), begun
+    return packets + robot.finish(), begun
 
 
-def row(building: str, seed: int, other: Drive, drive: Drive, moment: int, told: dict[str, list[Told]]) -> tuple:
-    """One kidnapping."""
-    _, packets, begun = driven(drive, WATCHED)
-    others = driven(other, WATCHED)[1]
-    corrections, errors = mission((other, drive), others, packets)
-    blind_corrections, blind_errors = mission((other, drive), others, driven(drive, BLIND)[1])
+def row(drives: tuple[Drive, Drive], others: list[Packet], moment: int, told: dict[str, list[Told]]) -> tuple:
+    """One kidnapping, of the second of two robots; ``others``: what the first says."""
+    drive = drives[1]
+    packets, begun = driven(drive, WATCHED)
+    corrections, errors = mission(drives, others, packets)
+    blind_corrections, blind_errors = mission(drives, others, driven(drive, BLIND)[0])
     since = drive.scans[moment].stamp
     told["with"] += [one for one in corrections if one.stamp >= since]
     told["without"] += [one for one in blind_corrections if one.stamp >= since]
@@ -173,7 +173,7 @@ def row(building: str, seed: int, other: Drive, drive: Drive, moment: int, told:
         off = first.off_m, np.rad2deg(first.off_rad)
         found = ("right" if first.is_right else "wrong", drive.travel_m(moment, at), *off)
     away = float(np.hypot(*np.diff(drive.T_building_base[moment - 1 : moment + 1, :2], axis=0)[0]))
-    return building, seed, away, *lost, *found, *errors, *blind_errors
+    return away, *lost, *found, *errors, *blind_errors
 
 
 def mission(

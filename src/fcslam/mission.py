@@ -12,7 +12,7 @@ from pydantic import Field
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.cloud.report import Track, run_of, traffic_metrics
-from fcslam.cloud.sessions import check_robot, session_name
+from fcslam.cloud.sessions import check_robot, robot_of, session_name
 from fcslam.config import Settings, dump
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.mapper import ScanPose
@@ -142,7 +142,7 @@ def _check_robots(sources: Sequence[Source]) -> None:
 
 def _check_vetoes(vetoes: Sequence[Veto], robots: Sequence[str]) -> None:
     for name in (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)):
-        if name not in robots:
+        if robot_of(name) not in robots:
             raise ConfigError(f"a veto names '{name}', but the robots are {', '.join(robots)}")
 
 
