@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 import yaml
+from robot.kidnapping import kidnapping
 
 from fcslam import mission
 from fcslam.errors import FcslamError, PacketError, SourceError
 from fcslam.mission import MissionConfig, run_mission
-from fcslam.records import ClosureStatus
+from fcslam.records import Channel, ClosureStatus, Veto
 from fcslam.runs import write_run
 from fcslam.sources import open_source, write_carmen
 
@@ -33,6 +34,27 @@ def test_the_same_seed_gives_the_same_bytes(run, logs, tmp_path):
     assert {"robots.csv", "closures.csv", "pose_graph.g2o", "metrics.json", "config.yaml", "map.pgm", "map.png"} <= set(
         one
     )
+
+
+class Kidnapped:
+    """A recording of a robot that was put down elsewhere."""
+
+    name = "r"
+
+    def records(self):
+        return iter(kidnapping()[0])
+
+
+def test_a_robot_that_was_lost_is_two_sessions_that_a_veto_may_name():
+    settings = MissionConfig()
+    robot = settings.robot.model_copy(update={"channels": (Channel.LIDAR,)})
+    run = run_mission([Kidnapped()], settings.model_copy(update={"robot": robot}), vetoes=[Veto("r", "r+1")])
+    scans, moment = kidnapping()
+    first, second = run.trajectories
+    assert (first.robot, second.robot) == ("r", "r+1")
+    assert [*first.stamps, *second.stamps] == [scan.stamp for scan in scans]
+    assert first.stamps[-1] == moment
+    assert first.map_index != second.map_index
 
 
 def test_the_watcher_sees_all_scans_and_then_that_the_cloud_fuses(logs):

@@ -12,9 +12,10 @@ from pydantic import Field
 
 from fcslam.cloud.fleet import Fleet, FleetConfig
 from fcslam.cloud.report import Track, run_of, traffic_metrics
-from fcslam.cloud.sessions import check_robot
+from fcslam.cloud.sessions import check_robot, robot_of, session_name
 from fcslam.config import Settings, dump
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
+from fcslam.lidar.mapper import ScanPose
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.records import Keyscan, LaserScan, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -76,7 +77,9 @@ def run_mission(
             raise FcslamError(f"{packet.robot}: the cloud refused a packet: {reply.refusal}")
     meter.tell(fusing=True)
     scans = (Metric("scans", meter.scans, "1"), Metric("recorded_time", meter.recorded_s, "s"))
-    tracks = {robot.robot: _track(robot) for robot in robots}
+    tracks = {
+        session_name(robot.robot, epoch): _track(poses) for robot in robots for epoch, poses in enumerate(robot.tracks)
+    }
     metrics = (*scans, *traffic_metrics(transport.ledger(), tracks))
     return run_of(cloud.finalize(), tracks, metrics, dump(config), config.map)
 
@@ -139,12 +142,11 @@ def _check_robots(sources: Sequence[Source]) -> None:
 
 def _check_vetoes(vetoes: Sequence[Veto], robots: Sequence[str]) -> None:
     for name in (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)):
-        if name not in robots:
+        if robot_of(name) not in robots:
             raise ConfigError(f"a veto names '{name}', but the robots are {', '.join(robots)}")
 
 
-def _track(robot: RobotFrontend) -> Track:
-    poses = robot.scan_poses
+def _track(poses: Sequence[ScanPose]) -> Track:
     return Track(
         np.array([pose.stamp for pose in poses]),
         np.array([pose.keyscan for pose in poses], dtype=np.int64),

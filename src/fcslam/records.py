@@ -260,3 +260,7 @@ class Correction:
     """Tells apart maps that are not joined yet; it may change when maps join."""
     T_map_odom: FloatArray
     """``odom`` here is the chain of the robot's own motions between keyscans, from zero at its first."""
+    quality: float = 0.0
+    """How well others bear it out, in [0, 1]: of what the session saw at its newest place that others have seen as
+    well, the share that lies where they saw it, times 1 - 2^-n with n closures to others. 0: none holds it in the map.
+    """

@@ -31,8 +31,8 @@ def store(tmp_path):
     store.close()
 
 
-def correction(robot, x, epoch=0, y=0.0, theta=0.0, map_index=0):
-    return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, map_index, frozen((x, y, theta))))
+def correction(robot, x, epoch=0, y=0.0, theta=0.0, map_index=0, quality=0.25):
+    return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, map_index, frozen((x, y, theta)), quality))
 
 
 @given(batches=BATCHES)

@@ -1,19 +1,21 @@
 """A robot maps the same whether its cloud is there, slow, or away, and comes back where it was."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import small_fleet
 from features.networks import tiny_network
 from robot.fake_cloud import FakeCloud, Network, content
+from robot.kidnapping import kidnapping
 from wire.examples import CORRECTION
 
 from fcslam.errors import CloudError, StateError
 from fcslam.features.release import file_of
 from fcslam.geometry import se2
 from fcslam.records import Channel, Place
-from fcslam.robot.agent import Agent, Pace
+from fcslam.robot.agent import Agent, Pace, Whereabouts
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
 from fcslam.wire.messages import Hello
@@ -181,10 +183,12 @@ def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
 def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tmp_path):
     tiny_network(tmp_path / "tiny.onnx", version="tiny-2")
     file = file_of(tmp_path / "tiny.onnx")
-    cloud = FakeCloud(releases={file: (tmp_path / "tiny.onnx").read_bytes()})
+    cloud = FakeCloud()
 
     def patient(records):
         for number, record in enumerate(records):
+            if number == 20:
+                cloud.releases = {file: (tmp_path / "tiny.onnx").read_bytes()}
             while number == 20 and not list((tmp_path / "detectors").glob("*.onnx")):
                 threading.Event().wait(0.01)
             yield record
@@ -195,6 +199,35 @@ def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tm
     hellos = [decode(data).body for data in cloud.stored.values() if isinstance(decode(data).body, Hello)]
     assert [hello.detector_versions[Channel.CAMERA] == "tiny-2" for hello in hellos] == [False, True]
     assert agent.progress().notices == ("detector tiny-2 from now on",)
+
+
+def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
+    """Put down elsewhere and, after another while, stopped and resumed: each part travels in an epoch of its own."""
+    scans, moment = kidnapping()
+    cloud = FakeCloud()
+    with pytest.raises(KeyboardInterrupt):
+        drive(tmp_path, Network(cloud), stop_after(scans, len(scans) - 5))
+    seen = []
+    agent = drive(tmp_path, Network(cloud), scans, resume=True, watch=lambda now: seen.append(now.whereabouts))
+    frontend = RobotFrontend("alice", RobotConfig())
+    said = [packet for scan in scans for packet in frontend.process(scan)] + frontend.finish()
+    assert {packet.epoch for packet in said} == {0, 1}
+    assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(said)]
+    assert list(cloud.stored) == [(packet.epoch, packet.sequence) for packet in said]
+    assert list(dict.fromkeys(seen)) == [Whereabouts.MAPPING, Whereabouts.LOST]
+    assert agent.trajectory() is None
+    newest = agent.localizer
+    agent._localizer(0).correct(replace(CORRECTION, map_index=1))
+    agent._localizer(1).correct(replace(CORRECTION, quality=0.5))
+    now = agent.progress()
+    assert agent.localizer is newest
+    assert (now.whereabouts, now.quality, now.map_index, now.times_lost) == (Whereabouts.RELOCALISED, 0.5, 0, 1)
+    stamps, poses = agent.trajectory()
+    assert stamps[0] > moment, "where it was before is known in another map only"
+    assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
+    agent._localizer(0).correct(replace(CORRECTION, version=CORRECTION.version + 1))
+    stamps, _ = agent.trajectory()
+    assert np.array_equal(stamps, [scan.stamp for scan in scans])
 
 
 def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, tmp_path):

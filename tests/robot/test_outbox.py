@@ -115,12 +115,44 @@ def test_oldest_first_one_epoch_a_batch_and_within_the_limits(outbox, path):
     again.begin("another", resume=False)
     assert again.epoch == 1
     again.put([said(k, LIDAR_PLACE) for k in range(3)])
+    assert again.batch(MAXIMUM_BATCH_BYTES, 100) is None, "whose epochs these are the cloud has not said"
+    again.meet({})
     first = again.batch(MAXIMUM_BATCH_BYTES, 100)
     assert (first.epoch, first.first, len(first.packets)) == (0, 0, 5)
     size = len(first.packets[1]) + 4
     assert len(again.batch(2 * size + 1, 100).packets) == 2
     assert len(again.batch(1, 100).packets) == 1, "one is better than none"
     assert list(drain(again, 2)) == [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (1, 0), (1, 1), (1, 2)]
+
+
+def of_part(part, *ordinals):
+    return [replace(said(ordinal), epoch=part) for ordinal in ordinals]
+
+
+def test_a_robot_that_was_lost_goes_on_in_the_next_epoch(outbox, path):
+    outbox.meet({})
+    outbox.put([*of_part(0, 0, 1), *of_part(1, 0)])
+    assert (outbox.epoch, outbox.is_met) == (1, False)
+    assert list(drain(outbox)) == [(0, 0), (0, 1)], "of the new one the cloud does not know yet"
+    outbox.meet({0: 2, 1: 5})
+    assert (outbox.epoch, outbox.is_met) == (2, True), "another state folder had that one"
+    assert [outbox.part(epoch) for epoch in (0, 1, 2)] == [0, None, 1]
+    assert list(drain(outbox)) == [(2, 0)]
+    outbox.close()
+    again = Outbox(path, "alice", LIMIT)
+    assert again.begin("r", resume=True) == 3
+    assert again.epoch == 2
+    again.put([*of_part(0, 0, 1), *of_part(1, 0, 1), *of_part(2, 0)])
+    again.meet({0: 2, 1: 5, 2: 1})
+    assert list(drain(again)) == [(2, 1), (3, 0)]
+    again.close()
+    anew = Outbox(path, "alice", LIMIT)
+    assert anew.begin("r", resume=False) == 0
+    anew.put(of_part(0, 0))
+    assert [anew.part(epoch) for epoch in (0, 2, 3, 4)] == [None, None, None, 0]
+    with pytest.raises(StateError, match="not what this recording said"):
+        anew.put([replace(said(0, KEYSCAN), epoch=0)])
+    anew.close()
 
 
 def test_an_epoch_that_the_cloud_knows_from_before_is_not_taken_again(outbox):
@@ -188,6 +220,7 @@ def test_a_full_outbox_leaves_places_out_and_keeps_the_chain(path):
     outbox.close()
     outbox = Outbox(path, "alice", 20 * size)
     assert outbox.begin("r", resume=True) == 23
+    outbox.meet({})
     stored = drain(outbox)
     assert list(stored) == [(0, number) for number in range(21)], "no gap where places were left out"
     assert not any(decode(data).body == LIDAR_PLACE for data in stored.values())
@@ -259,6 +292,7 @@ def test_a_killed_robot_has_all_that_it_put(path):
             writer.send_signal(signal.SIGKILL)
         most = max(most, put)
         outbox = Outbox(path, "alice", LIMIT)
+        outbox.meet({})
         (first, *_, last) = (decode(data).sequence for data in outbox.batch(10**9, 10**9).packets)
         assert (first, last + 1) == (0, outbox.waiting.packets)
         assert last >= most

@@ -28,7 +28,8 @@ class Robot:
         self.known = self.outbox.begin("r", resume=path.with_name("resumed").exists())
         path.with_name("resumed").touch()
         self.sender = Sender(
-            self.outbox, network, np.random.default_rng(0), lambda: self.now, self.corrections.append,
+            self.outbox, network, np.random.default_rng(0), lambda: self.now,
+            lambda _, correction: self.corrections.append(correction),
             lambda file, content: self.kept.append((file, content)),
             lambda data, reason: self.aside((content(data), reason)),
         )  # fmt: skip

@@ -64,7 +64,7 @@ CAMERA_PLACE = Place(
     frozen([[2.5, -1.25, 0.75], [3.0, 0.0, 1.5]], np.float32),
     frozen(np.arange(64).reshape(2, 32), np.uint8),
 )
-CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]))
+CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]), 0.75)
 ACKNOWLEDGEMENT = Acknowledgement("alice", 7, 41)
 RELEASE = Release("alice", DetectorFile(Channel.CAMERA, "light-0a1b2c3d4e5f", 1, 1588335, bytes(range(32))))
 

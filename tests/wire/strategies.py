@@ -104,7 +104,7 @@ def bodies(robot, epoch, time):
         st.builds(Keyscan, identity, stamps, codes().map(dequantise)),
         constraints(robot),
         places(robot),
-        st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses()),
+        st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),
         st.builds(Acknowledgement, st.just(robot), SEQUENCES, SEQUENCES),
         st.builds(Release, st.just(robot), detector_files()),
     )

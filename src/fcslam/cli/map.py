@@ -155,6 +155,8 @@ def _what(progress: "Progress", elapsed_s: float) -> str:
 def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, joined: bool) -> None:
     from rich.table import Table
 
+    from fcslam.cloud.sessions import robot_of
+
     values = {metric.name: metric.value for metric in run.metrics}
     table = Table("robot", "map", "path, m", "scans")
     for trajectory in run.trajectories:
@@ -169,6 +171,12 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, join
         highlight=False,
         soft_wrap=True,
     )
+    for session in run.trajectories:
+        if robot_of(session.robot) != session.robot:
+            console.print(
+                f"{session.robot}: {robot_of(session.robot)} was lost, and began anew at {session.stamps[0]:.3f}",
+                highlight=False, soft_wrap=True,
+            )  # fmt: skip
     maps = int(values["maps"])
     if maps > 1:
         why = (

@@ -278,19 +278,30 @@ def _progress(console: "Console", total: int) -> "Iterator[AgentWatch]":
     ]  # fmt: skip
     trouble: str | None = "connecting"
     notices: tuple[str, ...] = ()
+    whereabouts, times_lost = "mapping", 0
     with progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=total, stage="mapping", what="")
 
         def watch(now: "AgentProgress") -> None:
-            nonlocal trouble, notices
+            nonlocal trouble, notices, whereabouts, times_lost
             lines = [now.trouble or "connected"] * (now.trouble != trouble)
+            if (now.whereabouts, now.times_lost) != (whereabouts, times_lost):
+                lines.append(_found(now))
+            whereabouts, times_lost = now.whereabouts, now.times_lost
             for line in [*lines, *(notice for notice in now.notices if notice not in notices)]:
                 console.print(line, highlight=False, markup=False, soft_wrap=True)
             trouble, notices = now.trouble, now.notices
-            stage = "catching up" if now.catching_up else "mapping" if now.scans < total else "sending"
+            stage = "catching up" if now.catching_up else str(now.whereabouts) if now.scans < total else "sending"
             bar.update(task, completed=now.scans, stage=stage, what=_what(now))
 
         yield watch
+
+
+def _found(now: "AgentProgress") -> str:
+    """What a robot that was lost knows of its place."""
+    if now.quality > 0.0:
+        return f"relocalised in map {now.map_index}, quality {now.quality:.2f}"
+    return "lost: this is not the place of before; a new session begins here"
 
 
 def _what(now: "AgentProgress") -> str:
@@ -299,7 +310,9 @@ def _what(now: "AgentProgress") -> str:
         f"{now.sent_bytes / 1e3:.0f} kB sent",
         f"{now.confirmed} packets confirmed",
         f"{now.waiting.packets} waiting",
-        "alone" if now.map_index is None else f"map {now.map_index}, corrected {now.correction_age_s or 0.0:.0f} s ago",
+        "alone"
+        if now.map_index is None
+        else f"map {now.map_index}, quality {now.quality:.2f}, corrected {now.correction_age_s or 0.0:.0f} s ago",
     ]
     told += [f"{now.left_out} places left out"] if now.left_out else []
     told += [f"{now.refused} refused"] if now.refused else []
@@ -322,6 +335,9 @@ def _report(recording: "Source", agent: "Agent", state: Path, server: str) -> No
         console.print(f"{now.left_out} places were left out: too much waited, or the budget was spent", highlight=False)
     if now.refused:
         console.print(f"{now.refused} packets were refused: {state / 'refused'}", highlight=False, soft_wrap=True)
+    if now.times_lost:
+        lost = f"lost {now.times_lost} times" if now.times_lost > 1 else "lost once"
+        console.print(f"{lost}; {_found(now)}", highlight=False)
     trajectory = agent.trajectory()
     if trajectory is not None:
         write_tum(state / "trajectory.tum", *trajectory)

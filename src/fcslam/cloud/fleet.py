@@ -22,13 +22,14 @@ from fcslam.cloud.robots import RobotStore
 from fcslam.cloud.sessions import in_session, robot_of, session_name
 from fcslam.cloud.strategy import FusionStrategy
 from fcslam.cloud.submaps import SubmapShelf
+from fcslam.cloud.support import Support
 from fcslam.cloud.verdict import reconsider
 from fcslam.cloud.visits import Visit, visits_near
 from fcslam.config import Settings
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
-from fcslam.places.matcher import MatcherConfig, PlaceMatcher
+from fcslam.places.matcher import MatcherConfig, PlaceMatch, PlaceMatcher
 from fcslam.places.thinning import crowded_out
 from fcslam.records import (
     Channel,
@@ -96,6 +97,7 @@ class Fleet:
         self._store = RobotStore()
         self._graph = JointGraph()
         self._ledger = ClosureLedger()
+        self._support = Support(self._graph, config.surprise_m, config.surprise_rad)
         self._submaps = SubmapShelf(self._store, self._graph, config.submaps_kept)
         self._matchers: dict[_Words, PlaceMatcher] = {}
         """Words of different channels or detectors are never compared."""
@@ -239,6 +241,7 @@ class Fleet:
 
     def _add_place(self, place: Place) -> None:
         """Match a place (Algorithm 1), judge what it brings, join maps, optimise."""
+        matches: list[PlaceMatch] = []
         if self._config.join_maps and self._store.hold(place):
             words = place.channel, place.detector_version
             matcher = self._matcher(words)
@@ -254,6 +257,7 @@ class Fleet:
             self._optimize()
         if self._doubted and len(self._ledger) >= self._patience:
             self._reconsider()
+        self._support.weigh(matches, self._map_of(place.id.robot))
 
     def _thin(self, words: _Words, robot: str) -> None:
         """Forget the oldest places of a robot's sessions in one map where it has very many."""
@@ -391,7 +395,8 @@ class Fleet:
         return [encode(Packet(robot, epoch, first + k, packet.time, body)) for k, body in enumerate(bodies)]
 
     def _correction(self, session: str, map_index: int) -> Correction:
-        return Correction(session, self._version, map_index, frozen(self._graph.T_map_odom(session)))
+        quality = self._support.quality(session, self._map_of(session), self._ledger)
+        return Correction(session, self._version, map_index, frozen(self._graph.T_map_odom(session)), quality)
 
     def _newer_detectors(self, session: str) -> list[DetectorFile]:
         """Of the channels that the robot has."""

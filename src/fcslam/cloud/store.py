@@ -24,9 +24,10 @@ APPLIED = "applied"
 CONFIG = "config"
 """A fact: the mission's configuration."""
 
-NEWS_M, NEWS_RAD = 1e-3, 1e-5
-"""A correction that differs from the last one by less is none: 100 m from the origin of `odom` both are 1 mm. Without a
-closure it is the same but for rounding, and each robot would be told so with every answer."""
+NEWS_M, NEWS_RAD, NEWS_QUALITY = 1e-3, 1e-5, 0.02
+"""A correction that differs from the last one by less is none: 100 m from the origin of `odom` the first two are 1 mm.
+Without a closure it is the same but for rounding, and each robot would be told so with every answer. Whether anybody
+bears it out is always news."""
 
 _VERSION = 2
 
@@ -44,7 +45,8 @@ CREATE TABLE sessions (
 ) STRICT;
 CREATE TABLE corrections (
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, version INTEGER NOT NULL UNIQUE, time REAL NOT NULL,
-    map_index INTEGER NOT NULL, x REAL NOT NULL, y REAL NOT NULL, theta REAL NOT NULL, PRIMARY KEY (robot, epoch)
+    map_index INTEGER NOT NULL, x REAL NOT NULL, y REAL NOT NULL, theta REAL NOT NULL, quality REAL NOT NULL,
+    PRIMARY KEY (robot, epoch)
 ) STRICT;
 CREATE TABLE vetoes (
     number INTEGER PRIMARY KEY, robot_i TEXT NOT NULL, robot_j TEXT NOT NULL, stamp_i REAL, stamp_j REAL
@@ -206,18 +208,20 @@ class MissionStore:
         return hello
 
     def progress(self, turns: int, corrections: Sequence[SessionCorrection]) -> None:
-        """So many turns have taken effect; corrections that changed by ``NEWS_M`` or ``NEWS_RAD`` get a new version."""
+        """So many turns have taken effect; corrections that are news get a new version."""
         with self._database.transaction() as database:
             _remember(database, APPLIED, str(turns))
             for correction in corrections:
-                news = correction.correction
+                told = correction.correction
+                row = (told.map_index, *told.T_map_odom.tolist(), told.quality)
                 database.execute(
-                    "INSERT INTO corrections SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7"
+                    "INSERT INTO corrections SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7, ?8"
                     " FROM corrections WHERE true ON CONFLICT (robot, epoch) DO UPDATE SET version = excluded.version,"
                     " time = excluded.time, map_index = excluded.map_index, x = excluded.x, y = excluded.y,"
-                    " theta = excluded.theta WHERE map_index != ?4"
-                    f" OR max(abs(x - ?5), abs(y - ?6)) >= {NEWS_M} OR abs(theta - ?7) >= {NEWS_RAD}",
-                    (correction.robot, correction.epoch, correction.time, news.map_index, *news.T_map_odom.tolist()),
+                    " theta = excluded.theta, quality = excluded.quality WHERE map_index != ?4"
+                    f" OR max(abs(x - ?5), abs(y - ?6)) >= {NEWS_M} OR abs(theta - ?7) >= {NEWS_RAD}"
+                    f" OR abs(quality - ?8) >= {NEWS_QUALITY} OR (quality = 0) != (?8 = 0)",
+                    (correction.robot, correction.epoch, correction.time, *row),
                 )
 
     def applied(self) -> int:
@@ -226,10 +230,10 @@ class MissionStore:
 
     def correction(self, robot: str, epoch: int) -> SessionCorrection | None:
         """The newest correction of a session."""
-        columns = "time, version, map_index, x, y, theta"
+        columns = "time, version, map_index, quality, x, y, theta"
         statement = f"SELECT {columns} FROM corrections WHERE robot = ? AND epoch = ?"
-        for time, version, map_index, *pose in self._database.rows(statement, (robot, epoch)):
-            return SessionCorrection(robot, epoch, time, Correction(robot, version, map_index, frozen(pose)))
+        for time, version, map_index, quality, *pose in self._database.rows(statement, (robot, epoch)):
+            return SessionCorrection(robot, epoch, time, Correction(robot, version, map_index, frozen(pose), quality))
         return None
 
     def veto(self, veto: Veto) -> None:

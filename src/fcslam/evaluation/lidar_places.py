@@ -14,6 +14,7 @@ from fcslam.errors import EvaluationError
 from fcslam.evaluation.place_scoring import DescribedSet, PlaceFeatures
 from fcslam.evaluation.place_sets import PlaceSet
 from fcslam.features.codes import mutual_matches
+from fcslam.lidar.lost import LostConfig
 from fcslam.metrics.retrieval import PairTruth
 from fcslam.places.hypotheses import HypothesisConfig, propose
 from fcslam.places.motions import MotionConfig
@@ -39,7 +40,8 @@ def describe_recording(recording: Path) -> DescribedSet:
         EvaluationError: it has no two places.
     """
     source = open_source(recording)
-    robot = RobotFrontend(source.name, RobotConfig(channels=(Channel.LIDAR,)))
+    config = RobotConfig(channels=(Channel.LIDAR,), lost=LostConfig(doubted=0.0))  # one session, whatever happens
+    robot = RobotFrontend(source.name, config)
     packets: list[Packet] = []
     for record in source.records():
         packets += robot.process(record)

@@ -14,8 +14,8 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.closing import Anchored, ClosingConfig, Closure, LoopCloser
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.scan import PointScan, point_scan
-from fcslam.lidar.submap import build_submap
-from fcslam.lidar.tracker import ScanTracker, Tracked, TrackerConfig, odometry_information
+from fcslam.lidar.submap import Submap, build_submap
+from fcslam.lidar.tracker import ScanTracker, Sight, Tracked, TrackerConfig, odometry_information
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, KeyscanId, LaserScan, Ranges, frozen
 
@@ -83,7 +83,7 @@ class Mapper:
 
     def __init__(self, robot: str, config: LidarConfig) -> None:
         self.robot = robot
-        self._config = config
+        self.config = config
         self._tracker = ScanTracker(config.tracker)
         self._closer = LoopCloser(config.closing, config.search, config.verification)
         self._graph = PoseGraph()
@@ -95,14 +95,33 @@ class Mapper:
         self._next_anchor_m = 0.0
         self._unsolved = 0
 
-    def process(self, scan: LaserScan) -> Step:
-        """Take in the next scan."""
-        tracked = self._tracker.track(scan)
+    def look(self, scan: LaserScan) -> Sight:
+        """The next scan, which leaves no trace before it is processed."""
+        return self._tracker.look(scan)
+
+    def process(self, scan: LaserScan, sight: Sight | None = None) -> Step:
+        """Take in the next scan, as it was seen if it was looked at before."""
+        sight = self._tracker.look(scan) if sight is None else sight
+        self._tracker.follow(sight)
+        tracked = sight.tracked
         if not self._is_keyscan(tracked):
             return Step(self._scan_pose(scan.stamp, tracked))
         keyscan, odometry = self._add_keyscan(scan, tracked)  # pose graph grows
         submap = self._finish_submap()  # loops are closed between submaps
         return Step(self._scan_pose(scan.stamp, tracked), keyscan, odometry, submap)
+
+    @property
+    def travel_m(self) -> float:
+        """Path length up to the newest keyscan; turning counts a little."""
+        return self._travel[-1] if self._travel else 0.0
+
+    def surroundings(self) -> tuple[Submap, FloatArray]:
+        """What the robot saw on the last ``submap_reach_m`` of its way, and ``T_local_base`` of the anchor, the newest
+        keyscan."""
+        anchor = self._local[-1]
+        first = bisect_left(self._travel, self._travel[-1] - self.config.keyscans.submap_reach_m)
+        numbers = range(first, len(self._local))
+        return build_submap([(self._points[k], se2.between(anchor, self._local[k])) for k in numbers]), anchor
 
     def finish(self) -> list[FinishedSubmap]:
         """The submaps still open at the end of the recording."""
@@ -123,7 +142,7 @@ class Mapper:
         if not self._local:
             return True
         motion = se2.between(self._local[-1], tracked.T_local_base)
-        gate = self._config.keyscans
+        gate = self.config.keyscans
         return bool(
             np.hypot(motion[0], motion[1]) >= gate.minimum_travel_distance_m
             or abs(motion[2]) >= gate.minimum_travel_heading_rad
@@ -162,7 +181,7 @@ class Mapper:
 
     def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
         """The next submap, once the robot is far enough past its anchor; closes loops to earlier ones."""
-        gate, travel = self._config.keyscans, self._travel
+        gate, travel = self.config.keyscans, self._travel
         anchor = bisect_left(travel, self._next_anchor_m)
         if anchor == len(travel) or (not at_end and travel[-1] < travel[anchor] + gate.submap_reach_m):
             return None

@@ -43,6 +43,21 @@ class Tracked:
     """The scan's points; None if the robot stands still and nothing had to be computed."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One scan as the tracker sees it; it goes on from there once it is told to follow."""
+
+    tracked: Tracked
+    explained: float
+    """Share of the scan's points that lie on a surface of the running buffer, matched or not."""
+    known: float
+    """Share of them that fall near any surface; NaN, as ``explained``, if the scan was not matched."""
+    T_odom_base: FloatArray
+    moved_m: float
+    """Since the last match that was believed, by odometry; 0 if this is one."""
+    turned_rad: float
+
+
 class ScanTracker:
     """Tracks one robot in a running buffer of keyscans (Karto), kept as two overlapping surfel fields.
 
@@ -60,18 +75,32 @@ class ScanTracker:
 
     def track(self, scan: LaserScan) -> Tracked:
         """Pose of the next scan."""
-        T_local_guess = self._predict(scan)
-        if self._fields and self._moved_m < self._config.still_m and self._turned_rad < self._config.still_rad:
-            self._T_local_base = T_local_guess
-            return Tracked(T_local_guess, np.zeros((3, 3)), None)
+        sight = self.look(scan)
+        self.follow(sight)
+        return sight.tracked
+
+    def look(self, scan: LaserScan) -> Sight:
+        """The next scan, which leaves no trace before ``follow``."""
+        T_local_guess, moved_m, turned_rad = self._predict(scan)
+        if self._fields and moved_m < self._config.still_m and turned_rad < self._config.still_rad:
+            tracked = Tracked(T_local_guess, np.zeros((3, 3)), None)
+            return Sight(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad)
         points = point_scan(scan.ranges_m, scan.laser)
-        match = self._match(points, T_local_guess) if self._fields else None
-        if match is None:
-            self._T_local_base = T_local_guess
-            return Tracked(T_local_guess, np.zeros((3, 3)), points)
-        self._moved_m = self._turned_rad = 0.0
-        self._T_local_base = match.T_field_base
-        return Tracked(match.T_field_base, match.information, points)
+        if not self._fields:
+            tracked = Tracked(T_local_guess, np.zeros((3, 3)), points)
+            return Sight(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad)
+        match = self._match(points, T_local_guess, odometry_information(moved_m, turned_rad))
+        if match.explained < self._config.supported:
+            tracked = Tracked(T_local_guess, np.zeros((3, 3)), points)
+            return Sight(tracked, match.explained, match.known, scan.T_odom_base, moved_m, turned_rad)
+        tracked = Tracked(match.T_field_base, match.information, points)
+        return Sight(tracked, match.explained, match.known, scan.T_odom_base, 0.0, 0.0)
+
+    def follow(self, sight: Sight) -> None:
+        """The robot is where ``look`` saw it."""
+        self._T_local_base = sight.tracked.T_local_base
+        self._T_odom_base = sight.T_odom_base
+        self._moved_m, self._turned_rad = sight.moved_m, sight.turned_rad
 
     def insert(self, points: PointScan, T_local_base: FloatArray) -> None:
         """Add a keyscan to the running buffer."""
@@ -83,20 +112,17 @@ class ScanTracker:
             field.insert(points, T_local_base)
         self._fields = [(field, count + 1) for field, count in self._fields]
 
-    def _predict(self, scan: LaserScan) -> FloatArray:
-        """The last pose carried on by odometry."""
+    def _predict(self, scan: LaserScan) -> tuple[FloatArray, float, float]:
+        """The last pose carried on by odometry; how far and how much that leads from the last match."""
         last = scan.T_odom_base if self._T_odom_base is None else self._T_odom_base
         motion = se2.between(last, scan.T_odom_base)
-        self._T_odom_base = scan.T_odom_base
-        self._moved_m += float(np.hypot(motion[0], motion[1]))
-        self._turned_rad += abs(float(motion[2]))
-        return se2.compose(self._T_local_base, motion)
+        moved_m = self._moved_m + float(np.hypot(motion[0], motion[1]))
+        return se2.compose(self._T_local_base, motion), moved_m, self._turned_rad + abs(float(motion[2]))
 
-    def _match(self, points: PointScan, T_local_guess: FloatArray) -> ScanMatch | None:
-        """Gauss-Newton from the guess; correlative search where that is doubtful; None if nothing supports a match."""
+    def _match(self, points: PointScan, T_local_guess: FloatArray, prior: FloatArray) -> ScanMatch:
+        """Gauss-Newton from the guess; correlative search where that is doubtful."""
         config, field = self._config, self._fields[0][0]
         thinned = points.thinned(config.point_spacing_m, config.point_limit)
-        prior = odometry_information(self._moved_m, self._turned_rad)
         match = match_scan(thinned, field, T_local_guess, prior, config.matching)
         if self._is_doubtful(match, T_local_guess):
             window = SearchWindow(config.search_radius_m, config.search_angle_rad)
@@ -104,7 +130,7 @@ class ScanTracker:
             other = match_scan(thinned, field, found.T_field_base, np.zeros((3, 3)), config.matching)
             if other.explained > match.explained + 0.05:
                 match = other
-        return match if match.explained >= config.supported else None
+        return match
 
     def _is_doubtful(self, match: ScanMatch, T_local_guess: FloatArray) -> bool:
         step = se2.between(T_local_guess, match.T_field_base)

@@ -8,12 +8,13 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
 
 from fcslam.errors import StateError
-from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, LaserScan, SensorRecord
+from fcslam.records import Constraint, ConstraintKind, Correction, FloatArray, Keyscan, LaserScan, SensorRecord
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.localization import Localizer
@@ -27,6 +28,17 @@ LOOK_EVERY_S = 0.1
 """How often what waits for the sender looks after it."""
 FAREWELL_S = 2.0
 """How long a request under way may take when the robot stops; what it brought is sent again next time."""
+
+
+class Whereabouts(StrEnum):
+    """Whether a robot knows where it is."""
+
+    MAPPING = "mapping"
+    """It has not been lost."""
+    LOST = "lost"
+    """It maps, but how that lies to the fleet's map, and to what it mapped before, nobody knows yet."""
+    RELOCALISED = "relocalised"
+    """It was lost, and the cloud has found it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +59,10 @@ class AgentProgress:
     map_index: int | None
     """Which of the fleet's maps the robot is in; None: the cloud has not said."""
     correction_age_s: float | None
+    quality: float
+    """How well the newest correction is borne out, in [0, 1], as in ``Correction``."""
+    times_lost: int
+    """How often it was lost since it started."""
     trouble: str | None
     """Why nothing gets through; None: it does."""
     catching_up: bool
@@ -54,6 +70,13 @@ class AgentProgress:
     notices: tuple[str, ...]
     """What became of packets for another mission, what the cloud refused, and what became of the last detector that was
     announced, if there were any."""
+
+    @property
+    def whereabouts(self) -> Whereabouts:
+        """Whether the robot knows where it is, as far as it needed to find out."""
+        if not self.times_lost:
+            return Whereabouts.MAPPING
+        return Whereabouts.RELOCALISED if self.quality > 0.0 else Whereabouts.LOST
 
 
 AgentWatch = Callable[[AgentProgress], None]
@@ -89,16 +112,16 @@ class Agent:
         budget: Budget | None = None,
     ) -> None:  # fmt: skip
         """``folder``: for packets that the cloud will never take, and for detectors; without ``budget`` all is sent."""
-        self.localizer = Localizer(clock)
         self._frontend = frontend
         self._outbox = outbox
         self._refused = folder / "refused"
         self._sleep = sleep
         self._budget = budget
         self._releases = Releases(folder / "detectors", outbox, frontend)
-        self._sender = Sender(
-            outbox, transport, rng, clock, self.localizer.correct, self._releases.keep, self._keep_refused
-        )
+        self._clock = clock
+        self._localizers: dict[int, Localizer] = {}
+        """Of every part of this start: each has a frame of its own."""
+        self._sender = Sender(outbox, transport, rng, clock, self._correct, self._releases.keep, self._keep_refused)
         self._kept: int | None = None
         """Files of refused packets, once they were counted: there may be many."""
         self._known = self._said = self._keyscans = self._crowded_out = 0
@@ -130,26 +153,48 @@ class Agent:
         notices = tuple(filter(None, (sender.notice, sender.refused_notice, self._releases.notice)))
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
-            len(self._frontend.scan_poses), self._keyscans, self._outbox.waiting, sender.confirmed, sender.sent_bytes,
-            left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s, sender.trouble,
-            self._said < self._known, notices,
+            sum(map(len, self._frontend.tracks)), self._keyscans, self._outbox.waiting, sender.confirmed,
+            sender.sent_bytes, left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s,
+            self.localizer.quality, len(self._frontend.tracks) - 1, sender.trouble, self._said < self._known, notices,
         )  # fmt: skip
+
+    @property
+    def localizer(self) -> Localizer:
+        """Where the robot is, in the frame of the part that runs."""
+        return self._localizer(len(self._frontend.tracks) - 1)
 
     def trajectory(self) -> tuple[FloatArray, FloatArray] | None:
         """Stamps (N,) and poses (N, 3) of ``base`` in the fleet's map at every scan, by the newest correction.
 
+        From before the robot was lost, by the last correction of that time, as long as that was about the same map.
         None: the cloud has not said where the map is.
         """
-        poses = [self.localizer.T_map_base(pose) for pose in self._frontend.scan_poses]
-        known = [pose for pose in poses if pose is not None]
+        tracks = ((self._localizer(part), poses) for part, poses in enumerate(self._frontend.tracks))
+        here = self.localizer.map_index
+        known = [
+            (pose.stamp, T_map_base)
+            for localizer, poses in tracks
+            if localizer.map_index == here
+            for pose in poses
+            if (T_map_base := localizer.T_map_base(pose)) is not None
+        ]
         if not known:
             return None
-        return np.array([pose.stamp for pose in self._frontend.scan_poses]), np.array(known)
+        return np.array([stamp for stamp, _ in known]), np.array([T_map_base for _, T_map_base in known])
+
+    def _localizer(self, part: int) -> Localizer:
+        return self._localizers.setdefault(part, Localizer(self._clock))
+
+    def _correct(self, epoch: int, correction: Correction) -> None:
+        part = self._outbox.part(epoch)
+        if part is not None:
+            self._localizer(part).correct(correction)
 
     def _say(self, packets: list[Packet]) -> None:
-        for body in (packet.body for packet in packets):
+        for packet in packets:
+            body = packet.body
             if isinstance(body, Constraint) and body.kind is ConstraintKind.ODOMETRY:
-                self.localizer.extend(body)
+                self._localizer(packet.epoch).extend(body)
             self._keyscans += isinstance(body, Keyscan)
         chosen = packets if self._budget is None else self._budget.fit(packets)
         if chosen:

@@ -1,69 +1,64 @@
-"""One robot: sensor records in, packets out. It knows no network and no other robot."""
+"""One robot: sensor records in, packets out. It knows no network and no other robot.
 
-from collections.abc import Iterable
+While what the robot sees is doubtful (``fcslam.lidar.lost``), records are put by. Either they turn out to belong to
+what came before, and are processed as if nothing had been; or the robot is lost: its session ends where it last knew
+where it was, and a new one begins with them, as after a restart. So no motion that nobody measured enters a map.
+"""
+
 from dataclasses import replace
 from pathlib import Path
 
 from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.errors import FeatureError
-from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig, describe
-from fcslam.lidar.mapper import FinishedSubmap, LidarConfig, Mapper, ScanPose, Step
-from fcslam.records import (
-    CameraImage,
-    Channel,
-    DetectorFile,
-    KeyscanId,
-    LaserModel,
-    LaserScan,
-    Place,
-    SensorRecord,
-)
-from fcslam.robot.views import View, ViewFinder, ViewsConfig
-from fcslam.wire.messages import Body, Hello, Packet
+from fcslam.lidar.lost import LostConfig, is_doubtful, is_enough, is_lost
+from fcslam.lidar.mapper import ScanPose
+from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord
+from fcslam.robot.session import Session, SessionConfig
+from fcslam.robot.views import ViewFinder
+from fcslam.wire.messages import Packet
 from fcslam.wire.quantisation import dequantise, quantise
 
 
-class RobotConfig(Settings):
+class RobotConfig(SessionConfig):
     """What runs on a robot."""
 
-    lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM")
-    channels: tuple[Channel, ...] = Field(
-        default=tuple(Channel), min_length=1, description="what places are described by: lidar, camera"
-    )
-    birdseye: BirdseyeConfig = Field(default=BirdseyeConfig(), description="binary features of LiDAR submaps")
-    views: ViewsConfig = Field(default=ViewsConfig(), description="binary features of camera images")
+    lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost, and begins anew")
 
 
 class RobotFrontend:
-    """Turns a robot's sensor records into the packets that leave it; keeps every raw scan's pose for itself."""
+    """Turns a robot's sensor records into the packets that leave it; keeps every raw scan's pose for itself.
+
+    Packets bear the number of their session, from 0, as their epoch.
+    """
 
     def __init__(self, robot: str, config: RobotConfig) -> None:
         self.robot = robot
-        self.scan_poses: list[ScanPose] = []
+        self.tracks: list[list[ScanPose]] = []
+        """Poses of the scans of every session."""
         self._config = config
-        self._mapper = Mapper(robot, config.lidar)
         self._view_finder = ViewFinder(config.views)
-        self._views: list[View] = []
-        """Those that wait for the submap around them."""
-        self._submaps: dict[int, tuple[int, int]] = {}
-        """First and last keyscan of the submap that each camera place was sent with."""
-        self._described: set[tuple[int, str]] = set()
-        """Keyscans of camera places that were sent, with the version of the detector."""
-        self._laser: LaserModel | None = None
-        self._is_news = True
-        """Whether nobody was told of the laser or of the detectors that are there now."""
-        self._sequence = 0
-        self._time = float("-inf")
+        self._put_by: list[LaserScan | CameraImage] = []
+        """From the first scan on that is doubtful."""
+        self._T_local_doubted: FloatArray | None = None
+        """Where that seems to have been taken."""
+        self._session = self._begin(float("-inf"))
+
+    @property
+    def scan_poses(self) -> list[ScanPose]:
+        """Poses of the scans of the session that runs."""
+        return self.tracks[-1]
 
     def process(self, record: SensorRecord) -> list[Packet]:
         """The packets that the next record of the recording causes."""
         match record:
             case LaserScan():
-                return self._process_scan(record)
+                # The robot works with the ranges that the cloud will see, to the last bit.
+                return self._process_scan(replace(record, ranges_m=dequantise(quantise(record.ranges_m))))
+            case CameraImage() if Channel.CAMERA in self._config.channels and self._put_by:
+                self._put_by.append(record)
             case CameraImage() if Channel.CAMERA in self._config.channels:
-                self._process_image(record)
+                self._session.process_image(record)
         return []  # a scan brings its own odometry; images never leave the robot
 
     def adopt(self, file: DetectorFile, path: Path) -> None:
@@ -80,86 +75,43 @@ class RobotFrontend:
             raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
         if file.version != self._view_finder.detector_version:
             self._view_finder.take(file, path)
-            self._is_news = True
-
-    def _process_scan(self, record: LaserScan) -> list[Packet]:
-        self._time = max(self._time, record.stamp)
-        # The robot works with the ranges that the cloud will see, to the last bit.
-        scan = replace(record, ranges_m=dequantise(quantise(record.ranges_m)))
-        self._laser = scan.laser
-        news = self._news()
-        step = self._mapper.process(scan)
-        self.scan_poses.append(step.pose)
-        self._view_finder.at(scan, step.pose)
-        return self._packets([*news, *self._bodies(step)])
-
-    def _process_image(self, image: CameraImage) -> None:
-        view = self._view_finder.look(image)
-        if view is not None:
-            self._views.append(view)
 
     def finish(self) -> list[Packet]:
         """The packets of what was still open when the recording ended."""
-        news, rest = self._news(), self._mapper.finish()
-        last = rest[-1:]
-        bodies = [body for submap in rest for body in self._submap_bodies(submap, submap in last)]
-        return self._packets([*news, *bodies])
+        return [*self._go_on(), *self._session.finish()]
 
-    def _bodies(self, step: Step) -> list[Body]:
-        bodies: list[Body] = []
-        if step.keyscan is not None:
-            bodies.append(step.keyscan)
-        if step.odometry is not None:
-            bodies.append(step.odometry)
-        if step.submap is not None:
-            bodies += self._submap_bodies(step.submap)
-        return bodies
-
-    def _submap_bodies(self, submap: FinishedSubmap, at_end: bool = False) -> list[Body]:
-        """The robot's own closures to a submap, its LiDAR place, and the camera places on the way to its anchor."""
-        bodies: list[Body] = list(submap.closures)
-        if Channel.LIDAR in self._config.channels:
-            bodies.append(self._lidar_place(submap))
-        ripe = [view for view in self._views if at_end or view.keyscan <= submap.anchor]
-        self._views = self._views[len(ripe) :]
-        # Between two scans a robot may jump: a view whose surroundings no submap shows is no place.
-        shown = [view for view in ripe if submap.first <= view.keyscan <= submap.last]
-        self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
-        return [*bodies, *(self._camera_place(view) for view in shown)]
-
-    def _news(self) -> list[Body]:
-        """A hello, first of all and with another detector; then the camera places that this had not described yet."""
-        if self._laser is None or not self._is_news:
+    def _process_scan(self, scan: LaserScan) -> list[Packet]:
+        mapper, config = self._session.mapper, self._config.lost
+        sight = mapper.look(scan)
+        if not is_doubtful(sight, mapper, config):
+            if self._put_by:
+                return [*self._go_on(), *self._session.process_scan(scan)]
+            return self._session.process_scan(scan, sight)
+        if self._T_local_doubted is None:
+            self._T_local_doubted = sight.tracked.T_local_base
+        self._put_by.append(scan)
+        scans = [record for record in self._put_by if isinstance(record, LaserScan)]
+        if not is_enough(scans, config):
             return []
-        self._is_news = False
-        views = {view.keyscan: view for view in self._view_finder.look_again()} if self._submaps else {}
-        self._views = [views.get(view.keyscan, view) for view in self._views]
-        sent = [view for view in views.values() if view.keyscan in self._submaps]
-        fresh = [view for view in sent if (view.keyscan, view.detector_version) not in self._described]
-        return [self._hello(self._laser), *(self._camera_place(view) for view in fresh)]
+        if not is_lost(scans, self._T_local_doubted, mapper, config):
+            return self._go_on()
+        rest = self._session.finish()
+        self._view_finder.forget()
+        self._session = self._begin(self._session.time)
+        return [*rest, *self._go_on()]
 
-    def _lidar_place(self, submap: FinishedSubmap) -> Place:
-        features = describe(submap.surface, self._config.birdseye)
-        return Place(
-            KeyscanId(self.robot, submap.anchor), Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last,
-            features.keypoints_m, features.descriptors,
-        )  # fmt: skip
+    def _begin(self, time: float) -> Session:
+        session = Session(self.robot, len(self.tracks), time, self._view_finder, self._config)
+        self.tracks.append(session.scan_poses)
+        return session
 
-    def _camera_place(self, view: View) -> Place:
-        first, last = self._submaps[view.keyscan]
-        self._described.add((view.keyscan, view.detector_version))
-        return Place(
-            KeyscanId(self.robot, view.keyscan), Channel.CAMERA, view.detector_version, first, last, view.keypoints,
-            view.descriptors,
-        )  # fmt: skip
-
-    def _hello(self, laser: LaserModel) -> Hello:
-        versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_finder.detector_version}
-        return Hello(self.robot, 0, laser, {channel: versions[channel] for channel in self._config.channels})
-
-    def _packets(self, bodies: Iterable[Body]) -> list[Packet]:
-        packets = []
-        for body in bodies:
-            packets.append(Packet(self.robot, 0, self._sequence, self._time, body))
-            self._sequence += 1
+    def _go_on(self) -> list[Packet]:
+        """With what was put by."""
+        records, self._put_by, self._T_local_doubted = self._put_by, [], None
+        packets: list[Packet] = []
+        for record in records:
+            if isinstance(record, LaserScan):
+                packets += self._session.process_scan(record)
+            else:
+                self._session.process_image(record)
         return packets

@@ -35,6 +35,11 @@ class Localizer:
         return None if self._corrected is None else self._corrected[0].map_index
 
     @property
+    def quality(self) -> float:
+        """How well the newest correction is borne out, in [0, 1]; 0 before the first one."""
+        return 0.0 if self._corrected is None else self._corrected[0].quality
+
+    @property
     def age_s(self) -> float | None:
         """How long ago the last correction came; None: none has."""
         return None if self._corrected is None else self._clock() - self._corrected[1]

@@ -1,8 +1,9 @@
 """What a robot has to say and the cloud has not yet confirmed: numbered packets on disk.
 
-A start of the robot is an epoch. The front end counts its packets; here they get the epoch and the sequence by which
-they travel, in the order in which they leave. A packet is forgotten once the cloud has stored it; a digest of it stays,
-by which a recording that is read again is known to say the same.
+A start of the robot is an epoch, and whenever it was lost on the way another one begins: the start's next part. The
+front end counts parts, and the packets of each; here they get the epoch and the sequence by which they travel, in the
+order in which they leave. A packet is forgotten once the cloud has stored it; a digest of it stays, by which a
+recording that is read again is known to say the same.
 """
 
 import hashlib
@@ -26,7 +27,8 @@ PLACES_SHARE = 0.75
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS robot (name TEXT NOT NULL, agent TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS sessions (
-    epoch INTEGER PRIMARY KEY, recording TEXT NOT NULL, met INTEGER NOT NULL, stored INTEGER NOT NULL
+    epoch INTEGER PRIMARY KEY, part INTEGER NOT NULL, recording TEXT NOT NULL, met INTEGER NOT NULL,
+    stored INTEGER NOT NULL
 );
 CREATE TABLE IF NOT EXISTS packets (
     epoch INTEGER NOT NULL, ordinal INTEGER NOT NULL, digest BLOB NOT NULL, sequence INTEGER, data BLOB,
@@ -38,9 +40,9 @@ CREATE TABLE IF NOT EXISTS releases (
 );
 CREATE INDEX IF NOT EXISTS waiting ON packets (epoch, sequence) WHERE data IS NOT NULL;
 """
-# ordinal: the front end's own count; sequence: the number on the wire, NULL of a packet that never travels;
-# data: NULL once it need not be sent; met: the cloud has confirmed that the epoch belongs to this start;
-# stored: packets of the epoch, from its first, that the cloud has confirmed.
+# part: the front end's own epoch, 0 where a start begins; ordinal: the front end's own count; sequence: the number on
+# the wire, NULL of a packet that never travels; data: NULL once it need not be sent; met: the cloud has confirmed that
+# the epoch belongs to this start; stored: packets of the epoch, from its first, that the cloud has confirmed.
 
 
 class Batch(NamedTuple):
@@ -72,7 +74,9 @@ class Outbox:
         self._limit_bytes = limit_bytes
         self._lock = threading.Lock()
         self.epoch = -1
-        """Of the session that has begun."""
+        """Of the newest session."""
+        self._first = -1
+        """Epoch with which the start began."""
         with _in_words(path):
             self._database = sqlite3.connect(path, timeout=0.0, check_same_thread=False)
         try:
@@ -89,7 +93,7 @@ class Outbox:
         self._database.close()
 
     def begin(self, recording: str, resume: bool) -> int:
-        """Start a session that reads ``recording`` (a fingerprint of it): a new epoch, or the last one once more.
+        """Start to read ``recording`` (a fingerprint of it): with a new epoch, or as the last time once more.
 
         Returns how many packets the front end will say again: 0 unless there is something to resume.
 
@@ -97,18 +101,30 @@ class Outbox:
             StateError: it was another recording.
         """
         with self._transaction():
-            last, before = self._one("SELECT max(epoch), recording FROM sessions")
+            last, before = self._one("SELECT max(epoch), recording FROM sessions WHERE part = 0")
             if resume and last is not None:
                 if before != recording:
                     raise StateError(
                         f"{self._path}: left by another recording, other settings or another version; "
                         "leave --resume out to start anew"
                     )
-                self.epoch = int(last)
+                self._first = int(last)
+                (self.epoch,) = self._one("SELECT max(epoch) FROM sessions")
             else:
-                self.epoch = 0 if last is None else int(last) + 1
-                self._database.execute("INSERT INTO sessions VALUES (?, ?, 0, 0)", (self.epoch, recording))
-            return int(self._one("SELECT count(*) FROM packets WHERE epoch = ?", self.epoch)[0])
+                self._first = self._open_session(0, recording)
+            return int(self._one("SELECT count(*) FROM packets WHERE epoch >= ?", self._first)[0])
+
+    @property
+    def is_met(self) -> bool:
+        """Whether the cloud knows every session: packets of others do not travel."""
+        with self._transaction():
+            return self._one("SELECT 1 FROM sessions WHERE met = 0") is None
+
+    def part(self, epoch: int) -> int | None:
+        """Which part of this start an epoch is; None: of an earlier one."""
+        with self._transaction():
+            row = self._one("SELECT part FROM sessions WHERE epoch = ? AND epoch >= ?", epoch, self._first)
+        return None if row is None else int(row[0])
 
     @property
     def is_full(self) -> bool:
@@ -126,21 +142,21 @@ class Outbox:
         """
         left_out = 0
         with self._transaction():
-            (number,) = self._one("SELECT coalesce(max(sequence) + 1, 0) FROM packets WHERE epoch = ?", self.epoch)
             for packet in packets:
+                epoch = self._epoch_of(packet.epoch)
                 data = encode(packet)
                 digest = hashlib.blake2b(data, digest_size=8).digest()
-                if self._is_known(packet.sequence, digest):
+                if self._is_known(epoch, packet.sequence, digest):
                     continue
                 crowded = self.waiting.bytes >= PLACES_SHARE * self._limit_bytes
                 if crowded and isinstance(packet.body, Place):
-                    self._insert(packet.sequence, digest, None, None)
+                    self._insert(epoch, packet.sequence, digest, None, None)
                     left_out += 1
                     continue
-                sent = readdress(data, self.epoch, number)
-                self._insert(packet.sequence, digest, number, sent)
+                (number,) = self._one("SELECT coalesce(max(sequence) + 1, 0) FROM packets WHERE epoch = ?", epoch)
+                sent = readdress(data, epoch, number)
+                self._insert(epoch, packet.sequence, digest, number, sent)
                 self.waiting = Waiting(self.waiting.packets + 1, self.waiting.bytes + len(sent))
-                number += 1
         return left_out
 
     def take_release(self, record: int, file: DetectorFile) -> None:
@@ -150,15 +166,18 @@ class Outbox:
             self._database.execute("INSERT INTO releases VALUES (?, ?, ?, ?, ?, ?, ?)", told)
 
     def releases(self) -> dict[int, DetectorFile]:
-        """What the session has taken, by record."""
+        """What the start has taken, by record."""
         columns = "record, channel, version, format, size, sha256"
         with self._transaction():
-            rows = self._database.execute(f"SELECT {columns} FROM releases WHERE epoch = ?", (self.epoch,)).fetchall()
+            rows = self._database.execute(f"SELECT {columns} FROM releases WHERE epoch >= ?", (self._first,)).fetchall()
         return {record: DetectorFile(Channel(channel), *rest) for record, channel, *rest in rows}
 
     def batch(self, maximum_bytes: int, maximum_packets: int) -> Batch | None:
-        """The oldest waiting packets that fit one batch, at least one; None if nothing waits."""
-        question = "SELECT epoch, sequence, data FROM packets WHERE data IS NOT NULL ORDER BY epoch, sequence LIMIT ?"
+        """The oldest waiting packets of sessions that were met that fit one batch, at least one; None if none waits."""
+        question = (
+            "SELECT epoch, sequence, data FROM packets JOIN sessions USING (epoch) WHERE data IS NOT NULL AND met = 1 "
+            "ORDER BY epoch, sequence LIMIT ?"
+        )
         chosen: list[tuple[int, int, bytes]] = []
         size = 0
         with self._transaction():
@@ -242,8 +261,8 @@ class Outbox:
         for table in ("packets", "sessions", "releases"):
             self._database.execute(f"UPDATE {table} SET epoch = ? WHERE epoch = ?", (to, epoch))
         self.waiting = Waiting(*self._count("data IS NOT NULL"))
-        if self.epoch == epoch:
-            self.epoch = to
+        self.epoch = to if self.epoch == epoch else self.epoch
+        self._first = to if self._first == epoch else self._first
 
     def _open(self, robot: str) -> str:
         """Whose file it is is settled first; returns its agent."""
@@ -260,18 +279,29 @@ class Outbox:
             raise StateError(f"{self._path}: belongs to robot '{row[0]}', not '{robot}'; give each its own --state")
         return str(row[1])
 
-    def _is_known(self, ordinal: int, digest: bytes) -> bool:
-        row = self._one("SELECT digest FROM packets WHERE epoch = ? AND ordinal = ?", self.epoch, ordinal)
+    def _open_session(self, part: int, recording: str) -> int:
+        (self.epoch,) = self._one("SELECT coalesce(max(epoch) + 1, 0) FROM sessions")
+        self._database.execute("INSERT INTO sessions VALUES (?, ?, ?, 0, 0)", (self.epoch, part, recording))
+        return self.epoch
+
+    def _epoch_of(self, part: int) -> int:
+        """Epoch of a part of this start, which begins now if it had not."""
+        row = self._one("SELECT epoch FROM sessions WHERE part = ? AND epoch >= ?", part, self._first)
+        if row is not None:
+            return int(row[0])
+        (recording,) = self._one("SELECT recording FROM sessions WHERE epoch = ?", self._first)
+        return self._open_session(part, recording)
+
+    def _is_known(self, epoch: int, ordinal: int, digest: bytes) -> bool:
+        row = self._one("SELECT digest FROM packets WHERE epoch = ? AND ordinal = ?", epoch, ordinal)
         if row is not None and row[0] != digest:
             raise StateError(
                 f"{self._path}: packet {ordinal} is not what this recording said before; leave --resume out"
             )
         return row is not None
 
-    def _insert(self, ordinal: int, digest: bytes, sequence: int | None, data: bytes | None) -> None:
-        self._database.execute(
-            "INSERT INTO packets VALUES (?, ?, ?, ?, ?)", (self.epoch, ordinal, digest, sequence, data)
-        )
+    def _insert(self, epoch: int, ordinal: int, digest: bytes, sequence: int | None, data: bytes | None) -> None:
+        self._database.execute("INSERT INTO packets VALUES (?, ?, ?, ?, ?)", (epoch, ordinal, digest, sequence, data))
 
     def _count(self, which: str) -> tuple[int, int]:
         """Packets and their bytes."""

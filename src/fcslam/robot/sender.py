@@ -34,11 +34,12 @@ class Sender:
 
     def __init__(
         self, outbox: Outbox, transport: BatchTransport, rng: np.random.Generator, clock: Callable[[], float],
-        correct: Callable[[Correction], None], keep: Callable[[DetectorFile, bytes], None],
+        correct: Callable[[int, Correction], None], keep: Callable[[DetectorFile, bytes], None],
         refused: Callable[[bytes, str], None],
     ) -> None:  # fmt: skip
-        """Whom to tell, from where ``step`` is called: ``correct`` of corrections newer than all before, ``keep`` of
-        detectors that were announced and fetched, ``refused`` of packets that the cloud will never take, and why."""
+        """Whom to tell, from where ``step`` is called: ``correct`` of the newest session's corrections and its
+        epoch, ``keep`` of detectors that were announced and fetched, ``refused`` of packets that the cloud will never
+        take, and why."""
         self._outbox = outbox
         self._transport = transport
         self._rng = rng
@@ -94,7 +95,7 @@ class Sender:
             return error.retry_after_s + retry_delay_s(self._failures, self._rng)
 
     def _step(self) -> float:
-        if not self._met:
+        if not self._met or not self._outbox.is_met:
             self._meet()
             self._met = True
             self.trouble = None
@@ -171,7 +172,7 @@ class Sender:
                 # That of an earlier session, whose packets go first, is about another odometry.
                 case Correction() as news if packet.epoch == self._outbox.epoch and news.version > self._correction:
                     self._correction = news.version
-                    self._correct(news)
+                    self._correct(packet.epoch, news)
                 case Release(file=file) if file not in self._known:
                     self._fetch(file)
 

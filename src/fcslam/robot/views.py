@@ -106,6 +106,11 @@ class ViewFinder:
         """
         self._detector = open_release(file, path, self._config.onnx)
 
+    def forget(self) -> None:
+        """What was seen is of a session that has ended."""
+        self._album = Album(self._config.album)
+        self._scan = self._pose = self._last = None
+
     def look_again(self) -> list[View]:
         """The views in the images that are still here, oldest first, as the detector sees them now."""
         pictures = ((shot, decode_grey(shot.encoded)) for shot in self._album)

@@ -149,12 +149,16 @@ def _check_at_most(count: int, most: int, what: str) -> None:
 
 def _write_correction(correction: Correction) -> pb.Correction:
     return pb.Correction(
-        version=correction.version, map_index=correction.map_index, t_map_odom=_write_pose(correction.T_map_odom)
+        version=correction.version,
+        map_index=correction.map_index,
+        t_map_odom=_write_pose(correction.T_map_odom),
+        quality=correction.quality,
     )
 
 
 def _read_correction(message: pb.Correction, envelope: pb.Packet) -> Correction:
-    return Correction(envelope.robot, message.version, message.map_index, _read_pose(message, "t_map_odom"))
+    pose = _read_pose(message, "t_map_odom")
+    return Correction(envelope.robot, message.version, message.map_index, pose, message.quality)
 
 
 def _write_acknowledgement(acknowledgement: Acknowledgement) -> pb.Acknowledgement:

@@ -132,6 +132,7 @@ def _check_correction(correction: Correction, _: Packet) -> None:
     _check_count(correction.version, "correction: version", MAXIMUM_NUMBER)
     _check_count(correction.map_index, "correction: map index", MAXIMUM_NUMBER)
     _check_pose(correction.T_map_odom, "correction: T_map_odom", math.pi)
+    _require(0.0 <= correction.quality <= 1.0, f"correction: quality {correction.quality} is not within 0 and 1")
 
 
 def _check_acknowledgement(acknowledgement: Acknowledgement, _: Packet) -> None:

@@ -46,6 +46,7 @@ REVEALS: Mapping[str, str] = MappingProxyType(
         "Correction.version": "how often the cloud's map has changed",
         "Correction.map_index": "whether the robot has met others",
         "Correction.t_map_odom": "where the robot is in the building's map",
+        "Correction.quality": "how much of what it sees others have seen",
         "Release.channel": "nothing of the robot",
         "Release.version": "that the fleet has trained",
         "Release.format": "nothing of the robot",

@@ -134,14 +134,16 @@ class Place(_message.Message):
     def __init__(self, number: _Optional[int] = ..., channel: _Optional[_Union[Channel, str]] = ..., detector_version: _Optional[str] = ..., first: _Optional[int] = ..., last: _Optional[int] = ..., count: _Optional[int] = ..., keypoints: _Optional[bytes] = ..., descriptors: _Optional[bytes] = ...) -> None: ...
 
 class Correction(_message.Message):
-    __slots__ = ("version", "map_index", "t_map_odom")
+    __slots__ = ("version", "map_index", "t_map_odom", "quality")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     MAP_INDEX_FIELD_NUMBER: _ClassVar[int]
     T_MAP_ODOM_FIELD_NUMBER: _ClassVar[int]
+    QUALITY_FIELD_NUMBER: _ClassVar[int]
     version: int
     map_index: int
     t_map_odom: Pose
-    def __init__(self, version: _Optional[int] = ..., map_index: _Optional[int] = ..., t_map_odom: _Optional[_Union[Pose, _Mapping]] = ...) -> None: ...
+    quality: float
+    def __init__(self, version: _Optional[int] = ..., map_index: _Optional[int] = ..., t_map_odom: _Optional[_Union[Pose, _Mapping]] = ..., quality: _Optional[float] = ...) -> None: ...
 
 class Acknowledgement(_message.Message):
     __slots__ = ("epoch", "sequence")

@@ -73,6 +73,7 @@ class RobotSession(Settings):
     T_map_base: Pose | None
     T_map_odom: Pose | None
     correction: int = Field(description="version of the newest one; -1: none")
+    quality: float = Field(description="how well others bear it out, in [0, 1]; 0: nobody does")
     last_heard_s: float | None = Field(description="seconds since the robot's last batch")
 
 

@@ -184,6 +184,7 @@ def _sessions(state: ServiceState, robot: str) -> list[RobotSession]:
                 T_map_base=known.T_map_base[-1].tolist() if known else None,
                 T_map_odom=correction.correction.T_map_odom.tolist() if correction else None,
                 correction=correction.correction.version if correction else -1,
+                quality=correction.correction.quality if correction else 0.0,
                 last_heard_s=state.mission.intake.last_heard_s(robot),
             )
         )

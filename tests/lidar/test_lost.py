@@ -1,0 +1,107 @@
+"""A robot that sees another place than just before is lost; one that goes on, or meets a crowd, is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import LASER, box, drive, recording, ring, ring_drive, room
+
+from fcslam.geometry import se2
+from fcslam.lidar.lost import LostConfig, is_doubtful, is_enough, is_lost
+from fcslam.lidar.mapper import LidarConfig, Mapper
+from fcslam.records import frozen
+
+CONFIG = LostConfig()
+
+
+def mapped(scans):
+    mapper = Mapper("r", LidarConfig())
+    for scan in scans:
+        mapper.process(scan)
+    return mapper
+
+
+def moved_on(scans, before):
+    """``scans`` but the first, as wheels tell them that had stood there since the last one of ``before``."""
+    last, first = before[-1].T_odom_base, scans[0].T_odom_base
+    return [
+        replace(scan, stamp=before[-1].stamp + 0.2 * (k + 1), T_odom_base=frozen(
+            se2.compose(last, se2.between(first, scan.T_odom_base))
+        ))
+        for k, scan in enumerate(scans[1:])
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def around():
+    poses = ring_drive()
+    return recording(poses, poses, ring())
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    poses = drive([(-3.0, 0.0), (2.0, -2.0), (2.0, 2.0)])
+    return recording(poses, poses, room())
+
+
+def judged(mapper, scans):
+    sight = mapper.look(scans[0])
+    return is_lost(scans, sight.tracked.T_local_base, mapper, CONFIG)
+
+
+def test_looking_leaves_no_trace(around):
+    looked, plain = mapped(around[:80]), mapped(around[:80])
+    for scan in around[80:90]:
+        looked.look(scan)
+    again = [looked.process(scan) for scan in around[80:90]]
+    for step, other in zip(again, (plain.process(scan) for scan in around[80:90]), strict=True):
+        assert np.array_equal(step.pose.T_keyscan_base, other.pose.T_keyscan_base)
+        assert step.pose.keyscan == other.pose.keyscan
+
+
+def test_scans_of_one_drive_are_hardly_doubted_and_never_lost(around):
+    mapper = mapped(around[:60])
+    doubts = []
+    for k in range(60, len(around) - 20):
+        doubts.append(is_doubtful(mapper.look(around[k]), mapper, CONFIG))
+        if k % 25 == 0:
+            assert not judged(mapper, around[k : k + 15])
+        mapper.process(around[k])
+    assert np.mean(doubts) < 0.02
+
+
+def test_another_place_is_doubted_and_lost(around, elsewhere):
+    before = around[:120]
+    mapper, there = mapped(before), moved_on(elsewhere, before)
+    assert is_doubtful(mapper.look(there[0]), mapper, CONFIG)
+    assert judged(mapper, there[:20])
+
+
+def test_a_box_that_was_not_there_before_makes_nobody_lost(around):
+    poses = ring_drive()
+    changed = recording(poses, poses, np.vstack((ring(), box(13.6, 6.0, 14.1, 6.5))))
+    before = 120
+    mapper = mapped(around[:before])
+    assert not judged(mapper, changed[before : before + 20])
+
+
+def test_who_has_hardly_moved_cannot_be_lost(around, elsewhere):
+    before = around[:15]
+    mapper = mapped(before)
+    assert 0.0 < mapper.travel_m < CONFIG.settled_m
+    assert not is_doubtful(mapper.look(moved_on(elsewhere, before)[0]), mapper, CONFIG)
+
+
+def test_it_takes_a_way_and_several_scans_or_very_many(around):
+    still = [around[0]] * CONFIG.most_scans
+    far = [replace(around[0], T_odom_base=frozen(np.array([0.3 * k, 0.0, 0.0]))) for k in range(CONFIG.fewest_scans)]
+    assert is_enough(still, CONFIG)
+    assert not is_enough(still[:-1], CONFIG)
+    assert is_enough(far, CONFIG)
+    assert not is_enough(far[:-1], CONFIG)
+
+
+def test_what_was_not_matched_is_not_doubted(around):
+    mapper = mapped(around[:60])
+    nothing = replace(around[60], ranges_m=frozen(np.full(LASER.beam_count, LASER.max_range_m), np.float32))
+    assert not is_doubtful(mapper.look(nothing), mapper, CONFIG)

@@ -1,0 +1,28 @@
+"""A robot is picked up and put down elsewhere in its building; its wheels never notice."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import small_fleet
+
+from fcslam.geometry import se2
+from fcslam.records import LaserScan, frozen
+
+
+@lru_cache
+def drives() -> list[list[LaserScan]]:
+    """Of two robots in one building."""
+    return [list(robot.scans()) for robot in small_fleet.draw(2, path_length_m=24.0, seed=2).robots]
+
+
+def kidnapping() -> tuple[list[LaserScan], float]:
+    """Scans of the one, then of the other, as wheels tell them that never left the floor; when it happened."""
+    before, after = drives()[0][:80], drives()[1]
+    last = before[-1]
+    after = [
+        replace(scan, stamp=last.stamp + scan.stamp - after[0].stamp + 0.3, T_odom_base=frozen(
+            se2.compose(last.T_odom_base, se2.between(after[0].T_odom_base, scan.T_odom_base))
+        ))
+        for scan in after[1:]
+    ]  # fmt: skip
+    return before + after, last.stamp
