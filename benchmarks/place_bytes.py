@@ -2,8 +2,9 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/place_bytes.py
 
-Packets of two split logs and of two simulated fleets with cameras (seeds 101 and 105; it needs a GL library, or
-FLEETS that `fcslam simulate` recorded), none of which the weights of `src/fcslam/wire/predictors` were fitted to.
+Packets of two split logs, of the five runs of Wean Hall and of two simulated fleets with cameras (seeds 101 and 105; it
+needs a GL library, or FLEETS that `fcslam simulate` recorded), none of which the weights of
+`src/fcslam/wire/predictors` were fitted to.
 "Plain" is the same packet with 2 bytes a range, 2 a coordinate and 32 a descriptor; "deflated" is that with each of
 the three fields deflated by zlib at level 9. "A place with 300 descriptors" is every place that has as many, cut to
 its 300 strongest. Times are processor time of whole packets with all their checks.
@@ -31,6 +32,7 @@ from fcslam.wire.quantisation import quantise, quantise_keypoints
 from fcslam.wire.streams import ascending
 
 LOGS = {"intel": 3, "mit-csail": 2}
+WEAN_HALL = tuple(f"wean-hall/robotdata{number}.log.gz" for number in range(1, 6))
 SEEDS = (101, 105)
 STATED = 300
 KINDS = {"recording": "", "kind": "", "packets": ",", "plain, B": ",", "deflated, B": ",", "sent, B": ",",
@@ -47,7 +49,7 @@ def main() -> None:
         "--fleets", type=Path, nargs="+", default=[], help="recorded fleets, instead of simulating some"
     )
     chosen = parser.parse_args()
-    folder = common.recordings(*common.slam_benchmark_files())
+    folder = common.recordings(*common.slam_benchmark_files(), *WEAN_HALL)
     report = common.Report(__file__, __doc__, chosen)
     kinds, parts, rates = [], [], []
     with tempfile.TemporaryDirectory() as place:
@@ -68,6 +70,7 @@ def recordings(folder: Path, fleets: Sequence[Path], place: Path) -> Iterator[tu
     """Names and robots; without ``fleets`` some are simulated into ``place``."""
     for name, robots in LOGS.items():
         yield name, split(open_source(common.log_path(folder, name)), robots)
+    yield "wean-hall", [open_source(folder / run) for run in WEAN_HALL]
     for seed in SEEDS if not fleets else ():
         common.run_fcslam("simulate", "--robots", 3, "--seed", seed, "--output", place / f"seed-{seed}")
     for fleet in fleets or sorted(place.iterdir()):
