@@ -126,8 +126,8 @@ def live(place: Path, sessions: int, path_m: float, seed: int, most_nearby: int)
         memory_mb.append(peak_mb() - before_mb)
     maps, rmse_m, f1 = against_truth(result, drivers, config.map)
     said = (
-        f"End, of {turn:,} packets: {maps} map(s), RMSE {rmse_m:.3f} m, F1 {f1:.3f}; {spent[0]:.1f} s of CPU and at most "
-        f"{memory_mb[0]:.0f} MB so far; replayed {spent[1]:.1f} s and {memory_mb[1]:.0f} MB."
+        f"End, of {turn:,} packets: {maps} map(s), RMSE {rmse_m:.3f} m, F1 {f1:.3f}; {spent[0]:.1f} s of CPU and at "
+        f"most {memory_mb[0]:.0f} MB so far; replayed {spent[1]:.1f} s and {memory_mb[1]:.0f} MB."
     )
     return rows, said
 
