@@ -13,6 +13,10 @@ coordinates = st.floats(-4.0, 4.0)
 ways = st.lists(st.tuples(coordinates, coordinates), max_size=60)
 
 
+def square(xy, side_m):
+    return tuple(np.floor(np.array(xy) / side_m + 0.5).tolist())
+
+
 def driven(way, side_m, most):
     """Numbers of the places that are kept at the end of the way."""
     kept = []
@@ -26,8 +30,8 @@ def driven(way, side_m, most):
 @given(ways, st.integers(1, 4), st.sampled_from([0.7, 1.0, 2.0, 20.0]))
 def test_every_square_keeps_its_newest_and_never_more(way, most, side_m):
     squares = defaultdict(list)
-    for number, (x, y) in enumerate(way):
-        squares[x // side_m, y // side_m].append(number)
+    for number, xy in enumerate(way):
+        squares[square(xy, side_m)].append(number)
     assert driven(way, side_m, most) == sorted(k for numbers in squares.values() for k in numbers[-most:])
 
 
@@ -35,13 +39,13 @@ def test_a_robot_that_drives_its_rounds_for_ever_keeps_places_of_the_whole_round
     way = [(10.0 * np.cos(0.1 * k), 10.0 * np.sin(0.1 * k)) for k in range(1000)]
     kept = driven(way, 2.0, 6)
     assert len(kept) < 300
-    assert {(way[k][0] // 2, way[k][1] // 2) for k in kept} == {(x // 2, y // 2) for x, y in way}
+    assert {square(way[k], 2.0) for k in kept} == {square(xy, 2.0) for xy in way}
 
 
 def test_a_robot_that_sweeps_a_floor_lane_by_lane_keeps_all_of_the_floor():
     way = [(float(x), 0.25 * lane) for lane in range(80) for x in (range(10) if lane % 2 else range(9, -1, -1))]
     kept = driven(way, 2.0, 1)
-    assert {(way[k][0] // 2, way[k][1] // 2) for k in kept} == {(x, y) for x in range(5) for y in range(10)}
+    assert {square(way[k], 2.0) for k in kept} == {square(xy, 2.0) for xy in way}
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

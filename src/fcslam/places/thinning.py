@@ -16,7 +16,7 @@ def crowded_out(positions_m: FloatArray, side_m: float, most: int) -> NDArray[np
 
     Args:
         positions_m: shape (N, 2), the oldest first, the newest last.
-        side_m: of the squares, which lie side by side from the origin.
+        side_m: of the squares, which lie side by side; the origin, where a robot starts, is the middle of one.
         most: 1 or more, so that the newest always stays.
 
     Returns:
@@ -24,5 +24,5 @@ def crowded_out(positions_m: FloatArray, side_m: float, most: int) -> NDArray[np
     """
     if len(positions_m) <= most:
         return np.empty(0, np.int64)
-    squares = np.floor(positions_m / side_m)
+    squares = np.floor(positions_m / side_m + 0.5)
     return np.flatnonzero((squares == squares[-1]).all(axis=1))[:-most]
