@@ -15,6 +15,7 @@ CPU: user and system of each, all threads; the sender's is that of the robots' s
 """
 
 import asyncio
+import gc
 import os
 import sqlite3
 import tempfile
@@ -80,6 +81,8 @@ def main() -> None:
     begins_s = np.random.default_rng(chosen.seed).uniform(0.0, 0.0 if chosen.in_step else 1.0, chosen.robots)
     robots = simulate_fleet(settings, chosen.seed).robots
     agendas = {robot.name: _agenda(robot, begin_s) for robot, begin_s in zip(robots, begins_s, strict=True)}
+    gc.collect()
+    gc.freeze()  # the sender's own pauses are not the service's
     with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (server, port):
         began_s = time.process_time()
         mission = Path(place) / "cloud" / "missions" / FIRST / "mission.sqlite"

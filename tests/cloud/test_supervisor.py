@@ -11,6 +11,8 @@ from fcslam.cloud.folder import MissionFolder
 from fcslam.cloud.supervisor import Supervisor
 
 SAYS = 'import sys; print(\'{"event": "live", "number": 7}\', flush=True);'
+STAYS = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
+"""As a worker that is ready."""
 WAITS = (
     "import time, pathlib; go = pathlib.Path(sys.argv[1], 'go');"
     "[time.sleep(0.02 * (not go.exists())) for _ in range(1000)];"
@@ -80,7 +82,7 @@ def test_a_worker_that_cannot_be_started_is_tried_again(supervised, tmp_path):
 
 
 def test_a_ring_while_a_worker_ends_or_after_it_is_not_heard(supervised, tmp_path):
-    supervisor, told = supervised(SAYS + "sys.stdin.buffer.read();" + SAYS + WAITS)
+    supervisor, told = supervised(STAYS + SAYS + "sys.stdin.buffer.read();" + SAYS + WAITS)
     wait(lambda: told)
     stopping = threading.Thread(target=supervisor.stop)
     stopping.start()
@@ -102,3 +104,10 @@ def test_a_worker_is_ready_when_it_says_so_and_no_longer_when_it_is_gone(supervi
     assert told == [("live", 7)], "that is for nobody else"
     supervisor.stop()
     assert not supervisor.is_ready
+
+
+def test_a_worker_that_is_not_ready_keeps_nobody_waiting(supervised):
+    supervisor, told = supervised(SAYS + "import time; time.sleep(1000)")
+    wait(lambda: told)
+    supervisor.stop()
+    assert (supervisor.pid, supervisor.starts) == (None, 1)

@@ -2,6 +2,7 @@
 
 import fcntl
 import gc
+import signal
 import subprocess
 import sys
 import time
@@ -231,6 +232,18 @@ def test_a_worker_waits_until_the_one_before_is_gone(cloud):
             assert b"live" in process.stdout.readline()
             process.stdin.close()
             assert process.wait(60) == 0
+
+
+def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cloud):
+    command = [sys.executable, "-m", "fcslam.cloud.worker", str(cloud.folder.path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.terminate()
+        assert process.wait(60) == -signal.SIGTERM
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert b"ready" in process.stdout.readline()
+        process.terminate()
+        process.stdin.close()
+        assert process.wait(60) == 0
 
 
 def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):

@@ -92,7 +92,7 @@ class Supervisor:
                     self._process.stdin.write(b"\n")
 
     def stop(self) -> None:
-        """Let the worker end what it is doing, and wait for that."""
+        """Let the worker end what it is doing, and wait for that; one that is not ready yet does nothing."""
         self._stopping.set()
         with self._lock:
             self._end_input()
@@ -147,3 +147,4 @@ class Supervisor:
         if self._process is not None and self._process.stdin is not None:
             with suppress(OSError):
                 self._process.stdin.close()
+            self._process.terminate()  # a worker that is ready ignores it

@@ -176,10 +176,11 @@ class Worker:
 
 def main(arguments: Sequence[str]) -> int:
     """Work until stdin ends."""
-    # Who stops the service stops it first; its end ends stdin.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    # Who stops the service stops it first; its end ends stdin. It sends a signal as well, for nobody has to wait for a
+    # compiler.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     warm_up_fleet()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     folder = MissionFolder(Path(arguments[0]))
