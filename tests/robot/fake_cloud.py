@@ -66,7 +66,8 @@ class FakeCloud:
         if self.next(epoch):
             acknowledgement = Acknowledgement("alice", epoch, self.next(epoch) - 1)
             answer.append(encode(replace(packet(acknowledgement), epoch=epoch)))
-        answer += [encode(packet(Release("alice", file))) for file in self.releases]
+        if self.stored:  # nobody knows what detectors a robot has that never said hello
+            answer += [encode(packet(Release("alice", file))) for file in self.releases]
         if self.correction > correction:
             answer.append(encode(replace(packet(replace(CORRECTION, version=self.correction)), epoch=epoch)))
         return Answer(tuple(answer), refused=len(self.refused))
