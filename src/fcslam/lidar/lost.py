@@ -32,7 +32,7 @@ class LostConfig(Settings):
         default=0.90, ge=0, le=1, description="scans put by tell nothing where they explain less of each other (median)"
     )
     explained: float = Field(
-        default=0.50, ge=0, le=1, description="lost: of the points in known area fewer lie on a surface"
+        default=0.60, ge=0, le=1, description="lost: of the points in known area fewer lie on a surface"
     )
     violation: float = Field(default=0.30, ge=0, le=1, description="and more of them in free space")
     overlap: float = Field(default=0.25, ge=0, le=1, description="least share of points in known area to tell")
