@@ -66,9 +66,7 @@ def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, mapper: Mappe
     (seen, T_local_seen), (now, T_first_now) = mapper.surroundings(), anew.surroundings()
     predicted = se2.between(T_local_seen, se2.compose(T_local_first, T_first_now))
     worse = verify(seen, now, predicted, mapper.config.verification).worse
-    return (
-        worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
-    )
+    return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
 
 
 def _agree(scans: Sequence[LaserScan], anew: Mapper, config: LostConfig) -> bool:
@@ -77,5 +75,6 @@ def _agree(scans: Sequence[LaserScan], anew: Mapper, config: LostConfig) -> bool
     for scan in scans:
         sight = anew.look(scan)
         anew.process(scan, sight)
-        shares.append(sight.explained / sight.known)
-    return bool(np.nanmedian(shares) >= config.agreeing)
+        if sight.known > 0.0:  # not so for a scan that was not matched
+            shares.append(sight.explained / sight.known)
+    return bool(shares) and bool(np.median(shares) >= config.agreeing)
