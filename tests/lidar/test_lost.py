@@ -77,6 +77,14 @@ def test_another_place_is_doubted_and_lost(around, elsewhere):
     assert judged(mapper, there[:20])
 
 
+def test_scans_that_do_not_explain_one_another_tell_nothing(around, elsewhere):
+    before = around[:120]
+    mapper, there = mapped(before), moved_on(elsewhere, before)
+    rng = np.random.default_rng(0)
+    torn = [replace(s, ranges_m=frozen(s.ranges_m * rng.uniform(0.5, 1.0, len(s.ranges_m)), np.float32)) for s in there]
+    assert not judged(mapper, torn[:20])
+
+
 def test_a_box_that_was_not_there_before_makes_nobody_lost(around):
     poses = ring_drive()
     changed = recording(poses, poses, np.vstack((ring(), box(13.6, 6.0, 14.1, 6.5))))

@@ -28,8 +28,11 @@ class LostConfig(Settings):
     fewest_scans: int = Field(default=5, ge=1, description="and how many at least")
     most_scans: int = Field(default=100, ge=1, description="with so many it is decided, however short the way")
     settled_m: float = Field(default=3.0, ge=0, description="who has mapped less of a way cannot be lost")
+    agreeing: float = Field(
+        default=0.90, ge=0, le=1, description="scans put by tell nothing where they explain less of each other (median)"
+    )
     explained: float = Field(
-        default=0.50, ge=0, le=1, description="lost: of the points in known area fewer lie on a surface"
+        default=0.60, ge=0, le=1, description="lost: of the points in known area fewer lie on a surface"
     )
     violation: float = Field(default=0.30, ge=0, le=1, description="and more of them in free space")
     overlap: float = Field(default=0.25, ge=0, le=1, description="least share of points in known area to tell")
@@ -57,16 +60,21 @@ def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, mapper: Mappe
         mapper: of the robot.
         config: what tells two places apart.
     """
-    seen, T_local_seen = mapper.surroundings()
-    now, T_first_now = _mapped(scans, mapper).surroundings()
+    anew = Mapper(mapper.robot, mapper.config)
+    if not _agree(scans, anew, config):
+        return False
+    (seen, T_local_seen), (now, T_first_now) = mapper.surroundings(), anew.surroundings()
     predicted = se2.between(T_local_seen, se2.compose(T_local_first, T_first_now))
     worse = verify(seen, now, predicted, mapper.config.verification).worse
     return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
 
 
-def _mapped(scans: Sequence[LaserScan], mapper: Mapper) -> Mapper:
-    """A mapper that starts with these scans."""
-    anew = Mapper(mapper.robot, mapper.config)
+def _agree(scans: Sequence[LaserScan], anew: Mapper, config: LostConfig) -> bool:
+    """Whether scans explain one another, mapped anew: where even they do not, nothing can be told from the rest."""
+    shares = []
     for scan in scans:
-        anew.process(scan)
-    return anew
+        sight = anew.look(scan)
+        anew.process(scan, sight)
+        if sight.known > 0.0:  # not so for a scan that was not matched
+            shares.append(sight.explained / sight.known)
+    return bool(shares) and bool(np.median(shares) >= config.agreeing)
