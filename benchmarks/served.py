@@ -91,7 +91,8 @@ def main() -> None:
                 wire += [(name, each, s, *wire_row(each, s, served)) for each, s in seconds.items()]
     report.table("The same as `fcslam map`", SAME, same)
     report.table("By robot and kind", KINDS, kinds)
-    report.table("On the wire, at the speed of the recording", WIRE, wire)
+    if wire:
+        report.table("On the wire, at the speed of the recording", WIRE, wire)
     report.write()
     if not all(row[-1] == "yes" for row in same):
         sys.exit("served: a map is another one")
