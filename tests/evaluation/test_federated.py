@@ -165,10 +165,12 @@ def test_every_network_sees_as_many_samples(robots, tmp_path):
     def watch(name, done, of):
         steps[name] = of
 
-    run_study(study(robots, tmp_path, watch, seeds=1))
+    wide = {"together": False, "settings": {"training": TINY["federated"]["training"] | {"pairs": 2}}}
+    run_study(study(robots, tmp_path, watch, seeds=1, arms={"averaged": {}, "wide": wide}))
     assert steps["central, seed 1"] == steps["local-north, seed 1"] == steps["local-south, seed 1"] == 2 * 2 * 2
     assert steps["alone-north, seed 1"] == 2 * 2
     assert steps["averaged, seed 1"] == 2
+    assert steps["wide, seed 1"] == 2 * 2
 
 
 @pytest.mark.parametrize("name", ["start", "central", "local-north", "alone", "a/b"])

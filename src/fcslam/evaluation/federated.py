@@ -28,9 +28,9 @@ from fcslam.evaluation.federated_arms import (
     START,
     Arm,
     Ground,
+    train_arm,
     train_central,
     train_locally,
-    train_together,
 )
 from fcslam.evaluation.federated_pairs import MEASURES, MOST_POINTS, Described, described, held_out_pairs, measure_pair
 from fcslam.features.detector import OnnxConfig, OnnxDetector
@@ -158,7 +158,7 @@ def _trained(ground: Ground, name: str, arms: Mapping[str, Arm]) -> list[Keypoin
         return [network_of(ground.start, ground.settings.training.encoder)]
     if name == CENTRAL:
         return train_central(ground)
-    return train_together(ground, name, arms[name]) if name in arms else train_locally(ground, name)
+    return train_arm(ground, name, arms[name]) if name in arms else train_locally(ground, name)
 
 
 def _claim(study: Study) -> None:
