@@ -1,5 +1,7 @@
 """The study of federated training: it compares like with like, resumes, and its arithmetic is right."""
 
+from threading import Lock, Thread
+
 import cv2
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ from fcslam.evaluation.federated import Findings, Study, StudySettings, run_stud
 from fcslam.evaluation.federated_pairs import MEASURES, Described, described, held_out_pairs, measure_pair  # noqa: E402
 from fcslam.evaluation.federated_report import report  # noqa: E402
 from fcslam.evaluation.poison import Poisoned  # noqa: E402
+from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
+from fcslam.learning.export import export  # noqa: E402
 from fcslam.learning.images import find_images  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.trainer import Pace  # noqa: E402
@@ -97,6 +101,46 @@ def test_arms_and_seeds_may_be_added_to_a_study(robots, tmp_path):
         run_study(study(robots, tmp_path, seeds=2, arms={"averaged": {"poison": "nan", "seeds": 1}}))
 
 
+def test_robots_own_networks_may_have_fewer_seeds_and_images(robots, tmp_path):
+    settings = {"local_seeds": 1, "trained": 3, "arms": {}}
+    found = run_study(study(robots, tmp_path, **settings))
+    assert {name: len(values) for name, values in found.measured.items()} == {
+        "start": 1, "central": 2, "local": 1, "alone": 1,
+    }  # fmt: skip
+    assert len(list((tmp_path / "labels").rglob("*.npz"))) == 2 * 3
+    assert all(np.isfinite(row.gap.mean) for row in report(found))
+    more = run_study(study(robots, tmp_path, **settings | {"local_seeds": 2}))
+    assert len(more.measured["local"]) == 2
+
+
+def test_two_at_one_study_share_the_work_out(robots, tmp_path, monkeypatch):
+    told, found, exporting = [], [], Lock()
+
+    def export_one_at_a_time(network, path):  # processes need not; the exporter of threads has globals
+        with exporting:
+            export(network, path)
+
+    monkeypatch.setattr("fcslam.evaluation.federated.export", export_one_at_a_time)
+
+    def work(watch):
+        found.append(run_study(study(robots, tmp_path, watch, arms={"averaged": {}})))
+
+    helper = Thread(target=work, args=(lambda name, *_: told.append((2, name)),))
+
+    def begin(name, *_):
+        told.append((1, name))
+        if name == "central, seed 1" and not helper.ident:
+            helper.start()
+
+    work(begin)
+    helper.join()
+    trained = {name: {who for who, each in told if each == name} for _, name in told if ", seed" in name}
+    assert all(len(by) == 1 for by in trained.values())
+    assert {who for by in trained.values() for who in by} == {1, 2}
+    for name, values in found[0].measured.items():
+        assert np.array_equal(values, found[1].measured[name], equal_nan=True)
+
+
 def test_robots_own_networks_share_the_pairs_out(robots, tmp_path):
     local = run_study(study(robots, tmp_path, arms={"averaged": {}})).measured["local"]
     shown = np.isfinite(local[..., 0])
@@ -121,10 +165,12 @@ def test_every_network_sees_as_many_samples(robots, tmp_path):
     def watch(name, done, of):
         steps[name] = of
 
-    run_study(study(robots, tmp_path, watch, seeds=1))
+    wide = {"together": False, "settings": {"training": TINY["federated"]["training"] | {"pairs": 2}}}
+    run_study(study(robots, tmp_path, watch, seeds=1, arms={"averaged": {}, "wide": wide}))
     assert steps["central, seed 1"] == steps["local-north, seed 1"] == steps["local-south, seed 1"] == 2 * 2 * 2
     assert steps["alone-north, seed 1"] == 2 * 2
     assert steps["averaged, seed 1"] == 2
+    assert steps["wide, seed 1"] == 2 * 2
 
 
 @pytest.mark.parametrize("name", ["start", "central", "local-north", "alone", "a/b"])
@@ -133,21 +179,22 @@ def test_an_arm_may_not_take_the_name_of_another(name, robots, tmp_path):
         run_study(study(robots, tmp_path, arms={name: {}}))
 
 
-def test_a_network_matches_a_view_with_itself(robots):
+def test_a_network_matches_a_view_with_itself(robots, tmp_path):
     torch.manual_seed(1)
     network = KeypointNetwork("light").eval()
     network.body.code_head[-1].bias.data.zero_()  # or all its codes are alike
+    export(network, tmp_path / "detector.onnx")
+    detector = OnnxDetector(OnnxConfig(weights=tmp_path / "detector.onnx"))
     (pair,) = held_out_pairs("north", find_images([robots["north"]])[:1], 1)
     same = type(pair)((pair.views[0], pair.views[0]), pair.valid, pair.taught_valid, pair.taught, np.eye(3))
-    device = torch.device("cpu")
-    own = described(network, pair.views[0], device)
-    correct, accuracy, again, former = measure_pair(network, same, own, device)
+    own = described(detector, pair.views[0])
+    correct, accuracy, again, former = measure_pair(detector, same, own)
     assert (correct, again) == (1.0, 1.0)
     assert accuracy > 0.95
     assert former == accuracy
-    assert measure_pair(network, same, Described(own.points, np.bitwise_not(own.codes)), device)[3] < 0.2
+    assert measure_pair(detector, same, Described(own.points, np.bitwise_not(own.codes)))[3] < 0.2
     nothing = Described(np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
-    assert measure_pair(network, same, nothing, device)[3] == 0.0
+    assert measure_pair(detector, same, nothing)[3] == 0.0
 
 
 def findings(central, federated, local):

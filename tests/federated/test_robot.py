@@ -1,5 +1,7 @@
 """A robot's part: real training from given weights on its own images, and nothing of these in what it sends."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from fcslam.federated.network import network_of, version_maker, weights_of  # no
 from fcslam.federated.robot import RobotLearner, own_seed, secret_noise, seeded_noise  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.federated.weights import trained_names, update_vector  # noqa: E402
-from fcslam.learning.arrays import read_arrays  # noqa: E402
+from fcslam.learning.arrays import read_arrays, write_arrays  # noqa: E402
 from fcslam.learning.leg import network_with  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 
@@ -41,6 +43,10 @@ def robot(folder, cache, name="rover"):
     return RobotLearner(name, folder, cache, seeded_noise(name, 1))
 
 
+def labels_in(cache):
+    return [file for file in cache.rglob("*.npz") if not file.stem.startswith("moments")]
+
+
 def same(first, second):
     return all(np.array_equal(first[name], second[name]) for name in first)
 
@@ -62,12 +68,47 @@ def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
 def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
     first = robot(folder, tmp_path)
     first.learn(start, 0, "run", settings())
-    labels = {file: file.read_bytes() for file in tmp_path.rglob("*.npz")}
+    labels = {file: file.read_bytes() for file in labels_in(tmp_path)}
     assert len(labels) == 3
     moved = {name: array * np.float32(1.1) for name, array in start.items()}
     fresh = robot(folder, tmp_path)
     assert same(first.learn(moved, 1, "run", settings()).weights, fresh.learn(moved, 1, "run", settings()).weights)
-    assert {file: file.read_bytes() for file in tmp_path.rglob("*.npz")} == labels
+    assert {file: file.read_bytes() for file in labels_in(tmp_path)} == labels
+
+
+def test_the_optimiser_goes_on_from_the_robots_last_round(folder, start, tmp_path):
+    def learn(cache, round_number, run="run"):
+        return robot(folder, tmp_path / cache).learn(start, round_number, run, settings(rounds=9)).weights
+
+    def kept(cache):
+        return {int(file.stem.split("-")[-1]) for file in (tmp_path / cache).glob("moments-*.npz")}
+
+    learn("a", 0)
+    fresh, second = learn("b", 3), learn("a", 3)
+    assert not same(second, fresh), "it has learnt of gradients in round 0"
+    assert same(learn("a", 3), second), "asked again, it begins where it began before"
+    assert same(learn("a", 3, "another run"), fresh)
+    shutil.copytree(tmp_path / "a", tmp_path / "c")
+    learn("a", 4)
+    assert not same(learn("a", 5), learn("c", 5))
+    assert kept("a") == {3, 4, 5}  # 3 is the other run's
+    learn("a", 0)
+    assert same(learn("a", 3), second), "a run that begins anew does not know what came later"
+
+
+def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
+    robot(folder, tmp_path).learn(start, 0, "run", settings())
+    (moments,) = tmp_path.glob("moments-*.npz")
+    write_arrays(moments, {"0/exp_avg": np.zeros(3, np.float32)})
+    with pytest.raises(TrainingError, match="cannot go on"):
+        robot(folder, tmp_path).learn(start, 1, "run", settings())
+    moments.write_bytes(b"broken")
+    with pytest.raises(TrainingError, match=rf"{moments.name}: the optimiser's memory cannot be read"):
+        robot(folder, tmp_path).learn(start, 1, "run", settings())
+    moments.unlink()
+    moments.mkdir()
+    with pytest.raises(TrainingError, match=rf"{moments.name}: the optimiser's memory cannot be kept"):
+        robot(folder, tmp_path).learn(start, 0, "run", settings())
 
 
 def test_the_pull_holds_updates_back(folder, start, tmp_path):

@@ -12,7 +12,7 @@ from fcslam.learning.batches import draw_batch  # noqa: E402
 from fcslam.learning.descent import Former, Pull  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import fuse  # noqa: E402
-from fcslam.learning.leg import Leg, network_with, train_leg  # noqa: E402
+from fcslam.learning.leg import RAMP_STEPS, Leg, network_with, train_leg  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.pairs import Example  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
@@ -37,7 +37,7 @@ def start():
 def test_a_leg_does_its_steps_and_says_so(examples, start):
     done = []
     before = {name: tensor.clone() for name, tensor in start.items()}
-    network, losses = train_leg(start, examples, SMALL, Leg(first=5, steps=3), CPU, done.append)
+    network, losses, _ = train_leg(start, examples, SMALL, Leg(first=5, steps=3), CPU, done.append)
     assert done == [1, 2, 3]
     assert not network.training
     assert {"detector", "contrastive", "triplet"} <= losses.keys()
@@ -47,14 +47,26 @@ def test_a_leg_does_its_steps_and_says_so(examples, start):
 
 def test_a_leg_learns(examples, start):
     longer = SMALL.model_copy(update={"pairs": 2})
-    _, first = train_leg(start, examples, longer, Leg(first=0, steps=5), CPU)
-    network, _ = train_leg(start, examples, longer, Leg(first=0, steps=30), CPU)
-    _, last = train_leg(network.state_dict(), examples, longer, Leg(first=30, steps=5), CPU)
+    first = train_leg(start, examples, longer, Leg(first=0, steps=5), CPU).losses
+    network = train_leg(start, examples, longer, Leg(first=0, steps=30), CPU).network
+    last = train_leg(network.state_dict(), examples, longer, Leg(first=30, steps=5), CPU).losses
     assert last["detector"] < 0.9 * first["detector"]
 
 
+def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, start):
+    whole = train_leg(start, examples, SMALL, Leg(0, RAMP_STEPS + 3), CPU)
+    first = train_leg(start, examples, SMALL, Leg(0, RAMP_STEPS), CPU)
+    halfway = first.network.state_dict()
+    second = train_leg(halfway, examples, SMALL, Leg(RAMP_STEPS, 3), CPU, moments=first.moments)
+    forgetful = train_leg(halfway, examples, SMALL, Leg(RAMP_STEPS, 3), CPU)
+    expected = whole.network.state_dict()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
+    assert all(torch.equal(tensor, whole.moments[name]) for name, tensor in second.moments.items())
+    assert any(not torch.equal(tensor, expected[name]) for name, tensor in forgetful.network.state_dict().items())
+
+
 def test_frozen_statistics_are_not_touched_while_their_scales_are_trained(examples, start):
-    network, _ = train_leg(start, examples, SMALL, Leg(0, 2, frozen_statistics=True), CPU)
+    network = train_leg(start, examples, SMALL, Leg(0, 2, frozen_statistics=True), CPU).network
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(tensor, start[name])}
     assert not [name for name in changed if "running" in name]
     norms = {name.removesuffix("running_var") for name in start if name.endswith("running_var")}
@@ -103,7 +115,7 @@ def test_codes_are_kept_to_those_of_a_former_network(examples, start):
     wanted = bits(network_with("light", former))
 
     def agreement(leg, state):
-        network, losses = train_leg(start, examples, SMALL, leg, CPU, former=state)
+        network, losses, _ = train_leg(start, examples, SMALL, leg, CPU, former=state)
         assert ("former" in losses) is (state is not None and leg.compatible > 0.0)
         return float((bits(network) == wanted).float().mean())
 

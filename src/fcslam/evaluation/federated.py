@@ -1,12 +1,16 @@
 """Is training together as good as training in one place? Central, federated and local-only training, compared.
 
-All begin from the same weights, and every network that is compared saw the same number of samples. Each is measured on
-the same pairs of views of images that nobody trained on; robots' own networks share them out. Whatever is finished is
-kept, so a study can be interrupted. What is compared first, central, local and the first arm, is trained first.
+All begin from the same weights, and every network that is compared saw the same number of samples. Each is exported and
+measured on the same pairs of views of images that nobody trained on; robots' own networks share them out. Whatever is
+finished is kept, so a study can be interrupted. What is compared first, central, local and the first arm, is trained
+first. Several processes may work on one study.
 """
 
+import fcntl
+import tempfile
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -24,16 +28,18 @@ from fcslam.evaluation.federated_arms import (
     START,
     Arm,
     Ground,
+    train_arm,
     train_central,
     train_locally,
-    train_together,
 )
-from fcslam.evaluation.federated_pairs import MEASURES, Described, described, held_out_pairs, measure_pair
+from fcslam.evaluation.federated_pairs import MEASURES, MOST_POINTS, Described, described, held_out_pairs, measure_pair
+from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.federated.network import network_of
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.start import first_weights
 from fcslam.federated.weights import Weights
 from fcslam.learning.arrays import read_arrays, write_arrays
+from fcslam.learning.export import export
 from fcslam.learning.images import ImageFile, find_images
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import Pair
@@ -55,8 +61,12 @@ class StudySettings(Settings):
     )
     arms: dict[str, Arm] = Field(default_factory=lambda: {"federated": Arm()}, description="by name")
     seeds: int = Field(default=3, ge=1, description="each trains anew, from the same start")
+    local_seeds: int | None = Field(
+        default=None, ge=1, description="so many of them for robots' own networks, which cost most; null for all"
+    )
     pairs: int = Field(default=500, ge=1, description="pairs of views, shared out among the robots' held-out images")
     images: int = Field(default=400, ge=4, description="at most so many image files of a robot")
+    trained: int = Field(default=400, ge=2, description="of those not tested on, at most so many are trained on")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,24 +109,48 @@ def run_study(study: Study) -> Findings:
     _claim(study)
     share = -(-study.settings.pairs // len(study.robots))
     pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
-    owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
-    most, arms = study.settings.seeds, study.settings.arms
-    seeds = {START: 1, CENTRAL: most, LOCAL: most, ALONE: most}
-    seeds |= {name: min(arm.seeds or most, most) for name, arm in arms.items()}
+    files = _files_of_arms(study)
+    missing = [(name, seed, file) for name, places in files.items() for seed, file in enumerate(places, start=1)]
     common: Common | None = None
-    measured: dict[str, FloatArray] = {}
-    for name, count in seeds.items():
-        rows = []
-        for seed in range(1, count + 1):
-            file = study.folder / f"seed{seed}" / "measured" / f"{name}.npz"
-            if not file.exists():
-                common = common or _common(study, pairs)
-                ground = _ground(study, common, seed)
-                networks = _trained(ground, name, arms)
-                write_arrays(file, {"measures": _measured(networks, pairs, common, seed, study)})
-            rows.append(read_arrays(file)["measures"])
-        measured[name] = np.stack(rows)
+    # What another process is at is left to it; when there is nothing else to do it is waited for, or taken over.
+    for patient in (False, True):
+        for name, seed, file in missing:
+            with _alone(file.with_suffix(".lock"), patient) as mine:
+                if mine and not file.exists():
+                    common = common or _common(study, pairs)
+                    networks = _trained(_ground(study, common, seed), name, study.settings.arms)
+                    write_arrays(file, {"measures": _measured(networks, pairs, common, seed, study)})
+    owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
+    measured = {name: np.stack([read_arrays(file)["measures"] for file in places]) for name, places in files.items()}
     return Findings(tuple(study.robots), owners, measured)
+
+
+def _files_of_arms(study: Study) -> dict[str, list[Path]]:
+    """Where what is measured of each arm is kept, by seed."""
+    settings = study.settings
+    own = min(settings.local_seeds or settings.seeds, settings.seeds)
+    seeds = {START: 1, CENTRAL: settings.seeds, LOCAL: own, ALONE: own}
+    seeds |= {name: min(arm.seeds or settings.seeds, settings.seeds) for name, arm in settings.arms.items()}
+    return {
+        name: [study.folder / f"seed{seed}" / "measured" / f"{name}.npz" for seed in range(1, count + 1)]
+        for name, count in seeds.items()
+    }
+
+
+@contextmanager
+def _alone(path: Path, patient: bool) -> Iterator[bool]:
+    """Whether no other process is in here with the same file; if ``patient``, it is waited for."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", encoding="utf-8") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX if patient else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                yield False
+            else:
+                yield True
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error})") from error
 
 
 def _trained(ground: Ground, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:
@@ -124,7 +158,7 @@ def _trained(ground: Ground, name: str, arms: Mapping[str, Arm]) -> list[Keypoin
         return [network_of(ground.start, ground.settings.training.encoder)]
     if name == CENTRAL:
         return train_central(ground)
-    return train_together(ground, name, arms[name]) if name in arms else train_locally(ground, name)
+    return train_arm(ground, name, arms[name]) if name in arms else train_locally(ground, name)
 
 
 def _claim(study: Study) -> None:
@@ -135,7 +169,8 @@ def _claim(study: Study) -> None:
         study.folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
             before = load(StudySettings, path)
-            known = before.model_copy(update={"arms": before.arms | settings.arms, "seeds": settings.seeds})
+            counts = {"seeds": settings.seeds, "local_seeds": settings.local_seeds}
+            known = before.model_copy(update={"arms": before.arms | settings.arms, **counts})
             settings = settings.model_copy(update={"arms": known.arms})
             same = {name: known.arms[name].model_copy(update={"seeds": arm.seeds}) for name, arm in before.arms.items()}
             changed = same != before.arms
@@ -163,14 +198,17 @@ def _common(study: Study, pairs: Sequence[Pair]) -> Common:
     def watch(stage: str, status: Status) -> None:
         study.watch(stage, status.step, status.steps)
 
-    start = first_weights(study.settings.start, study.folder, study.settings.federated, study.pace, watch)
     device = torch.device(study.pace.device)
-    network = network_of(start, training.encoder).to(device)
     images: dict[str, Images] = {}
-    for robot in study.robots:
-        files = _files(study, robot)[0]
-        images[robot] = gather(files, study.folder / "labels", training, as_detector(network, device), None, watch)
-    return Common(start, images, [described(network, pair.views[0], device) for pair in pairs])
+    with _alone(study.folder / "common.lock", patient=True):
+        start = first_weights(study.settings.start, study.folder, study.settings.federated, study.pace, watch)
+        network = network_of(start, training.encoder)
+        labeller = as_detector(network.to(device), device)
+        for robot in study.robots:
+            files = _files(study, robot)[0]
+            images[robot] = gather(files, study.folder / "labels", training, labeller, None, watch)
+    detector = _detector(network)
+    return Common(start, images, [described(detector, pair.views[0]) for pair in pairs])
 
 
 def _ground(study: Study, common: Common, seed: int) -> Ground:
@@ -183,22 +221,32 @@ def _ground(study: Study, common: Common, seed: int) -> Ground:
 
 def _files(study: Study, robot: str) -> tuple[list[ImageFile], list[ImageFile]]:
     """A robot's image files, to train and to test on, spread over all it has."""
-    files = find_images([study.robots[robot]])
-    step = max(len(files) / study.settings.images, 1.0)
-    some = [files[int(index * step)] for index in range(min(len(files), study.settings.images))]
+    some = _spread(find_images([study.robots[robot]]), study.settings.images)
     tests = [file for file in some if zlib.crc32(file.name.encode()) < TEST_SHARE * 2**32]
-    return [file for file in some if file not in tests], tests
+    return _spread([file for file in some if file not in tests], study.settings.trained), tests
+
+
+def _spread(files: Sequence[ImageFile], most: int) -> list[ImageFile]:
+    step = max(len(files) / most, 1.0)
+    return [files[int(index * step)] for index in range(min(len(files), most))]
 
 
 def _measured(
     networks: Sequence[KeypointNetwork], pairs: Sequence[Pair], common: Common, seed: int, study: Study
 ) -> FloatArray:
     """Shape (networks, pairs, measures): several networks take turns, so that all together cost what one does."""
-    device = torch.device(study.pace.device)
-    ready = [network.to(device).eval() for network in networks]
-    measures = np.full((len(ready), len(pairs), len(MEASURES)), np.nan)
+    detectors = [_detector(network) for network in networks]
+    measures = np.full((len(detectors), len(pairs), len(MEASURES)), np.nan)
     for index, pair in enumerate(pairs):
-        turn = (index + seed) % len(ready)
-        measures[turn, index] = measure_pair(ready[turn], pair, common.former[index], device)
+        turn = (index + seed) % len(detectors)
+        measures[turn, index] = measure_pair(detectors[turn], pair, common.former[index])
         study.watch("measuring", index + 1, len(pairs))
     return measures
+
+
+def _detector(network: KeypointNetwork) -> OnnxDetector:
+    """A network as robots run it, exported."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "detector.onnx"
+        export(network, path)
+        return OnnxDetector(OnnxConfig(weights=path, most_features=MOST_POINTS))

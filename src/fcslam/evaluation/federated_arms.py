@@ -19,6 +19,7 @@ from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import Example
+from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import Images
 from fcslam.learning.trainer import Pace, Run, Status
 
@@ -31,8 +32,9 @@ ALONE: Final = "alone"
 
 
 class Arm(Settings):
-    """One way to train together."""
+    """One way to train."""
 
+    together: bool = Field(default=True, description="false: in one place, as many steps as a robot of the fleet does")
     settings: dict[str, Any] = Field(default_factory=dict, description="federated settings that differ")
     poison: Poison | None = Field(default=None, description="what the last robot does to its updates")
     seeds: int | None = Field(default=None, ge=1, description="so many of the study's seeds; null for all")
@@ -65,19 +67,20 @@ class Ground:
 
 def train_central(ground: Ground) -> list[KeypointNetwork]:
     """One network, on all images in one place."""
-    everything = [example for images in ground.images.values() for example in images.train]
-    return [_train_alone(ground, CENTRAL, everything, len(ground.images))]
+    return [_train_alone(ground, CENTRAL, _everything(ground), _of_robots(ground, len(ground.images)))]
 
 
 def train_locally(ground: Ground, name: str) -> list[KeypointNetwork]:
     """A network for each robot, on its images alone: with as many samples as all of them saw together, or its share."""
-    shares = len(ground.images) if name == LOCAL else 1
-    return [_train_alone(ground, f"{name}-{robot}", images.train, shares) for robot, images in ground.images.items()]
+    training = _of_robots(ground, len(ground.images) if name == LOCAL else 1)
+    return [_train_alone(ground, f"{name}-{robot}", images.train, training) for robot, images in ground.images.items()]
 
 
-def train_together(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]:
-    """One network, by federated training in one process; the one after the last round."""
+def train_arm(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]:
+    """One network, in one place, or by federated training in one process; the one after the last round."""
     settings, place = arm.federated(ground.settings, ground.seed), ground.folder / name
+    if not arm.together:
+        return [_train_alone(ground, name, _everything(ground), settings.of_robots())]
     learners: list[Learner] = [
         RobotLearner(
             robot, Path(robot), place / robot, seeded_noise(robot, ground.seed), ground.pace.device, gathered=own
@@ -101,15 +104,22 @@ def train_together(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]
     return [network_of(state.weights, settings.training.encoder)]
 
 
-def _train_alone(ground: Ground, name: str, examples: list[Example], shares: int) -> KeypointNetwork:
-    """By the central trainer; ``shares`` times the steps of a robot."""
+def _everything(ground: Ground) -> list[Example]:
+    return [example for images in ground.images.values() for example in images.train]
+
+
+def _of_robots(ground: Ground, shares: int) -> TrainingSettings:
+    """With ``shares`` times the steps of a robot."""
     training = ground.settings.of_robots()
-    steps = training.steps * shares
-    training = training.model_copy(update={"steps": steps, "seed": ground.seed})
+    return training.model_copy(update={"steps": training.steps * shares, "seed": ground.seed})
+
+
+def _train_alone(ground: Ground, name: str, examples: list[Example], training: TrainingSettings) -> KeypointNetwork:
+    """By the central trainer."""
     state = network_of(ground.start, training.encoder).state_dict()
     folder = ground.folder / name
     folder.mkdir(parents=True, exist_ok=True)
-    quiet = replace(ground.pace, validate_every=steps, log_every=max(steps // 20, 1))
+    quiet = replace(ground.pace, validate_every=training.steps, log_every=max(training.steps // 20, 1))
 
     def watch(status: Status) -> None:
         ground.watch(name, status.step, status.steps)

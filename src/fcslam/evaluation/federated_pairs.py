@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-import torch
 
 from fcslam.errors import EvaluationError
 from fcslam.features.codes import mutual_matches
+from fcslam.features.detector import Detector
 from fcslam.learning.images import ImageFile, is_usable, read_image
 from fcslam.learning.labels import Labels
-from fcslam.learning.monitor import MOST_POINTS, detect
-from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import Example, Pair, View, draw_pair
 from fcslam.metrics.homography import corner_error, estimate_homography, inverse, match_errors
 from fcslam.metrics.repeatability import in_common_view, repeatability
@@ -22,10 +20,12 @@ MEASURES: Final = ("homography_3px", "mma_3px", "repeatability", "mma_3px_former
 WITHIN_PX: Final = 3.0
 VIEW: Final = (320, 240)
 PAIR_SEED: Final = 414
+MOST_POINTS: Final = 300
+"""The best of so many that each view sees are looked for again."""
 
 
 class Described(NamedTuple):
-    """What a network finds in a view."""
+    """What a detector finds in a view."""
 
     points: FloatArray
     """Shape (N, 2) [px]."""
@@ -50,20 +50,19 @@ def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[P
     return pairs
 
 
-def described(network: KeypointNetwork, view: View, device: torch.device) -> Described:
-    """What the network, which is on the device, finds."""
-    return Described(*detect(network, torch.from_numpy(view.image)[None, None].to(device)))
+def described(detector: Detector, view: View) -> Described:
+    """What a detector finds, of 8 bits a pixel as a camera gives them."""
+    found = detector.detect(np.rint(255.0 * view.image).astype(np.uint8))
+    return Described(found.keypoints_px.astype(np.float64), found.descriptors)
 
 
-def measure_pair(
-    network: KeypointNetwork, pair: Pair, former: Described, device: torch.device
-) -> tuple[float, float, float, float]:
+def measure_pair(detector: Detector, pair: Pair, former: Described) -> tuple[float, float, float, float]:
     """``MEASURES`` of one pair: homography right to 3 px at the corners or not, MMA at 3 px, repeatability, former MMA.
 
-    The last is that of the codes which a ``former`` network gave the first view and this one gives the second.
-    Where nothing is matched MMA is 0, or a network that finds nothing would look good.
+    The last is that of the codes which a ``former`` detector gave the first view and this one gives the second.
+    Where nothing is matched MMA is 0, or a detector that finds nothing would look good.
     """
-    first, second = (described(network, view, device) for view in pair.views)
+    first, second = (described(detector, view) for view in pair.views)
     matched = _matched(first, second, pair)
     error = corner_error(estimate_homography(*matched), pair.homography, VIEW)
     again = repeatability(first.points, second.points, pair.homography, VIEW, MOST_POINTS).repeatability

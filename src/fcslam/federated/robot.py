@@ -11,12 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fcslam.errors import TrainingError
+from fcslam.federated.keeping import former_weights, keep_moments, last_moments
 from fcslam.federated.network import network_of, weights_of
 from fcslam.federated.privacy import privatised
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, trained_names
-from fcslam.learning.arrays import read_arrays, write_arrays
 from fcslam.learning.images import find_images
 from fcslam.learning.leg import Leg, train_leg
 from fcslam.learning.monitor import validate
@@ -53,8 +52,8 @@ class Learner(Protocol):
 class RobotLearner:
     """A robot with images of its own in ``folder``.
 
-    What outlives a round is kept in ``cache``: labels of the images, and the weights that codes are to be compatible
-    with, if they are to be.
+    What outlives a round is kept in ``cache``: labels of the images, the memory of the optimiser, and the weights that
+    codes are to be compatible with, if they are to be.
     """
 
     name: str
@@ -68,7 +67,7 @@ class RobotLearner:
     """Its images with their labels, once they are read."""
 
     def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> Learned:
-        """As in ``Learner``; the result depends on the arguments, the images, their labels, and the noise.
+        """As in ``Learner``; the result depends on the arguments, what is kept, the images, and the noise.
 
         Raises:
             TrainingError: there are too few usable images, the weights are of another network, training diverged, or
@@ -85,36 +84,27 @@ class RobotLearner:
             frozen_statistics=frozen,
         )
         own = settings.of_robots().model_copy(update={"seed": own_seed(self.name, settings.training.seed)})
-        kept = self._former(weights, round_number, run) if leg.compatible else None
-        network, losses = train_leg(
+        former = former_weights(self.cache, run, round_number, weights) if leg.compatible else None
+        moments = last_moments(self.cache, run, round_number)
+        trained = train_leg(
             network.state_dict(),
             examples,
             own,
             leg,
             torch.device(self.device),
             partial(self.watch, self.name),
-            None if kept is None else network_of(kept, settings.training.encoder).state_dict(),
+            former=None if former is None else network_of(former, settings.training.encoder).state_dict(),
+            moments=moments,
         )
-        trained = weights_of(network)
-        names = trained_names(weights, frozen)
-        return Learned(privatised(trained, weights, names, settings.privacy, self.noise(round_number)), losses)
+        keep_moments(self.cache, run, round_number, trained.moments)
+        found, names = weights_of(trained.network), trained_names(weights, frozen)
+        return Learned(privatised(found, weights, names, settings.privacy, self.noise(round_number)), trained.losses)
 
     def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
         """As in ``Learner``, on pairs of images that were held out."""
         network = network_of(weights, settings.training.encoder).to(self.device)
         held_out = self._examples(weights, settings).held_out
         return validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
-
-    def _former(self, weights: Weights, round_number: int, run: str) -> Weights:
-        """The weights that the run began from, or the first that came here of a run that had begun before."""
-        # By a number of its own: whatever the server calls the run, it is a file of this folder.
-        path = self.cache / f"former-{zlib.crc32(run.encode()):08x}.npz"
-        try:
-            if round_number == 0 or not path.exists():
-                write_arrays(path, weights)
-            return read_arrays(path)
-        except (OSError, ValueError) as error:
-            raise TrainingError(f"{path}: the first weights cannot be kept there ({error}); make room") from error
 
     def _examples(self, weights: Weights, settings: FederatedSettings) -> Images:
         """The images, labelled by the first weights that ever came here, and by no later ones."""

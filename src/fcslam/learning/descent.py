@@ -57,6 +57,28 @@ def new_optimiser(network: KeypointNetwork) -> torch.optim.Optimizer:
     return torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
 
 
+def moments_of(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """What an optimiser has learnt of gradients, by the parameters' numbers."""
+    states = optimiser.state_dict()["state"]
+    return {f"{index}/{name}": value for index, entries in states.items() for name, value in entries.items()}
+
+
+def give_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
+    """Let a new optimiser go on with what another one had learnt.
+
+    Raises:
+        ValueError: they are of another network.
+    """
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in moments.items():
+        index, key = name.split("/")
+        state.setdefault(int(index), {})[key] = tensor
+    shapes = [value.shape for group in optimiser.param_groups for value in group["params"]]
+    if any(index >= len(shapes) or state[index]["exp_avg"].shape != shapes[index] for index in state):
+        raise ValueError("an optimiser's memory of other parameters")
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+
+
 def descend(
     network: KeypointNetwork,
     optimiser: torch.optim.Optimizer,

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from fcslam.errors import TrainingError
 from fcslam.learning.batches import stream
-from fcslam.learning.descent import Former, Pull, descend, learning_rate, new_optimiser
+from fcslam.learning.descent import Former, Pull, descend, give_moments, learning_rate, moments_of, new_optimiser
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import Example
 from fcslam.learning.settings import Encoder, TrainingSettings
@@ -32,6 +32,16 @@ class Leg:
     """Whether batch normalisation uses the means and variances it came with, and leaves them as they are."""
 
 
+class Trained(NamedTuple):
+    """What a leg gives."""
+
+    network: KeypointNetwork
+    losses: dict[str, float]
+    """Means over the steps."""
+    moments: dict[str, Tensor]
+    """What the optimiser has learnt of gradients."""
+
+
 def train_leg(
     start: Mapping[str, Tensor],
     examples: Sequence[Example],
@@ -40,15 +50,16 @@ def train_leg(
     device: torch.device,
     watch: Callable[[int], None] = lambda _steps: None,
     former: Mapping[str, Tensor] | None = None,
-) -> tuple[KeypointNetwork, dict[str, float]]:
-    """Train from ``start`` (a network's state) with an optimiser of its own; the network and its mean losses.
+    moments: Mapping[str, Tensor] | None = None,
+) -> Trained:
+    """Train from ``start`` (a network's state), with an optimiser that goes on from the ``moments`` of an earlier leg.
 
     The result depends on the arguments alone. ``settings.steps`` are those of the whole run: the rate falls towards
     its end. ``watch`` is told how many steps are done. ``former`` is the state of the network that made codes which are
     still in use.
 
     Raises:
-        TrainingError: ``start`` or ``former`` does not fit the network, or training diverged.
+        TrainingError: ``start``, ``former`` or ``moments`` does not fit the network, or training diverged.
     """
     network = network_with(settings.encoder, start).to(device, memory_format=torch.channels_last)
     network.train()
@@ -61,17 +72,22 @@ def train_leg(
     if former is not None and leg.compatible > 0.0:
         keeper = Former(leg.compatible, network_with(settings.encoder, former).to(device))
     optimiser = new_optimiser(network)
+    if moments is not None:
+        try:
+            give_moments(optimiser, moments)
+        except (KeyError, ValueError) as error:
+            raise TrainingError(f"the optimiser cannot go on ({error})") from error
     sums: dict[str, float] = {}
     ends = settings.model_copy(update={"steps": leg.first + leg.steps})
     for step, batch in stream(examples, ends, leg.first, ahead=2, threads=1):
         done = step - leg.first + 1
-        rate = learning_rate(settings, step) * min(done / RAMP_STEPS, 1.0)
+        rate = learning_rate(settings, step) * (min(done / RAMP_STEPS, 1.0) if moments is None else 1.0)
         parts = descend(network, optimiser, batch.to(device), settings, step, rate, pull=pull, former=keeper)
         for name, part in parts.items():
             sums[name] = sums.get(name, 0.0) + float(part)
         watch(done)
     network.eval()
-    return network, {name: total / leg.steps for name, total in sums.items()}
+    return Trained(network, {name: total / leg.steps for name, total in sums.items()}, moments_of(optimiser))
 
 
 def network_with(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:

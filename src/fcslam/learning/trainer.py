@@ -17,7 +17,7 @@ from torch import Tensor
 from fcslam.errors import OutputError, TrainingError
 from fcslam.learning.batches import Batch, stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from fcslam.learning.descent import descend, learning_rate, new_optimiser
+from fcslam.learning.descent import descend, give_moments, learning_rate, moments_of, new_optimiser
 from fcslam.learning.monitor import alarms, validate
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits
@@ -154,18 +154,13 @@ class Run:
     def _load(self, checkpoint: Checkpoint) -> None:
         self.network.load_state_dict(checkpoint.part(NETWORK))
         self.average.load_state_dict(checkpoint.part(AVERAGE))
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in checkpoint.part(OPTIMISER).items():
-            index, key = name.split("/")
-            state.setdefault(int(index), {})[key] = tensor
-        self.optimiser.load_state_dict({"state": state, "param_groups": self.optimiser.state_dict()["param_groups"]})
+        give_moments(self.optimiser, checkpoint.part(OPTIMISER))
         self.step = checkpoint.step
 
     def _save(self) -> None:
         tensors = {f"{NETWORK}{name}": value for name, value in self.network.state_dict().items()}
         tensors |= {f"{AVERAGE}{name}": value for name, value in self.average.state_dict().items()}
-        for index, entries in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"{OPTIMISER}{index}/{name}": value for name, value in entries.items()}
+        tensors |= {f"{OPTIMISER}{name}": value for name, value in moments_of(self.optimiser).items()}
         settings = self.settings.model_dump(mode="json")
         write_checkpoint(self.folder / CHECKPOINT_FILE, Checkpoint(self.stage, self.step, settings, tensors))
         self._saved = time.monotonic()
