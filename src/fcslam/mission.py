@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.report import Track, run_of, traffic_metrics
 from fcslam.cloud.sessions import check_robot, robot_of, session_name
+from fcslam.cloud.settings import FleetConfig
 from fcslam.config import Settings, dump
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.mapper import ScanPose

@@ -2,7 +2,8 @@ import pytest
 from cloud.scripted import ScriptedMatcher
 
 from fcslam.cloud import fleet
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
 
 
 @pytest.fixture

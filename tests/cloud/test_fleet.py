@@ -9,7 +9,8 @@ import small_fleet
 from cloud.scripted import ALIAS, ScriptedMatcher, closures, motion, rectangle, stream
 from small_fleet import feed, fingerprint, in_order, map_of
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.places.matcher import MatcherConfig

@@ -8,9 +8,10 @@ import small_fleet
 from cloud.test_sessions import started_again
 from small_fleet import feed, fingerprint, in_order, map_of
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.fusion import fuse
 from fcslam.cloud.report import keyscan_track, run_of
+from fcslam.cloud.settings import FleetConfig
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.map_files import Occupancy
 from fcslam.metrics.grid import LabelledGrid, grid_agreement

@@ -7,7 +7,8 @@ import pytest
 from cloud.scripted import LASER, closures, keyscan, motion, place, rectangle, stream
 from small_fleet import feed, fingerprint, in_order
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
 from fcslam.records import Channel, ConstraintKind, Correction, KeyscanId, frozen
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
@@ -149,7 +150,8 @@ def test_a_duplicate_is_acknowledged_again(scripted):
 @pytest.mark.parametrize("changed", [{"keypoints": 0.0}, {"keypoints": 300.0}])
 def test_places_made_to_confuse_are_matched_without_harm(packets, changed):
     """Through the real matcher: all keypoints in one spot or far away, descriptors all alike."""
-    from fcslam.cloud.fleet import Fleet, FleetConfig
+    from fcslam.cloud.fleet import Fleet
+    from fcslam.cloud.settings import FleetConfig
 
     def poisoned(packet):
         if not hasattr(packet.body, "descriptors") or packet.robot != "robot_2":

@@ -9,9 +9,10 @@ import small_fleet
 from cloud.scripted import ALIAS, closures, rectangle, stream, verified
 from small_fleet import feed, fingerprint, in_order, map_of
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.ledger import ClosureLedger
 from fcslam.cloud.rigid_fusion import fuse_rigidly
+from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.strategy import FusionStrategy
 from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch

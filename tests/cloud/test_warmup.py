@@ -24,7 +24,9 @@ def news(before):
     return {name: sorted(kinds - before.get(name, set())) for name, kinds in compiled().items()
             if kinds - before.get(name, set())}
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
+
+from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.wire.packets import decode

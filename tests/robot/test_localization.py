@@ -7,7 +7,8 @@ import pytest
 import small_fleet
 from wire.examples import CORRECTION
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.records import Constraint, ConstraintKind, Correction, Keyscan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend

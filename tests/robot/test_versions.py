@@ -7,7 +7,8 @@ from features.networks import tiny_network
 from robot.test_views import records_of
 from small_fleet import fingerprint
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import FeatureError
 from fcslam.features.detector import SHIPPED_NETWORK
 from fcslam.features.kinds import DetectorKind

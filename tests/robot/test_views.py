@@ -9,7 +9,8 @@ from features.networks import tiny_network
 from features.pictures import image_at
 from lidar.worlds import drifting, drive, path, recording, ring
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
 from fcslam.config import dump, load
 from fcslam.errors import FeatureError
 from fcslam.features.detector import OnnxConfig, OnnxDetector

@@ -10,7 +10,6 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from fcslam.cloud.joining import first_estimate, judge
 from fcslam.cloud.joint_graph import JointGraph
@@ -20,16 +19,15 @@ from fcslam.cloud.result import FleetResult, Fusion, conclude, map_indices
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.robots import RobotStore
 from fcslam.cloud.sessions import in_session, robot_of, session_name
+from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.strategy import FusionStrategy
 from fcslam.cloud.submaps import SubmapShelf
 from fcslam.cloud.support import Support
 from fcslam.cloud.verdict import reconsider
 from fcslam.cloud.visits import Visit, visits_near
-from fcslam.config import Settings
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
-from fcslam.graph.consistency import ConsistencySettings
-from fcslam.places.matcher import MatcherConfig, PlaceMatch, PlaceMatcher
+from fcslam.places.matcher import PlaceMatch, PlaceMatcher
 from fcslam.places.thinning import crowded_out
 from fcslam.records import (
     Channel,
@@ -47,26 +45,6 @@ from fcslam.records import (
 )
 from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
 from fcslam.wire.packets import decode, encode
-
-
-class FleetConfig(Settings):
-    """The cloud's part."""
-
-    join_maps: bool = Field(default=True, description="look for places that several robots saw")
-    fusion: FusionStrategy = Field(
-        default=FusionStrategy.JOINT,
-        description="joint: one robust graph; two_point, n_point: rigid maps laid on one another by matched points",
-    )
-    sight_m: float = Field(default=6.0, gt=0, description="in a joint map, places this near are compared")
-    near_visits: int = Field(
-        default=2, ge=0, description="so many of another robot's visits are compared with one place"
-    )
-    surprise_m: float = Field(default=0.5, gt=0, description="a closure this far off the joint map needs a cluster")
-    surprise_rad: float = Field(default=0.1, gt=0, description="or turned this much")
-    solve_every: int = Field(default=40, gt=0, description="closures between two quick solves")
-    submaps_kept: int = Field(default=300, gt=1, description="submaps held ready for comparison; others are rebuilt")
-    matcher: MatcherConfig = Field(default=MatcherConfig(), description="place matching")
-    consistency: ConsistencySettings = Field(default=ConsistencySettings(), description="pairwise consistency")
 
 
 class VocabularyState(NamedTuple):

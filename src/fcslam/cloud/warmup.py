@@ -8,8 +8,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.report import keyscan_track, run_of
+from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.places.matcher import MatcherConfig

@@ -9,7 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.cloud.fleet import Fleet, FleetConfig
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import EvaluationError
 from fcslam.evaluation.place_scoring import DescribedSet, PlaceFeatures
 from fcslam.evaluation.place_sets import PlaceSet
