@@ -331,7 +331,7 @@ def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
 
     def in_memory():
         gc.collect()
-        return sum(isinstance(each, Packet) for each in gc.get_objects())
+        return sum(type(each) is Packet for each in gc.get_objects())
 
     cloud.put(two_robots())
     before = in_memory()

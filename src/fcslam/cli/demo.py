@@ -112,7 +112,7 @@ def _learn(sources: "Sequence[Source]", folder: Path, seed: int, camera: bool, c
         _announce(console, 2, "learn: left out, there is no camera")
         return config
     if missing:
-        how = "pip install 'fcslam[federated]'"
+        how = "pip install 'fcslam\\[federated]'"  # escaped: brackets are the console's markup
         _announce(console, 2, f"learn: left out, as {' and '.join(missing)} are not installed; to have it: {how}")
         return config
     _announce(console, 2, "learn: the robots train the detector together, no image leaves its robot")
