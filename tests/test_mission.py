@@ -48,7 +48,9 @@ class Kidnapped:
 def test_a_robot_that_was_lost_is_two_sessions_that_a_veto_may_name():
     settings = MissionConfig()
     robot = settings.robot.model_copy(update={"channels": (Channel.LIDAR,)})
-    run = run_mission([Kidnapped()], settings.model_copy(update={"robot": robot}), vetoes=[Veto("r", "r+1")])
+    seen = []
+    run = run_mission([Kidnapped()], settings.model_copy(update={"robot": robot}), seen.append, [Veto("r", "r+1")])
+    assert {metric.name: metric.value for metric in run.metrics}["keyscans"] == seen[-1].keyscans
     scans, moment = kidnapping()
     first, second = run.trajectories
     assert (first.robot, second.robot) == ("r", "r+1")

@@ -116,7 +116,7 @@ class _Meter:
         first, last = self._span.get(robot, (stamp, stamp))
         self._span[robot] = min(first, stamp), max(last, stamp)
         self.scans += 1
-        self.keyscans += any(isinstance(packet.body, Keyscan) for packet in packets)
+        self.keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
         if self.scans % self.EVERY == 0:
             self.tell()
 

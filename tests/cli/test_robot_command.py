@@ -1,5 +1,6 @@
 """The command: one robot against a cloud behind real HTTP."""
 
+import io
 import re
 import signal
 import subprocess
@@ -7,10 +8,14 @@ import sys
 
 import pytest
 import small_fleet
+from rich.console import Console
 from robot.fake_cloud import FakeCloud
 from robot.http_cloud import serving
 
 from fcslam.cli import main
+from fcslam.cli.robot import _progress
+from fcslam.robot.agent import AgentProgress
+from fcslam.robot.outbox import Waiting
 from fcslam.runs import read_tum
 from fcslam.sources import write_carmen
 from fcslam.wire.packets import decode
@@ -108,3 +113,12 @@ def test_the_traffic_is_explained_without_a_recording(capsys):
     out = capsys.readouterr().out
     assert "descriptors" in out
     assert "no image" in " ".join(out.split())
+
+
+def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begins():
+    console = Console(file=io.StringIO(), width=200)
+    with _progress(console, 100) as watch:
+        for times_lost, quality in [(0, 0.0), (1, 0.0), (1, 0.5), (1, 0.0), (2, 0.0)]:
+            watch(AgentProgress(9, 9, Waiting(0, 0), 9, 9, 0, 0, 0, 0.0, quality, times_lost, None, False, ()))
+    said = [line.split(":")[0] for line in console.file.getvalue().splitlines()]
+    assert said == ["connected", "lost", "relocalised in map 0, quality 0.50", "not relocalised", "lost"]

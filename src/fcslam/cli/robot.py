@@ -286,7 +286,7 @@ def _progress(console: "Console", total: int) -> "Iterator[AgentWatch]":
             nonlocal trouble, notices, whereabouts, times_lost
             lines = [now.trouble or "connected"] * (now.trouble != trouble)
             if (now.whereabouts, now.times_lost) != (whereabouts, times_lost):
-                lines.append(_found(now))
+                lines.append(_found(now, times_lost))
             whereabouts, times_lost = now.whereabouts, now.times_lost
             for line in [*lines, *(notice for notice in now.notices if notice not in notices)]:
                 console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -297,11 +297,13 @@ def _progress(console: "Console", total: int) -> "Iterator[AgentWatch]":
         yield watch
 
 
-def _found(now: "AgentProgress") -> str:
-    """What a robot that was lost knows of its place."""
+def _found(now: "AgentProgress", before: int) -> str:
+    """What a robot that was lost knows of its place; ``before``: how often it was when that was last said."""
     if now.quality > 0.0:
         return f"relocalised in map {now.map_index}, quality {now.quality:.2f}"
-    return "lost: this is not the place of before; a new session begins here"
+    if now.times_lost > before:
+        return "lost: this is not the place of before; a new session begins here"
+    return "not relocalised: nobody bears out where it is"
 
 
 def _what(now: "AgentProgress") -> str:
@@ -337,7 +339,7 @@ def _report(recording: "Source", agent: "Agent", state: Path, server: str) -> No
         console.print(f"{now.refused} packets were refused: {state / 'refused'}", highlight=False, soft_wrap=True)
     if now.times_lost:
         lost = f"lost {now.times_lost} times" if now.times_lost > 1 else "lost once"
-        console.print(f"{lost}; {_found(now)}", highlight=False)
+        console.print(f"{lost}; {_found(now, now.times_lost)}", highlight=False)
     trajectory = agent.trajectory()
     if trajectory is not None:
         write_tum(state / "trajectory.tum", *trajectory)

@@ -34,14 +34,13 @@ class ClosureLedger:
         self._entries: list[Entry] = []
         self._between: dict[frozenset[str], list[Entry]] = {}
         """Entries between two robots, by these: a large fleet asks for its pairs again and again."""
+        self._ties: dict[str, list[Entry]] = {}
+        """Entries between each robot and others, without mere candidates: those never become more."""
         self._confirmed: set[tuple[frozenset[KeyscanId], Channel]] = set()
         """Pairs of places between which geometry has confirmed a closure, with its channel."""
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries)
-
-    def __reversed__(self) -> Iterator[Entry]:
-        return reversed(self._entries)
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -63,6 +62,8 @@ class ClosureLedger:
         self._entries.append(entry)
         if entry.is_between:
             self._between.setdefault(frozenset((match.i.robot, match.j.robot)), []).append(entry)
+            for robot in (match.i.robot, match.j.robot) if match.M else ():
+                self._ties.setdefault(robot, []).append(entry)
         return entry
 
     def add_local(self, constraint: Constraint, edge: int) -> Entry:
@@ -83,3 +84,8 @@ class ClosureLedger:
             for entry in self._between.get(frozenset((a, b)), ())
             if entry.independent and not entry.vetoed and entry.closure.status is not ClosureStatus.CANDIDATE
         ]
+
+    def ties(self, robot: str) -> Iterator[Entry]:
+        """What is accepted between a robot and others, the newest first."""
+        entries = reversed(self._ties.get(robot, ()))
+        return (entry for entry in entries if entry.closure.status is ClosureStatus.ACCEPTED)

@@ -8,7 +8,6 @@ import numpy as np
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.ledger import ClosureLedger
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import ClosureStatus
 
 MOST_TIES = 10
 """More closures make no difference: 1 - 2^-10 is as good as 1."""
@@ -40,14 +39,7 @@ class Support:
         """In [0, 1], as in ``Correction``; ``robots`` share the session's map."""
         if len(robots) == 1:
             return 0.0
-        ties = (
-            entry
-            for entry in reversed(ledger)
-            if entry.is_between
-            and entry.closure.status is ClosureStatus.ACCEPTED
-            and session in (entry.closure.i.robot, entry.closure.j.robot)
-        )
-        count = sum(1 for _ in islice(ties, MOST_TIES))
+        count = sum(1 for _ in islice(ledger.ties(session), MOST_TIES))
         return self._share.get(session, 0.0) * (1.0 - 0.5**count)
 
     def _fits(self, match: PlaceMatch) -> bool:
