@@ -1,5 +1,6 @@
 """The study of federated training: it compares like with like, resumes, and its arithmetic is right."""
 
+import fcntl
 from threading import Lock, Thread
 
 import cv2
@@ -99,6 +100,25 @@ def test_arms_and_seeds_may_be_added_to_a_study(robots, tmp_path):
     assert "central, seed 1" not in told
     with pytest.raises(EvaluationError, match="another study"):
         run_study(study(robots, tmp_path, seeds=2, arms={"averaged": {"poison": "nan", "seeds": 1}}))
+
+
+def test_nobody_reads_what_a_study_is_while_another_begins_it(robots, tmp_path, monkeypatch):
+    begun = study(robots, tmp_path)
+    monkeypatch.setattr("fcslam.evaluation.federated._files_of_arms", lambda _: {})
+    run_study(begun)
+    content = (tmp_path / "study.yaml").read_bytes()
+    with (tmp_path / "study.lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        (tmp_path / "study.yaml").write_bytes(b"")
+        waiting = Thread(target=run_study, args=(begun,), daemon=True)
+        waiting.start()
+        waiting.join(0.5)
+        assert waiting.is_alive()
+        assert not (tmp_path / "study.yaml").read_bytes()
+        (tmp_path / "study.yaml").write_bytes(content)
+    waiting.join(60.0)
+    assert not waiting.is_alive()
+    assert (tmp_path / "study.yaml").read_bytes() == content
 
 
 def test_robots_own_networks_may_have_fewer_seeds_and_images(robots, tmp_path):

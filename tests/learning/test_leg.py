@@ -65,6 +65,19 @@ def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, s
     assert any(not torch.equal(tensor, expected[name]) for name, tensor in forgetful.network.state_dict().items())
 
 
+def test_moments_that_are_no_numbers_are_given_to_no_other_leg(examples, start, monkeypatch):
+    def overflow(network, optimiser, *_, **__):
+        for value in network.parameters():
+            value.grad = torch.full_like(value, torch.inf)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        return {}
+
+    monkeypatch.setattr("fcslam.learning.leg.descend", overflow)
+    with pytest.raises(TrainingError, match="diverged in the last step"):
+        train_leg(start, examples, SMALL, Leg(0, 1), CPU)
+
+
 def test_frozen_statistics_are_not_touched_while_their_scales_are_trained(examples, start):
     network = train_leg(start, examples, SMALL, Leg(0, 2, frozen_statistics=True), CPU).network
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(tensor, start[name])}

@@ -106,7 +106,8 @@ def run_study(study: Study) -> Findings:
     for name in study.settings.arms:
         if name.split("-")[0] in (START, CENTRAL, LOCAL, ALONE) or not name.replace("-", "").isalnum():
             raise EvaluationError(f"{name}: an arm of a study needs another name")
-    _claim(study)
+    with _alone(study.folder / "study.lock", patient=True):  # who begins at the same time reads all of it
+        _claim(study)
     share = -(-study.settings.pairs // len(study.robots))
     pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
     files = _files_of_arms(study)

@@ -87,7 +87,10 @@ def train_leg(
             sums[name] = sums.get(name, 0.0) + float(part)
         watch(done)
     network.eval()
-    return Trained(network, {name: total / leg.steps for name, total in sums.items()}, moments_of(optimiser))
+    learnt = moments_of(optimiser)
+    if not all(bool(torch.isfinite(value).all()) for value in learnt.values()):
+        raise TrainingError("training diverged in the last step; lower the learning rate")  # who went on would, too
+    return Trained(network, {name: total / leg.steps for name, total in sums.items()}, learnt)
 
 
 def network_with(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:

@@ -170,6 +170,11 @@ def test_viewers_get_the_files_of_the_live_run(mapped):
         assert mapped.ask("GET", f"{API}/{path}", "eye").status_code in (400, 404)
 
 
+@pytest.mark.parametrize("path", [f"maps/{10**300}.png", f"maps/0/tiles/0/{10**30}/0.png"])
+def test_numbers_that_no_map_has_are_refused_and_no_fault_of_the_service(mapped, path):
+    assert mapped.ask("GET", f"{API}/{path}", "eye").status_code == 400
+
+
 def test_before_the_first_map_there_is_none(desk):
     assert get(desk, "fleet").json()["robots"] == []
     assert get(desk, "maps").json() == []

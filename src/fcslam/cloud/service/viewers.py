@@ -27,7 +27,10 @@ from fcslam.cloud.sessions import session_name
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import POSE_GRAPH, TRAJECTORIES, ClosureRow, Run, open_run
 
-Index = Annotated[int, PathParameter(ge=0)]
+MOST = 2**31 - 1
+"""No map and no square has a larger number."""
+Index = Annotated[int, PathParameter(ge=0, le=MOST)]
+Square = Annotated[int, PathParameter(ge=-MOST, le=MOST)]
 TEXT = "text/plain"
 MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "application/yaml"}
 
@@ -117,7 +120,7 @@ def map_router(state: ServiceState) -> APIRouter:
         response_class=Response,
         responses={**refusals(400, 404), 200: content(MEDIA["png"])},
     )
-    def get_tile(k: Index, z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)], x: int, y: int) -> Response:
+    def get_tile(k: Index, z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)], x: Square, y: Square) -> Response:
         """A square of a map: at zoom z it has 256 m / 2^z; x and y count squares from the origin, y upwards."""
         return tile_png(_live_folder(state), _stem(k), z, x, y)
 
