@@ -19,7 +19,7 @@ class FleetConfig(Settings):
     )
     sight_m: float = Field(default=6.0, gt=0, description="in a joint map, places this near are compared")
     near_visits: int = Field(
-        default=2, ge=0, description="so many of another robot's visits are compared with one place"
+        default=2, ge=0, description="so many visits of each robot, in other sessions, are compared with one place"
     )
     surprise_m: float = Field(default=0.5, gt=0, description="a closure this far off the joint map needs a cluster")
     surprise_rad: float = Field(default=0.1, gt=0, description="or turned this much")

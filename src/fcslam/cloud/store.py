@@ -5,6 +5,7 @@ and stays as it came. Its **turn** is its place in the order in which packets ta
 a session that of their numbers. A packet has no turn while one before it is missing.
 """
 
+import math
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
@@ -219,7 +220,8 @@ class MissionStore:
                     " FROM corrections WHERE true ON CONFLICT (robot, epoch) DO UPDATE SET version = excluded.version,"
                     " time = excluded.time, map_index = excluded.map_index, x = excluded.x, y = excluded.y,"
                     " theta = excluded.theta, quality = excluded.quality WHERE map_index != ?4"
-                    f" OR max(abs(x - ?5), abs(y - ?6)) >= {NEWS_M} OR abs(theta - ?7) >= {NEWS_RAD}"
+                    f" OR max(abs(x - ?5), abs(y - ?6)) >= {NEWS_M}"
+                    f" OR min(abs(theta - ?7), {2.0 * math.pi} - abs(theta - ?7)) >= {NEWS_RAD}"
                     f" OR abs(quality - ?8) >= {NEWS_QUALITY} OR (quality = 0) != (?8 = 0)",
                     (correction.robot, correction.epoch, correction.time, *row),
                 )

@@ -166,21 +166,13 @@ class Agent:
     def trajectory(self) -> tuple[FloatArray, FloatArray] | None:
         """Stamps (N,) and poses (N, 3) of ``base`` in the fleet's map at every scan, by the newest correction.
 
-        From before the robot was lost, by the last correction of that time, as long as that was about the same map.
-        None: the cloud has not said where the map is.
+        Since the robot was last lost: of what was before, corrections are as old as that, and maps are numbered anew as
+        they join. None: the cloud has not said where the map is.
         """
-        tracks = ((self._localizer(part), poses) for part, poses in enumerate(self._frontend.tracks))
-        here = self.localizer.map_index
-        known = [
-            (pose.stamp, T_map_base)
-            for localizer, poses in tracks
-            if localizer.map_index == here
-            for pose in poses
-            if (T_map_base := localizer.T_map_base(pose)) is not None
-        ]
-        if not known:
-            return None
-        return np.array([stamp for stamp, _ in known]), np.array([T_map_base for _, T_map_base in known])
+        localizer, track = self.localizer, self._frontend.tracks[-1]
+        poses = [localizer.T_map_base(pose) for pose in track]
+        known = [pose for pose in poses if pose is not None]
+        return (np.array([pose.stamp for pose in track]), np.array(known)) if known else None
 
     def _localizer(self, part: int) -> Localizer:
         return self._localizers.setdefault(part, Localizer(self._clock))

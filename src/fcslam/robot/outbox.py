@@ -38,6 +38,7 @@ CREATE TABLE IF NOT EXISTS releases (
     epoch INTEGER NOT NULL, record INTEGER NOT NULL, channel TEXT NOT NULL, version TEXT NOT NULL,
     format INTEGER NOT NULL, size INTEGER NOT NULL, sha256 BLOB NOT NULL
 );
+CREATE INDEX IF NOT EXISTS numbers ON packets (epoch, sequence);
 CREATE INDEX IF NOT EXISTS waiting ON packets (epoch, sequence) WHERE data IS NOT NULL;
 """
 # part: the front end's own epoch, 0 where a start begins; ordinal: the front end's own count; sequence: the number on
