@@ -92,8 +92,8 @@ def arms() -> dict[str, Any]:
     poisoned: dict[str, Any] = {"poison": "reversed", **few}
     return {
         "averaged": {},
-        "wide": {"together": False, "settings": {"training": WIDE}, **few},
         **{f"{name}-reversed": {"settings": how, **poisoned} for name, how in ROBUST.items()},
+        "wide": {"together": False, "settings": {"training": WIDE}, **few},
         "frozen": {"settings": {"normalisation": "frozen"}, **few},
         **{name: {"settings": private(multiplier), **few} for name, multiplier in NOISE.items()},
         **{name: {"settings": {"compatible": strength}, **few} for name, strength in KEPT.items()},
