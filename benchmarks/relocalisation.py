@@ -82,7 +82,7 @@ class Told:
 
     @property
     def is_right(self) -> bool:
-        return self.off_m <= RIGHT_M and self.off_rad <= RIGHT_RAD
+        return self.off_m <= RIGHT_M and bool(self.off_rad <= RIGHT_RAD)
 
 
 def main() -> None:
@@ -211,7 +211,7 @@ def mission(
 def true_poses(robot, drives: Sequence[Drive]) -> FloatArray:
     """At a session's keyscans."""
     names = {session_name(drive.name, epoch): drive for drive in drives for epoch in range(20)}
-    return names[robot.robot].truth([keyscan.stamp for keyscan in robot.keyscans])
+    return names[robot.robot].truth(robot.stamps)
 
 
 def final_errors(cloud: Fleet, drives: Sequence[Drive]) -> tuple[float, float, float]:
@@ -221,7 +221,7 @@ def final_errors(cloud: Fleet, drives: Sequence[Drive]) -> tuple[float, float, f
     truth = np.vstack([true_poses(robot, drives) for robot in here])
     poses = np.vstack([robot.T_map_base for robot in here])
     off = position_errors(align(truth, poses), truth, poses)
-    total = sum(len(robot.keyscans) for robot in robots)
+    total = sum(len(robot.stamps) for robot in robots)
     return float(np.sqrt(np.mean(off**2))), float(off.max()), 1.0 - len(poses) / total
 
 
