@@ -126,7 +126,8 @@ def main() -> None:
     for measure, title in TITLES.items():
         report.table(title, GAPS, [gap_row(below[measure, arm]) for arm in COMPARED if arm in known])
     unpoisoned = compare(findings, "averaged")
-    report.table("One of five robots poisoned", LOSSES, poison_rows(unpoisoned))
+    if poisoned := list(poison_rows(unpoisoned)):
+        report.table("One of five robots poisoned", LOSSES, poisoned)
     report.table("Updates that screening refused", REFUSED, refused_rows(folder / "study", known))
     if known.issuperset(NOISE):
         report.table("Noise for privacy", PRIVATE, private_rows(compare(findings, "frozen")))

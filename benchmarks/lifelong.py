@@ -15,7 +15,7 @@ session:
 - CPU seconds a place (match, verify, solve) and a solve, means of the session; and of 1,000 packets, whatever they are,
   which is what a worker needs that starts again;
 - the live map against the truth: RMSE of all keyscans of the first map once that is moved onto the truth, F1 of the
-  map's surfaces (0.10 m) against the building as it is in this session, seen from wherever the robot has been.
+  map's surfaces (0.10 m) against the building as it was on that drive, seen from wherever the robot has been.
 
 "End" is the result of all sessions: decided once, as the packets came in canonical order, and once more by a replay of
 all of them, as it is where several robots' packets arrive as they may.
