@@ -53,7 +53,9 @@ def grid_of(robots, **extra):
 
 
 def settings(**given):
-    return FederatedSettings.model_validate({"rounds": 2, "local_steps": 1, "screening": LENIENT} | given)
+    return FederatedSettings.model_validate(
+        {"rounds": 2, "local_steps": 1, "screening": LENIENT, "server_momentum": 0.0} | given
+    )
 
 
 LENIENT = {"largest_change": None, "longest": None, "least_agreement": None}

@@ -99,8 +99,15 @@ def test_the_optimiser_goes_on_from_the_robots_last_round(folder, start, tmp_pat
 def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
     robot(folder, tmp_path).learn(start, 0, "run", settings())
     (moments,) = tmp_path.glob("moments-*.npz")
-    write_arrays(moments, {"0/exp_avg": np.zeros(3, np.float32)})
-    with pytest.raises(TrainingError, match="cannot go on"):
+    whole = read_arrays(moments)
+    of_another = {"0/exp_avg_sq": np.zeros(3, np.float32)}
+    halved = {name: array for name, array in whole.items() if name != "0/exp_avg_sq"}
+    for odd in (whole | of_another, halved, {"0/exp_avg": whole["0/exp_avg"]}, {"nonsense": np.zeros(1)}):
+        write_arrays(moments, odd)
+        with pytest.raises(TrainingError, match="cannot go on"):
+            robot(folder, tmp_path).learn(start, 1, "run", settings())
+    write_arrays(moments, {"0/step": np.array("text")})
+    with pytest.raises(TrainingError, match="cannot be read"):
         robot(folder, tmp_path).learn(start, 1, "run", settings())
     moments.write_bytes(b"broken")
     with pytest.raises(TrainingError, match=rf"{moments.name}: the optimiser's memory cannot be read"):

@@ -58,23 +58,29 @@ def by_hand(strategy, answers, before, memory):
 
 
 @pytest.mark.parametrize("strategy", ["fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum"])
-def test_a_round_merges_as_a_hand_would(strategy, tmp_path):
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_round_merges_as_a_hand_would(strategy, share, tmp_path):
     robots = [Fake(f"r{seed}", answer=ragged(seed)) for seed in range(5)]
-    state, _ = run(robots, tmp_path, settings(strategy=strategy, rounds=3, normalisation="frozen"))
+    chosen = settings(strategy=strategy, rounds=3, normalisation="frozen", server_momentum=share)
+    state, _ = run(robots, tmp_path, chosen)
     weights, memory = START, {}
+    momentum = {name: 0.0 for name in START if name != "a.running_var" and strategy != "fedadam"}
     for round_number in range(3):
         answers = [robot.answer(weights, round_number) for robot in robots]
         merged = by_hand(strategy, answers, weights, memory)
+        for name, before in momentum.items():
+            momentum[name] = merged[name] - weights[name] + share * before
+            merged[name] = merged[name] + share * momentum[name]
         weights = {name: np.asarray(array, np.float32) for name, array in merged.items()}
     for name, array in weights.items():
-        assert state.weights[name] == pytest.approx(array, abs=1e-6)
+        assert state.weights[name] == pytest.approx(array, rel=1e-6, abs=1e-6)
     assert not same(state.weights, START)
 
 
 @pytest.mark.parametrize("strategy", ["fedavg", "fedadam"])
 @pytest.mark.parametrize("moment", ["in training", "after a round"])
 def test_a_killed_server_ends_as_if_it_had_not_been(strategy, moment, tmp_path):
-    chosen = settings(strategy=strategy, rounds=4, normalisation="frozen")
+    chosen = settings(strategy=strategy, rounds=4, normalisation="frozen", server_momentum=0.5)
     whole, rows = run([Fake("a", answer=ragged(1)), Fake("b", answer=ragged(2))], tmp_path / "whole", chosen)
 
     def killed(weights, round_number):
@@ -238,7 +244,7 @@ def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
     def fleet():
         return [Fake(f"r{seed}", answer=towards(seed)) for seed in range(4)]
 
-    chosen = settings(rounds=3, screening={})
+    chosen = settings(rounds=3, screening={"least_agreement": 0.01})
     alone, _ = run(fleet(), tmp_path / "alone", chosen, start=start)
     bad = Poisoned(Fake("bad", answer=towards(9)), poison)
     together, reports = run([*fleet(), bad], tmp_path / "together", chosen, start=start)

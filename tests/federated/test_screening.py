@@ -38,10 +38,18 @@ def poisoned(kind):
     return BEFORE | {"convolution.weight": (BEFORE["convolution.weight"] + update).astype(np.float32)}
 
 
-@pytest.mark.parametrize("kind", ["flipped", "scaled", "random", "huge", "nan", "zero"])
-def test_one_poisoned_robot_of_five_is_refused_and_no_other(kind):
+STRICT = ScreeningSettings(least_agreement=0.01)
+"""Refuses what agrees with nobody as well, which does less harm than honest robots' being refused after short legs."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [(kind, ScreeningSettings()) for kind in ("flipped", "scaled", "huge", "nan")]
+    + [(kind, STRICT) for kind in ("random", "zero")],
+)
+def test_one_poisoned_robot_of_five_is_refused_and_no_other(kind, settings):
     answers = {f"robot{seed}": honest(seed) for seed in range(4)} | {"bad": poisoned(kind)}
-    refused = screen(answers, BEFORE, ScreeningSettings())
+    refused = screen(answers, BEFORE, settings)
     assert set(refused) == {"bad"}
     assert refused["bad"]
 
@@ -58,7 +66,7 @@ def test_poison_does_not_hide_behind_honest_statistics(kind):
 
     start = BEFORE | {"norm.running_mean": np.full(20, 90.0, np.float32)}
     answers = {f"robot{seed}": in_daylight(honest(seed)) for seed in range(4)} | {"bad": in_daylight(poisoned(kind))}
-    assert set(screen(answers, start, ScreeningSettings())) == {"bad"}
+    assert set(screen(answers, start, STRICT)) == {"bad"}
 
 
 def test_statistics_may_lie_on_all_sides_but_not_far_away():

@@ -10,7 +10,7 @@ import fcntl
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -141,17 +141,17 @@ def _files_of_arms(study: Study) -> dict[str, list[Path]]:
 @contextmanager
 def _alone(path: Path, patient: bool) -> Iterator[bool]:
     """Whether no other process is in here with the same file; if ``patient``, it is waited for."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", encoding="utf-8") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX if patient else fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                yield False
-            else:
-                yield True
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error})") from error
+    mine = True
+    with ExitStack() as stack:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = stack.enter_context(path.open("w", encoding="utf-8"))
+            fcntl.flock(file, fcntl.LOCK_EX if patient else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            mine = False
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written ({error})") from error
+        yield mine
 
 
 def _trained(ground: Ground, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:

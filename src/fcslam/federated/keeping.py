@@ -77,5 +77,5 @@ def _number(run: str) -> str:
 def _told(path: Path, what: str) -> Iterator[None]:
     try:
         yield
-    except (OSError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:  # torch knows not every type of numbers
         raise TrainingError(f"{path}: {what} ({error}); make room, or take it away") from error

@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
-from fcslam.federated.flower import Grid, Message, MessageType, MetricRecord, RecordDict
+from fcslam.federated.flower import Grid, Message, MessageType, RecordDict
 from fcslam.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
 from fcslam.federated.letters import (
     ARRAYS,
     CONFIG,
-    METRICS,
-    WEIGHT,
     figures_of,
     order_config,
     read_arrays,
@@ -34,8 +32,8 @@ from fcslam.federated.privacy import epsilon
 from fcslam.federated.roster import Roster, choose
 from fcslam.federated.screening import screen
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.strategies import memory_of, new_strategy, remember
-from fcslam.federated.weights import Weights, malformed
+from fcslam.federated.strategies import Merger
+from fcslam.federated.weights import Weights
 
 SCORE_FIGURES: Final = ("repeatability", "mma_3px")
 _CHOICE_SEED: Final = 77
@@ -74,7 +72,7 @@ class Server:
 
     def __init__(self, settings: FederatedSettings, start: Weights, folder: Path, outside: Outside) -> None:
         self._settings, self._start, self._folder, self._outside = settings, start, folder, outside
-        self._strategy = new_strategy(settings)
+        self._merger = Merger(settings, {})
         self._run = run_name(settings, outside.version(start))
 
     def run(self, grid: Grid) -> State:
@@ -93,7 +91,7 @@ class Server:
             state = self._begin(grid, roster)
         else:
             rows = read_rows(self._folder / ROUNDS_FILE, state.rounds_done)
-        remember(self._strategy, state.memory)
+        self._merger = Merger(self._settings, state.memory)
         while state.rounds_done < self._settings.rounds:
             state, report = self._round(grid, roster, state)
             rows.append(report.row())
@@ -128,12 +126,12 @@ class Server:
             best=weights if released else state.best,
             best_score=score if released else state.best_score,
             best_round=state.rounds_done + 1 if released else state.best_round,
-            memory={} if returned else memory_of(self._strategy),
+            memory={} if returned else self._merger.memory,
             asked=Counter(state.asked) + Counter(asked),
             origin=state.origin,
         )
         if returned:
-            self._strategy = new_strategy(self._settings)
+            self._merger = Merger(self._settings, {})
         privacy = self._settings.privacy
         report = RoundReport(
             round_number=following.rounds_done,
@@ -158,7 +156,7 @@ class Server:
         rng = np.random.default_rng([self._settings.training.seed, state.rounds_done, _CHOICE_SEED])
         chosen = choose(present, self._settings.participation, self._settings.minimum_robots, rng)
         version = self._outside.version(state.weights)
-        orders = self._strategy.configure_train(
+        orders = self._merger.strategy.configure_train(
             state.rounds_done + 1,
             write_arrays(state.weights),
             order_config(version, state.rounds_done, self._run, self._settings),
@@ -171,23 +169,10 @@ class Server:
             del answers.weights[robot], answers.losses[robot]
         return answers, chosen
 
-    def _merge(self, answers: Answers, state: State) -> dict[str, NDArray[np.float32]]:
-        """By Flower's strategy, in the order of the robots' names: sums of floats depend on it."""
-        messages = []
-        for robot in sorted(answers.weights):
-            # All did the same number of steps, so all weigh the same, whatever a robot would like to weigh.
-            metrics = MetricRecord({WEIGHT: 1.0})
-            message = answers.messages[robot]
-            message.content = RecordDict({ARRAYS: write_arrays(answers.weights[robot]), METRICS: metrics})
-            messages.append(message)
-        merged, _ = self._strategy.aggregate_train(state.rounds_done + 1, messages)
-        weights = {name: np.asarray(array, np.float32) for name, array in read_arrays(merged).items()}
-        reason = malformed(weights, state.weights)
-        if reason is not None:
-            raise TrainingError(
-                f"round {state.rounds_done + 1}: {self._settings.strategy} gave unusable weights: {reason}"
-            )
-        return {name: weights[name] for name in state.weights}
+    def _merge(self, answers: Answers, state: State) -> Weights:
+        """In the order of the robots' names: sums of floats depend on it."""
+        ordered = [(answers.messages[robot], answers.weights[robot]) for robot in sorted(answers.weights)]
+        return self._merger.merge(state.rounds_done + 1, ordered, state.weights)
 
     def _judge(self, weights: Weights, round_number: int, grid: Grid, roster: Roster) -> dict[str, float]:
         if self._outside.judge is not None:

@@ -21,7 +21,7 @@ class ScreeningSettings(Settings):
         default=3.0, gt=1.0, description="its length, in medians of the round's lengths; null for any"
     )
     least_agreement: float | None = Field(
-        default=0.01, ge=-1.0, le=1.0, description="its cosine with the median of the others; null for any"
+        default=-0.03, ge=-1.0, le=1.0, description="its cosine with the median of the others; null for any"
     )
     quorum: int = Field(default=4, ge=3, description="updates from which on they are compared with one another")
 
@@ -37,8 +37,8 @@ class PrivacySettings(Settings):
 class FederatedSettings(Settings):
     """One federated training run."""
 
-    rounds: int = Field(default=40, ge=1, description="rounds of local training and aggregation")
-    local_steps: int = Field(default=50, ge=1, description="optimiser steps of a robot in a round")
+    rounds: int = Field(default=100, ge=1, description="rounds of local training and aggregation")
+    local_steps: int = Field(default=20, ge=1, description="optimiser steps of a robot in a round")
     strategy: StrategyName = Field(default="fedavg", description="how updates become one, by Flower's class")
     participation: float = Field(default=1.0, gt=0.0, le=1.0, description="share of the robots asked in a round")
     minimum_robots: int = Field(default=1, ge=1, description="updates without which a round does not count")
@@ -46,6 +46,9 @@ class FederatedSettings(Settings):
     proximal: float = Field(default=0.01, ge=0.0, description="strength of FedProx's pull to the global weights")
     compatible: float = Field(
         default=0.0, ge=0.0, description="how strongly codes are kept to those of the first weights; 0 is not at all"
+    )
+    server_momentum: float = Field(
+        default=0.5, ge=0.0, lt=1.0, description="Nesterov's, between rounds; 0 is none; FedAdam has its own"
     )
     server_rate: float = Field(default=0.003, gt=0.0, description="learning rate of FedAdam")
     trimmed: float = Field(default=0.2, ge=0.0, lt=0.5, description="share that FedTrimmedAvg cuts at either end")

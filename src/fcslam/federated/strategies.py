@@ -1,17 +1,89 @@
-"""Flower's strategies, and what of them has to outlive a restart."""
+"""How updates become one: Flower's strategies, momentum between rounds, and what of both has to outlive a restart."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.federated.flower import FedAdam, FedAvg, FedMedian, FedProx, FedTrimmedAvg, Krum
-from fcslam.federated.letters import ARRAYS, CONFIG, WEIGHT
+from fcslam.errors import TrainingError
+from fcslam.federated.flower import (
+    FedAdam,
+    FedAvg,
+    FedMedian,
+    FedProx,
+    FedTrimmedAvg,
+    Krum,
+    Message,
+    MetricRecord,
+    RecordDict,
+)
+from fcslam.federated.letters import ARRAYS, CONFIG, METRICS, WEIGHT, read_arrays, write_arrays
 from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.weights import Weights, malformed, trained_names
 
 _MOMENTS: Final = ("m_t", "v_t")
 """FedAdam's memory, by its attributes' names."""
+_MOMENTUM: Final = "momentum"
+
+
+class Merger:
+    """One of Flower's strategies, and what it is to remember of earlier rounds."""
+
+    def __init__(self, settings: FederatedSettings, memory: Mapping[str, NDArray[Any]]) -> None:
+        self.strategy = new_strategy(settings)
+        # FedAdam has a momentum of its own.
+        self._share = 0.0 if settings.strategy == "fedadam" else settings.server_momentum
+        for moment in _MOMENTS:
+            if part := _part(memory, moment):
+                setattr(self.strategy, moment, part)
+        self._momentum = _part(memory, _MOMENTUM)
+
+    @property
+    def memory(self) -> dict[str, NDArray[Any]]:
+        """What another one needs to go on as this one would, as arrays by name."""
+        parts = {moment: getattr(self.strategy, moment, None) or {} for moment in _MOMENTS}
+        parts[_MOMENTUM] = self._momentum
+        return {f"{part}/{name}": np.asarray(array) for part, arrays in parts.items() for name, array in arrays.items()}
+
+    def merge(self, round_number: int, answers: Sequence[tuple[Message, Weights]], old: Weights) -> Weights:
+        """The next weights, from robots' answers to ``old`` ones.
+
+        Raises:
+            TrainingError: they are unusable.
+        """
+        messages = []
+        for message, weights in answers:
+            # All did the same number of steps, so all weigh the same, whatever a robot would like to weigh.
+            metrics = MetricRecord({WEIGHT: 1.0})
+            message.content = RecordDict({ARRAYS: write_arrays(weights), METRICS: metrics})
+            messages.append(message)
+        record, _ = self.strategy.aggregate_train(round_number, messages)
+        merged = {name: np.asarray(array, np.float32) for name, array in read_arrays(record).items()}
+        reason = malformed(merged, old)
+        if reason is not None:
+            raise TrainingError(f"round {round_number}: the strategy gave unusable weights: {reason}")
+        if self._share == 0.0:
+            return {name: merged[name] for name in old}
+        onward, self._momentum = with_momentum(merged, old, self._momentum, self._share)
+        return onward
+
+
+def with_momentum(
+    merged: Weights, old: Weights, momentum: Mapping[str, NDArray[np.float32]], share: float
+) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]]:
+    """Weights beyond the ``merged`` ones by Nesterov's momentum, and the momentum for the next round.
+
+    A mean of updates is less noisy than each of them and can be followed further: m <- share m + u,
+    w <- w + u + share m with u = ``merged`` - ``old``, as in Douillard et al. 2023 (DiLoCo). Batch statistics are
+    taken as merged: they are measured and not learnt, and variances may not turn negative.
+    """
+    onward, following = {name: merged[name] for name in old}, {}
+    for name in trained_names(old, frozen_statistics=True):
+        update = merged[name] - old[name]
+        following[name] = np.asarray(update + share * momentum[name] if momentum else update, np.float32)
+        onward[name] = np.asarray(merged[name] + share * following[name], np.float32)
+    return onward, following
 
 
 def new_strategy(settings: FederatedSettings) -> FedAvg:
@@ -40,20 +112,5 @@ def new_strategy(settings: FederatedSettings) -> FedAvg:
             return Krum(num_malicious_nodes=settings.malicious, **everyone)
 
 
-def memory_of(strategy: FedAvg) -> dict[str, NDArray[Any]]:
-    """What the strategy remembers of earlier rounds, as arrays by name."""
-    return {
-        f"{moment}/{name}": np.asarray(array)
-        for moment in _MOMENTS
-        for name, array in (getattr(strategy, moment, None) or {}).items()
-    }
-
-
-def remember(strategy: FedAvg, memory: Mapping[str, NDArray[Any]]) -> None:
-    """Give a new strategy the memory of one before."""
-    for moment in _MOMENTS:
-        part = {
-            name.removeprefix(f"{moment}/"): array for name, array in memory.items() if name.startswith(f"{moment}/")
-        }
-        if part:
-            setattr(strategy, moment, part)
+def _part(memory: Mapping[str, NDArray[Any]], part: str) -> dict[str, NDArray[Any]]:
+    return {name.removeprefix(f"{part}/"): array for name, array in memory.items() if name.startswith(f"{part}/")}

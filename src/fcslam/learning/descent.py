@@ -73,9 +73,12 @@ def give_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]
     for name, tensor in moments.items():
         index, key = name.split("/")
         state.setdefault(int(index), {})[key] = tensor
-    shapes = [value.shape for group in optimiser.param_groups for value in group["params"]]
-    if any(index >= len(shapes) or state[index]["exp_avg"].shape != shapes[index] for index in state):
-        raise ValueError("an optimiser's memory of other parameters")
+    shapes = [tuple(value.shape) for group in optimiser.param_groups for value in group["params"]]
+    for number, entries in state.items():
+        found = {key: tuple(value.shape) for key, value in entries.items()}
+        shape = shapes[number] if 0 <= number < len(shapes) else None
+        if found != {"step": (), "exp_avg": shape, "exp_avg_sq": shape}:
+            raise ValueError("an optimiser's memory of other parameters")
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
