@@ -77,6 +77,23 @@ def test_a_round_merges_as_a_hand_would(strategy, share, tmp_path):
     assert not same(state.weights, START)
 
 
+@pytest.mark.parametrize(("robots", "most"), [(1, 0.0), (2, 0.5), (4, 0.75)])
+def test_momentum_goes_no_further_than_all_robots_one_after_another(robots, most, tmp_path):
+    def end(share):
+        fleet = [Fake(f"r{seed}", answer=ragged(seed)) for seed in range(robots)]
+        return run(fleet, tmp_path / str(share), settings(rounds=3, server_momentum=share))[0].weights
+
+    assert same(end(0.9), end(most))
+    assert same(end(0.9), end(0.2)) is (robots == 1)
+
+
+def test_statistics_are_taken_as_they_were_measured(tmp_path):
+    state, _ = run([Fake("a", 0.5), Fake("b", 0.5)], tmp_path, settings(rounds=3, server_momentum=0.5))
+    assert state.weights["a.running_var"] == pytest.approx(1.0 + 3 * 0.5)
+    steps = 0.5 * np.array([1.0, 1.5, 1.75]) * 0.5  # each round's share of momentum, on top of its update
+    assert state.weights["b.weight"] == pytest.approx(0.5 + 3 * 0.5 + steps.sum())
+
+
 @pytest.mark.parametrize("strategy", ["fedavg", "fedadam"])
 @pytest.mark.parametrize("moment", ["in training", "after a round"])
 def test_a_killed_server_ends_as_if_it_had_not_been(strategy, moment, tmp_path):

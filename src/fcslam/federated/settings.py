@@ -48,7 +48,10 @@ class FederatedSettings(Settings):
         default=0.0, ge=0.0, description="how strongly codes are kept to those of the first weights; 0 is not at all"
     )
     server_momentum: float = Field(
-        default=0.5, ge=0.0, lt=1.0, description="Nesterov's, between rounds; 0 is none; FedAdam has its own"
+        default=0.5,
+        ge=0.0,
+        lt=1.0,
+        description="Nesterov's, between rounds; 1 - 1/N of N robots at most; 0 is none; FedAdam has its own",
     )
     server_rate: float = Field(default=0.003, gt=0.0, description="learning rate of FedAdam")
     trimmed: float = Field(default=0.2, ge=0.0, lt=0.5, description="share that FedTrimmedAvg cuts at either end")

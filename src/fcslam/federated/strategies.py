@@ -32,18 +32,18 @@ class Merger:
 
     def __init__(self, settings: FederatedSettings, memory: Mapping[str, NDArray[Any]]) -> None:
         self.strategy = new_strategy(settings)
-        # FedAdam has a momentum of its own.
-        self._share = 0.0 if settings.strategy == "fedadam" else settings.server_momentum
+        self._most = settings.server_momentum
         for moment in _MOMENTS:
             if part := _part(memory, moment):
                 setattr(self.strategy, moment, part)
-        self._momentum = _part(memory, _MOMENTUM)
+        without = settings.strategy == "fedadam" or settings.server_momentum == 0.0  # FedAdam has its own
+        self._momentum = None if without else _part(memory, _MOMENTUM)
 
     @property
     def memory(self) -> dict[str, NDArray[Any]]:
         """What another one needs to go on as this one would, as arrays by name."""
         parts = {moment: getattr(self.strategy, moment, None) or {} for moment in _MOMENTS}
-        parts[_MOMENTUM] = self._momentum
+        parts[_MOMENTUM] = self._momentum or {}
         return {f"{part}/{name}": np.asarray(array) for part, arrays in parts.items() for name, array in arrays.items()}
 
     def merge(self, round_number: int, answers: Sequence[tuple[Message, Weights]], old: Weights) -> Weights:
@@ -63,9 +63,11 @@ class Merger:
         reason = malformed(merged, old)
         if reason is not None:
             raise TrainingError(f"round {round_number}: the strategy gave unusable weights: {reason}")
-        if self._share == 0.0:
+        if self._momentum is None:
             return {name: merged[name] for name in old}
-        onward, self._momentum = with_momentum(merged, old, self._momentum, self._share)
+        # No further than all robots would have come one after another.
+        share = min(self._most, 1.0 - 1.0 / len(answers))
+        onward, self._momentum = with_momentum(merged, old, self._momentum, share)
         return onward
 
 
