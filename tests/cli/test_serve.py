@@ -13,11 +13,19 @@ from pathlib import Path
 import httpx
 import pytest
 import yaml
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
 from small_fleet import in_order
 
 from fcslam.cli import main
+from fcslam.errors import CloudError
 from fcslam.runs import open_run
 from fcslam.wire.batches import read_batch, write_batch
+from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.packets import decode, encode
 
 API = "/api/v1"
@@ -81,6 +89,20 @@ def test_a_service_that_cannot_run_as_told_says_so_in_one_line(tmp_path, wrong, 
     line = capsys.readouterr().err
     assert line.count("\n") == 1
     assert says in line
+
+
+def test_an_encrypted_key_is_told_and_no_passphrase_asked_for(credentials, tmp_path, capsys):
+    key = load_pem_private_key((credentials / "cloud.key").read_bytes(), None)
+    sealed = tmp_path / "sealed.key"
+    sealed.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")))
+    words = ["--tls-certificate", str(credentials / "cloud.pem"), "--tls-key", str(sealed)]
+    assert main(["serve", "--data", str(tmp_path / "data"), "--port", "0", *words]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert "sealed.key" in line
+    assert "encrypted" in line
+    with pytest.raises(CloudError, match="encrypted"):
+        HttpTransport("https://cloud.test", "robot_1", "agent", own=(credentials / "cloud.pem", sealed))
 
 
 def test_a_port_that_is_taken_is_told(tmp_path, capsys):

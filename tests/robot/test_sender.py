@@ -177,6 +177,7 @@ def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
     assert {key: decode(data).time for key, data in network.cloud.stored.items()} == times
     assert (robot.sender.confirmed, robot.sender.refusals) == (4, 2)
     assert robot.outbox.waiting == (0, 0)
+    assert network.requests == 4, "one to meet, three to send: what was refused in an answer is not asked for again"
 
 
 def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):

@@ -136,6 +136,7 @@ def _check_tls(certificate: Path | None, key: Path | None, client_ca: Path | Non
     import ssl
 
     from fcslam.errors import ServiceError
+    from fcslam.wire.keys import no_passphrase
 
     if (certificate is None) != (key is None):
         raise ServiceError("--tls-certificate and --tls-key belong together; give both or none")
@@ -145,7 +146,7 @@ def _check_tls(certificate: Path | None, key: Path | None, client_ca: Path | Non
         return
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
-        context.load_cert_chain(certificate, key)
+        context.load_cert_chain(certificate, key, no_passphrase)
     except (OSError, ssl.SSLError) as error:
         raise ServiceError(f"{certificate}, {key}: no certificate with its key ({error})") from error
     if client_ca is None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.errors import TrainingError
+from fcslam.wire.keys import no_passphrase
 
 PATIENCE_S: Final = 10.0
 FLIGHTS: Final = 8
@@ -49,7 +50,7 @@ def check_own(certificates: Certificates, host: str) -> None:
     outgoing, incoming = ssl.MemoryBIO(), ssl.MemoryBIO()
     try:
         server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        server.load_cert_chain(certificates.certificate, certificates.key)
+        server.load_cert_chain(certificates.certificate, certificates.key, no_passphrase)
     except (ssl.SSLError, OSError) as error:
         raise TrainingError(
             f"{certificates.key}: is no key of {certificates.certificate} ({_reason(error)}); give both of one pair"

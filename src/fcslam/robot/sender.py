@@ -145,6 +145,7 @@ class Sender:
             sequence = batch.first + answer.refusal.index
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)
             self._set_aside(batch.epoch, sequence, answer.refusal.reason)
+            self._refused_there += 1  # heard of here: the whole list need not be asked for because of it
         if answer.refusal is None and answer.refused != self._refused_there:
             self._hear(self._transport.state())
         if batch is not None and self.confirmed + self.refusals == before:

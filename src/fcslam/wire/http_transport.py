@@ -11,6 +11,7 @@ from urllib.parse import quote, urlsplit
 from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
 from fcslam.records import Channel
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, REFUSED_HEADER, read_batch, write_batch
+from fcslam.wire.keys import no_passphrase
 
 if TYPE_CHECKING:
     import httpx
@@ -223,7 +224,7 @@ def _trust(ca: Path | None, own: tuple[Path, Path] | None) -> ssl.SSLContext:
         raise CloudError(f"{ca}: no certificate authority can be read ({error}); give a PEM file") from error
     if own is not None:
         try:
-            context.load_cert_chain(*own)
+            context.load_cert_chain(*own, password=no_passphrase)
         except (OSError, ssl.SSLError) as error:
             raise CloudError(f"{own[0]}, {own[1]}: no certificate with its key ({error}); give PEM files") from error
     return context
