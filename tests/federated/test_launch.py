@@ -1,5 +1,6 @@
 """How long a robot tries to join, told by a clock that the test moves."""
 
+import socket
 from types import SimpleNamespace
 
 import pytest
@@ -7,7 +8,10 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
+from fcslam.errors import OutputError, TrainingError
 from fcslam.federated import launch
+from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.task import Task
 from fcslam.federated.tls import Address
 
 REFUSED, INTERRUPTED = 1, 0
@@ -66,3 +70,33 @@ def test_a_server_that_goes_and_comes_back_is_joined_again(joined):
     lives = {1: (1000.0, REFUSED), 2: (0.0, REFUSED), 3: (1000.0, REFUSED), 4: (0.0, REFUSED), 5: (9.0, INTERRUPTED)}
     code, starts, _, _ = joined(lives.__getitem__)
     assert (code, len(starts)) == (INTERRUPTED, 5)
+
+
+def serve(tmp_path, where):
+    task = Task(tmp_path / "run", FederatedSettings())
+    launch.serve(task, "cpu", where, None, [], lambda: None)
+
+
+def test_a_port_that_is_taken_is_told_before_anything_is_started(tmp_path, monkeypatch):
+    monkeypatch.setattr(launch, "FREED_S", 0.3)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(TrainingError, match="somebody listens there already"),
+    ):
+        serve(tmp_path, Address("127.0.0.1", taken.getsockname()[1]))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_name_that_means_this_machine_alone_is_told(tmp_path, monkeypatch):
+    def debian(host, port):
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("127.0.1.1", port))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", debian)
+    with pytest.raises(TrainingError, match=r"that name means 127\.0\.1\.1"):
+        serve(tmp_path, Address("server.lab", 8000))
+
+
+def test_a_log_that_cannot_be_written_is_told(tmp_path):
+    (tmp_path / "run" / launch.LOG_FILE).mkdir(parents=True)
+    with pytest.raises(OutputError, match="run: cannot be used as the output folder"):
+        serve(tmp_path, Address("127.0.0.1", launch.free_port()))

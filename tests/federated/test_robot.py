@@ -205,3 +205,12 @@ def test_weights_become_the_same_network_again(start):
     assert torch.equal(network(image).code_logits, again(image).code_logits)
     version = version_maker("light")
     assert version(weights_of(network)) == version(weights_of(again)) != version(start)
+
+
+def test_with_noise_no_exact_number_leaves_a_robot(folder, start, tmp_path):
+    private = settings(normalisation="frozen", privacy={"noise_multiplier": 1.0})
+    ours = robot(folder, tmp_path)
+    assert ours.learn(start, 0, "run", settings()).losses
+    assert ours.learn(start, 0, "run", private).losses == {}
+    with pytest.raises(TrainingError, match="give --public"):
+        ours.judge(start, private)

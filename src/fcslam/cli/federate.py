@@ -30,6 +30,7 @@ def federate(
     local: Annotated[bool, typer.Option("--local", help="All robots in this process.")] = False,
     serve: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Robots join this machine, there.")] = None,
     join: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Be a robot of the server there.")] = None,
+    name: Annotated[str | None, typer.Option(help="With --join the robot's name; else its folder's.")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for all that is made; the same one resumes.")],
     config: Annotated[Path | None, typer.Option(help="YAML file of federated settings.")] = None,
     start: Annotated[
@@ -79,7 +80,7 @@ def federate(
     if serve is not None:
         run_server(serve, task, device, security, folders or [])
     elif join is not None:
-        run_robot(join, folders or [], output, device, security)
+        run_robot(join, folders or [], output, device, security, name)
 
 
 def _run_locally(folders: list[Path], task: "Task", device: str, quick: bool) -> None:

@@ -79,12 +79,15 @@ def run_server(where: str, task: "Task", device: str, security: Security, folder
     typer.echo(str(task.output / "detector.onnx"))
 
 
-def run_robot(where: str, folders: list[Path], output: Path, device: str, security: Security) -> None:
-    """Be a robot until interrupted; a line while there is no server."""
+def run_robot(
+    where: str, folders: list[Path], output: Path, device: str, security: Security, name: str | None = None
+) -> None:
+    """Be a robot until interrupted, called like its folder if no ``name`` is given; a line while there is no server."""
     from rich.console import Console
 
     from fcslam.cli.train import pace_on
     from fcslam.federated.launch import LOG_FILE, join
+    from fcslam.federated.letters import LONGEST_NAME
 
     if len(folders) != 1 or not folders[0].is_dir():
         raise TrainingError("--join needs one folder, that of the robot's images")
@@ -92,8 +95,11 @@ def run_robot(where: str, folders: list[Path], output: Path, device: str, securi
     if len(security.robot_keys) > 1:
         raise TrainingError("a robot has one --robot-key, its private one")
     folder = folders[0].resolve()
+    called = folder.name if name is None else name
+    if not (0 < len(called) <= LONGEST_NAME and called.isprintable()):
+        raise TrainingError(f"{called!r}: a robot's name has 1 to {LONGEST_NAME} printable characters; give --name")
     robot = {
-        "robot": folder.name,
+        "robot": called,
         "images": str(folder),
         "labels": str((output / "labels").resolve()),
         "device": pace_on(device, False).device,

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import ipaddress
 import json
 import math
 import os
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from fcslam.errors import OutputError, TrainingError
-from fcslam.federated.deployed import STATUS_FILE, read_status, task_text
+from fcslam.federated.deployed import read_status, task_text, write_status
 from fcslam.federated.flower import QUIET
 from fcslam.federated.task import Task
 from fcslam.federated.tls import Address, Certificates, check_own, check_server
@@ -26,6 +27,8 @@ START_S: Final = 180.0
 GRACE_S: Final = 90.0
 """A server that has just started does not know its robots' keys yet: it refuses them for a moment."""
 RETRY_S: Final = 3.0
+FREED_S: Final = 15.0
+"""A server that was killed leaves its port within that time."""
 LOG_FILE: Final = "flower.log"
 LOOPBACK: Final = "127.0.0.1"
 PR_SET_PDEATHSIG: Final = 1
@@ -75,14 +78,15 @@ def serve(
         say: called about every second, to look at the run folder.
 
     Raises:
-        TrainingError: certificates do not fit, Flower does not start, or the training failed; the message says why.
+        TrainingError: certificates do not fit, the address is taken or out of the robots' reach, Flower does not
+            start, or the training failed; the message says why.
         OutputError: the run folder cannot be written.
     """
     if certificates is not None:
         check_own(certificates, address.host)
-    _made(task.output)
-    (task.output / STATUS_FILE).unlink(missing_ok=True)
-    with tempfile.TemporaryDirectory() as place, (task.output / LOG_FILE).open("ab") as log:
+    _check_place(address)
+    with tempfile.TemporaryDirectory() as place, _log(task.output / LOG_FILE) as log:
+        write_status(task.output, "running", "")
         home = Path(place)
         environment = _environment(home / "home")
         _write_app(home, task_text(task, device), address, certificates)
@@ -136,7 +140,6 @@ def join(
         security += ["--auth-supernode-private-key", str(private_key.resolve())]
     config = " ".join(f"{name}={json.dumps(value)}" for name, value in robot.items())
     command = ["flower-supernode", *security, "--superlink", str(address), "--host", LOOPBACK, "--node-config", config]
-    _made(log_file.parent)
     refused_since = math.inf
     while True:
         _await(address, say)
@@ -156,7 +159,7 @@ def join(
 def _be_node(command: Sequence[str], log_file: Path) -> int:
     with (
         tempfile.TemporaryDirectory() as home,
-        log_file.open("ab") as log,
+        _log(log_file) as log,
         _daemon(command, _environment(Path(home)), log) as node,
     ):
         return node.wait()
@@ -260,8 +263,35 @@ def _die_with_parent() -> None:
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _made(folder: Path) -> None:
+def _check_place(address: Address) -> None:
+    """A SuperLink that is not ours would be given the robots' keys; one on loopback would be found by none of them."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        found = {str(entry[4][0]) for entry in socket.getaddrinfo(address.host, address.port)}
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be used as the output folder ({error})") from error
+        raise TrainingError(f"{address}: this machine knows no such name ({error})") from error
+    if address.host != "localhost" and address.host not in found and all(map(_is_loopback, found)):
+        raise TrainingError(
+            f"{address}: on this machine that name means {min(found)}, where no other machine gets to; "
+            "let it mean the address that robots know, in /etc/hosts for instance"
+        )
+    end = time.monotonic() + FREED_S
+    while _listens(address):
+        if time.monotonic() > end:
+            raise TrainingError(f"{address}: somebody listens there already; end that, or choose another port")
+        time.sleep(0.2)
+
+
+def _is_loopback(address: str) -> bool:
+    return ipaddress.ip_address(address.partition("%")[0]).is_loopback
+
+
+@contextlib.contextmanager
+def _log(path: Path) -> Iterator[IO[bytes]]:
+    """A file to be written on, with its folder."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("ab")
+    except OSError as error:
+        raise OutputError(f"{path.parent}: cannot be used as the output folder ({error})") from error
+    with file:
+        yield file

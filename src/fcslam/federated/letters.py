@@ -15,6 +15,7 @@ ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"
 WEIGHT = "num-examples"
 """Flower's name for how much an update weighs."""
 LONGEST_NAME = 64
+MOST_FIGURES = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +62,25 @@ def read_arrays(record: ArrayRecord) -> dict[str, NDArray[np.float32]]:
     """Weights of a record, as they are: neither names nor shapes nor numbers are checked.
 
     Raises:
-        ValueError: an array is not one of numbers.
+        ValueError: an array is none, or none of numbers.
     """
-    return {str(name): array.numpy() for name, array in record.items()}
+    _check_kind(record, ArrayRecord)
+    try:
+        arrays = {str(name): array.numpy() for name, array in record.items()}
+    except MemoryError as error:
+        raise ValueError("an array that says it is larger than this machine's memory") from error
+    if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+        raise ValueError("an archive in place of an array")
+    return arrays
 
 
 def size_of(record: ArrayRecord) -> int:
-    """Bytes of its arrays."""
+    """Bytes of its arrays.
+
+    Raises:
+        ValueError: it is another record.
+    """
+    _check_kind(record, ArrayRecord)
     return sum(len(array.data) for array in record.values())
 
 
@@ -94,5 +107,19 @@ def signature(content: RecordDict) -> tuple[str, str]:
 
 
 def figures_of(content: RecordDict) -> dict[str, float]:
-    """The numbers of an answer."""
-    return {str(name): float(value) for name, value in content[METRICS].items() if isinstance(value, int | float)}
+    """The numbers of an answer.
+
+    Raises:
+        ValueError: there are none, too many, or some with odd names.
+    """
+    record = content[METRICS]
+    _check_kind(record, MetricRecord)
+    figures = {str(name): float(value) for name, value in record.items() if isinstance(value, int | float)}
+    if len(figures) > MOST_FIGURES or not all(name.isidentifier() and len(name) <= LONGEST_NAME for name in figures):
+        raise ValueError("figures that nobody asked for")
+    return figures
+
+
+def _check_kind(record: object, kind: type) -> None:
+    if not isinstance(record, kind):
+        raise ValueError(f"a {type(record).__name__} in place of a {kind.__name__}")

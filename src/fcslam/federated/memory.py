@@ -31,7 +31,8 @@ class State:
     """What the next round begins from."""
     best: Weights
     """The released ones."""
-    best_score: float
+    best_scores: Mapping[str, float]
+    """By who judged them, see ``judging``."""
     best_round: int
     """The round they are of; 0 is the start."""
     memory: Mapping[str, NDArray[Any]]
@@ -54,7 +55,7 @@ def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
         OutputError: it cannot be written; the last one stays.
     """
     numbers = {
-        "best_score": state.best_score,
+        "best_scores": dict(state.best_scores),
         "best_round": state.best_round,
         "asked": dict(state.asked),
         "origin": state.origin,
@@ -88,7 +89,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
             checkpoint.step,
             groups["weights"],
             groups["best"],
-            float(header["best_score"]),
+            {str(judge): float(score) for judge, score in header["best_scores"].items()},
             int(header["best_round"]),
             groups["memory"],
             {str(robot): int(rounds) for robot, rounds in header["asked"].items()},

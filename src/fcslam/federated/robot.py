@@ -5,12 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fcslam.errors import TrainingError
 from fcslam.federated.keeping import former_weights, keep_moments, last_moments
 from fcslam.federated.network import network_of, weights_of
 from fcslam.federated.privacy import privatised
@@ -22,6 +23,8 @@ from fcslam.learning.monitor import validate
 from fcslam.learning.stages import Images, as_detector, gather
 from fcslam.learning.trainer import Status, validation_pairs
 
+FIGURES_TELL: Final = "with noise for privacy no figures of a robot's own images may leave it: give --public images"
+
 NoiseSource = Callable[[int], np.random.Generator]
 """Gives the generator of a round's noise: of the system's entropy where robots are real, seeded where they are not."""
 
@@ -31,7 +34,7 @@ class Learned(NamedTuple):
 
     weights: dict[str, NDArray[np.float32]]
     losses: dict[str, float]
-    """Means over the steps."""
+    """Means over the steps; none with noise, which they are without."""
 
 
 class Learner(Protocol):
@@ -98,10 +101,17 @@ class RobotLearner:
         )
         keep_moments(self.cache, run, round_number, trained.moments)
         found, names = weights_of(trained.network), trained_names(weights, frozen)
-        return Learned(privatised(found, weights, names, settings.privacy, self.noise(round_number)), trained.losses)
+        sent = privatised(found, weights, names, settings.privacy, self.noise(round_number))
+        return Learned(sent, {} if settings.privacy.noise_multiplier else trained.losses)
 
     def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
-        """As in ``Learner``, on pairs of images that were held out."""
+        """As in ``Learner``, on pairs of images that were held out.
+
+        Raises:
+            TrainingError: noise is to keep the images private, and figures are without any; or as in ``learn``.
+        """
+        if settings.privacy.noise_multiplier:
+            raise TrainingError(FIGURES_TELL)
         network = network_of(weights, settings.training.encoder).to(self.device)
         held_out = self._examples(weights, settings).held_out
         return validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)

@@ -14,14 +14,18 @@ class Roster:
     def __init__(self, grid: Grid, deadline_s: float) -> None:
         self._grid, self._deadline_s = grid, deadline_s
         self._names: dict[int, str] = {}
+        self.doubles: tuple[str, ...] = ()
+        """Names that more than one of those present had when last looked."""
 
     def present(self) -> dict[str, int]:
         """Nodes by the names of the robots that are there now, in the names' order; of two with one name, the first."""
         nodes = sorted(self._grid.get_node_ids())
         self._meet([node for node in nodes if node not in self._names])
         found: dict[str, int] = {}
+        doubles: dict[str, int] = {}
         for name, node in sorted((self._names[node], node) for node in nodes if node in self._names):
-            found.setdefault(name, node)
+            (doubles if name in found else found)[name] = node
+        self.doubles = tuple(doubles)
         return found
 
     def _meet(self, nodes: Sequence[int]) -> None:

@@ -7,22 +7,22 @@ that was killed goes on from its last round as if it had not been.
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
+from fcslam.federated.answers import Answers, read_answers
 from fcslam.federated.flower import Grid, Message, MessageType, RecordDict
 from fcslam.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
+from fcslam.federated.judging import Figures, Verdict, credible, score_of
 from fcslam.federated.letters import (
     ARRAYS,
     CONFIG,
     figures_of,
     order_config,
-    read_arrays,
     signature,
     size_of,
     write_arrays,
@@ -35,21 +35,11 @@ from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.strategies import Merger
 from fcslam.federated.weights import Weights
 
-SCORE_FIGURES: Final = ("repeatability", "mma_3px")
+PUBLIC: Final = ""
+"""Stands for the server where it judges itself, among the names of robots that do."""
 _CHOICE_SEED: Final = 77
 
-Judge = Callable[[Weights], Mapping[str, float]]
-
-
-@dataclass(slots=True)
-class Answers:
-    """What came back in a round."""
-
-    weights: dict[str, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
-    losses: dict[str, dict[str, float]] = field(default_factory=dict)
-    messages: dict[str, Message] = field(default_factory=dict)
-    left_out: dict[str, str] = field(default_factory=dict)
-    bytes_up: int = 0
+Judge = Callable[[Weights], Figures]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,32 +92,29 @@ class Server:
 
     def _begin(self, grid: Grid, roster: Roster) -> State:
         """How good the start is: what comes must not be worse."""
-        figures = self._judge(self._start, -1, grid, roster)
-        return State(0, self._start, self._start, score_of(figures), 0, {}, {}, self._outside.version(self._start))
+        scores = {judge: score_of(found) for judge, found in self._judge(self._start, -1, grid, roster).items()}
+        return State(0, self._start, self._start, scores, 0, {}, {}, self._outside.version(self._start))
 
     def _round(self, grid: Grid, roster: Roster, state: State) -> tuple[State, RoundReport]:
-        began = self._outside.clock()
-        asked: list[str] = []
-        while True:
-            answers, chosen = self._train(grid, roster, state)
-            asked += chosen
-            if len(answers.weights) >= self._settings.minimum_robots:
-                break
+        began, sent = self._outside.clock(), Counter(state.asked)
+        answers, state = self._train(grid, roster, state)
+        while len(answers.weights) < self._settings.minimum_robots:
             self._wait_or_end(answers.left_out)
+            answers, state = self._train(grid, roster, state)
         weights = self._merge(answers, state)
-        figures = self._judge(weights, state.rounds_done, grid, roster)
-        score = score_of(figures)
-        released = score >= state.best_score
+        verdict = self._verdict(weights, state, grid, roster)
+        released = verdict.gain is not None and verdict.gain >= 0.0
         # The start is no place to go back to: nothing would be learnt as long as learning costs something at first.
-        returned = state.best_round > 0 and score < state.best_score - self._settings.collapse
+        collapsed = verdict.gain is not None and verdict.gain < -self._settings.collapse
+        returned = state.best_round > 0 and collapsed
         following = State(
             rounds_done=state.rounds_done + 1,
             weights=state.best if returned else weights,
             best=weights if released else state.best,
-            best_score=score if released else state.best_score,
+            best_scores=verdict.scores if released else verdict.best,
             best_round=state.rounds_done + 1 if released else state.best_round,
             memory={} if returned else self._merger.memory,
-            asked=Counter(state.asked) + Counter(asked),
+            asked=state.asked,
             origin=state.origin,
         )
         if returned:
@@ -139,22 +126,25 @@ class Server:
             robots=tuple(sorted(answers.weights)),
             left_out=answers.left_out,
             losses=_means(answers.losses),
-            figures=figures,
-            score=score,
+            figures=verdict.figures,
+            score=verdict.score,
             released=released,
             returned=returned,
-            bytes_down=len(asked) * size_of(write_arrays(state.weights)),
+            bytes_down=(Counter(state.asked) - sent).total() * size_of(write_arrays(state.weights)),
             bytes_up=answers.bytes_up,
             seconds=self._outside.clock() - began,
             epsilon=epsilon(privacy.noise_multiplier, max(following.asked.values()), privacy.delta),
         )
         return following, report
 
-    def _train(self, grid: Grid, roster: Roster, state: State) -> tuple[Answers, list[str]]:
-        """Answers that may be merged, and the robots that were asked."""
+    def _train(self, grid: Grid, roster: Roster, state: State) -> tuple[Answers, State]:
+        """Answers that may be merged, and the state in which robots were asked for them."""
         present = self._await(roster)
         rng = np.random.default_rng([self._settings.training.seed, state.rounds_done, _CHOICE_SEED])
         chosen = choose(present, self._settings.participation, self._settings.minimum_robots, rng)
+        # Counted before anybody hears of it: a server that is killed now will not know what left the robots.
+        state = replace(state, asked=Counter(state.asked) + Counter(chosen))
+        write_state(self._folder / CHECKPOINT_FILE, state, self._settings)
         version = self._outside.version(state.weights)
         orders = self._merger.strategy.configure_train(
             state.rounds_done + 1,
@@ -163,32 +153,59 @@ class Server:
             _Nodes([present[robot] for robot in chosen]),
         )
         replies = grid.send_and_receive(orders, timeout=self._settings.deadline_s)
-        answers = _read(replies, {present[robot]: robot for robot in chosen}, version)
-        for robot, reason in screen(answers.weights, state.weights, self._settings.screening).items():
-            answers.left_out[robot] = reason
-            del answers.weights[robot], answers.losses[robot]
-        return answers, chosen
+        answers = read_answers(replies, {present[robot]: robot for robot in chosen}, version, state.weights)
+        frozen = self._settings.normalisation == "frozen"
+        for robot, reason in screen(answers.weights, state.weights, self._settings.screening, frozen).items():
+            answers.leave_out(robot, reason)
+        for robot in roster.doubles:
+            answers.leave_out(f"another {robot}", "two robots of one name are there, and one of them is not asked")
+        return answers, state
 
     def _merge(self, answers: Answers, state: State) -> Weights:
         """In the order of the robots' names: sums of floats depend on it."""
         ordered = [(answers.messages[robot], answers.weights[robot]) for robot in sorted(answers.weights)]
         return self._merger.merge(state.rounds_done + 1, ordered, state.weights)
 
-    def _judge(self, weights: Weights, round_number: int, grid: Grid, roster: Roster) -> dict[str, float]:
+    def _verdict(self, weights: Weights, state: State, grid: Grid, roster: Roster) -> Verdict:
+        """How good weights are beside the best, which robots judge now that have come since."""
+        figures = self._judge(weights, state.rounds_done, grid, roster)
+        new = {robot: node for robot, node in roster.present().items() if robot in figures.keys() - state.best_scores}
+        late, _ = self._ask_to_judge(state.best, state.rounds_done, grid, new) if new else ({}, {})
+        return Verdict(figures, dict(state.best_scores) | {robot: score_of(found) for robot, found in late.items()})
+
+    def _judge(self, weights: Weights, round_number: int, grid: Grid, roster: Roster) -> dict[str, Figures]:
+        """Figures by whoever judges."""
         if self._outside.judge is not None:
-            return dict(self._outside.judge(weights))
-        version, present = self._outside.version(weights), self._await(roster)
+            return {PUBLIC: self._outside.judge(weights)}
+        found, failed = self._ask_to_judge(weights, round_number, grid, self._await(roster))
+        while not found:
+            self._wait_or_end(failed)
+            found, failed = self._ask_to_judge(weights, round_number, grid, self._await(roster))
+        return found
+
+    def _ask_to_judge(
+        self, weights: Weights, round_number: int, grid: Grid, nodes: Mapping[str, int]
+    ) -> tuple[dict[str, Figures], dict[str, str]]:
+        """Figures of these robots, and why others gave none."""
+        version = self._outside.version(weights)
         config = order_config(version, round_number, self._run, self._settings)
         letter = RecordDict({ARRAYS: write_arrays(weights), CONFIG: config})
-        questions = [Message(letter, node, MessageType.EVALUATE) for node in present.values()]
-        found = []
+        questions = [Message(letter, node, MessageType.EVALUATE) for node in nodes.values()]
+        names = {node: robot for robot, node in nodes.items()}
+        found: dict[str, Figures] = {}
+        answers = Answers()
         for reply in grid.send_and_receive(questions, timeout=self._settings.deadline_s):
+            robot = names.get(reply.metadata.src_node_id, "")
             try:
-                if not reply.has_error() and signature(reply.content)[1] == version:
-                    found.append(figures_of(reply.content))
-            except (ValueError, KeyError, TypeError):
-                continue
-        return _medians(found)
+                if reply.has_error():
+                    raise ValueError(reply.error.reason or f"error {reply.error.code}")
+                figures = credible(figures_of(reply.content)) if signature(reply.content) == (robot, version) else {}
+                if not figures:
+                    raise ValueError("an answer without figures that could be")
+                found[robot] = figures
+            except (ValueError, KeyError, TypeError) as error:
+                answers.leave_out(robot, str(error))
+        return found, answers.left_out
 
     def _await(self, roster: Roster) -> dict[str, int]:
         while len(present := roster.present()) < self._settings.minimum_robots:
@@ -212,45 +229,6 @@ class _Nodes:
         return self._nodes
 
 
-def score_of(figures: Mapping[str, float]) -> float:
-    """What versions of the detector are compared by: the mean of repeatability and MMA; -1 where one is not known."""
-    values = [figures.get(name, np.nan) for name in SCORE_FIGURES]
-    return float(np.mean(values)) if np.isfinite(values).all() else -1.0
-
-
-def _read(replies: Any, robots: Mapping[int, str], version: str) -> Answers:
-    """Answers by robot, with a reason for each robot that gave none."""
-    answers = Answers()
-    for reply in replies:
-        robot = robots.get(reply.metadata.src_node_id)
-        if robot is None:
-            continue
-        if reply.has_error():
-            answers.left_out[robot] = reply.error.reason or f"error {reply.error.code}"
-            continue
-        try:
-            name, base = signature(reply.content)
-            if (name, base) != (robot, version):
-                raise ValueError(f"an answer by {name} about version {base}, not by {robot} about {version}")
-            record = reply.content[ARRAYS]
-            answers.bytes_up += size_of(record)
-            answers.weights[robot] = read_arrays(record)
-            answers.losses[robot] = figures_of(reply.content)
-            answers.messages[robot] = reply
-        except (ValueError, KeyError, TypeError, EOFError) as error:
-            answers.left_out[robot] = f"an answer that cannot be read ({error})"
-    for robot in robots.values():
-        if robot not in answers.weights and robot not in answers.left_out:
-            answers.left_out[robot] = "no answer: gone, or later than the deadline"
-    return answers
-
-
 def _means(rows: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     names = dict.fromkeys(name for row in rows.values() for name in row)
     return {name: float(np.mean([row[name] for row in rows.values() if name in row])) for name in names}
-
-
-def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Medians over robots: one that lies about its images does not decide."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: float(np.nanmedian([row.get(name, np.nan) for row in rows])) for name in names}

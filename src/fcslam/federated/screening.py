@@ -8,8 +8,12 @@ from fcslam.federated.settings import ScreeningSettings
 from fcslam.federated.weights import FloatVector, Weights, malformed, trained_names, update_vector
 
 
-def screen(answers: Mapping[str, Weights], asked: Weights, settings: ScreeningSettings) -> dict[str, str]:
+def screen(
+    answers: Mapping[str, Weights], asked: Weights, settings: ScreeningSettings, frozen: bool = False
+) -> dict[str, str]:
     """Reasons by robot for every answer that is refused; ``asked`` are the weights that all began from.
+
+    With ``frozen`` batch statistics are to come back as they were sent.
 
     Batch statistics move many times as far as what is trained, and each robot's lie where its own light puts them:
     their length is looked at by itself, and their direction not at all.
@@ -17,6 +21,9 @@ def screen(answers: Mapping[str, Weights], asked: Weights, settings: ScreeningSe
     refused = {robot: reason for robot, weights in answers.items() if (reason := malformed(weights, asked))}
     parameters = trained_names(asked, frozen_statistics=True)
     statistics = [name for name in asked if name not in set(parameters)]
+    for robot in [robot for robot in answers if frozen and robot not in refused]:
+        if any(not np.array_equal(answers[robot][name], asked[name]) for name in statistics):
+            refused[robot] = "batch statistics that were to stay as they are have changed"
     for names in (parameters, statistics):
         rest = _updates(answers, asked, names, refused)
         refused |= _too_long(rest, float(np.linalg.norm(_vector(asked, names))), settings)

@@ -51,7 +51,7 @@ class FederatedSettings(Settings):
         default=0.5,
         ge=0.0,
         lt=1.0,
-        description="Nesterov's, between rounds; 1 - 1/N of N robots at most; 0 is none; FedAdam has its own",
+        description="Nesterov's, between rounds; 1 - 1/N of N robots at most; 0 is none; not for fedadam, krum",
     )
     server_rate: float = Field(default=0.003, gt=0.0, description="learning rate of FedAdam")
     trimmed: float = Field(default=0.2, ge=0.0, lt=0.5, description="share that FedTrimmedAvg cuts at either end")

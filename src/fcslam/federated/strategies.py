@@ -36,7 +36,8 @@ class Merger:
         for moment in _MOMENTS:
             if part := _part(memory, moment):
                 setattr(self.strategy, moment, part)
-        without = settings.strategy == "fedadam" or settings.server_momentum == 0.0  # FedAdam has its own
+        # FedAdam has its own, and Krum's choice is one robot's update, as noisy as any.
+        without = settings.strategy in ("fedadam", "krum") or settings.server_momentum == 0.0
         self._momentum = None if without else _part(memory, _MOMENTUM)
 
     @property
@@ -60,15 +61,15 @@ class Merger:
             messages.append(message)
         record, _ = self.strategy.aggregate_train(round_number, messages)
         merged = {name: np.asarray(array, np.float32) for name, array in read_arrays(record).items()}
-        reason = malformed(merged, old)
+        reason, onward = malformed(merged, old), merged
+        if reason is None and self._momentum is not None:
+            # As far as all robots would have come one after another, at most.
+            share = min(self._most, 1.0 - 1.0 / len(answers))
+            onward, self._momentum = with_momentum(merged, old, self._momentum, share)
+            reason = malformed(onward, old)
         if reason is not None:
             raise TrainingError(f"round {round_number}: the strategy gave unusable weights: {reason}")
-        if self._momentum is None:
-            return {name: merged[name] for name in old}
-        # No further than all robots would have come one after another.
-        share = min(self._most, 1.0 - 1.0 / len(answers))
-        onward, self._momentum = with_momentum(merged, old, self._momentum, share)
-        return onward
+        return {name: onward[name] for name in old}
 
 
 def with_momentum(

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.config import dump
-from fcslam.errors import OutputError
+from fcslam.errors import OutputError, TrainingError
 from fcslam.federated.delivery import DETECTOR, deliver
 from fcslam.federated.flower import Grid
 from fcslam.federated.history import RoundReport
 from fcslam.federated.network import network_of, version_maker
+from fcslam.federated.robot import FIGURES_TELL
 from fcslam.federated.rounds import Outside, Server
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.start import calibration_images, first_weights, judge_by, public_images
@@ -52,6 +53,8 @@ def run_task(
         TrainingError: something given is unusable, no robot can train, or the output is another run's.
         OutputError: something cannot be written.
     """
+    if task.settings.privacy.noise_multiplier and not task.public:
+        raise TrainingError(FIGURES_TELL)
     images = public_images(task.public)
     _write_config(task, task.output / CONFIG_FILE)
     start = first_weights(task.start, task.output, task.settings, pace, watches.stage)

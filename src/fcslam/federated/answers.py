@@ -1,0 +1,63 @@
+"""What robots answered in a round, read as what it is: something from outside."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.federated.flower import Message
+from fcslam.federated.letters import ARRAYS, figures_of, read_arrays, signature, size_of, write_arrays
+from fcslam.federated.weights import Weights
+
+LONGEST_REASON: Final = 300
+LARGEST: Final = 2.0
+"""An answer's size, in sizes of what was asked about; one that is larger is not unpacked."""
+
+
+@dataclass(slots=True)
+class Answers:
+    """Updates by robot, and why others gave none."""
+
+    weights: dict[str, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
+    losses: dict[str, dict[str, float]] = field(default_factory=dict)
+    messages: dict[str, Message] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    bytes_up: int = 0
+
+    def leave_out(self, robot: str, reason: str) -> None:
+        """Whatever the robot sent, it does not count; the reason is shown and kept, so it is a short line of text."""
+        words = " ".join("".join(sign if sign.isprintable() else " " for sign in reason).split())
+        self.left_out[robot] = words if len(words) <= LONGEST_REASON else f"{words[: LONGEST_REASON - 3]}..."
+        for kept in (self.weights, self.losses, self.messages):
+            kept.pop(robot, None)
+
+
+def read_answers(replies: Any, robots: Mapping[int, str], version: str, asked: Weights) -> Answers:
+    """Answers of these robots, by node, to ``asked`` weights of this version; arrays are checked by ``screen``."""
+    answers, most = Answers(), LARGEST * size_of(write_arrays(asked))
+    for reply in replies:
+        robot = robots.get(reply.metadata.src_node_id)
+        if robot is None:
+            continue
+        if reply.has_error():
+            answers.leave_out(robot, reply.error.reason or f"error {reply.error.code}")
+            continue
+        try:
+            name, base = signature(reply.content)
+            if (name, base) != (robot, version):
+                raise ValueError(f"an answer by {name} about version {base}, not by {robot} about {version}")
+            size = size_of(reply.content[ARRAYS])
+            if size > most:
+                raise ValueError(f"{size} bytes, where {most:.0f} were enough")
+            weights, losses = read_arrays(reply.content[ARRAYS]), figures_of(reply.content)
+        except (ValueError, KeyError, TypeError, EOFError) as error:
+            answers.leave_out(robot, f"an answer that cannot be read ({error})")
+            continue
+        answers.bytes_up += size
+        answers.weights[robot], answers.losses[robot], answers.messages[robot] = weights, losses, reply
+    for robot in robots.values():
+        if robot not in answers.weights and robot not in answers.left_out:
+            answers.leave_out(robot, "no answer: gone, or later than the deadline")
+    return answers
