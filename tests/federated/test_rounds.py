@@ -311,7 +311,7 @@ def test_a_start_that_nothing_beats_stays(tmp_path):
 
 def test_a_checkpoint_of_another_run_is_refused_but_more_rounds_are_not(tmp_path):
     run([Fake("a")], tmp_path)
-    with pytest.raises(TrainingError, match="other settings"):
+    with pytest.raises(TrainingError, match=r"other settings \(local_steps\)"):
         run([Fake("a")], tmp_path, settings(local_steps=2))
     with pytest.raises(TrainingError, match="began from"):
         run([Fake("a")], tmp_path, start=shifted(START, 1.0))

@@ -54,8 +54,10 @@ def test_one_poisoned_robot_of_five_is_refused_and_no_other(kind, settings):
     assert refused["bad"]
 
 
-@pytest.mark.parametrize("kind", ["flipped", "random", "scaled"])
-def test_poison_does_not_hide_behind_honest_statistics(kind):
+@pytest.mark.parametrize(
+    ("kind", "settings"), [("flipped", ScreeningSettings()), ("random", STRICT), ("scaled", ScreeningSettings())]
+)
+def test_poison_does_not_hide_behind_honest_statistics(kind, settings):
     """These may be longer than all else by far, and alike, for all robots see other things than what the start saw."""
 
     def in_daylight(weights):
@@ -66,7 +68,7 @@ def test_poison_does_not_hide_behind_honest_statistics(kind):
 
     start = BEFORE | {"norm.running_mean": np.full(20, 90.0, np.float32)}
     answers = {f"robot{seed}": in_daylight(honest(seed)) for seed in range(4)} | {"bad": in_daylight(poisoned(kind))}
-    assert set(screen(answers, start, STRICT)) == {"bad"}
+    assert set(screen(answers, start, settings)) == {"bad"}
 
 
 def test_statistics_may_lie_on_all_sides_but_not_far_away():

@@ -97,8 +97,13 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrainingError(f"{path}: is no checkpoint of federated training ({error}); take it away") from error
-    if checkpoint.stage != STAGE or fixed != _fixed(settings.model_dump(mode="json")):
-        raise TrainingError(f"{path}: is of a run with other settings; give them again, or another --output")
+    if checkpoint.stage != STAGE:
+        raise TrainingError(f"{path}: is a checkpoint of something else; give another --output")
+    asked = _fixed(settings.model_dump(mode="json"))
+    if others := sorted(name for name in asked.keys() | fixed.keys() if asked.get(name) != fixed.get(name)):
+        raise TrainingError(
+            f"{path}: is of a run with other settings ({', '.join(others)}); give them again, or another --output"
+        )
     reason = malformed(state.weights, start)
     if reason is not None:
         raise TrainingError(f"{path}: does not fit this network ({reason})")
