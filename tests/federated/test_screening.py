@@ -101,12 +101,13 @@ def test_bounds_that_are_off_let_everything_finite_pass():
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_an_update_taken_apart_and_added_again_is_the_same(seed, frozen):
     rng = np.random.default_rng(seed)
-    after = {name: (array + rng.random(array.shape)).astype(np.float32) for name, array in BEFORE.items()}
-    names = trained_names(BEFORE, frozen)
-    back = moved(BEFORE, update_vector(after, BEFORE, names), names)
-    for name, array in BEFORE.items():
+    before = {name: array[:7] for name, array in BEFORE.items()}
+    after = {name: (array + rng.random(array.shape)).astype(np.float32) for name, array in before.items()}
+    names = trained_names(before, frozen)
+    back = moved(before, update_vector(after, before, names), names)
+    for name, array in before.items():
         assert back[name] == pytest.approx(after[name] if name in names else array, abs=1e-6)
-    assert malformed(after, BEFORE) is None
+    assert malformed(after, before) is None
     assert ("norm.running_var" in names) is not frozen
 
 
