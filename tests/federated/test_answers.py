@@ -1,6 +1,5 @@
 """Answers that no robot of ours would give: left out in a line, and the server goes on."""
 
-import contextlib
 import io
 
 import numpy as np
@@ -31,6 +30,12 @@ def boundless():
     content = io.BytesIO()
     np.lib.format.write_array_header_1_0(content, {"descr": "<f4", "fortran_order": False, "shape": (2**50,)})
     return content.getvalue()
+
+
+def header(text):
+    """Of an array, as somebody else might write it."""
+    line = text.encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line
 
 
 def without_metrics(content):
@@ -66,6 +71,11 @@ ODD = {
     "an archive": with_data(archive()),
     "boundless": with_data(boundless()),
     "noise": with_data(b"noise"),
+    "a broken archive": with_data(b"PK\x03\x04junk"),
+    "an endless number": with_data(header(f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({2**70},)}}")),
+    "an open bracket": with_data(header("{'descr': '<f4', ")),
+    "bad indentation": with_data(header("{'descr': '<f4'}\n  x\n y")),
+    "no type": with_data(header("{'descr': (), 'fortran_order': False, 'shape': (1,)}")),
     "large": with_data(bytes(100_000)),
     "odd names": with_figures({"x\ny": 1.0}),
     "long names": with_figures({"x" * 1000: 1.0}),
@@ -73,27 +83,46 @@ ODD = {
 }
 
 
-@pytest.mark.parametrize("odd", ODD)
-@pytest.mark.parametrize("kind", [MessageType.TRAIN, MessageType.EVALUATE, MessageType.QUERY])
-def test_an_odd_answer_leaves_the_others_their_round(odd, kind, tmp_path):
-    robots = [Fake("bad"), Fake("good", 0.25)]
+def twisted_grid(robots, kind, change):
+    """The first robot's answers of this kind are changed on their way."""
     grid = grid_of(robots)
     ask = grid._ask
 
     def twisted(message):
         reply = ask(message)
-        if message.metadata.message_type == kind and message.metadata.dst_node_id == 2 and not reply.has_error():
-            with contextlib.suppress(KeyError):  # there may be nothing of that kind in it
-                ODD[odd](reply.content)
+        if message.metadata.message_type == kind and message.metadata.dst_node_id == 2:
+            change(reply.content)
         return reply
 
     grid._ask = twisted
-    state, reports = run(robots, tmp_path, grid=grid, judge=None)
-    assert all("good" in report.robots for report in reports)
-    if kind == MessageType.TRAIN:
-        assert all(report.left_out["bad"] for report in reports)
-        assert np.array_equal(state.weights["a.weight"], shifted(START, 0.5)["a.weight"])
+    return grid
+
+
+@pytest.mark.parametrize("odd", ODD)
+def test_an_odd_answer_leaves_the_others_their_round(odd, tmp_path):
+    robots = [Fake("bad"), Fake("good", 0.25)]
+    state, reports = run(robots, tmp_path, grid=twisted_grid(robots, MessageType.TRAIN, ODD[odd]))
+    assert [report.robots for report in reports] == [("good",)] * 2
+    assert all(report.left_out["bad"] for report in reports)
+    assert np.array_equal(state.weights["a.weight"], shifted(START, 0.5)["a.weight"])
     assert len(read_rows(tmp_path / ROUNDS_FILE, 9)) == 2
+
+
+@pytest.mark.parametrize("odd", ["no metrics", "odd names", "long names", "many"])
+def test_who_judges_oddly_does_not_judge(odd, tmp_path):
+    robots = [Fake("bad"), Fake("good", 0.25)]
+    state, _ = run(robots, tmp_path, grid=twisted_grid(robots, MessageType.EVALUATE, ODD[odd]), judge=None)
+    assert state.best_scores == {"good": 0.5}
+
+
+def test_who_does_not_say_a_name_is_not_asked(tmp_path):
+    def nameless(content):
+        del content["config"]
+
+    robots = [Fake("bad"), Fake("good")]
+    _, reports = run(robots, tmp_path, grid=twisted_grid(robots, MessageType.QUERY, nameless))
+    assert [report.robots for report in reports] == [("good",)] * 2
+    assert robots[0].asked == []
 
 
 def test_reasons_are_short_lines(tmp_path):

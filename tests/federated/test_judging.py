@@ -95,6 +95,29 @@ def test_nobody_who_can_judge_is_waited_for_and_is_no_collapse(tmp_path):
         run([Sick("a")], tmp_path / "ends", judge=None)
 
 
+def test_a_run_that_robots_judged_goes_on_with_public_images(tmp_path):
+    run([Judging("a")], tmp_path, settings(rounds=2), judge=None)
+
+    def judge(weights):
+        return figures(0.9 + 0.1 * float(weights["b.weight"] - START["b.weight"]))
+
+    state, reports = run([Judging("a")], tmp_path, settings(rounds=4), judge=judge)
+    assert [report.released for report in reports] == [True, True]
+    assert state.best_scores == {"": pytest.approx(0.94)}
+
+
+def test_a_robot_that_only_fails_to_judge_the_best_is_named(tmp_path):
+    class Late(Judging):
+        def judge(self, weights, chosen):
+            if weights["b.weight"] < START["b.weight"] + 0.25:
+                raise TrainingError("too dark")
+            return super().judge(weights, chosen)
+
+    _, reports = run_coming([Judging("a", slope=-0.01), Late("b", slope=-0.01)], [0, 2], tmp_path, rounds=4)
+    assert reports[2].left_out == {"judging by b": "too dark"}
+    assert not any(report.released for report in reports)
+
+
 def test_one_that_has_judged_neither_decides_nothing():
     assert Verdict({"a": figures(0.5)}, {"b": 0.4}).gain is None
     assert Verdict({"a": figures(0.5), "b": figures(0.1)}, {"b": 0.4}).gain == pytest.approx(-0.3)

@@ -121,6 +121,6 @@ def _address(text: str) -> "Address":
     from fcslam.federated.tls import Address
 
     host, colon, port = text.removeprefix("https://").removeprefix("http://").rpartition(":")
-    if not (colon and host and port.isdecimal() and 0 < int(port) < 65536):
+    if not (colon and host.strip("[]") and port.isdecimal() and 0 < int(port) < 65536):
         raise TrainingError(f"{text}: is no HOST:PORT")
-    return Address(host, int(port))
+    return Address(host.strip("[]"), int(port))

@@ -27,11 +27,21 @@ class Answers:
     bytes_up: int = 0
 
     def leave_out(self, robot: str, reason: str) -> None:
-        """Whatever the robot sent, it does not count; the reason is shown and kept, so it is a short line of text."""
-        words = " ".join("".join(sign if sign.isprintable() else " " for sign in reason).split())
-        self.left_out[robot] = words if len(words) <= LONGEST_REASON else f"{words[: LONGEST_REASON - 3]}..."
+        """Whatever the robot sent, it does not count."""
+        self.left_out[robot] = line_of(reason)
         for kept in (self.weights, self.losses, self.messages):
             kept.pop(robot, None)
+
+    def mention(self, reasons: Mapping[str, str]) -> None:
+        """What else was amiss, shown and kept in the same place."""
+        for what, reason in reasons.items():
+            self.left_out.setdefault(what, line_of(reason))
+
+
+def line_of(text: str) -> str:
+    """A short line of printable text."""
+    words = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+    return words if len(words) <= LONGEST_REASON else f"{words[: LONGEST_REASON - 3]}..."
 
 
 def read_answers(replies: Any, robots: Mapping[int, str], version: str, asked: Weights) -> Answers:

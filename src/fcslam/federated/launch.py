@@ -267,9 +267,9 @@ def _check_place(address: Address) -> None:
     """A SuperLink that is not ours would be given the robots' keys; one on loopback would be found by none of them."""
     try:
         found = {str(entry[4][0]) for entry in socket.getaddrinfo(address.host, address.port)}
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         raise TrainingError(f"{address}: this machine knows no such name ({error})") from error
-    if address.host != "localhost" and address.host not in found and all(map(_is_loopback, found)):
+    if not _means_loopback(address.host) and all(map(_is_loopback, found)):
         raise TrainingError(
             f"{address}: on this machine that name means {min(found)}, where no other machine gets to; "
             "let it mean the address that robots know, in /etc/hosts for instance"
@@ -279,6 +279,11 @@ def _check_place(address: Address) -> None:
         if time.monotonic() > end:
             raise TrainingError(f"{address}: somebody listens there already; end that, or choose another port")
         time.sleep(0.2)
+
+
+def _means_loopback(host: str) -> bool:
+    """Whether that is what who wrote it wants; 127.1 is an address, too."""
+    return host.lower().startswith("localhost") or host.strip("0123456789.") == "" or ":" in host
 
 
 def _is_loopback(address: str) -> bool:

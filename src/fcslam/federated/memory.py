@@ -78,6 +78,8 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
     if not path.exists():
         return None
     checkpoint = read_checkpoint(path)
+    if checkpoint.stage != STAGE:
+        raise TrainingError(f"{path}: is a checkpoint of other training; give another --output")
     groups: dict[str, dict[str, NDArray[Any]]] = {"weights": {}, "best": {}, "memory": {}}
     try:
         for key, tensor in checkpoint.tensors.items():
@@ -96,9 +98,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
             str(header["origin"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise TrainingError(f"{path}: is no checkpoint of federated training ({error}); take it away") from error
-    if checkpoint.stage != STAGE:
-        raise TrainingError(f"{path}: is a checkpoint of something else; give another --output")
+        raise TrainingError(f"{path}: is no checkpoint of this version ({error}); give another --output") from error
     asked = _fixed(settings.model_dump(mode="json"))
     if others := sorted(name for name in asked.keys() | fixed.keys() if asked.get(name) != fixed.get(name)):
         raise TrainingError(

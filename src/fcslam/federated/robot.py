@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
+from fcslam.federated.judging import SCORE_FIGURES
 from fcslam.federated.keeping import former_weights, keep_moments, last_moments
 from fcslam.federated.network import network_of, weights_of
 from fcslam.federated.privacy import privatised
@@ -114,7 +115,9 @@ class RobotLearner:
             raise TrainingError(FIGURES_TELL)
         network = network_of(weights, settings.training.encoder).to(self.device)
         held_out = self._examples(weights, settings).held_out
-        return validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
+        found = validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
+        # What finds nothing finds nothing again: a detector that collapsed is judged, too.
+        return {name: found[name] if np.isfinite(found[name]) else 0.0 for name in SCORE_FIGURES}
 
     def _examples(self, weights: Weights, settings: FederatedSettings) -> Images:
         """The images, labelled by the first weights that ever came here, and by no later ones."""

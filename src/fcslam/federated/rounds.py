@@ -102,7 +102,7 @@ class Server:
             self._wait_or_end(answers.left_out)
             answers, state = self._train(grid, roster, state)
         weights = self._merge(answers, state)
-        verdict = self._verdict(weights, state, grid, roster)
+        verdict = self._verdict(weights, state, grid, roster, answers)
         released = verdict.gain is not None and verdict.gain >= 0.0
         # The start is no place to go back to: nothing would be learnt as long as learning costs something at first.
         collapsed = verdict.gain is not None and verdict.gain < -self._settings.collapse
@@ -157,8 +157,7 @@ class Server:
         frozen = self._settings.normalisation == "frozen"
         for robot, reason in screen(answers.weights, state.weights, self._settings.screening, frozen).items():
             answers.leave_out(robot, reason)
-        for robot in roster.doubles:
-            answers.leave_out(f"another {robot}", "two robots of one name are there, and one of them is not asked")
+        answers.mention({f"another {robot}": "two of one name are there, one is not asked" for robot in roster.doubles})
         return answers, state
 
     def _merge(self, answers: Answers, state: State) -> Weights:
@@ -166,12 +165,17 @@ class Server:
         ordered = [(answers.messages[robot], answers.weights[robot]) for robot in sorted(answers.weights)]
         return self._merger.merge(state.rounds_done + 1, ordered, state.weights)
 
-    def _verdict(self, weights: Weights, state: State, grid: Grid, roster: Roster) -> Verdict:
-        """How good weights are beside the best, which robots judge now that have come since."""
+    def _verdict(self, weights: Weights, state: State, grid: Grid, roster: Roster, answers: Answers) -> Verdict:
+        """How good weights are beside the best, which those judge now that have not yet."""
         figures = self._judge(weights, state.rounds_done, grid, roster)
-        new = {robot: node for robot, node in roster.present().items() if robot in figures.keys() - state.best_scores}
-        late, _ = self._ask_to_judge(state.best, state.rounds_done, grid, new) if new else ({}, {})
-        return Verdict(figures, dict(state.best_scores) | {robot: score_of(found) for robot, found in late.items()})
+        new, late = figures.keys() - state.best_scores, dict[str, Figures]()
+        if new and self._outside.judge is not None:
+            late = {PUBLIC: self._outside.judge(state.best)}
+        elif new:
+            nodes = {robot: node for robot, node in roster.present().items() if robot in new}
+            late, failed = self._ask_to_judge(state.best, state.rounds_done, grid, nodes)
+            answers.mention({f"judging by {robot}": why for robot, why in failed.items()})
+        return Verdict(figures, dict(state.best_scores) | {judge: score_of(found) for judge, found in late.items()})
 
     def _judge(self, weights: Weights, round_number: int, grid: Grid, roster: Roster) -> dict[str, Figures]:
         """Figures by whoever judges."""
