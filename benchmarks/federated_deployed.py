@@ -36,6 +36,7 @@ KILLED = ROBOTS[-1]
 PATIENCE_S = 1800.0
 TINY = """rounds: 2
 local_steps: 4
+judge_every: 1
 minimum_robots: 4
 training: {shape_steps: 2, pairs: 1, side_px: 96, points: 32, label_copies: 1}
 """
@@ -173,7 +174,8 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
 
     torch.set_num_threads(1)
     torch.manual_seed(1)
-    settings = FederatedSettings(local_steps=steps, rounds=count, training=TrainingSettings(label_copies=1))
+    training = TrainingSettings(label_copies=1)
+    settings = FederatedSettings(local_steps=steps, rounds=count, judge_every=1, training=training)
     fleet = [
         robots.RobotLearner(name, drawn(folder / name, 5, seed), folder / "labels" / name, robots.secret_noise)
         for seed, name in enumerate(ROBOTS)

@@ -10,6 +10,7 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from federated.fakes import START, Fake, run, settings, shifted
 
+from fcslam.cli.federate import line_of
 from fcslam.errors import TrainingError
 from fcslam.federated.client import client_app
 from fcslam.federated.grid import InProcessGrid
@@ -45,6 +46,16 @@ class Coming(InProcessGrid):
 
 def run_coming(robots, since, folder, **given):
     return run(robots, folder, settings(**given), grid=Coming(robots, since), judge=None)
+
+
+def test_only_some_rounds_are_judged_and_the_last(tmp_path):
+    robots = [Judging("a")]
+    state, reports = run(robots, tmp_path, settings(rounds=5, judge_every=2), judge=None)
+    assert [report.released for report in reports] == [False, True, False, True, True]
+    assert [bool(report.figures) for report in reports] == [False, True, False, True, True]
+    assert state.best_round == 5
+    assert "not judged" in line_of(reports[0].row(), 5)
+    assert "released" in line_of(reports[1].row(), 5)
 
 
 def test_the_median_robot_decides(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
+from fcslam.cli.federate_apart import _address
 from fcslam.errors import OutputError, TrainingError
 from fcslam.federated import launch
 from fcslam.federated.settings import FederatedSettings
@@ -100,3 +101,23 @@ def test_a_log_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "run" / launch.LOG_FILE).mkdir(parents=True)
     with pytest.raises(OutputError, match="run: cannot be used as the output folder"):
         serve(tmp_path, Address("127.0.0.1", launch.free_port()))
+
+
+def test_an_ipv6_address_keeps_its_brackets_outside():
+    assert _address("[::1]:8000") == Address("::1", 8000)
+    assert str(_address("[::1]:8000")) == "[::1]:8000"
+    with pytest.raises(TrainingError, match="is no HOST:PORT"):
+        _address("[]:8000")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1", "localhost", "LOCALHOST", "localhost.localdomain", "::1"])
+def test_who_wants_loopback_gets_it(host, tmp_path, monkeypatch):
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: [(2, 1, 6, "", ("127.0.0.1", 8000))])
+    monkeypatch.setattr(launch, "_listens", lambda _address: False)
+    launch._check_place(Address(host, 8000))
+
+
+@pytest.mark.parametrize("host", ["no.such.name.invalid", ".lab", "x" * 64])
+def test_a_name_that_is_none_is_told(host, tmp_path):
+    with pytest.raises(TrainingError, match="knows no such name"):
+        serve(tmp_path, Address(host, 8000))

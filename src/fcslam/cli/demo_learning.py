@@ -53,8 +53,8 @@ def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console
     from fcslam.federated.task import Task, Watches
     from fcslam.learning.trainer import Pace
 
-    given = {"rounds": ROUNDS, "local_steps": STEPS, "normalisation": "frozen", "training": TRAINING | {"seed": seed}}
-    settings = parse(FederatedSettings, given, "the demo")
+    given = {"rounds": ROUNDS, "local_steps": STEPS, "judge_every": 1, "normalisation": "frozen"}
+    settings = parse(FederatedSettings, given | {"training": TRAINING | {"seed": seed}}, "the demo")
     homes = [_own_images(source, folder / "images" / source.name) for source in sources]
     released = False
 

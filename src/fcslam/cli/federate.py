@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fcslam.federated.task import Task, Watches
     from fcslam.learning.trainer import Status
 
-QUICK = {"rounds": 3, "local_steps": 6}
+QUICK = {"rounds": 3, "local_steps": 6, "judge_every": 1}
 QUICK_TRAINING = {"shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Enough to see that everything works, and no more."""
 
@@ -147,7 +147,8 @@ def _progress(console: Any, settings: "FederatedSettings") -> "Iterator[Watches]
 
 def line_of(row: "Mapping[str, str]", rounds: int) -> str:
     """A round in a line."""
-    released, returned = row["released"] == "1", row["returned"] == "1"
+    released, returned, judged = row["released"] == "1", row["returned"] == "1", row["score"] != "nan"
+    outcome = "back to the best" if returned else "not released" if judged else "not judged"
     shown = {"detector": "loss_detector", "contrastive": "loss_contrastive", "repeatability": "repeatability",
              "MMA": "mma_3px"}  # fmt: skip
     parts = [
@@ -155,7 +156,7 @@ def line_of(row: "Mapping[str, str]", rounds: int) -> str:
         f"{len(row['robots'].split(' | '))} robots",
         *(f"{name} {float(row[column]):.3f}" for name, column in shown.items() if row.get(column)),
         f"down {float(row['bytes_down']) / 1e6:.1f} MB, up {float(row['bytes_up']) / 1e6:.1f} MB",
-        f"released {row['version']}" if released else "back to the best" if returned else "not released",
+        f"released {row['version']}" if released else outcome,
         *([f"without {row['left_out']}"] if row["left_out"] else []),
     ]
     return "  ".join(parts)

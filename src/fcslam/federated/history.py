@@ -32,7 +32,7 @@ class RoundReport:
     losses: Mapping[str, float] = field(default_factory=dict)
     """Means over robots and steps."""
     figures: Mapping[str, float] = field(default_factory=dict)
-    """Of the validation."""
+    """Of the validation, if there was one."""
     score: float = math.nan
     released: bool = False
     """Whether these weights are the best so far: the new version of the detector."""

@@ -1,5 +1,6 @@
 """Which of two versions of the detector is better, by whoever judged both."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -28,7 +29,7 @@ class Verdict:
     """On a version, beside the best one so far."""
 
     by_judge: Mapping[str, Figures]
-    """Figures of the version."""
+    """Figures of the version; none where it is not judged."""
     best: Mapping[str, float]
     """Scores of the best, by all who ever judged it."""
 
@@ -39,8 +40,8 @@ class Verdict:
 
     @property
     def score(self) -> float:
-        """The median."""
-        return float(np.median(list(self.scores.values())))
+        """The median; NaN if nobody judged."""
+        return float(np.median(list(self.scores.values()))) if self.by_judge else math.nan
 
     @property
     def figures(self) -> dict[str, float]:

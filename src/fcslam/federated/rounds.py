@@ -102,17 +102,19 @@ class Server:
             self._wait_or_end(answers.left_out)
             answers, state = self._train(grid, roster, state)
         weights = self._merge(answers, state)
-        verdict = self._verdict(weights, state, grid, roster, answers)
+        number = state.rounds_done + 1
+        is_judged = number % self._settings.judge_every == 0 or number == self._settings.rounds
+        verdict = self._verdict(weights, state, grid, roster, answers) if is_judged else Verdict({}, state.best_scores)
         released = verdict.gain is not None and verdict.gain >= 0.0
         # The start is no place to go back to: nothing would be learnt as long as learning costs something at first.
         collapsed = verdict.gain is not None and verdict.gain < -self._settings.collapse
         returned = state.best_round > 0 and collapsed
         following = State(
-            rounds_done=state.rounds_done + 1,
+            rounds_done=number,
             weights=state.best if returned else weights,
             best=weights if released else state.best,
             best_scores=verdict.scores if released else verdict.best,
-            best_round=state.rounds_done + 1 if released else state.best_round,
+            best_round=number if released else state.best_round,
             memory={} if returned else self._merger.memory,
             asked=state.asked,
             origin=state.origin,
@@ -121,7 +123,7 @@ class Server:
             self._merger = Merger(self._settings, {})
         privacy = self._settings.privacy
         report = RoundReport(
-            round_number=following.rounds_done,
+            round_number=number,
             version=self._outside.version(weights),
             robots=tuple(sorted(answers.weights)),
             left_out=answers.left_out,

@@ -37,8 +37,11 @@ class PrivacySettings(Settings):
 class FederatedSettings(Settings):
     """One federated training run."""
 
-    rounds: int = Field(default=100, ge=1, description="rounds of local training and aggregation")
-    local_steps: int = Field(default=20, ge=1, description="optimiser steps of a robot in a round")
+    rounds: int = Field(default=200, ge=1, description="rounds of local training and aggregation")
+    local_steps: int = Field(default=10, ge=1, description="optimiser steps of a robot in a round")
+    judge_every: int = Field(
+        default=5, ge=1, description="rounds from one judged version to the next; these and the last may be released"
+    )
     strategy: StrategyName = Field(default="fedavg", description="how updates become one, by Flower's class")
     participation: float = Field(default=1.0, gt=0.0, le=1.0, description="share of the robots asked in a round")
     minimum_robots: int = Field(default=1, ge=1, description="updates without which a round does not count")
