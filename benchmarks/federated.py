@@ -43,6 +43,8 @@ from fcslam.federated.settings import PrivacySettings
 from fcslam.metrics.bootstrap import Interval
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from fcslam.evaluation.federated import Findings
     from fcslam.evaluation.federated_report import ArmReport
 
@@ -65,6 +67,7 @@ ROBUST: dict[str, dict[str, Any]] = {
     "fedavg": TRUSTING,
     "screened": {},
     "median": {"strategy": "fedmedian", **TRUSTING},
+    "plain-median": {"strategy": "fedmedian", "server_momentum": 0.0, **TRUSTING},
 }
 NOISE = {"noise-001": 1e-3, "noise-003": 3e-3, "noise-01": 1e-2}
 """Multipliers."""
@@ -133,7 +136,7 @@ def main() -> None:
     if known.issuperset(NOISE):
         report.table("Noise for privacy", PRIVATE, private_rows(compare(findings, "frozen")))
     report.table("Old codes in the first view, new ones in the second", KEEPING, kept_rows(unpoisoned))
-    report.picture("Gap to central training by arm, and what noise costs", draw(below))
+    report.picture("Gap to central training by arm; beside it, if there was noise, what that costs", draw(below))
     report.write()
 
 
@@ -256,32 +259,38 @@ def kept_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
 
 
 def draw(rows: "Rows") -> Figure:
-    """Gaps with intervals by arm, and accuracy against epsilon."""
-    figure = Figure(figsize=(11, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    """Gaps with intervals by arm; where there is noise, accuracy against epsilon beside them."""
     names = [arm for arm in ("local", "alone", *arms()) if ("mma_3px", arm) in rows]
+    noisy = set(NOISE) <= set(names)
+    figure = Figure(figsize=(11 if noisy else 7, 4.5), layout="constrained")
+    panels = figure.subplots(1, 2 if noisy else 1, squeeze=False)[0]
     for offset, (measure, title) in zip((-0.15, 0.15), TITLES.items(), strict=True):
         gaps = np.array([rows[measure, arm].gap for arm in names]) * 100
         at, spread = np.arange(len(names)) + offset, np.abs(gaps[:, 1:].T - gaps[:, 0])
-        left.errorbar(gaps[:, 0], at, xerr=spread, fmt="o", capsize=2, label=title)
-        if set(NOISE) <= set(names):
-            noisy = [(promised(noise), 100 * rows[measure, arm].mean) for arm, noise in NOISE.items()]
-            line = right.plot(*zip(*noisy, strict=True), "o-", label=title)[0]
-            right.axhline(100 * rows[measure, "frozen"].mean, color=line.get_color(), linestyle="--", linewidth=1)
-    left.axvline(0.0, color="black", linewidth=1)
-    left.axvline(2.0, color="grey", linewidth=1, linestyle=":")
-    left.set_yticks(range(len(names)), names)
-    left.invert_yaxis()
-    left.set_xscale("symlog", linthresh=5.0)
-    left.set_xticks(ticks := (-5, -2, 0, 2, 5, 10, 30), [str(tick) for tick in ticks])
-    left.set_xlabel("points below central training, 95 %")
-    right.set_xscale("log")
-    right.set_xlabel("epsilon; dashed: without noise")
-    right.set_ylabel("%")
-    right.legend(frameon=False)
-    for panel in (left, right):
+        panels[0].errorbar(gaps[:, 0], at, xerr=spread, fmt="o", capsize=2, label=title)
+    panels[0].axvline(0.0, color="black", linewidth=1)
+    panels[0].axvline(2.0, color="grey", linewidth=1, linestyle=":")
+    panels[0].set_yticks(range(len(names)), names)
+    panels[0].invert_yaxis()
+    panels[0].set_xscale("symlog", linthresh=5.0)
+    panels[0].set_xticks(ticks := (-5, -2, 0, 2, 5, 10, 30), [str(tick) for tick in ticks])
+    panels[0].set_xlabel("points below central training, 95 %")
+    if noisy:
+        draw_noise(panels[1], rows)
+    for panel in panels:
         panel.grid(alpha=0.3)
+        panel.legend(frameon=False)
     return figure
+
+
+def draw_noise(panel: "Axes", rows: "Rows") -> None:
+    for measure, title in TITLES.items():
+        curve = [(promised(noise), 100 * rows[measure, arm].mean) for arm, noise in NOISE.items()]
+        line = panel.plot(*zip(*curve, strict=True), "o-", label=title)[0]
+        panel.axhline(100 * rows[measure, "frozen"].mean, color=line.get_color(), linestyle="--", linewidth=1)
+    panel.set_xscale("log")
+    panel.set_xlabel("epsilon; dashed: without noise")
+    panel.set_ylabel("%")
 
 
 if __name__ == "__main__":
