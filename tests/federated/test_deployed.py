@@ -156,10 +156,10 @@ def test_a_deployed_fleet_ends_as_one_in_a_process(deployment, embedded):
     server = deployment.server()
     deployment.until("server", "waiting: 0 robots are there, 2 needed")
     stranger = deployment.robot("one", key="stranger")
-    for robot in ("one", "two"):
-        deployment.robot(robot)
     assert stranger.wait(LIMIT_S) == 2
     assert "does not take this robot" in deployment.said("stranger")
+    for robot in ("one", "two"):
+        deployment.robot(robot)
     assert server.wait(LIMIT_S) == 0, deployment.said("server")
     assert_same(deployment.folder / "deployed", embedded / "out")
 
