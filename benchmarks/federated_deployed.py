@@ -63,12 +63,23 @@ def federate(*words: object, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """A command in the background, interrupted at the end of the block."""
     command = [sys.executable, "-m", "fcslam.cli", "federate", *map(str, words)]
     with log.open("wb") as file:
-        process = subprocess.Popen(command, env=ENVIRONMENT, stdout=file, stderr=file)
+        process = subprocess.Popen(
+            command,
+            env=ENVIRONMENT,
+            stdout=file,
+            stderr=file,
+            preexec_fn=heed_interrupts,  # noqa: PLW1509
+        )
     try:
         yield process
     finally:
         process.send_signal(signal.SIGINT)
         process.wait(180.0)
+
+
+def heed_interrupts() -> None:
+    """A benchmark in the background ignores them, and what it starts would as well."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for(happened: Callable[[], bool], what: str, log: Path) -> None:

@@ -48,8 +48,14 @@ def test_the_status_is_what_was_written_last(tmp_path):
 
 
 def start(*words, log):
+    """A command that an interrupt ends, even where the tests were started in the background, which ignores them."""
+    command = [sys.executable, "-m", "fcslam.cli", "federate", *words]
     with log.open("ab") as file:
-        return subprocess.Popen([sys.executable, "-m", "fcslam.cli", "federate", *words], stdout=file, stderr=file)
+        return subprocess.Popen(command, stdout=file, stderr=file, preexec_fn=heed_interrupts)  # noqa: PLW1509
+
+
+def heed_interrupts():
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def versions(folder):
