@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import TrainingError
-from fcslam.federated.answers import Answers, read_answers
+from fcslam.federated.answers import Answers, line_of, read_answers
 from fcslam.federated.flower import Grid, Message, MessageType, RecordDict
 from fcslam.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
 from fcslam.federated.judging import Figures, Verdict, credible, score_of
@@ -199,7 +199,7 @@ class Server:
         questions = [Message(letter, node, MessageType.EVALUATE) for node in nodes.values()]
         names = {node: robot for robot, node in nodes.items()}
         found: dict[str, Figures] = {}
-        answers = Answers()
+        failed: dict[str, str] = {}
         for reply in grid.send_and_receive(questions, timeout=self._settings.deadline_s):
             robot = names.get(reply.metadata.src_node_id, "")
             try:
@@ -210,8 +210,8 @@ class Server:
                     raise ValueError("an answer without figures that could be")
                 found[robot] = figures
             except (ValueError, KeyError, TypeError) as error:
-                answers.leave_out(robot, str(error))
-        return found, answers.left_out
+                failed[robot] = line_of(str(error))
+        return found, failed
 
     def _await(self, roster: Roster) -> dict[str, int]:
         while len(present := roster.present()) < self._settings.minimum_robots:
