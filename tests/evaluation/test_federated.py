@@ -131,6 +131,11 @@ def test_robots_own_networks_may_have_fewer_seeds_and_images(robots, tmp_path):
     assert all(np.isfinite(row.gap.mean) for row in report(found))
     more = run_study(study(robots, tmp_path, **settings | {"local_seeds": 2}))
     assert len(more.measured["local"]) == 2
+    without = run_study(study(robots, tmp_path, **settings | {"local_seeds": 0}))
+    assert set(without.measured) == {"start", "central"}
+    rows = report(without)
+    assert all(np.isfinite(row.gap.mean) for row in rows)
+    assert all(np.isnan([row.closed, row.closed_alone]).all() for row in rows)
 
 
 def test_two_at_one_study_share_the_work_out(robots, tmp_path, monkeypatch):

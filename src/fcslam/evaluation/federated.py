@@ -62,7 +62,7 @@ class StudySettings(Settings):
     arms: dict[str, Arm] = Field(default_factory=lambda: {"federated": Arm()}, description="by name")
     seeds: int = Field(default=3, ge=1, description="each trains anew, from the same start")
     local_seeds: int | None = Field(
-        default=None, ge=1, description="so many of them for robots' own networks, which cost most; null for all"
+        default=None, ge=0, description="so many of them for robots' own networks, which cost most; null for all"
     )
     pairs: int = Field(default=500, ge=1, description="pairs of views, shared out among the robots' held-out images")
     images: int = Field(default=400, ge=4, description="at most so many image files of a robot")
@@ -91,7 +91,8 @@ class Findings:
     """For each pair the number of the robot whose image it is."""
     measured: Mapping[str, FloatArray]
     """By arm: shape (seeds, networks, pairs, measures). ``local`` and ``alone`` have a network for each robot, all the
-    others one; a pair is shown to one of them only, the rest have NaN there. An arm may have fewer seeds than central.
+    others one; a pair is shown to one of them only, the rest have NaN there. An arm may have fewer seeds than central,
+    and robots' own networks may be missing.
     """
 
 
@@ -129,12 +130,13 @@ def run_study(study: Study) -> Findings:
 def _files_of_arms(study: Study) -> dict[str, list[Path]]:
     """Where what is measured of each arm is kept, by seed."""
     settings = study.settings
-    own = min(settings.local_seeds or settings.seeds, settings.seeds)
+    own = settings.seeds if settings.local_seeds is None else min(settings.local_seeds, settings.seeds)
     seeds = {START: 1, CENTRAL: settings.seeds, LOCAL: own, ALONE: own}
     seeds |= {name: min(arm.seeds or settings.seeds, settings.seeds) for name, arm in settings.arms.items()}
     return {
         name: [study.folder / f"seed{seed}" / "measured" / f"{name}.npz" for seed in range(1, count + 1)]
         for name, count in seeds.items()
+        if count
     }
 
 

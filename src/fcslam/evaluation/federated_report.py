@@ -30,7 +30,7 @@ class ArmReport:
     """Central, or what else it is compared to, minus this arm on the same pairs and seeds, means over seeds first: the
     paired bootstrap interval."""
     closed: float
-    """(arm - local) / (central - local); NaN where central is not clearly better than local."""
+    """(arm - local) / (central - local); NaN where central is not clearly better than local, or local is unknown."""
     closed_alone: float
     """The same with robots that train alone for no longer than in the fleet."""
     worst_robot: str
@@ -70,8 +70,12 @@ def write_report(reports: list[ArmReport], path: Path) -> None:
 
 def _report(findings: Findings, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
     seeds = len(findings.measured[arm])
-    values, reference, central, local, alone = (
-        _by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL, LOCAL, ALONE)
+    values, reference, central = (_by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL))
+    closed, closed_alone = (
+        _closed(values, _by_pair(findings.measured[own][:seeds], index), central, rng)
+        if own in findings.measured
+        else np.nan
+        for own in (LOCAL, ALONE)
     )
     owners = np.array(findings.owners)
     gaps = [float(np.nanmean((reference - values)[owners == robot])) for robot in range(len(findings.robots))]
@@ -81,8 +85,8 @@ def _report(findings: Findings, arm: str, index: int, against: str, rng: np.rand
         measure=MEASURES[index],
         mean=float(np.nanmean(values)),
         gap=mean_interval(reference - values, rng),
-        closed=_closed(values, local, central, rng),
-        closed_alone=_closed(values, alone, central, rng),
+        closed=closed,
+        closed_alone=closed_alone,
         worst_robot=findings.robots[worst],
         worst_gap=gaps[worst],
         seeds=tuple(float(np.nanmean(each[..., index])) for each in findings.measured[arm]),
