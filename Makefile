@@ -14,7 +14,7 @@ APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire:
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 HAS_LEARNING := $(BIN)/python -c "import flwr, onnx, torch" 2>/dev/null
-BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py,$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py,$(wildcard benchmarks/*.py))
 
 .PHONY: help install gl learning demo test test-system check bench proto
 .DEFAULT_GOAL := help

@@ -31,29 +31,23 @@ import csv
 import json
 import sys
 from collections.abc import Iterator, Set
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import common
 import numpy as np
 from matplotlib.figure import Figure
+from training_fleet import GAPS, SIMULATED, TITLES, VISION, compare, gap_row, points, robots, run
 
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.settings import FederatedSettings, PrivacySettings
-from fcslam.metrics.bootstrap import Interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from training_fleet import Rows
 
     from fcslam.evaluation.federated import Findings
-    from fcslam.evaluation.federated_report import ArmReport
 
-    Rows = dict[tuple[str, str], ArmReport]
-
-VISION = {"tower": "ie_tower/floor22", "town": "camvid/0016E5", "photos": "coco_subset/train2017"}
-SIMULATED = {"day": "robot_1", "lamp-off": "robot_2"}
-SIMULATION = ("--robots", 2, "--seed", 7, "--path-length", 40, "--lighting", "day", "--lighting", "lamp-off")
 PUBLIC = "sun_hays80"
 """Photographs that the start is trained on."""
 START = {"shape_steps": 400, "steps": 1000, "label_copies": 4, "pairs": 4, "side_px": 128, "points": 160}
@@ -74,9 +68,6 @@ NOISE = {"noise-001": 1e-3, "noise-003": 3e-3, "noise-01": 1e-2}
 KEPT = {"compatible-30": 30.0}
 """Strengths of the pull to the codes of the start."""
 CLIP_NORM = 3.0
-TITLES = {"homography_3px": "Homographies right to 3 px, %", "mma_3px": "MMA at 3 px, %"}
-GAPS = {"arm": "s", "seeds": "d", "mean": ".1f", "gap": "s", "closed": ".2f", "of alone": ".2f", "worst robot": "s",
-        "each seed": "s"}  # fmt: skip
 LOST = {"homography, %": ".1f", "lost": "s", "MMA, %": ".1f", "lost ": "s"}
 LOSSES = {"arm": "s"} | LOST
 PRIVATE = {"arm": "s", "noise": "g", "epsilon": ".3g"} | LOST
@@ -120,7 +111,6 @@ def main() -> None:
     folder: Path = chosen.study.resolve()
     vision = common.recordings(*VISION.values(), PUBLIC, kind="vision")
     folder.mkdir(parents=True, exist_ok=True)
-    prepare(vision, folder)
     findings = study(vision, folder, chosen.until)
     below = compare(findings, "central")
     report = common.Report(__file__, __doc__ or "", chosen)
@@ -139,25 +129,12 @@ def main() -> None:
     report.write()
 
 
-def prepare(vision: Path, folder: Path) -> None:
-    """The simulated robots and the start, unless they are there."""
-    if not (folder / "fleet" / "simulation.yaml").exists():
-        common.run_fcslam("simulate", "--output", folder / "fleet", *SIMULATION)
+def study(vision: Path, folder: Path, until: str | None) -> "Findings":
+    """Train and measure whatever is missing, up to an arm."""
+    fleet = robots(vision, folder)
     if not (folder / "start" / "detector.onnx").exists():
         (folder / "start.yaml").write_text(json.dumps(START), encoding="utf-8")
         common.run_fcslam("train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start")
-
-
-def study(vision: Path, folder: Path, until: str | None) -> "Findings":
-    """Train and measure whatever is missing, up to an arm."""
-    import torch
-
-    from fcslam.evaluation.federated import Study, StudySettings, run_study
-    from fcslam.learning.trainer import Pace
-
-    torch.set_num_threads(1)
-    robots = {name: vision / place for name, place in VISION.items()}
-    robots |= {name: folder / "fleet" / robot for name, robot in SIMULATED.items()}
     names = list(arms())
     wanted = names[: names.index(until) + 1] if until else names
     content = {
@@ -165,23 +142,12 @@ def study(vision: Path, folder: Path, until: str | None) -> "Findings":
         "arms": {name: arms()[name] for name in wanted},
         "seeds": SEEDS,
         "local_seeds": 1,
+        "pairs": PAIRS,
+        "images": IMAGES,
+        "trained": TRAINED,
+        "start": folder / "start" / "joint" / "checkpoint.npz",
     }
-    content |= {"pairs": PAIRS, "images": IMAGES, "trained": TRAINED}
-    content["start"] = folder / "start" / "joint" / "checkpoint.npz"
-    settings = StudySettings.model_validate(content)
-
-    def watch(name: str, done: int, of: int) -> None:
-        if done == of:
-            print(f"{datetime.now(UTC):%H:%M:%S} {name}: {of}", flush=True)
-
-    return run_study(Study(robots, folder / "study", settings, Pace(), watch))
-
-
-def compare(findings: "Findings", against: str) -> "Rows":
-    """Every arm by every measure, compared to one."""
-    from fcslam.evaluation.federated_report import report
-
-    return {(row.measure, row.arm): row for row in report(findings, against=against)}
+    return run(fleet, folder / "study", content)
 
 
 def setting(findings: "Findings", folder: Path) -> str:
@@ -201,17 +167,6 @@ def setting(findings: "Findings", folder: Path) -> str:
 def places() -> list[tuple[str, str]]:
     """The robots, and how their labels' folders are called."""
     return [(name, Path(place).name) for name, place in VISION.items()] + list(SIMULATED.items())
-
-
-def gap_row(row: "ArmReport") -> tuple[object, ...]:
-    worst = f"{row.worst_robot} {100 * row.worst_gap:.1f}"
-    seeds = " ".join(f"{100 * mean:.1f}" for mean in row.seeds)
-    return row.arm, len(row.seeds), 100 * row.mean, points(row.gap), row.closed, row.closed_alone, worst, seeds
-
-
-def points(interval: Interval) -> str:
-    """A share's interval in points."""
-    return f"{100 * interval.mean:.1f} [{100 * interval.low:.1f}, {100 * interval.high:.1f}]"
 
 
 def poison_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:

@@ -20,7 +20,7 @@ from fcslam.mission import MissionConfig
 from fcslam.records import Channel
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-SHARED = ("common", "processes")
+SHARED = ("common", "processes", "training_fleet")
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 
 
