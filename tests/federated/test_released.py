@@ -11,10 +11,12 @@ from features.networks import tiny_network  # noqa: E402
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import SHIPPED_NETWORK, OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.federated.network import network_of  # noqa: E402
+from fcslam.federated.released import normalised  # noqa: E402
 from fcslam.federated.start import read_weights  # noqa: E402
 from fcslam.federated.weights import trained_names  # noqa: E402
 from fcslam.learning.export import export, quantise  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
+from fcslam.learning.stages import Shapes  # noqa: E402
 
 
 def lived_in(encoder):
@@ -62,6 +64,32 @@ def test_its_normalisations_begin_as_none(tmp_path):
     assert statistics
     for name in statistics:
         assert np.allclose(weights[name], 0.0 if name.endswith("mean") else 1.0, atol=2e-5)
+
+
+def test_normalised_it_is_the_same_function_and_stays_so_when_batches_normalise_it():
+    """What no normalisation had become is another function as soon as it is trained."""
+    released = read_weights(SHIPPED_NETWORK, "light")
+    shapes = [example.image for example in Shapes(5, 8)[:]]
+    batch = torch.from_numpy(np.stack(shapes))[:, None].float() / 255.0
+    given = normalised(released, "light", shapes)
+    with torch.inference_mode():
+        expected = network_of(released, "light")(batch)
+        networks = [network_of(weights, "light") for weights in (given, released)]
+        assert torch.allclose(networks[0](batch).code_logits, expected.code_logits, rtol=1e-3, atol=1e-3)
+        assert torch.allclose(networks[0](batch).point_logits, expected.point_logits, rtol=1e-3, atol=1e-3)
+        bits = [network.train()(batch).code_logits > 0.0 for network in networks]
+    same = [float((each == (expected.code_logits > 0.0)).float().mean()) for each in bits]
+    assert same[0] > 0.9
+    assert same[1] < 0.75
+
+
+def test_normalised_weights_do_not_hang_on_the_last_digit_of_an_image():
+    released = read_weights(SHIPPED_NETWORK, "light")
+    shapes = [example.image for example in Shapes(5, 3)[:]]
+    again = [image.copy() for image in shapes]
+    again[0][10, 10] ^= 1
+    first, other = (normalised(released, "light", images) for images in (shapes, again))
+    assert all(np.array_equal(first[name], other[name]) for name in released)
 
 
 def test_another_network_is_refused_by_name(tmp_path):

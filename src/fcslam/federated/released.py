@@ -1,27 +1,34 @@
 """A released detector as something to train on from: its ONNX file read back as weights."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from fcslam.errors import TrainingError
+from fcslam.features.dense import CELL_PX
+from fcslam.features.detector import GreyImage
 from fcslam.federated.network import network_of, weights_of
+from fcslam.federated.weights import Weights
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import Encoder
 
 SUFFIX: Final = ".onnx"
 VARIANCE: Final = 1.0 - 1e-5
 """With it batch normalisation, which adds 1e-5, changes nothing."""
+LEAST_DEVIATION: Final = 2.0**-10
+"""Of a channel that says the same everywhere."""
 
 
 def read_released(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
     """Weights of a network that gives what the float32 file gives.
 
     Exporting folded each batch normalisation into the convolution before it. Read back, it holds the shift alone:
-    another network of the same function, which can be trained on.
+    another network of the same function. Before it is trained on by batches' own statistics, see ``normalised``.
 
     Raises:
         TrainingError: the file is no detector in float32, or of another encoder.
@@ -70,3 +77,55 @@ def _unfolded(
         f"{norm}.running_mean": np.zeros_like(ones),
         f"{norm}.running_var": VARIANCE * ones,
     }
+
+
+def normalised(weights: Weights, encoder: Encoder, images: Sequence[GreyImage]) -> dict[str, NDArray[np.float32]]:
+    """The same function, its batch normalisations by what these images are within the network.
+
+    Training normalises by each batch: a network whose normalisations changed nothing would be another one from the
+    first step on. Only images much like a robot's make no difference; any are far better than none.
+    """
+    network = network_of(weights, encoder)
+    norms = {name: module for name, module in network.named_modules() if isinstance(module, nn.BatchNorm2d)}
+    sums = _sums_before(norms, network, images)
+    given = dict(weights)
+    for name, norm in norms.items():
+        count, total, squares = sums[name]
+        mean = total / count
+        deviation = (squares / count - mean.square()).clamp(min=0.0).sqrt().clamp(min=LEAST_DEVIATION)
+        # Rounded, so that machines whose sums differ in the last digit begin from the same weights.
+        deviation = torch.exp2(torch.round(4.0 * deviation.log2()) / 4.0)
+        mean = deviation * torch.round(8.0 * mean / deviation) / 8.0
+        arrays = {
+            "weight": deviation,
+            "bias": norm.bias.double() + mean,
+            "running_mean": mean,
+            "running_var": deviation.square() - norm.eps,
+        }
+        given |= {f"{name}.{part}": tensor.detach().float().numpy() for part, tensor in arrays.items()}
+    return given
+
+
+@torch.inference_mode()
+def _sums_before(
+    norms: Mapping[str, nn.BatchNorm2d], network: KeypointNetwork, images: Sequence[GreyImage]
+) -> dict[str, tuple[int, Tensor, Tensor]]:
+    """By normalisation: how many values of a channel come to it, their sums (C,) and the sums of their squares (C,)."""
+    found: dict[str, tuple[int, Tensor, Tensor]] = {}
+
+    def watch(name: str) -> Any:
+        def add(_module: nn.Module, inputs: tuple[Tensor]) -> None:
+            values = inputs[0].double()
+            count, total, squares = found.get(name, (0, torch.zeros(()), torch.zeros(())))
+            part = values.sum((0, 2, 3)), values.square().sum((0, 2, 3))
+            found[name] = count + values[:, 0].numel(), total + part[0], squares + part[1]
+
+        return add
+
+    handles = [norm.register_forward_pre_hook(watch(name)) for name, norm in norms.items()]
+    for image in images:
+        height, width = (side // CELL_PX * CELL_PX for side in image.shape)
+        network(torch.from_numpy(image[:height, :width])[None, None].float() / 255.0)
+    for handle in handles:
+        handle.remove()
+    return found

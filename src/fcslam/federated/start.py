@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fcslam.errors import TrainingError
 from fcslam.features.detector import GreyImage
 from fcslam.federated.network import network_of, weights_of
-from fcslam.federated.released import SUFFIX, read_released
+from fcslam.federated.released import SUFFIX, normalised, read_released
 from fcslam.federated.rounds import Judge
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
@@ -30,9 +30,16 @@ GROUPS: Final = ("best/", "average/")
 
 
 def first_weights(
-    start: Path | None, folder: Path, settings: FederatedSettings, pace: Pace, watch: Watch
+    start: Path | None,
+    folder: Path,
+    settings: FederatedSettings,
+    pace: Pace,
+    watch: Watch,
+    public: Sequence[GreyImage] = (),
 ) -> dict[str, NDArray[np.float32]]:
     """Weights of a checkpoint or a released detector; without one, of a detector trained on shapes in ``folder``.
+
+    A released one is normalised by ``public`` images, or by shapes without any.
 
     Raises:
         TrainingError: ``start`` is neither or of another network, or ``folder`` holds another run.
@@ -40,7 +47,9 @@ def first_weights(
     """
     if start is None:
         return weights_of(train_on_shapes(folder / "shapes", settings.training, pace, watch))
-    return read_weights(start, settings.training.encoder)
+    encoder = settings.training.encoder
+    weights = read_weights(start, encoder)
+    return normalised(weights, encoder, calibration_images(public)) if start.suffix == SUFFIX else weights
 
 
 def read_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
@@ -92,7 +101,7 @@ def judge_by(images: Sequence[GreyImage], encoder: Encoder, device: str) -> Judg
 
 
 def calibration_images(public: Sequence[GreyImage]) -> list[GreyImage]:
-    """Images that give int8 its ranges: public ones, or synthetic shapes."""
+    """Images that stand for all: public ones, or synthetic shapes."""
     if public:
         return list(public[:: max(len(public) // CALIBRATION_IMAGES, 1)])[:CALIBRATION_IMAGES]
     return [example.image for example in Shapes(2, CALIBRATION_IMAGES)[:]]

@@ -57,7 +57,7 @@ def run_task(
         raise TrainingError(FIGURES_TELL)
     images = public_images(task.public)
     _write_config(task, task.output / CONFIG_FILE)
-    start = first_weights(task.start, task.output, task.settings, pace, watches.stage)
+    start = first_weights(task.start, task.output, task.settings, pace, watches.stage, images)
     encoder = task.settings.training.encoder
 
     def watch(report: RoundReport, best: Weights) -> None:
