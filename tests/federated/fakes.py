@@ -54,7 +54,15 @@ def grid_of(robots, **extra):
 
 def settings(**given):
     return FederatedSettings.model_validate(
-        {"rounds": 2, "local_steps": 1, "judge_every": 1, "screening": LENIENT, "server_momentum": 0.0} | given
+        {
+            "rounds": 2,
+            "local_steps": 1,
+            "judge_every": 1,
+            "screening": LENIENT,
+            "server_momentum": 0.0,
+            "smoothing": 0.0,
+        }
+        | given
     )
 
 

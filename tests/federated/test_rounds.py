@@ -97,10 +97,32 @@ def test_statistics_are_taken_as_they_were_measured(tmp_path):
     assert state.weights["b.weight"] == pytest.approx(0.5 + 3 * 0.5 + steps.sum())
 
 
+def test_what_is_judged_and_released_is_a_mean_of_rounds(tmp_path):
+    judged = []
+
+    def judge(weights):
+        judged.append(float(weights["b.weight"]))
+        return {"repeatability": 0.5, "mma_3px": 0.5}
+
+    chosen = settings(rounds=10, local_steps=100, smoothing=0.8)
+    state, reports = run([Fake("a", 0.1), Fake("b", 0.1)], tmp_path, chosen, judge=judge)
+    weight, mean, expected = 0.5, 0.5, [0.5]
+    for number in range(1, 11):
+        weight += 0.1
+        rate = max(min((1000 - (100 * number - 1)) / 300, 1.0), 1e-5 / 2e-3)
+        share = min(0.8, number / (number + 9)) * rate
+        mean = share * mean + (1.0 - share) * weight
+        expected.append(mean)
+    assert judged == pytest.approx(expected)
+    assert state.weights["b.weight"] == pytest.approx(1.5), "training goes on from the weights themselves"
+    assert state.best["b.weight"] == state.average["b.weight"] == pytest.approx(mean)
+    assert reports[-1].version == version(state.best)
+
+
 @pytest.mark.parametrize("strategy", ["fedavg", "fedadam"])
 @pytest.mark.parametrize("moment", ["in training", "after a round"])
 def test_a_killed_server_ends_as_if_it_had_not_been(strategy, moment, tmp_path):
-    chosen = settings(strategy=strategy, rounds=4, normalisation="frozen", server_momentum=0.5)
+    chosen = settings(strategy=strategy, rounds=4, normalisation="frozen", server_momentum=0.5, smoothing=0.8)
     fleet = [Fake("a", answer=ragged(1)), Fake("b", answer=ragged(2))]
     whole, rows = run(fleet, tmp_path / "whole", chosen, start=TRAINED)
 

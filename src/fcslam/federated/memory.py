@@ -29,6 +29,8 @@ class State:
     rounds_done: int
     weights: Weights
     """What the next round begins from."""
+    average: Weights
+    """Of the rounds' weights, the latest most of all: what is judged."""
     best: Weights
     """The released ones."""
     best_scores: Mapping[str, float]
@@ -62,7 +64,12 @@ def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
     }
     tensors = {
         f"{group}/{name}": torch.from_numpy(np.asarray(array, order="C"))
-        for group, arrays in (("weights", state.weights), ("best", state.best), ("memory", state.memory))
+        for group, arrays in (
+            ("weights", state.weights),
+            ("average", state.average),
+            ("best", state.best),
+            ("memory", state.memory),
+        )
         for name, array in arrays.items()
     }
     header = {"settings": settings.model_dump(mode="json"), **numbers}
@@ -80,7 +87,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
     checkpoint = read_checkpoint(path)
     if checkpoint.stage != STAGE:
         raise TrainingError(f"{path}: is a checkpoint of other training; give another --output")
-    groups: dict[str, dict[str, NDArray[Any]]] = {"weights": {}, "best": {}, "memory": {}}
+    groups: dict[str, dict[str, NDArray[Any]]] = {"weights": {}, "average": {}, "best": {}, "memory": {}}
     try:
         for key, tensor in checkpoint.tensors.items():
             group, _, name = key.partition("/")
@@ -90,6 +97,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
         state = State(
             checkpoint.step,
             groups["weights"],
+            groups["average"],
             groups["best"],
             {str(judge): float(score) for judge, score in header["best_scores"].items()},
             int(header["best_round"]),
@@ -104,9 +112,10 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
         raise TrainingError(
             f"{path}: is of a run with other settings ({', '.join(others)}); give them again, or another --output"
         )
-    reason = malformed(state.weights, start)
-    if reason is not None:
-        raise TrainingError(f"{path}: does not fit this network ({reason})")
+    for weights in (state.weights, state.average, state.best):
+        reason = malformed(weights, start)
+        if reason is not None:
+            raise TrainingError(f"{path}: does not fit this network ({reason})")
     if state.origin != origin:
         raise TrainingError(
             f"{path}: is of a run that began from {state.origin}, not from {origin}; give another --output"

@@ -33,7 +33,8 @@ from fcslam.federated.roster import Roster, choose
 from fcslam.federated.screening import screen
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.strategies import Merger
-from fcslam.federated.weights import Weights
+from fcslam.federated.weights import Weights, blended
+from fcslam.learning.descent import learning_rate
 
 PUBLIC: Final = ""
 """Stands for the server where it judges itself, among the names of robots that do."""
@@ -93,7 +94,7 @@ class Server:
     def _begin(self, grid: Grid, roster: Roster) -> State:
         """How good the start is: what comes must not be worse."""
         scores = {judge: score_of(found) for judge, found in self._judge(self._start, -1, grid, roster).items()}
-        return State(0, self._start, self._start, scores, 0, {}, {}, self._outside.version(self._start))
+        return State(0, self._start, self._start, self._start, scores, 0, {}, {}, self._outside.version(self._start))
 
     def _round(self, grid: Grid, roster: Roster, state: State) -> tuple[State, RoundReport]:
         began, sent = self._outside.clock(), Counter(state.asked)
@@ -103,8 +104,9 @@ class Server:
             answers, state = self._train(grid, roster, state)
         weights = self._merge(answers, state)
         number = state.rounds_done + 1
+        average = blended(state.average, weights, self._share(number))
         is_judged = number % self._settings.judge_every == 0 or number == self._settings.rounds
-        verdict = self._verdict(weights, state, grid, roster, answers) if is_judged else Verdict({}, state.best_scores)
+        verdict = self._verdict(average, state, grid, roster, answers) if is_judged else Verdict({}, state.best_scores)
         released = verdict.gain is not None and verdict.gain >= 0.0
         # The start is no place to go back to: nothing would be learnt as long as learning costs something at first.
         collapsed = verdict.gain is not None and verdict.gain < -self._settings.collapse
@@ -112,7 +114,8 @@ class Server:
         following = State(
             rounds_done=number,
             weights=state.best if returned else weights,
-            best=weights if released else state.best,
+            average=state.best if returned else average,
+            best=average if released else state.best,
             best_scores=verdict.scores if released else verdict.best,
             best_round=number if released else state.best_round,
             memory={} if returned else self._merger.memory,
@@ -124,7 +127,7 @@ class Server:
         privacy = self._settings.privacy
         report = RoundReport(
             round_number=number,
-            version=self._outside.version(weights),
+            version=self._outside.version(average),
             robots=tuple(sorted(answers.weights)),
             left_out=answers.left_out,
             losses=_means(answers.losses),
@@ -166,6 +169,12 @@ class Server:
         """In the order of the robots' names: sums of floats depend on it."""
         ordered = [(answers.messages[robot], answers.weights[robot]) for robot in sorted(answers.weights)]
         return self._merger.merge(state.rounds_done + 1, ordered, state.weights)
+
+    def _share(self, number: int) -> float:
+        """How much of the mean so far stays in it: the lower the learning rate, the less noise is there to smooth."""
+        training = self._settings.of_robots()
+        rate = learning_rate(training, number * self._settings.local_steps - 1)
+        return min(self._settings.smoothing, number / (number + 9)) * rate / training.learning_rate
 
     def _verdict(self, weights: Weights, state: State, grid: Grid, roster: Roster, answers: Answers) -> Verdict:
         """How good weights are beside the best, which those judge now that have not yet."""

@@ -56,6 +56,12 @@ class FederatedSettings(Settings):
         lt=1.0,
         description="Nesterov's, between rounds; 1 - 1/N of N robots at most; 0 is none; not for fedadam, krum",
     )
+    smoothing: float = Field(
+        default=0.8,
+        ge=0.0,
+        lt=1.0,
+        description="what a round leaves of the mean of earlier ones, which is released; falls with the learning rate",
+    )
     server_rate: float = Field(default=0.003, gt=0.0, description="learning rate of FedAdam")
     trimmed: float = Field(default=0.2, ge=0.0, lt=0.5, description="share that FedTrimmedAvg cuts at either end")
     malicious: int = Field(default=1, ge=0, description="poisoned robots that Krum reckons with")

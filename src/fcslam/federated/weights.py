@@ -35,6 +35,11 @@ def moved(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str
     return arrays
 
 
+def blended(old: Weights, new: Weights, share: float) -> dict[str, NDArray[np.float32]]:
+    """A ``share`` of old weights and the rest of new ones."""
+    return {name: (share * old[name] + (1.0 - share) * new[name]).astype(np.float32) for name in old}
+
+
 def malformed(new: Weights, old: Weights) -> str | None:
     """Why ``new`` cannot be weights of the network that ``old`` are of, in words; None if it can."""
     if new.keys() != old.keys():
