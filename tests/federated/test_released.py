@@ -39,11 +39,13 @@ def lived_in(encoder):
 def test_it_is_the_same_function(encoder, tmp_path):
     network = lived_in(encoder)
     export(network, tmp_path / "detector.onnx")
-    read = network_of(read_weights(tmp_path / "detector.onnx", encoder), encoder)
-    images = torch.rand(2, 1, 64, 96, generator=torch.Generator().manual_seed(1))
-    with torch.inference_mode():
-        for ours, theirs in zip(read(images), network(images), strict=True):
-            assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4 * float(theirs.abs().max()))
+    weights = read_weights(tmp_path / "detector.onnx", encoder)
+    pictures = np.random.default_rng(1).integers(0, 256, (2, 64, 96), np.uint8)
+    images = torch.from_numpy(pictures)[:, None].float() / 255.0
+    for read in (weights, normalised(weights, encoder, list(pictures))):
+        with torch.inference_mode():
+            for ours, theirs in zip(network_of(read, encoder)(images), network(images), strict=True):
+                assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4 * float(theirs.abs().max()))
 
 
 def test_the_network_that_comes_with_fcslam_can_be_trained_on():
