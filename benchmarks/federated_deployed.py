@@ -120,9 +120,9 @@ def rounds(folder: Path) -> list[dict[str, str]]:
 
 
 def weights(folder: Path) -> list[tuple[str, bytes]]:
-    """All arrays of weights in the checkpoint, as bytes."""
+    """All arrays of weights in the checkpoint, and the server's momentum, as bytes."""
     with np.load(folder / "checkpoint.npz") as file:
-        return [(name, file[name].tobytes()) for name in sorted(file.files) if "weights/" in name or "best/" in name]
+        return [(name, file[name].tobytes()) for name in sorted(file.files) if name.partition("/")[1]]
 
 
 def compare(report: common.Report, folder: Path) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import common
-from training_fleet import GAPS, TITLES, compare, gap_row, points, robots, run
+from training_fleet import GAPS, TITLES, VISION, compare, gap_row, points, robots, run
 
 from fcslam.evaluation.contenders import choose_contenders
 from fcslam.evaluation.homography import evaluate_homography
@@ -49,7 +49,7 @@ def main() -> None:
         print("skipped: takes an hour; name a folder by --study")
         return
     folder: Path = chosen.study.resolve()
-    vision = common.recordings(*SCENES, kind="vision")
+    vision = common.recordings(*VISION.values(), *SCENES, kind="vision")
     content = {
         "federated": {"rounds": ROUNDS},
         "arms": ARMS,

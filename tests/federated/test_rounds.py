@@ -15,6 +15,7 @@ from fcslam.evaluation.poison import Poisoned
 from fcslam.federated.history import ROUNDS_FILE
 from fcslam.federated.memory import CHECKPOINT_FILE, read_state, write_state
 from fcslam.federated.privacy import epsilon
+from fcslam.federated.settings import FederatedSettings
 
 TRAINED = {name: array for name, array in START.items() if name != "a.running_var"}
 """For where statistics are frozen and fakes would move them."""
@@ -268,6 +269,38 @@ def test_a_worse_detector_is_not_released_and_a_collapsed_one_is_undone(tmp_path
     assert state.best_round == 4
 
 
+def test_after_a_collapse_the_mean_begins_anew_as_well(tmp_path):
+    scores = iter([0.5, 0.6, 0.2, 0.1])
+    judged = []
+
+    def judge(weights):
+        judged.append(weights)
+        return dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+
+    state, reports = run([Fake("a", 1.0)], tmp_path, settings(rounds=3, smoothing=0.8), judge=judge)
+    assert [report.returned for report in reports] == [False, True, True]
+    assert same(state.weights, judged[1])
+    assert same(state.average, judged[1])
+    # Of the third round: what the second had come to is in it no more.
+    share = 3 / 12 * (3 - 2) / (0.3 * 3)
+    assert judged[3]["b.weight"] == pytest.approx(judged[1]["b.weight"] + (1.0 - min(share, 3 / 12)))
+
+
+def test_a_mean_never_reaches_beyond_what_it_is_of(tmp_path):
+    """However low the learning rate: that of training has a floor."""
+    chosen = settings(rounds=12, smoothing=0.8, training={"learning_rate": 1e-6})
+    state, _ = run([Fake("a", 1.0)], tmp_path, chosen)
+    assert 0.5 < float(state.average["b.weight"]) < float(state.weights["b.weight"]) == 12.5
+
+
+def test_what_does_not_change_stays_to_the_last_bit_in_the_mean(tmp_path):
+    frozen = {"a.running_var": START["a.running_var"] / 3}
+    robot = Fake("a", answer=lambda weights, _round: shifted(weights, 0.1) | frozen)
+    state, _ = run([robot], tmp_path, settings(rounds=12, smoothing=0.7), start=START | frozen)
+    assert np.array_equal(state.average["a.running_var"], frozen["a.running_var"])
+    assert all(isinstance(array, np.ndarray) for array in state.average.values())
+
+
 def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
     scores = iter([0.9, 0.1, 0.3])
     state, reports = run(
@@ -337,10 +370,23 @@ def test_a_checkpoint_of_another_run_is_refused_but_more_rounds_are_not(tmp_path
         run([Fake("a")], tmp_path, settings(local_steps=2))
     with pytest.raises(TrainingError, match="began from"):
         run([Fake("a")], tmp_path, start=shifted(START, 1.0))
-    with pytest.raises(TrainingError, match="does not fit"):
+    with pytest.raises(TrainingError, match="its weights do not fit"):
         run([Fake("a")], tmp_path, start={"other": np.zeros(3, np.float32)})
     state, reports = run([Fake("a")], tmp_path, settings(rounds=3))
     assert (state.rounds_done, len(reports)) == (3, 1)
+
+
+def test_a_checkpoint_of_a_version_without_some_setting_is_told_as_such(tmp_path, monkeypatch):
+    whole = FederatedSettings.model_dump
+    monkeypatch.setattr(
+        FederatedSettings,
+        "model_dump",
+        lambda self, **how: {name: value for name, value in whole(self, **how).items() if name != "smoothing"},
+    )
+    run([Fake("a")], tmp_path)
+    monkeypatch.undo()
+    with pytest.raises(TrainingError, match=r"is of another version of fcslam \(smoothing\)"):
+        run([Fake("a")], tmp_path)
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
     with pytest.raises(TrainingError, match="is no checkpoint"):
         run([Fake("a")], tmp_path)

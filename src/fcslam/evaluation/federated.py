@@ -57,12 +57,12 @@ class StudySettings(Settings):
 
     federated: FederatedSettings = Field(default_factory=FederatedSettings, description="of every arm")
     start: Path | None = Field(
-        default=None, description="checkpoint that all begin from; without one a detector of synthetic shapes"
+        default=None, description="checkpoint or detector.onnx that all begin from; without one, synthetic shapes"
     )
     arms: dict[str, Arm] = Field(default_factory=lambda: {"federated": Arm()}, description="by name")
     seeds: int = Field(default=3, ge=1, description="each trains anew, from the same start")
     local_seeds: int | None = Field(
-        default=None, ge=0, description="so many of them for robots' own networks, which cost most; null for all"
+        default=None, ge=0, description="so many of them for robots' own networks, which cost most; 0 is none, null all"
     )
     pairs: int = Field(default=500, ge=1, description="pairs of views, shared out among the robots' held-out images")
     images: int = Field(default=400, ge=4, description="at most so many image files of a robot")

@@ -77,7 +77,7 @@ def train_locally(ground: Ground, name: str) -> list[KeypointNetwork]:
 
 
 def train_arm(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]:
-    """One network, in one place, or by federated training in one process; the one after the last round."""
+    """One network, in one place, or by federated training in one process: what that would release at its end."""
     settings, place = arm.federated(ground.settings, ground.seed), ground.folder / name
     if not arm.together:
         return [_train_alone(ground, name, _everything(ground), settings.of_robots())]
@@ -101,7 +101,7 @@ def train_arm(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]:
     )
     server = Server(settings, ground.start, place, outside)
     state = server.run(InProcessGrid(client_app(learner_of), len(learners)))
-    return [network_of(state.weights, settings.training.encoder)]
+    return [network_of(state.average, settings.training.encoder)]
 
 
 def _everything(ground: Ground) -> list[Example]:

@@ -71,6 +71,7 @@ def write_report(reports: list[ArmReport], path: Path) -> None:
 def _report(findings: Findings, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
     seeds = len(findings.measured[arm])
     values, reference, central = (_by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL))
+    gap = mean_interval(reference - values, rng)
     closed, closed_alone = (
         _closed(values, _by_pair(findings.measured[own][:seeds], index), central, rng)
         if own in findings.measured
@@ -84,7 +85,7 @@ def _report(findings: Findings, arm: str, index: int, against: str, rng: np.rand
         arm=arm,
         measure=MEASURES[index],
         mean=float(np.nanmean(values)),
-        gap=mean_interval(reference - values, rng),
+        gap=gap,
         closed=closed,
         closed_alone=closed_alone,
         worst_robot=findings.robots[worst],

@@ -24,7 +24,7 @@ class RoundReport:
     round_number: int
     """From 1; 0 is the start."""
     version: str
-    """Of the weights after it."""
+    """Of the mean of weights after it, which is what may be judged and released."""
     robots: tuple[str, ...] = ()
     """Whose updates counted."""
     left_out: Mapping[str, str] = field(default_factory=dict)
@@ -35,9 +35,9 @@ class RoundReport:
     """Of the validation, if there was one."""
     score: float = math.nan
     released: bool = False
-    """Whether these weights are the best so far: the new version of the detector."""
+    """Whether that mean is the best so far: the new version of the detector."""
     returned: bool = False
-    """Whether they were so bad that the fleet goes on from the best ones."""
+    """Whether it was so bad that the fleet goes on from the best one."""
     bytes_down: int = 0
     bytes_up: int = 0
     """Weights to and from all robots."""

@@ -108,14 +108,16 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrainingError(f"{path}: is no checkpoint of this version ({error}); give another --output") from error
     asked = _fixed(settings.model_dump(mode="json"))
-    if others := sorted(name for name in asked.keys() | fixed.keys() if asked.get(name) != fixed.get(name)):
+    if odd := sorted(asked.keys() ^ fixed.keys()):
+        raise TrainingError(f"{path}: is of another version of fcslam ({odd[0]}); give another --output")
+    if others := sorted(name for name in asked if asked[name] != fixed[name]):
         raise TrainingError(
             f"{path}: is of a run with other settings ({', '.join(others)}); give them again, or another --output"
         )
-    for weights in (state.weights, state.average, state.best):
-        reason = malformed(weights, start)
+    for group in ("weights", "average", "best"):
+        reason = malformed(groups[group], start)
         if reason is not None:
-            raise TrainingError(f"{path}: does not fit this network ({reason})")
+            raise TrainingError(f"{path}: its {group} do not fit this network ({reason})")
     if state.origin != origin:
         raise TrainingError(
             f"{path}: is of a run that began from {state.origin}, not from {origin}; give another --output"

@@ -20,8 +20,8 @@ from fcslam.learning.settings import Encoder
 SUFFIX: Final = ".onnx"
 VARIANCE: Final = 1.0 - 1e-5
 """With it batch normalisation, which adds 1e-5, changes nothing."""
-LEAST_DEVIATION: Final = 2.0**-10
-"""Of a channel that says the same everywhere."""
+LEAST_DEVIATION: Final = 2.0**-8
+"""Of a channel that says the same everywhere; its square has to be more than the 1e-5."""
 
 
 def read_released(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
@@ -83,7 +83,7 @@ def normalised(weights: Weights, encoder: Encoder, images: Sequence[GreyImage]) 
     """The same function, its batch normalisations by what these images are within the network.
 
     Training normalises by each batch: a network whose normalisations changed nothing would be another one from the
-    first step on. Only images much like a robot's make no difference; any are far better than none.
+    first step on. The more these images resemble a robot's, the closer it stays; any are far better than none.
     """
     network = network_of(weights, encoder)
     norms = {name: module for name, module in network.named_modules() if isinstance(module, nn.BatchNorm2d)}
@@ -93,12 +93,10 @@ def normalised(weights: Weights, encoder: Encoder, images: Sequence[GreyImage]) 
         count, total, squares = sums[name]
         mean = total / count
         deviation = (squares / count - mean.square()).clamp(min=0.0).sqrt().clamp(min=LEAST_DEVIATION)
-        # Rounded, so that machines whose sums differ in the last digit begin from the same weights.
-        deviation = torch.exp2(torch.round(4.0 * deviation.log2()) / 4.0)
-        mean = deviation * torch.round(8.0 * mean / deviation) / 8.0
+        before = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
         arrays = {
-            "weight": deviation,
-            "bias": norm.bias.double() + mean,
+            "weight": before * deviation,
+            "bias": norm.bias.double() + before * (mean - norm.running_mean),
             "running_mean": mean,
             "running_var": deviation.square() - norm.eps,
         }
@@ -122,10 +120,9 @@ def _sums_before(
 
         return add
 
-    handles = [norm.register_forward_pre_hook(watch(name)) for name, norm in norms.items()]
+    for name, norm in norms.items():
+        norm.register_forward_pre_hook(watch(name))
     for image in images:
         height, width = (side // CELL_PX * CELL_PX for side in image.shape)
         network(torch.from_numpy(image[:height, :width])[None, None].float() / 255.0)
-    for handle in handles:
-        handle.remove()
     return found

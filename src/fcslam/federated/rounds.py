@@ -94,7 +94,17 @@ class Server:
     def _begin(self, grid: Grid, roster: Roster) -> State:
         """How good the start is: what comes must not be worse."""
         scores = {judge: score_of(found) for judge, found in self._judge(self._start, -1, grid, roster).items()}
-        return State(0, self._start, self._start, self._start, scores, 0, {}, {}, self._outside.version(self._start))
+        return State(
+            rounds_done=0,
+            weights=self._start,
+            average=self._start,
+            best=self._start,
+            best_scores=scores,
+            best_round=0,
+            memory={},
+            asked={},
+            origin=self._outside.version(self._start),
+        )
 
     def _round(self, grid: Grid, roster: Roster, state: State) -> tuple[State, RoundReport]:
         began, sent = self._outside.clock(), Counter(state.asked)
@@ -174,7 +184,9 @@ class Server:
         """How much of the mean so far stays in it: the lower the learning rate, the less noise is there to smooth."""
         training = self._settings.of_robots()
         rate = learning_rate(training, number * self._settings.local_steps - 1)
-        return min(self._settings.smoothing, number / (number + 9)) * rate / training.learning_rate
+        # Early means forget the start, from which everything is still moving away.
+        most = min(self._settings.smoothing, number / (number + 9))
+        return most * min(rate / training.learning_rate, 1.0)
 
     def _verdict(self, weights: Weights, state: State, grid: Grid, roster: Roster, answers: Answers) -> Verdict:
         """How good weights are beside the best, which those judge now that have not yet."""

@@ -60,7 +60,7 @@ class FederatedSettings(Settings):
         default=0.8,
         ge=0.0,
         lt=1.0,
-        description="what a round leaves of the mean of earlier ones, which is released; falls with the learning rate",
+        description="share of the mean of earlier rounds in what is judged and released; falls with the learning rate",
     )
     server_rate: float = Field(default=0.003, gt=0.0, description="learning rate of FedAdam")
     trimmed: float = Field(default=0.2, ge=0.0, lt=0.5, description="share that FedTrimmedAvg cuts at either end")

@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fcslam.errors import TrainingError
+from fcslam.errors import OutputError, TrainingError
 from fcslam.features.detector import GreyImage
-from fcslam.federated.network import network_of, weights_of
+from fcslam.federated.network import network_of, version_maker, weights_of
 from fcslam.federated.released import SUFFIX, normalised, read_released
 from fcslam.federated.rounds import Judge
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
+from fcslam.learning.arrays import read_arrays, write_arrays
 from fcslam.learning.checkpoint import read_checkpoint
 from fcslam.learning.export import CALIBRATION_IMAGES
 from fcslam.learning.images import find_images, is_usable, read_image
@@ -39,17 +40,28 @@ def first_weights(
 ) -> dict[str, NDArray[np.float32]]:
     """Weights of a checkpoint or a released detector; without one, of a detector trained on shapes in ``folder``.
 
-    A released one is normalised by ``public`` images, or by shapes without any.
+    A released one is normalised by ``public`` images, or by shapes without any, once: what came of it is kept in
+    ``folder``, so that other images there do not make it another start.
 
     Raises:
-        TrainingError: ``start`` is neither or of another network, or ``folder`` holds another run.
+        TrainingError: ``start`` is neither or of another network, or ``folder`` holds another run or a broken file.
         OutputError: something cannot be written.
     """
     if start is None:
         return weights_of(train_on_shapes(folder / "shapes", settings.training, pace, watch))
     encoder = settings.training.encoder
     weights = read_weights(start, encoder)
-    return normalised(weights, encoder, calibration_images(public)) if start.suffix == SUFFIX else weights
+    if start.suffix != SUFFIX:
+        return weights
+    kept = folder / f"start-{version_maker(encoder)(weights)}.npz"
+    try:
+        if not kept.exists():
+            write_arrays(kept, normalised(weights, encoder, calibration_images(public)))
+        return weights_of(network_of(read_arrays(kept), encoder))
+    except OSError as error:
+        raise OutputError(f"{kept}: cannot be used ({error}); make room and run the same command again") from error
+    except (ValueError, TrainingError) as error:
+        raise TrainingError(f"{kept}: is broken ({error}); take it away") from error
 
 
 def read_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:

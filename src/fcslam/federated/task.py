@@ -30,7 +30,7 @@ class Task:
     output: Path
     settings: FederatedSettings
     start: Path | None = None
-    """A checkpoint to begin from; None for synthetic shapes."""
+    """A checkpoint or a released detector to begin from; None for synthetic shapes."""
     public: Sequence[Path] = ()
     """Folders of images that the server may look at."""
 

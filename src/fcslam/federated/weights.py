@@ -37,7 +37,8 @@ def moved(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str
 
 def blended(old: Weights, new: Weights, share: float) -> dict[str, NDArray[np.float32]]:
     """A ``share`` of old weights and the rest of new ones."""
-    return {name: (share * old[name] + (1.0 - share) * new[name]).astype(np.float32) for name in old}
+    # Not a sum of products: what is equal in both is to stay as it is, to the last bit.
+    return {name: np.asarray(new[name] + share * (old[name] - new[name]), np.float32) for name in old}
 
 
 def malformed(new: Weights, old: Weights) -> str | None:
