@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -280,6 +281,14 @@ for k in range(10**6):
     outbox.put([replace(packet(KEYSCAN), epoch=0, sequence=k)])
     print(k, flush=True)
 """
+
+
+def test_an_outbox_of_another_version_is_told_as_such(path):
+    with sqlite3.connect(path) as older:
+        older.execute("CREATE TABLE sessions (epoch INTEGER PRIMARY KEY, recording TEXT NOT NULL)")
+    older.close()
+    with pytest.raises(StateError, match="is of another version of fcslam; give another --state"):
+        Outbox(path, "anna", LIMIT)
 
 
 def test_a_killed_robot_has_all_that_it_put(path):

@@ -24,7 +24,10 @@ from fcslam.wire.packets import encode, readdress
 PLACES_SHARE = 0.75
 """Share of the outbox up to which places are taken: the rest is for what the map cannot do without."""
 
-_SCHEMA = """
+_VERSION = 1
+"""Of the schema; with another one goes another number."""
+_SCHEMA = f"""
+PRAGMA user_version = {_VERSION};
 CREATE TABLE IF NOT EXISTS robot (name TEXT NOT NULL, agent TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS sessions (
     epoch INTEGER PRIMARY KEY, part INTEGER NOT NULL, recording TEXT NOT NULL, met INTEGER NOT NULL,
@@ -271,6 +274,9 @@ class Outbox:
             # Without more syncs a power cut may take the last packets; a recording makes them again.
             for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL", "synchronous = NORMAL"):
                 self._database.execute(f"PRAGMA {pragma}")
+            (tables,), (version,) = self._one("SELECT count(*) FROM sqlite_master"), self._one("PRAGMA user_version")
+            if tables and version != _VERSION:
+                raise StateError(f"{self._path}: is of another version of fcslam; give another --state")
             self._database.executescript(_SCHEMA)
             row = self._one("SELECT name, agent FROM robot")
             if row is None:
