@@ -86,11 +86,11 @@ def arms() -> dict[str, Any]:
     return {
         "together": {},
         **{f"{name}-reversed": {"settings": how, **poisoned} for name, how in ROBUST.items()},
+        "wide": {"together": False, "settings": {"training": WIDE}, **few},
         "frozen": {"settings": {"normalisation": "frozen"}, **few},
         **{name: {"settings": private(multiplier), **few} for name, multiplier in NOISE.items()},
         **{name: {"settings": {"compatible": strength}, **few} for name, strength in KEPT.items()},
         "plain": {"settings": {"server_momentum": 0.0}, **few},
-        "wide": {"together": False, "settings": {"training": WIDE}, **few},
     }
 
 
