@@ -233,7 +233,7 @@ def draw(rows: "Rows") -> Figure:
         draw_noise(panels[1], rows)
     for panel in panels:
         panel.grid(alpha=0.3)
-        panel.legend(frameon=False)
+        panel.legend(frameon=False, loc="lower right")
     return figure
 
 
