@@ -12,7 +12,8 @@ all robots together, in steps of two pairs one after another; a robot of a fleet
 arm, in the default's rounds, and so do robots that train alone. Plain is without the server's momentum. Wide is central
 training in as few steps as a robot of the fleet does, each of five times as many pairs, at twice the learning rate:
 what it lacks, the fleet lacks for want of steps and not for images that are elsewhere. Pairs are drawn from images that
-no network saw; a robot's own network is shown every fifth of them, in turns.
+no network saw; a robot's own network is shown every fifth of all of them, in turns, so mostly of places where it never
+was; the worst robot is the one whose images an arm does worst on, whoever trained.
 
 Chosen on another fleet's held-out images (another floor, another drive, photographs of another set, robots of another
 simulation; 600 pairs, one seed): the learning rate, which gave central training the better MMA of 1e-3 and 3e-3, that a
@@ -41,6 +42,7 @@ from training_fleet import GAPS, SIMULATED, TITLES, VISION, compare, gap_row, po
 
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.settings import FederatedSettings, PrivacySettings
+from fcslam.metrics.bootstrap import mean_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,6 +70,8 @@ NOISE = {"noise-0003": 3e-4, "noise-001": 1e-3, "noise-003": 3e-3, "noise-10": 1
 KEPT = {"compatible-30": 30.0}
 """Strengths of the pull to the codes of the start."""
 CLIP_NORM = 3.0
+AT_HOME = {"arm": "s", "images": "s", "pairs": "d", "homographies, %": ".1f", "below central": "s",
+           "below together": "s", "MMA, %": ".1f", "below central ": "s", "below together ": "s"}  # fmt: skip
 LOST = {"homography, %": ".1f", "lost": "s", "MMA, %": ".1f", "lost ": "s"}
 LOSSES = {"arm": "s"} | LOST
 PRIVATE = {"arm": "s", "noise": "g", "epsilon": ".3g"} | LOST
@@ -118,6 +122,7 @@ def main() -> None:
     known = set(findings.measured)
     for measure, title in TITLES.items():
         report.table(title, GAPS, [gap_row(below[measure, arm]) for arm in COMPARED if arm in known])
+    report.table("Robots' own networks, at home and where other robots are", AT_HOME, list(home_rows(findings)))
     unpoisoned = compare(findings, "together")
     if poisoned := list(poison_rows(unpoisoned)):
         report.table("One of five robots poisoned", LOSSES, poisoned)
@@ -167,6 +172,27 @@ def setting(findings: "Findings", folder: Path) -> str:
 def places() -> list[tuple[str, str]]:
     """The robots, and how their labels' folders are called."""
     return [(name, Path(place).name) for name, place in VISION.items()] + list(SIMULATED.items())
+
+
+def home_rows(findings: "Findings") -> Iterator[tuple[object, ...]]:
+    """What a robot's own network makes of its own images, and of others', beside the networks that all have."""
+    from fcslam.evaluation.federated_pairs import MEASURES
+
+    owners = np.array(findings.owners)
+    everybody = {arm: np.nanmean(findings.measured[arm], axis=(0, 1)) for arm in ("central", "together")}
+    for arm in ("local", "alone"):
+        values = findings.measured[arm][0]
+        known = np.isfinite(values[..., 0])
+        shown = [network == owners[pair] for network, pair in np.argwhere(known)]
+        pairs = np.argwhere(known)[:, 1]
+        for images, mask in (("its own", np.array(shown)), ("others'", ~np.array(shown))):
+            cells: list[object] = []
+            for index in (MEASURES.index(measure) for measure in TITLES):
+                found = values[known][mask, index]
+                gaps = [each[pairs[mask], index] - found for each in everybody.values()]
+                rng = np.random.default_rng(1)
+                cells += [100 * float(found.mean()), *(points(mean_interval(gap, rng)) for gap in gaps)]
+            yield arm, images, int(mask.sum()), *cells
 
 
 def poison_rows(rows: "Rows") -> Iterator[tuple[object, ...]]:
