@@ -257,9 +257,9 @@ def draw(rows: "Rows") -> Figure:
     panels[0].set_xlabel("points below central training, 95 %")
     if noisy:
         draw_noise(panels[1], rows)
-    for panel in panels:
+    for panel, corner in zip(panels, ("lower left", "lower right"), strict=False):
         panel.grid(alpha=0.3)
-        panel.legend(frameon=False, loc="lower right")
+        panel.legend(frameon=False, loc=corner)
     return figure
 
 
