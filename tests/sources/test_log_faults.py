@@ -246,6 +246,12 @@ words = st.one_of(
 )
 
 
+@pytest.mark.parametrize("count", ["-2", "-1", "0", "1"])
+def test_a_count_of_ranges_that_cannot_be_is_a_broken_line(tmp_path, count):
+    line = " ".join(["ROBOTLASER1", "0", "0", "3", "0", "8", "0", "0", count, "1", *["0"] * 14])
+    survives(save(tmp_path / "run.log", ["ODOM 0 0 0 0 0 0 0 h 0", line]))
+
+
 @fuzz
 @given(
     st.sampled_from(["ODOM 0 0 0 0 0 0 0 h 0", "Odometry 0 0 0", " ".join(["0"] * 707)]),

@@ -67,7 +67,7 @@ def _without_remissions(body: bytes, beam_count: int) -> bytes:
     if body.endswith(b" 0") and body.count(b" ") == beam_count:
         return body[:-2]
     words = body.split()
-    if len(words) <= beam_count or len(words) != beam_count + 1 + int(words[beam_count]):
+    if not 0 < beam_count < len(words) or len(words) != beam_count + 1 + int(words[beam_count]):
         raise ValueError("not as many ranges and remissions as stated")
     return b" ".join(words[:beam_count])
 
