@@ -35,8 +35,7 @@ if TYPE_CHECKING:
 SCENES = ("oxford_affine", "hpatches_subset")
 ROUNDS, PAIRS, IMAGES = 40, 1000, 64
 ARMS: dict[str, Any] = {"together": {}, "kept": {"settings": {"compatible": 30.0}}}
-SHIPPED = "start"
-COMPARED = (SHIPPED, "central", *ARMS)
+COMPARED = ("start", "central", *ARMS)
 OTHERS = {"mma_3px_former": "MMA at 3 px with old codes in the first view, %", "repeatability": "Repeatability, %"}
 SEED, NMS_PX = 1, 8
 SHARE = ".3f"
