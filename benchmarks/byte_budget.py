@@ -22,7 +22,7 @@ import numpy as np
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.report import Track, run_of
 from fcslam.config import dump
-from fcslam.evaluation.relations import RelationsQuestion, evaluate_relations
+from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.budget import Budget

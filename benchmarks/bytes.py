@@ -23,8 +23,8 @@ import common
 import numpy as np
 
 from fcslam.cloud.fleet import Fleet
-from fcslam.evaluation.closures import Within, evaluate_closures
-from fcslam.evaluation.relations import RelationsQuestion, evaluate_relations
+from fcslam.evaluation.fleet.closures import Within, evaluate_closures
+from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.metrics.closures import ClosureCriteria
 from fcslam.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place

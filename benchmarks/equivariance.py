@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from fcslam.evaluation.contenders import Contender, Picture, choose_contenders, frame, one_thread
-from fcslam.evaluation.homography import LARGE, described, match_pair
-from fcslam.evaluation.scenes import find_scenes
+from fcslam.evaluation.detectors.contenders import Contender, Picture, choose_contenders, frame, one_thread
+from fcslam.evaluation.detectors.homography import LARGE, described, match_pair
+from fcslam.evaluation.detectors.scenes import find_scenes
 from fcslam.features.detector import GreyImage
 from fcslam.features.kinds import ContenderKind
 

@@ -17,10 +17,16 @@ import common
 import numpy as np
 from homography import SCENES, SEED
 
-from fcslam.evaluation.contenders import choose_contenders, frame, one_thread
-from fcslam.evaluation.homography import LARGE, MATCHED, MATCHING_NMS_PX, HomographyReport, evaluate_homography
-from fcslam.evaluation.homography_measures import difference, mean
-from fcslam.evaluation.scenes import Scene, find_scenes
+from fcslam.evaluation.detectors.contenders import choose_contenders, frame, one_thread
+from fcslam.evaluation.detectors.homography import (
+    LARGE,
+    MATCHED,
+    MATCHING_NMS_PX,
+    HomographyReport,
+    evaluate_homography,
+)
+from fcslam.evaluation.detectors.measures import difference, mean
+from fcslam.evaluation.detectors.scenes import Scene, find_scenes
 from fcslam.features.dense import Logits, Probabilities, sample_codes
 from fcslam.features.detector import GreyImage, OnnxConfig, OnnxDetector
 from fcslam.features.kinds import ContenderKind

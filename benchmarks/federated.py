@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from training_fleet import Rows
 
-    from fcslam.evaluation.federated import Findings
+    from fcslam.evaluation.federated.study import Findings
 
 PUBLIC = "sun_hays80"
 """Photographs that the start is trained on."""
@@ -176,7 +176,7 @@ def places() -> list[tuple[str, str]]:
 
 def home_rows(findings: "Findings") -> Iterator[tuple[object, ...]]:
     """What a robot's own network makes of its own images, and of others', beside the networks that all have."""
-    from fcslam.evaluation.federated_pairs import MEASURES
+    from fcslam.evaluation.federated.pairs import MEASURES
 
     owners = np.array(findings.owners)
     everybody = {arm: np.nanmean(findings.measured[arm], axis=(0, 1)) for arm in ("central", "together")}

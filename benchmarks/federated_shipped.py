@@ -21,16 +21,16 @@ from typing import TYPE_CHECKING, Any
 import common
 from training_fleet import GAPS, TITLES, VISION, compare, gap_row, points, robots, run
 
-from fcslam.evaluation.contenders import choose_contenders
-from fcslam.evaluation.homography import evaluate_homography
-from fcslam.evaluation.homography_measures import difference, mean
-from fcslam.evaluation.scenes import SceneKind, find_scenes
+from fcslam.evaluation.detectors.contenders import choose_contenders
+from fcslam.evaluation.detectors.homography import evaluate_homography
+from fcslam.evaluation.detectors.measures import difference, mean
+from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.features.detector import SHIPPED_NETWORK
 from fcslam.features.kinds import ContenderKind
 from fcslam.metrics.framing import GroundTruth
 
 if TYPE_CHECKING:
-    from fcslam.evaluation.homography import HomographyReport
+    from fcslam.evaluation.detectors.homography import HomographyReport
 
 SCENES = ("oxford_affine", "hpatches_subset")
 ROUNDS, PAIRS, IMAGES = 40, 1000, 64

@@ -16,10 +16,10 @@ from collections.abc import Iterator
 import common
 import numpy as np
 
-from fcslam.evaluation.growth_figure import draw_growth
-from fcslam.evaluation.place_features import choose_features, describe_sets, describe_training
-from fcslam.evaluation.place_figures import save
-from fcslam.evaluation.vocabulary_growth import (
+from fcslam.evaluation.places.features import choose_features, describe_sets, describe_training
+from fcslam.evaluation.places.figures import save
+from fcslam.evaluation.places.growth_figure import draw_growth
+from fcslam.evaluation.places.vocabulary_growth import (
     MEASURES,
     Arrival,
     Growth,

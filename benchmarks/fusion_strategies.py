@@ -16,8 +16,8 @@ from pathlib import Path
 
 import common
 
-from fcslam.cloud.strategy import FusionStrategy
-from fcslam.evaluation.fleet import FleetReport, evaluate_fleet
+from fcslam.cloud.fusion_strategy import FusionStrategy
+from fcslam.evaluation.fleet.report import FleetReport, evaluate_fleet
 from fcslam.simulation.kinds import Building
 
 ROW = {"seed": "", "strategy": "", "maps": "", "ATE, m": ".4f", "across robots: mean, m": ".4f", "max, m": ".3f",

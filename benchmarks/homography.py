@@ -17,10 +17,10 @@ from pathlib import Path
 
 import common
 
-from fcslam.evaluation.contenders import choose_contenders
-from fcslam.evaluation.homography import LARGE, MATCHING_NMS_PX, SMALL, HomographyReport, evaluate_homography
-from fcslam.evaluation.homography_measures import difference, interval, mean
-from fcslam.evaluation.scenes import SceneKind, find_scenes
+from fcslam.evaluation.detectors.contenders import choose_contenders
+from fcslam.evaluation.detectors.homography import LARGE, MATCHING_NMS_PX, SMALL, HomographyReport, evaluate_homography
+from fcslam.evaluation.detectors.measures import difference, interval, mean
+from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.metrics.bootstrap import Interval
 from fcslam.metrics.framing import GroundTruth
 

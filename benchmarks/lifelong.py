@@ -79,9 +79,9 @@ def robots(sessions: int, path_m: float, seed: int) -> list[Any]:
 
 def record(place: Path, sessions: int, path_m: float, seed: int) -> None:
     """What the robot sends, as the service would have stored it."""
-    from fcslam.cloud.store import MissionStore, StoredPacket
     from fcslam.mission import MissionConfig
     from fcslam.robot.frontend import RobotFrontend
+    from fcslam.service.mission_store import MissionStore, StoredPacket
     from fcslam.wire.packets import encode, read_label, readdress
 
     store = MissionStore(place / "mission.sqlite")
@@ -101,8 +101,8 @@ def live(place: Path, sessions: int, path_m: float, seed: int, most_nearby: int)
     """One row after each session, and what the end took."""
     from fcslam.cloud.fleet import Fleet
     from fcslam.cloud.journal import StoredJournal
-    from fcslam.cloud.store import MissionStore
     from fcslam.mission import MissionConfig
+    from fcslam.service.mission_store import MissionStore
 
     warm_up()
     config, store, drivers = MissionConfig(), MissionStore(place / "mission.sqlite"), robots(sessions, path_m, seed)
@@ -182,8 +182,8 @@ def against_truth(result: Any, drivers: list[Any], grid: Any) -> tuple[int, floa
 def labelled(seen: Any) -> Any:
     import numpy as np
 
-    from fcslam.map_files import Occupancy
     from fcslam.metrics.grid import LabelledGrid
+    from fcslam.runs.map_files import Occupancy
 
     corner = np.array([*seen.origin_xy, 0.0])
     return LabelledGrid(seen.cells == Occupancy.OCCUPIED, seen.cells == Occupancy.FREE, seen.resolution_m, corner)

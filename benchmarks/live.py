@@ -30,9 +30,9 @@ import httpx
 import numpy as np
 from faults import cloud, finalize
 
-from fcslam.cloud.missions import FIRST
 from fcslam.mission import MissionConfig
 from fcslam.robot.frontend import RobotFrontend
+from fcslam.service.missions import FIRST
 from fcslam.simulation.fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.wire.batches import MEDIA_TYPE, write_batch
 from fcslam.wire.packets import encode

@@ -17,10 +17,10 @@ import common
 import cv2
 import numpy as np
 
-from fcslam.evaluation.contenders import choose_contenders
-from fcslam.evaluation.homography import MATCHING_NMS_PX, HomographyReport, evaluate_homography
-from fcslam.evaluation.homography_measures import difference, interval, mean
-from fcslam.evaluation.scenes import find_scenes
+from fcslam.evaluation.detectors.contenders import choose_contenders
+from fcslam.evaluation.detectors.homography import MATCHING_NMS_PX, HomographyReport, evaluate_homography
+from fcslam.evaluation.detectors.measures import difference, interval, mean
+from fcslam.evaluation.detectors.scenes import find_scenes
 from fcslam.features.files import read_grey
 from fcslam.features.kinds import ContenderKind
 from fcslam.learning.warps import random_change, relight, warp_image

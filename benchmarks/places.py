@@ -18,11 +18,11 @@ from pathlib import Path
 
 import common
 
-from fcslam.evaluation.place_checks import PairChecker
-from fcslam.evaluation.place_features import FeatureChoice, choose_features, describe_sets, describe_training
-from fcslam.evaluation.place_figures import curves_figure
-from fcslam.evaluation.place_scoring import DescribedSet, choose_scorers
-from fcslam.evaluation.places import SetResult, evaluate_set
+from fcslam.evaluation.places.checks import PairChecker
+from fcslam.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
+from fcslam.evaluation.places.figures import curves_figure
+from fcslam.evaluation.places.report import SetResult, evaluate_set
+from fcslam.evaluation.places.scoring import DescribedSet, choose_scorers
 from fcslam.metrics.bootstrap import Interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes

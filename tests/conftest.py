@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
-import small_fleet
 from hypothesis import settings
 
+from fcslam.cloud import fleet
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
 from fcslam.simulation.fleet import SimulatedFleet
 from fcslam.simulation.truth import write_truth
 from fcslam.sources import write_carmen
 from fcslam.wire.messages import Packet
+from tests import small_fleet
+from tests.scripted import ScriptedMatcher
 
 # How long an example takes says something of the machine, and of code that is compiled at its first call.
 settings.register_profile("fcslam", deadline=None)
@@ -35,3 +39,16 @@ def logs(drawn, tmp_path_factory):
         write_carmen(folder / f"{robot.name}.clf", robot.scans())
     write_truth(drawn, folder, np.random.default_rng(0))
     return [folder / f"{robot.name}.clf" for robot in drawn.robots]
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Makes a fleet whose place matcher finds what the given scripts say."""
+    monkeypatch.setattr(fleet, "PlaceMatcher", ScriptedMatcher)
+
+    def make(*scripts, **settings) -> Fleet:
+        monkeypatch.setattr(ScriptedMatcher, "script", [line for script in scripts for line in script])
+        monkeypatch.setattr(ScriptedMatcher, "predictions", {})
+        return Fleet(FleetConfig(**settings), seed=0)
+
+    return make

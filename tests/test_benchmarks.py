@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from features.networks import tiny_network
 from scipy.ndimage import binary_dilation
 
 from fcslam.config import load as load_config
@@ -18,6 +17,7 @@ from fcslam.features.classical import OrbConfig
 from fcslam.geometry import se2
 from fcslam.mission import MissionConfig
 from fcslam.records import Channel
+from tests.features.networks import tiny_network
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 SHARED = ("common", "processes", "training_fleet")

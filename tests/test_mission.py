@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import yaml
-from robot.kidnapping import kidnapping
 
 from fcslam import mission
 from fcslam.errors import FcslamError, PacketError, SourceError
@@ -13,6 +12,7 @@ from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus, Veto
 from fcslam.runs import write_run
 from fcslam.sources import open_source, write_carmen
+from tests.robot.kidnapping import kidnapping
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fcslam import runs
 from fcslam.errors import ConfigError, EvaluationError, OutputError
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus
@@ -17,11 +16,13 @@ from fcslam.runs import (
     Metric,
     RobotTrajectory,
     Run,
+    folder,
     open_run,
     prepare_output,
     read_vetoes,
     write_run,
 )
+from fcslam.storage import files
 
 
 def trajectory(robot="robot_1", map_index=0, count=40, seed=0):
@@ -141,14 +142,14 @@ def test_the_working_folder_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError, MemoryError])
-@pytest.mark.parametrize("step", ["write_tum", "metrics_json", "_replace"])
-def test_an_interrupted_writer_leaves_the_place_as_it_was(tmp_path, run, monkeypatch, failure, step):
+@pytest.mark.parametrize(("module", "step"), [(folder, "write_tum"), (folder, "metrics_json"), (files, "_exchange")])
+def test_an_interrupted_writer_leaves_the_place_as_it_was(tmp_path, run, monkeypatch, failure, module, step):
     write_run(Run((trajectory("first"),)), tmp_path / "run")
 
     def interrupted(*_arguments):
         raise failure
 
-    monkeypatch.setattr(runs, step, interrupted)
+    monkeypatch.setattr(module, step, interrupted)
     for place in ("run", "fresh"):
         with pytest.raises(OutputError if failure is OSError else failure):
             write_run(run, tmp_path / place, force=True)

@@ -6,12 +6,14 @@ BEFORE and AFTER are folders of two checkouts, for instance git worktrees. Both 
 script. The cases are three logs of the SLAM benchmark as one robot, intel as three robots, the five runs of Wean Hall,
 a simulated fleet with cameras (it needs a GL library) and a federated run of two rounds (it needs torch and Flower).
 
-Compared are all files of the run folders, and the packets that the robots sent. Configuration files are left out, as
-they hold the descriptions of the settings. Of the metrics the downlink is left out with ``--ignore-downlink``.
+The script compares all files of the run folders, and the packets that the robots sent. It leaves out configuration
+files, which hold the descriptions of the settings, and the seconds that a round took. ``--ignore-downlink`` leaves the
+metrics of the downlink out.
 Results of BEFORE stay in the working folder and are used again.
 """
 
 import argparse
+import csv
 import hashlib
 import json
 import os
@@ -63,7 +65,7 @@ def cases(data: Path, work: Path) -> Iterator[Case]:
     yield Case("wean-hall", ("map", *runs, "--output", "{output}"))
     simulate = ("simulate", "--robots", "3", "--seed", "101", "--path-length", "40", "--output", "{output}")
     yield Case("simulate", simulate)
-    fleet = [str(work / "before" / "simulate" / f"robot_{letter}") for letter in "abc"]
+    fleet = [str(work / "before" / "simulate" / f"robot_{number}") for number in range(1, 4)]
     yield Case("cameras", ("map", *fleet, "--output", "{output}"))
     robots = [str(data / "vision" / name) for name in ("kodak24", "sun_hays80")]
     yield Case("federated", ("federate", "local", *robots, "--quick", "--rounds", "2", "--output", "{output}"))
@@ -99,11 +101,15 @@ def contents(place: Path, case: Case, ignore_downlink: bool) -> dict[str, str]:
         if path.name == "metrics.json" and ignore_downlink:
             rows = [row for row in json.loads(content) if not DOWNLINK.search(row["name"])]
             content = json.dumps(rows).encode()
+        if path.name == "rounds.csv":
+            rows = list(csv.DictReader(content.decode().splitlines()))
+            content = json.dumps([{name: row[name] for name in row if name != "seconds"} for row in rows]).encode()
         found[str(path.relative_to(place))] = hashlib.sha256(content).hexdigest()
     return found
 
 
 def main() -> None:
+    """Compare the cases that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path)

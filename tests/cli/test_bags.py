@@ -4,14 +4,14 @@ import csv
 
 import numpy as np
 import pytest
-from sources import carmen_text
-from sources.bag_messages import drive, mounted, odom, save, scan, text
-from sources.camera_records import CAMERA, LASER
-from sources.camera_records import drive as camera_drive
 
 from fcslam.cli import main
 from fcslam.runs import read_tum
 from fcslam.sources import open_source, write_recording
+from tests.sources import carmen_text
+from tests.sources.bag_messages import drive, mounted, odom, save, scan, text
+from tests.sources.camera_records import CAMERA, LASER
+from tests.sources.camera_records import drive as camera_drive
 
 
 def run(*arguments):

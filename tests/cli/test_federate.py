@@ -5,9 +5,9 @@ import csv
 import cv2
 import pytest
 import yaml
-from learning.textures import textured
 
 from fcslam.cli import BAD_INPUT, main
+from tests.learning.textures import textured
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")

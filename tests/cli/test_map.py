@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from small_fleet import truth_at
-from sources.carmen_text import drive, flaser, odom, pose_at, save
 
 from fcslam import mission
 from fcslam.cli import main
@@ -20,6 +18,8 @@ from fcslam.config import dump
 from fcslam.geometry import se2
 from fcslam.mission import MissionConfig
 from fcslam.runs import read_tum
+from tests.small_fleet import truth_at
+from tests.sources.carmen_text import drive, flaser, odom, pose_at, save
 
 RUN_FILES = {
     "closures.csv", "config.yaml", "local", "map.pgm", "map.png", "map.yaml", "metrics.json", "pose_graph.g2o",

@@ -7,10 +7,7 @@ import subprocess
 import sys
 
 import pytest
-import small_fleet
 from rich.console import Console
-from robot.fake_cloud import FakeCloud
-from robot.http_cloud import serving
 
 from fcslam.cli import main
 from fcslam.cli.robot import _progress
@@ -19,6 +16,9 @@ from fcslam.robot.outbox import Waiting
 from fcslam.runs import read_tum
 from fcslam.sources import write_carmen
 from fcslam.wire.packets import decode
+from tests import small_fleet
+from tests.robot.fake_cloud import FakeCloud
+from tests.robot.http_cloud import serving
 
 
 @pytest.fixture(scope="module")

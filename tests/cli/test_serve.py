@@ -19,7 +19,6 @@ from cryptography.hazmat.primitives.serialization import (
     PrivateFormat,
     load_pem_private_key,
 )
-from small_fleet import in_order
 
 from fcslam.cli import main
 from fcslam.errors import CloudError
@@ -27,6 +26,7 @@ from fcslam.runs import open_run
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.packets import decode, encode
+from tests.small_fleet import in_order
 
 API = "/api/v1"
 

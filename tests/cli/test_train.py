@@ -2,9 +2,9 @@
 
 import cv2
 import pytest
-from learning.textures import textured
 
 from fcslam.cli import BAD_INPUT, main
+from tests.learning.textures import textured
 
 OPTIONS = ["--device", "cpu"]
 

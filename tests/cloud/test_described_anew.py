@@ -3,13 +3,13 @@
 from dataclasses import replace
 
 import pytest
-from cloud.scripted import LASER, closures, rectangle, stream
-from small_fleet import feed, fingerprint, in_order
 
 from fcslam.errors import PacketError
 from fcslam.records import Channel, Place
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
+from tests.scripted import LASER, closures, rectangle, stream
+from tests.small_fleet import feed, fingerprint, in_order
 
 POSES = rectangle(17)
 FIRST = in_order([*stream("a", POSES, start_s=0.0), *stream("b", POSES, start_s=0.5)])

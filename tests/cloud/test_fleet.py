@@ -5,9 +5,6 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-import small_fleet
-from cloud.scripted import ALIAS, ScriptedMatcher, closures, motion, rectangle, stream
-from small_fleet import feed, fingerprint, in_order, map_of
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
@@ -16,6 +13,9 @@ from fcslam.graph.consistency import ConsistencySettings
 from fcslam.places.matcher import MatcherConfig
 from fcslam.records import ClosureStatus, ConstraintKind, Correction, KeyscanId, Place, Veto
 from fcslam.wire.packets import decode, encode
+from tests import small_fleet
+from tests.scripted import ALIAS, ScriptedMatcher, closures, motion, rectangle, stream
+from tests.small_fleet import feed, fingerprint, in_order, map_of
 
 POSES = rectangle()
 A, B, C = ("a", POSES), ("b", POSES), ("c", POSES)

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cloud.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, verified
 
+from fcslam.cloud.closure_log import ClosureLedger, Entry
 from fcslam.cloud.joining import first_estimate, judge
 from fcslam.cloud.joint_graph import JointGraph
-from fcslam.cloud.ledger import ClosureLedger, Entry
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import Channel, ClosureStatus, LoopClosure, frozen
+from tests.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, verified
 
 POSES = rectangle(31)
 SETTINGS = ConsistencySettings()

@@ -4,24 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import small_fleet
-from cloud.test_sessions import started_again
-from small_fleet import feed, fingerprint, in_order, map_of
 
 from fcslam.cloud.fleet import Fleet
-from fcslam.cloud.fusion import fuse
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.map_files import Occupancy
+from fcslam.maps.fusion import fuse
 from fcslam.metrics.grid import LabelledGrid, grid_agreement
 from fcslam.metrics.trajectory import align, position_errors
 from fcslam.places.matcher import MatcherConfig
 from fcslam.records import Channel, Place, Veto
 from fcslam.runs import open_run, write_run
+from fcslam.runs.map_files import Occupancy
 from fcslam.simulation.truth import true_map
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
+from tests import small_fleet
+from tests.cloud.test_sessions import started_again
+from tests.small_fleet import feed, fingerprint, in_order, map_of
 
 SESSIONS, BETWEEN_S = 4, 1000.0
 ONE_A_SQUARE = FleetConfig(matcher=MatcherConfig(most_nearby=1, nearby_m=6.0))

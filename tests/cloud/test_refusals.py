@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cloud.scripted import LASER, closures, keyscan, motion, place, rectangle, stream
-from small_fleet import feed, fingerprint, in_order
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
@@ -13,6 +11,8 @@ from fcslam.records import Channel, ConstraintKind, Correction, KeyscanId, froze
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
 from fcslam.wire.transport import InMemoryTransport
+from tests.scripted import LASER, closures, keyscan, motion, place, rectangle, stream
+from tests.small_fleet import feed, fingerprint, in_order
 
 POSES = rectangle(17)
 STEP = np.array([1.0, 0.0, 0.0])

@@ -5,18 +5,18 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-import small_fleet
-from cloud.scripted import ALIAS, closures, rectangle, stream, verified
-from small_fleet import feed, fingerprint, in_order, map_of
 
+from fcslam.cloud.closure_log import ClosureLedger
 from fcslam.cloud.fleet import Fleet
-from fcslam.cloud.ledger import ClosureLedger
+from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.settings import FleetConfig
-from fcslam.cloud.strategy import FusionStrategy
 from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import Channel, ClosureStatus, Veto
+from tests import small_fleet
+from tests.scripted import ALIAS, closures, rectangle, stream, verified
+from tests.small_fleet import feed, fingerprint, in_order, map_of
 
 POSES = rectangle()
 A, B = ("a", POSES), ("b", POSES)

@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cloud.scripted import closures, motion, rectangle, stream
 from hypothesis import given
 from hypothesis import strategies as st
-from small_fleet import feed, fingerprint, in_order, map_of
 
 from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
 from fcslam.errors import PacketError
@@ -15,6 +13,8 @@ from fcslam.geometry import se2
 from fcslam.records import NAME, ConstraintKind, Correction, KeyscanId
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
+from tests.scripted import closures, motion, rectangle, stream
+from tests.small_fleet import feed, fingerprint, in_order, map_of
 
 POSES = rectangle(29)
 CLOSURE = ConstraintKind.CLOSURE

@@ -9,9 +9,9 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.closures import Within, closure_metrics, closure_rows, evaluate_closures
-from fcslam.evaluation.relation_graph import build_relation_graph
-from fcslam.evaluation.relations import pose_table, write_metrics
+from fcslam.evaluation.fleet.closures import Within, closure_metrics, closure_rows, evaluate_closures
+from fcslam.evaluation.fleet.relation_graph import build_relation_graph
+from fcslam.evaluation.fleet.relations import pose_table, write_metrics
 from fcslam.geometry import se2
 from fcslam.metrics.closures import ClosureCriteria
 from fcslam.metrics.relations import Relations, write_relations

@@ -8,10 +8,10 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.closures import Within
-from fcslam.evaluation.fleet import evaluate_fleet
-from fcslam.evaluation.fleet_metrics import fleet_metrics
-from fcslam.evaluation.truth import read_grid
+from fcslam.evaluation.fleet.closures import Within
+from fcslam.evaluation.fleet.ground_truth import read_grid
+from fcslam.evaluation.fleet.metrics import fleet_metrics
+from fcslam.evaluation.fleet.report import evaluate_fleet
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_run, write_tum

@@ -5,19 +5,19 @@ import csv
 import cv2
 import numpy as np
 import pytest
-from features.networks import tiny_network
 
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.contenders import choose_contenders, frame
-from fcslam.evaluation.homography import LARGE, SMALL, evaluate_homography, match_pair, matched_points
-from fcslam.evaluation.homography_measures import column, difference, mean
-from fcslam.evaluation.scenes import SceneKind, find_scenes
+from fcslam.evaluation.detectors.contenders import choose_contenders, frame
+from fcslam.evaluation.detectors.homography import LARGE, SMALL, evaluate_homography, match_pair, matched_points
+from fcslam.evaluation.detectors.measures import column, difference, mean
+from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.features.detector import ImageFeatures
 from fcslam.features.files import read_features, write_features
 from fcslam.features.kinds import ContenderKind
 from fcslam.metrics.framing import GroundTruth, framed_homography
 from fcslam.metrics.homography import warp
+from tests.features.networks import tiny_network
 
 TURN = np.array([[0.96, -0.12, 40.0], [0.10, 0.98, -15.0], [4e-5, 2e-5, 1.0]])
 

@@ -3,26 +3,26 @@
 import csv
 
 import numpy as np
-import place_folders
 import pytest
 
 from fcslam.cli import main
-from fcslam.evaluation.place_checks import ACCEPTED_INLIERS, PairChecker
-from fcslam.evaluation.place_features import choose_features, describe_images, describe_sets
-from fcslam.evaluation.place_scoring import (
+from fcslam.evaluation.places.checks import ACCEPTED_INLIERS, PairChecker
+from fcslam.evaluation.places.features import choose_features, describe_images, describe_sets
+from fcslam.evaluation.places.scoring import (
     ForeignTree,
     brute_force,
     index_scores,
     matching_descriptors,
     strategy_scorer,
 )
-from fcslam.evaluation.place_sequences import in_sequence
-from fcslam.evaluation.place_sets import read_place_set
+from fcslam.evaluation.places.sequences import in_sequence
+from fcslam.evaluation.places.sets import read_place_set
 from fcslam.features.codes import hamming_matrix
 from fcslam.metrics.retrieval import recall_at
 from fcslam.places.index import PlaceIndex
 from fcslam.places.similarity import similarity
 from fcslam.places.vocabulary import Scoring, Strategy, VocabularyConfig
+from tests.evaluation import place_folders
 
 WORDS = VocabularyConfig(scoring=Scoring.WORDS, train_batch=3)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import EvaluationError, OutputError
-from fcslam.evaluation.relations import (
+from fcslam.evaluation.fleet.relations import (
     RelationsQuestion,
     evaluate_relations,
     pose_table,

@@ -6,24 +6,24 @@ from threading import Lock, Thread
 import cv2
 import numpy as np
 import pytest
-from learning.textures import textured
+
+from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from federated.fakes import Fake  # noqa: E402
-
 from fcslam.errors import EvaluationError  # noqa: E402
-from fcslam.evaluation.federated import Findings, Study, StudySettings, run_study  # noqa: E402
-from fcslam.evaluation.federated_pairs import MEASURES, Described, described, held_out_pairs, measure_pair  # noqa: E402
-from fcslam.evaluation.federated_report import report  # noqa: E402
-from fcslam.evaluation.poison import Poisoned  # noqa: E402
+from fcslam.evaluation.federated.pairs import MEASURES, Described, described, held_out_pairs, measure_pair  # noqa: E402
+from fcslam.evaluation.federated.poison import Poisoned  # noqa: E402
+from fcslam.evaluation.federated.report import report  # noqa: E402
+from fcslam.evaluation.federated.study import Findings, Study, StudySettings, run_study  # noqa: E402
 from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.learning.export import export  # noqa: E402
 from fcslam.learning.images import find_images  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.trainer import Pace  # noqa: E402
+from tests.federated.fakes import Fake  # noqa: E402
 
 TINY = {
     "federated": {
@@ -104,7 +104,7 @@ def test_arms_and_seeds_may_be_added_to_a_study(robots, tmp_path):
 
 def test_nobody_reads_what_a_study_is_while_another_begins_it(robots, tmp_path, monkeypatch):
     begun = study(robots, tmp_path)
-    monkeypatch.setattr("fcslam.evaluation.federated._files_of_arms", lambda _: {})
+    monkeypatch.setattr("fcslam.evaluation.federated.study._files_of_arms", lambda _: {})
     run_study(begun)
     content = (tmp_path / "study.yaml").read_bytes()
     with (tmp_path / "study.lock").open("w") as other:
@@ -145,7 +145,7 @@ def test_two_at_one_study_share_the_work_out(robots, tmp_path, monkeypatch):
         with exporting:
             export(network, path)
 
-    monkeypatch.setattr("fcslam.evaluation.federated.export", export_one_at_a_time)
+    monkeypatch.setattr("fcslam.evaluation.federated.study.export", export_one_at_a_time)
 
     def work(watch):
         found.append(run_study(study(robots, tmp_path, watch, arms={"averaged": {}})))

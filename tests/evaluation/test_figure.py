@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.cloud import palette
 from fcslam.errors import EvaluationError, OutputError
-from fcslam.evaluation.charts import RAY_M, Chart, FleetCharts, Match, Outline, fleet_charts, spread
-from fcslam.evaluation.figure import MATCHES_DRAWN, WIDTH_PX, draw_figure, write_figure
+from fcslam.evaluation.fleet.charts import RAY_M, Chart, FleetCharts, Match, Outline, fleet_charts, spread
+from fcslam.evaluation.fleet.figure import MATCHES_DRAWN, WIDTH_PX, draw_figure, write_figure
 from fcslam.geometry import se2
+from fcslam.maps import palette
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import ClosureRow, LocalMap, RobotTrajectory, Run, write_run, write_tum

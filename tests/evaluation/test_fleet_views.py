@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.fleet_views import lidar_overlap, read_fleet_views
-from fcslam.evaluation.place_sets import read_place_set
+from fcslam.evaluation.places.sets import read_place_set
+from fcslam.evaluation.places.simulated_views import lidar_overlap, read_fleet_views
 from fcslam.geometry import se2
 from fcslam.records import CameraImage, CameraModel, GroundTruth, LaserModel, LaserScan, Transform, frozen
 from fcslam.sources import RecordingWriter

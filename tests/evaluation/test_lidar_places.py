@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.lidar_places import agreeing_in_plane, describe_recording
-from fcslam.evaluation.place_scoring import PlaceFeatures
+from fcslam.evaluation.places.lidar_places import agreeing_in_plane, describe_recording
+from fcslam.evaluation.places.scoring import PlaceFeatures
 from fcslam.geometry import se2
 
 

@@ -4,12 +4,12 @@ import re
 
 import cv2
 import numpy as np
-import place_folders
 import pytest
 
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.place_sets import read_place_set
-from fcslam.evaluation.view_overlap import DepthCamera, view_overlap
+from fcslam.evaluation.places.sets import read_place_set
+from fcslam.evaluation.places.view_overlap import DepthCamera, view_overlap
+from tests.evaluation import place_folders
 
 
 def test_floors_of_a_tower(tmp_path):

@@ -3,12 +3,11 @@
 import csv
 
 import numpy as np
-import place_folders
 import pytest
 
 from fcslam.cli import main
-from fcslam.evaluation.place_features import choose_features, describe_sets
-from fcslam.evaluation.vocabulary_growth import (
+from fcslam.evaluation.places.features import choose_features, describe_sets
+from fcslam.evaluation.places.vocabulary_growth import (
     BATCH,
     MEASURES,
     ahead_of,
@@ -19,6 +18,7 @@ from fcslam.evaluation.vocabulary_growth import (
 )
 from fcslam.places.index import PlaceIndex
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
+from tests.evaluation import place_folders
 
 GROUPS, SEED = 12, 3
 

@@ -1,13 +1,13 @@
 import cv2
 import numpy as np
 import pytest
-from rooms import asymmetric_room
 from scipy.spatial import cKDTree
 
 from fcslam.config import dump
 from fcslam.features.birdseye import BirdseyeConfig, describe, likelihood_picture, pixels_to_metres
 from fcslam.features.codes import mutual_matches
 from fcslam.geometry import se2
+from tests.rooms import asymmetric_room
 
 CONFIG = BirdseyeConfig()
 

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from features.pictures import picture
-from lidar.worlds import room
 
 from fcslam.features.classical import ORB_VERSION, Orb, OrbConfig
 from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import decode_grey
+from tests.features.pictures import picture
+from tests.lidar.worlds import room
 
 POSE = np.array([-1.5, -1.0, 0.2])
 

@@ -3,9 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from features.networks import tiny_network
-from features.pictures import picture
-from lidar.worlds import room
 
 from fcslam.cli import main
 from fcslam.errors import FeatureError
@@ -13,6 +10,9 @@ from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, Shi, Sift
 from fcslam.features.detector import NO_FEATURES, FloatFeatures
 from fcslam.features.extraction import extract
 from fcslam.features.files import read_features, read_grey, write_features
+from tests.features.networks import tiny_network
+from tests.features.pictures import picture
+from tests.lidar.worlds import room
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,13 @@ import sys
 
 import numpy as np
 import pytest
-from features.networks import tiny_network
 
 from fcslam.errors import FeatureError
 from fcslam.features.choice import make_detector
 from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.features.kinds import DetectorKind
+from tests.features.networks import tiny_network
 
 pytest.importorskip("onnxruntime")
 

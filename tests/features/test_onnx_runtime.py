@@ -5,7 +5,8 @@ import subprocess
 import sys
 
 import pytest
-from features.networks import tiny_network
+
+from tests.features.networks import tiny_network
 
 pytest.importorskip("onnxruntime")
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from features.pictures import CAMERA
-from lidar.worlds import LASER, box, path, room, scan_at
 
 from fcslam.features.placing import LidarView, place_keypoints
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, Transform
+from tests.features.pictures import CAMERA
+from tests.lidar.worlds import LASER, box, path, room, scan_at
 
 POSE = np.array([-1.5, -1.0, 0.2])
 

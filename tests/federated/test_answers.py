@@ -8,11 +8,10 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from federated.fakes import START, Fake, grid_of, run, settings, shifted
-
 from fcslam.federated.answers import LONGEST_REASON, Answers
 from fcslam.federated.flower import Array, ArrayRecord, Error, Message, MessageType, MetricRecord
 from fcslam.federated.history import ROUNDS_FILE, read_rows
+from tests.federated.fakes import START, Fake, grid_of, run, settings, shifted
 
 
 def array_of(data):

@@ -11,8 +11,9 @@ import time
 import cv2
 import pytest
 import yaml
-from federated.authority import certificates, keys
-from learning.textures import textured
+
+from tests.federated.authority import certificates, keys
+from tests.learning.textures import textured
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")

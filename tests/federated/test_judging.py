@@ -8,13 +8,12 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from federated.fakes import START, Fake, run, settings, shifted
-
 from fcslam.cli.federate import line_of
 from fcslam.errors import TrainingError
 from fcslam.federated.client import client_app
 from fcslam.federated.grid import InProcessGrid
 from fcslam.federated.judging import Verdict, credible
+from tests.federated.fakes import START, Fake, run, settings, shifted
 
 
 def figures(value):

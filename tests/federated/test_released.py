@@ -6,8 +6,6 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from features.networks import tiny_network  # noqa: E402
-
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import SHIPPED_NETWORK, OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.federated.network import network_of, weights_of  # noqa: E402
@@ -19,6 +17,7 @@ from fcslam.learning.export import export, quantise  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.stages import Shapes  # noqa: E402
 from fcslam.learning.trainer import Pace  # noqa: E402
+from tests.features.networks import tiny_network  # noqa: E402
 
 
 def lived_in(encoder):

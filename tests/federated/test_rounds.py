@@ -8,14 +8,13 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from federated.fakes import START, Fake, grid_of, run, settings, shifted, version
-
 from fcslam.errors import OutputError, TrainingError
-from fcslam.evaluation.poison import Poisoned
+from fcslam.evaluation.federated.poison import Poisoned
 from fcslam.federated.history import ROUNDS_FILE
 from fcslam.federated.memory import CHECKPOINT_FILE, read_state, write_state
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.settings import FederatedSettings
+from tests.federated.fakes import START, Fake, grid_of, run, settings, shifted, version
 
 TRAINED = {name: array for name, array in START.items() if name != "a.running_var"}
 """For where statistics are frozen and fakes would move them."""

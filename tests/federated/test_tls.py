@@ -6,10 +6,10 @@ import threading
 from contextlib import contextmanager
 
 import pytest
-from federated.authority import certificates
 
 from fcslam.errors import TrainingError
 from fcslam.federated.tls import Address, Certificates, check_own, check_server
+from tests.federated.authority import certificates
 
 
 @pytest.fixture(scope="module")

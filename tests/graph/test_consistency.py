@@ -4,13 +4,13 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from graph_worlds import INFORMATION, manhattan, measured, walk
 
 from fcslam.geometry import se2
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.cluster import apart, dominant_cluster
 from fcslam.graph.consistency import Closures, ConsistencySettings, loop_chi2, pairwise_consistency, witnesses
 from fcslam.graph.trajectory import Trajectory, trajectory
+from tests.graph.graph_worlds import INFORMATION, manhattan, measured, walk
 
 SETTINGS = ConsistencySettings(position_drift_m=0.03, heading_drift_rad=0.01)
 STILL = trajectory(np.zeros((1, 3)), SETTINGS)

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from graph_worlds import manhattan
 
 from fcslam.errors import InputError
 from fcslam.graph.g2o import read_g2o, write_g2o
+from tests.graph.graph_worlds import manhattan
 
 VERTICES = "VERTEX_SE2 3 0 0 0\nVERTEX_SE2 7 1 0 0\n"
 EDGE = "EDGE_SE2 3 7 1 0 0.1 9 1 2 8 3 7\n"

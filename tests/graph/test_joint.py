@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graph_worlds import INFORMATION, measured, walk
 
 from fcslam.geometry import se2
 from fcslam.graph import joint
@@ -13,6 +12,7 @@ from fcslam.graph.joint import JointEvidence, JointSolution, solve_jointly
 from fcslam.graph.optimizer import Solution, SolveStats, optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.trajectory import trajectory
+from tests.graph.graph_worlds import INFORMATION, measured, walk
 
 SETTINGS = ConsistencySettings()
 STEPS = 100

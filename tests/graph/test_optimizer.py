@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from graph_worlds import INFORMATION, gauss_newton, manhattan
 
 from fcslam.geometry import se2
 from fcslam.graph.alone import solve_alone
@@ -11,6 +10,7 @@ from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.optimizer import GncSettings, Solution, optimize, optimize_gnc, settle
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from tests.graph.graph_worlds import INFORMATION, gauss_newton, manhattan
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> float:

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from graph_worlds import INFORMATION, manhattan
 
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import MAXIMUM_INFORMATION, Edge, PoseGraph
+from tests.graph.graph_worlds import INFORMATION, manhattan
 
 
 def edge(i: int, j: int, information: np.ndarray = INFORMATION) -> Edge:

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from learning.textures import textured
+
+from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 pytest.importorskip("onnx", reason="needs fcslam[train]")

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from learning.textures import textured
 
 from fcslam.errors import TrainingError
 from fcslam.learning.homographic_adaptation import adapt, harris, peaks
 from fcslam.learning.labels import Labels, fuse, read_labels, read_teacher, write_labels
 from fcslam.learning.synthetic_shapes import FAMILIES, background, ellipses, noise
+from tests.learning.textures import textured
 
 
 def points(*pairs):

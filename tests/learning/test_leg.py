@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 import pytest
-from learning.textures import textured
+
+from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from learning.textures import textured
 
 from fcslam.learning.labels import Labels, Teacher
 from fcslam.learning.pairs import Example, draw_pair, splat
 from fcslam.learning.warps import random_change, random_view, relight, seen, warp_image, well_inside
 from fcslam.metrics.homography import inverse, warp
+from tests.learning.textures import textured
 
 SIZE = (96, 80)
 

@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 import pytest
-from learning.textures import textured
 
 from fcslam.errors import TrainingError
 from fcslam.learning.images import LARGEST_SIDE_PX, find_images, is_held_out, is_usable, read_image
+from tests.learning.textures import textured
 
 
 def write(path, image):

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from learning.textures import textured
+
+from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import bare_scan, ring, ring_drive, room, scan_at
 
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchConfig, SearchWindow, likelihood_pyramid, search, search_pyramid
 from fcslam.lidar.field import field_of
+from tests.lidar.worlds import bare_scan, ring, ring_drive, room, scan_at
 
 CONFIG = SearchConfig()
 

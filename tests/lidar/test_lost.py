@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import LASER, box, drive, recording, ring, ring_drive, room
 
 from fcslam.geometry import se2
 from fcslam.lidar.lost import LostConfig, is_doubtful, is_enough, is_lost
 from fcslam.lidar.mapper import LidarConfig, Mapper
 from fcslam.records import frozen
+from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
 CONFIG = LostConfig()
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from worlds import box, drifting, drive, path, pose_errors, recording, ring, ring_drive, shifted
 
 from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.mapper import LidarConfig, Mapper, motion_information
 from fcslam.lidar.tracker import Tracked
 from fcslam.records import ConstraintKind
+from tests.lidar.worlds import box, drifting, drive, path, pose_errors, recording, ring, ring_drive, shifted
 
 DRIFT = {"scale": 1.03, "veer_rad_m": 0.015, "noise": 0.02}
 

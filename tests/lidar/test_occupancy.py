@@ -6,8 +6,8 @@ from scipy import ndimage
 
 from fcslam.geometry import se2
 from fcslam.lidar.occupancy import OccupancyConfig, cast, classify
-from fcslam.map_files import Occupancy
 from fcslam.records import LaserModel
+from fcslam.runs.map_files import Occupancy
 
 CELL_M = 0.0625  # a power of two: moving by whole cells is exact
 CONFIG = OccupancyConfig(resolution_m=CELL_M)

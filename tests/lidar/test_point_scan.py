@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import LASER, MAX_RANGE_M, bare_scan, box, path, ranges, room, scan_at
 
 from fcslam.geometry import se2
 from fcslam.lidar.scan import point_scan
 from fcslam.records import LaserModel, frozen
+from tests.lidar.worlds import LASER, MAX_RANGE_M, bare_scan, box, path, ranges, room, scan_at
 
 
 def clear_of_ends(points, segments, margin_m):

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from worlds import bare_scan, box, corridor, path, ring, ring_drive, room, scan_at
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import field_of
 from fcslam.lidar.matching import MatchingConfig, match_scan
+from tests.lidar.worlds import bare_scan, box, corridor, path, ring, ring_drive, room, scan_at
 
 NO_PRIOR = np.zeros((3, 3))
 CONFIG = MatchingConfig()

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import LASER, box, corridor, drifting, drive, pose_errors, recording, ring, ring_drive
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import TABLE
 from fcslam.lidar.tracker import ScanTracker, TrackerConfig
 from fcslam.records import LaserModel, frozen
+from tests.lidar.worlds import LASER, box, corridor, drifting, drive, pose_errors, recording, ring, ring_drive
 
 KEYSCAN_M, KEYSCAN_RAD = 0.25, 0.25
 

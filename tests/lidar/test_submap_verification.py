@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
 
 from fcslam.geometry import se2
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, agreement, build_submap
 from fcslam.lidar.verification import VerificationConfig, _of_inverse, verify
+from tests.lidar.worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
 
 CONFIG = VerificationConfig()
 

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
-from worlds import bare_scan, path, ring, ring_drive, room, scan_at
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import CELL_M, EMPTY, MERGE_M, REACH_M, TABLE, TILE, SurfelField, field_of
+from tests.lidar.worlds import bare_scan, path, ring, ring_drive, room, scan_at
 
 HALF_DIAGONAL_M = CELL_M * np.sqrt(0.5)
 SIDE_M = TABLE * TILE * CELL_M

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
-from rooms import asymmetric_room
 
 from fcslam.features.birdseye import BirdseyeConfig, describe
 from fcslam.features.codes import Matches, mutual_matches
 from fcslam.geometry import se2
 from fcslam.places.hypotheses import HypothesisConfig, propose
+from tests.rooms import asymmetric_room
 
 CONFIG = HypothesisConfig()
 

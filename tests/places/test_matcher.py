@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from lidar.worlds import corridor, other_room, room, scan_at
 
 from fcslam.features.birdseye import BirdseyeConfig, describe
 from fcslam.geometry import se2
@@ -11,6 +10,7 @@ from fcslam.places.matcher import MatcherConfig, PlaceMatcher
 from fcslam.places.motions import MotionConfig
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, KeyscanId, Place, frozen
+from tests.lidar.worlds import corridor, other_room, room, scan_at
 
 STRANGERS, FRIENDS = (lambda _: True), (lambda _: False)
 STEPS = np.array([(0.0, 0.0, 0.0), (0.4, 0.1, 0.1), (0.8, -0.1, 0.2), (1.1, 0.3, -0.2)])

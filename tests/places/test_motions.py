@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from features.pictures import CAMERA, picture
-from lidar.worlds import LASER, room, scan_at
 
 from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.placing import LidarView, place_keypoints
 from fcslam.geometry import se2
 from fcslam.places.motions import MotionConfig, motions
 from fcslam.records import Channel, KeyscanId, Place, frozen
+from tests.features.pictures import CAMERA, picture
+from tests.lidar.worlds import LASER, room, scan_at
 
 CONFIG = MotionConfig()
 T_A_B = np.array([0.7, -0.4, 0.5])

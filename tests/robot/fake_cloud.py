@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass, field, replace
 
-from wire.examples import CLOSURE, CORRECTION, HELLO, packet
-
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import DetectorFile
 from fcslam.wire.http_transport import Answer, CloudState, Refusal
 from fcslam.wire.messages import Acknowledgement, Release
 from fcslam.wire.packets import decode, encode, readdress
+from tests.wire.examples import CLOSURE, CORRECTION, HELLO, packet
 
 
 def said(ordinal, body=CLOSURE, time=1042.5):

@@ -7,9 +7,8 @@ from collections import deque
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-from robot.fake_cloud import FakeCloud
-
 from fcslam.wire.batches import CORRECTION_HEADER, MEDIA_TYPE, REFUSED_HEADER, read_batch, write_batch
+from tests.robot.fake_cloud import FakeCloud
 
 
 class HttpCloud:

@@ -3,10 +3,9 @@
 from dataclasses import replace
 from functools import lru_cache
 
-import small_fleet
-
 from fcslam.geometry import se2
 from fcslam.records import LaserScan, frozen
+from tests import small_fleet
 
 
 @lru_cache

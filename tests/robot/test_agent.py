@@ -5,11 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import small_fleet
-from features.networks import tiny_network
-from robot.fake_cloud import FakeCloud, Network, content
-from robot.kidnapping import kidnapping
-from wire.examples import CORRECTION
 
 from fcslam.errors import CloudError, StateError
 from fcslam.features.release import file_of
@@ -20,6 +15,11 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
+from tests import small_fleet
+from tests.features.networks import tiny_network
+from tests.robot.fake_cloud import FakeCloud, Network, content
+from tests.robot.kidnapping import kidnapping
+from tests.wire.examples import CORRECTION
 
 AS_FAST_AS_POSSIBLE = Pace(None, lambda: 0.0, lambda _: None)
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from robot.fake_cloud import said
-from wire.examples import CLOSURE, HELLO, KEYSCAN, LIDAR_PLACE
 
 from fcslam.records import Place, frozen
 from fcslam.robot.budget import BURST_S, FEWEST_DESCRIPTORS, Budget
 from fcslam.wire.packets import encode
+from tests.robot.fake_cloud import said
+from tests.wire.examples import CLOSURE, HELLO, KEYSCAN, LIDAR_PLACE
 
 
 def place(count):

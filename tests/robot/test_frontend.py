@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import small_fleet
 
 from fcslam.features.birdseye import DETECTOR_VERSION
 from fcslam.features.detector import OnnxConfig, OnnxDetector
@@ -23,6 +22,7 @@ from fcslam.records import (
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
+from tests import small_fleet
 
 
 @pytest.fixture(scope="module")

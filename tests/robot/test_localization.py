@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import small_fleet
-from wire.examples import CORRECTION
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
@@ -14,6 +12,8 @@ from fcslam.records import Constraint, ConstraintKind, Correction, Keyscan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.localization import Localizer
 from fcslam.wire.packets import decode, encode
+from tests import small_fleet
+from tests.wire.examples import CORRECTION
 
 
 @pytest.fixture(scope="module")

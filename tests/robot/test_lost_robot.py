@@ -3,14 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-import small_fleet
-from robot.kidnapping import drives, kidnapping
 
 from fcslam.lidar.lost import LostConfig
 from fcslam.records import Channel, Constraint, Keyscan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
+from tests import small_fleet
+from tests.robot.kidnapping import drives, kidnapping
 
 LIDAR = (Channel.LIDAR,)
 ROBOT = RobotConfig(channels=LIDAR)

@@ -13,13 +13,13 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from robot.fake_cloud import said
-from wire.examples import HELLO, KEYSCAN, LIDAR_PLACE
 
 from fcslam.errors import StateError
 from fcslam.robot.outbox import Outbox
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
 from fcslam.wire.packets import decode, encode
+from tests.robot.fake_cloud import said
+from tests.wire.examples import HELLO, KEYSCAN, LIDAR_PLACE
 
 LIMIT = 10_000_000
 BODIES = [HELLO, KEYSCAN, LIDAR_PLACE]
@@ -273,7 +273,7 @@ WRITER = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from wire.examples import KEYSCAN, packet
+from tests.wire.examples import KEYSCAN, packet
 from fcslam.robot.outbox import Outbox
 outbox = Outbox(Path(sys.argv[1]), "alice", 10**9)
 outbox.begin("r", resume=sys.argv[2] == "True")

@@ -4,11 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from wire.examples import RELEASE
 
 from fcslam.errors import FeatureError, StateError
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.releases import Releases
+from tests.wire.examples import RELEASE
 
 FIRST, SECOND = RELEASE.file, replace(RELEASE.file, version="second")
 

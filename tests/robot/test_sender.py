@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robot.fake_cloud import FakeCloud, Network, content, said
-from wire.examples import HELLO, LIDAR_PLACE, RELEASE
 
 from fcslam.errors import CloudError, OversizeError, StateError, UnavailableError
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import ASK_AFTER_S, EVERY_S, LONGEST_RETRY_S, Sender, retry_delay_s
 from fcslam.wire.http_transport import Answer
 from fcslam.wire.packets import decode, encode
+from tests.robot.fake_cloud import FakeCloud, Network, content, said
+from tests.wire.examples import HELLO, LIDAR_PLACE, RELEASE
 
 
 class Robot:

@@ -3,9 +3,6 @@
 from dataclasses import replace
 
 import pytest
-from features.networks import tiny_network
-from robot.test_views import records_of
-from small_fleet import fingerprint
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
@@ -19,6 +16,9 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.views import ViewsConfig
 from fcslam.wire.messages import Hello, Release
 from fcslam.wire.packets import decode, encode
+from tests.features.networks import tiny_network
+from tests.robot.test_views import records_of
+from tests.small_fleet import fingerprint
 
 WITH_ORB = RobotConfig(channels=(Channel.CAMERA,), views=ViewsConfig(detector=DetectorKind.ORB))
 WITH_NETWORK = RobotConfig(channels=(Channel.CAMERA,))

@@ -5,9 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from features.networks import tiny_network
-from features.pictures import image_at
-from lidar.worlds import drifting, drive, path, recording, ring
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
@@ -21,6 +18,9 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.views import ViewsConfig
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
+from tests.features.networks import tiny_network
+from tests.features.pictures import image_at
+from tests.lidar.worlds import drifting, drive, path, recording, ring
 
 EVERY = 3
 """Scans between two images."""

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulation.driving import distances, route
 
 from fcslam.simulation.floorplan import DOOR_M, Kind, draw_floor_plan, move_furniture
 from fcslam.simulation.kinds import Building, Lighting
 from fcslam.simulation.lighting import light_of
 from fcslam.simulation.route import drive, schedule
+from tests.simulation.driving import distances, route
 
 every_building = pytest.mark.parametrize("building", Building)
 

@@ -9,8 +9,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from simulation.driving import route
-from simulation.gl import require_gl
 
 from fcslam.records import CameraImage, LaserScan
 from fcslam.simulation.decoration import Picture, decorate
@@ -23,6 +21,8 @@ from fcslam.simulation.noise import LidarSettings
 from fcslam.simulation.route import drive
 from fcslam.simulation.scene import furnished_model
 from fcslam.simulation.sensors import Camera
+from tests.simulation.driving import route
+from tests.simulation.gl import require_gl
 
 pytestmark = pytest.mark.system
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulation.gl import require_gl
 
 from fcslam.cli import main
 from fcslam.records import GroundTruth, LaserScan, Odometry
@@ -16,6 +15,7 @@ from fcslam.simulation.noise import LidarSettings
 from fcslam.simulation.recording import record_robot
 from fcslam.simulation.sensors import Camera, RayCaster
 from fcslam.sources import RecordingWriter, open_source
+from tests.simulation.gl import require_gl
 
 BLIND = SimulationSettings(
     building=Building.FLAT, robots=1, path_length_m=3.0, camera=None, lidar=LidarSettings(beams=40, rate_hz=10.0)

@@ -5,13 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from simulation.driving import distances, route
 
 from fcslam.errors import SimulationError
 from fcslam.simulation.floorplan import FloorPlan, Kind, Piece, Room, draw_floor_plan, move_furniture
 from fcslam.simulation.free_space import ROBOT_RADIUS_M, FreeSpace
 from fcslam.simulation.kinds import Building
 from fcslam.simulation.route import SPEED_M_S, TURN_RATE_RAD_S, draw_goals, drive, plan_route, schedule
+from tests.simulation.driving import distances, route
 
 
 def box(west, south, east, north):

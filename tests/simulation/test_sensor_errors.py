@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from simulation.driving import route
 
 from fcslam import config
 from fcslam.errors import ConfigError
@@ -13,6 +12,7 @@ from fcslam.simulation.floorplan import draw_floor_plan
 from fcslam.simulation.noise import LidarSettings, disturb
 from fcslam.simulation.odometry import DriftSettings, drift
 from fcslam.simulation.route import drive
+from tests.simulation.driving import route
 
 NO_DRIFT = DriftSettings(travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0)
 STRAIGHT = np.column_stack((np.linspace(0.0, 20.0, 401), np.zeros((401, 2))))

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulation.driving import route
 
 from fcslam.errors import SimulationError
 from fcslam.geometry import se2
@@ -19,6 +18,7 @@ from fcslam.simulation.noise import LidarSettings
 from fcslam.simulation.route import drive
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster
+from tests.simulation.driving import route
 
 TINY = SimulationSettings(
     building=Building.FLAT, robots=2, path_length_m=4.0, camera=None, lidar=LidarSettings(beams=60, rate_hz=4.0)

@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from simulation.driving import distances
 
-from fcslam.map_files import Occupancy
 from fcslam.metrics.relations import PoseTable, read_relations, relation_errors
+from fcslam.runs.map_files import Occupancy
 from fcslam.simulation.fleet import SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import Kind
 from fcslam.simulation.kinds import Building
 from fcslam.simulation.noise import LidarSettings
 from fcslam.simulation.truth import true_map, true_relations, write_truth
+from tests.simulation.driving import distances
 
 SETTINGS = SimulationSettings(
     building=Building.FLAT, robots=2, path_length_m=30.0, camera=None, lidar=LidarSettings(max_range_m=6.0, rate_hz=5.0)

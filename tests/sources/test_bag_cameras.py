@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from camera_records import CAMERA, drive, image, png, same, scan
 from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -11,6 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from fcslam.errors import SourceError
 from fcslam.records import CameraImage, GroundTruth, LaserScan, frozen
 from fcslam.sources import BagOptions, Fault, open_source, write_bag, write_recording
+from tests.sources.camera_records import CAMERA, drive, image, png, same, scan
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 KINDS = ["run.bag", "run.mcap", "run.db3", "run"]

@@ -10,7 +10,12 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from bag_messages import (
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fcslam.errors import SourceError
+from fcslam.sources import BagOptions, Fault, Tally, open_source
+from tests.sources.bag_messages import (
     Said,
     drive,
     mounted,
@@ -22,12 +27,7 @@ from bag_messages import (
     text,
     tf,
 )
-from carmen_text import scans_of
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-
-from fcslam.errors import SourceError
-from fcslam.sources import BagOptions, Fault, Tally, open_source
+from tests.sources.carmen_text import scans_of
 
 FILES = ["run.bag", "run.mcap", "run.db3"]
 KINDS = [*FILES, "run"]

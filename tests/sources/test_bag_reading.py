@@ -7,7 +7,14 @@ from copy import copy
 
 import numpy as np
 import pytest
-from bag_messages import (
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from fcslam.errors import SourceError
+from fcslam.records import LaserScan, Odometry
+from fcslam.sources import BagOptions, Fault, open_source, split
+from tests.sources.bag_messages import (
     ANGLE_MIN,
     BEAMS,
     INCREMENT,
@@ -22,16 +29,9 @@ from bag_messages import (
     text,
     tf,
 )
-from carmen_text import drive as drive_log
-from carmen_text import save as save_log
-from carmen_text import scans_of
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
-
-from fcslam.errors import SourceError
-from fcslam.records import LaserScan, Odometry
-from fcslam.sources import BagOptions, Fault, open_source, split
+from tests.sources.carmen_text import drive as drive_log
+from tests.sources.carmen_text import save as save_log
+from tests.sources.carmen_text import scans_of
 
 KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
 

@@ -5,8 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from bag_messages import BEAMS, ROS1, ROS2, drive, save
-from carmen_text import pose_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
@@ -14,6 +12,8 @@ from rosbags.highlevel import AnyReader
 from fcslam.errors import OutputError, SourceError
 from fcslam.records import LaserModel, LaserScan, Odometry, frozen
 from fcslam.sources import open_source, write_bag
+from tests.sources.bag_messages import BEAMS, ROS1, ROS2, drive, save
+from tests.sources.carmen_text import pose_at
 
 KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
 SICK = LaserModel(181, -90 * math.radians(1.0), math.radians(1.0), 50.0, (0.25, 0.0, 0.0))

@@ -2,13 +2,13 @@ import math
 
 import numpy as np
 import pytest
-from carmen_text import pose_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import OutputError
 from fcslam.records import LaserModel, LaserScan, Odometry, frozen
 from fcslam.sources import open_source, write_carmen
+from tests.sources.carmen_text import pose_at
 
 SICK = LaserModel(181, -90 * math.radians(1.0), math.radians(1.0), 50.0, (0.25, 0.0, 0.0))
 ROUND = LaserModel(12, -math.pi, math.tau / 12, 12.5, (-0.1, 0.05, 0.4))

@@ -5,12 +5,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from carmen_text import pose_at, save, scans_of
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import LaserScan
 from fcslam.sources import Fault, ScanRange, open_source, split
+from tests.sources.carmen_text import pose_at, save, scans_of
 
 RADIUS_M, TRACK_M, TICKS_A_TURN = 0.077, 0.33, 2000
 SCAN_AGE_S = 0.15

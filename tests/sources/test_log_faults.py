@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from carmen_text import BEAMS, drive, flaser, odom, pose_at, save, scans_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import SourceError
 from fcslam.sources import Fault, Tally, open_source
+from tests.sources.carmen_text import BEAMS, drive, flaser, odom, pose_at, save, scans_of
 
 
 def refusal(path):

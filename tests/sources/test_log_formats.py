@@ -6,13 +6,13 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from carmen_text import BEAMS, drive, flaser, odom, only_scans, pose_at, robotlaser, save, scans_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.geometry import se2
 from fcslam.records import LaserScan, Odometry
 from fcslam.sources import ScanRange, open_source
+from tests.sources.carmen_text import BEAMS, drive, flaser, odom, only_scans, pose_at, robotlaser, save, scans_of
 
 
 def test_every_message_becomes_its_record_in_file_order(tmp_path):

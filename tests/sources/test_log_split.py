@@ -2,7 +2,6 @@ from itertools import zip_longest
 
 import numpy as np
 import pytest
-from carmen_text import drive, flaser, pose_at, save, scans_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -10,6 +9,7 @@ from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import LaserScan, Odometry
 from fcslam.sources import Fault, open_source, split
+from tests.sources.carmen_text import drive, flaser, pose_at, save, scans_of
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from carmen_text import scans_of
 
 from fcslam.cli import main
 from fcslam.runs import read_tum
 from fcslam.sources import Fault, open_source, write_bag
+from tests.sources.carmen_text import scans_of
 
 DATA = Path(os.environ.get("FCSLAM_DATA", "")) / "lidar"
 pytestmark = [

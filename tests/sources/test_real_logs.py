@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from carmen_text import scans_of
 
 from fcslam.sources import Fault, open_source, split
+from tests.sources.carmen_text import scans_of
 
 DATA = Path(os.environ.get("FCSLAM_DATA", "")) / "lidar"
 pytestmark = [

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from carmen_text import scans_of
 
 from fcslam.geometry import se2
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import LaserScan
 from fcslam.sources import open_source
+from tests.sources.carmen_text import scans_of
 
 DATA = Path(os.environ.get("FCSLAM_DATA", "")) / "lidar"
 pytestmark = [

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from camera_records import CAMERA, LASER, drive, image, png, same, scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,6 +21,7 @@ from fcslam.records import GroundTruth, LaserScan, Odometry, frozen
 from fcslam.sources import Fault, Recording, RecordingWriter, open_source, split, write_recording
 from fcslam.sources.images import image_size
 from fcslam.sources.recording.layout import ODOMETRY_FILE
+from tests.sources.camera_records import CAMERA, LASER, drive, image, png, same, scan
 
 GOLDEN = Path(__file__).parent / "golden" / "robot.fcslam"
 HEADER, SCAN, IMAGE = 16, 8 + 8 + 24 + 4 * LASER.beam_count + 4, 8 + 8 + 24 + 4 + 4 + 4 + 4
@@ -288,8 +288,8 @@ def test_a_recording_without_scans(tmp_path):
 def test_what_is_on_the_disk_when_the_process_dies_is_whole(tmp_path):
     script = f"""
 import os, sys
-sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[2] / "src")!r}]
-from camera_records import CAMERA, LASER, drive
+sys.path[:0] = [{str(Path(__file__).parents[2])!r}, {str(Path(__file__).parents[2] / "src")!r}]
+from tests.sources.camera_records import CAMERA, LASER, drive
 from fcslam.sources import RecordingWriter
 from pathlib import Path
 writer = RecordingWriter.create(Path({str(tmp_path / "run.fcslam")!r}), LASER, CAMERA)

@@ -3,12 +3,12 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from wire.examples import EXAMPLES
 
 from fcslam.errors import PacketError
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS, MAXIMUM_PACKET_BYTES
 from fcslam.wire.packets import encode
+from tests.wire.examples import EXAMPLES
 
 PACKETS = [encode(example) for example in EXAMPLES.values()]
 

@@ -2,11 +2,11 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wire.examples import EXAMPLES, same
 
 from fcslam.errors import PacketError
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.packets import decode, encode, read_label
+from tests.wire.examples import EXAMPLES, same
 
 VALID = [encode(example) for example in EXAMPLES.values()]
 

@@ -3,10 +3,6 @@
 import json
 
 import pytest
-from federated.authority import certificates
-from robot.fake_cloud import said
-from robot.http_cloud import serving
-from wire.examples import LIDAR_PLACE
 
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import Channel
@@ -14,6 +10,10 @@ from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, rea
 from fcslam.wire.http_transport import Answer, HttpTransport, Refusal
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode, encode
+from tests.federated.authority import certificates
+from tests.robot.fake_cloud import said
+from tests.robot.http_cloud import serving
+from tests.wire.examples import LIDAR_PLACE
 
 PACKETS = [encode(said(0)), encode(said(1, LIDAR_PLACE))]
 

@@ -5,7 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from wire.examples import (
+
+from fcslam.errors import PacketError
+from fcslam.records import Channel, KeyscanId
+from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.packets import decode, encode
+from fcslam.wire.streams import pack_ranges
+from tests.wire.examples import (
     ACKNOWLEDGEMENT,
     CLOSURE,
     CORRECTION,
@@ -17,12 +23,6 @@ from wire.examples import (
     packet,
     same,
 )
-
-from fcslam.errors import PacketError
-from fcslam.records import Channel, KeyscanId
-from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.packets import decode, encode
-from fcslam.wire.streams import pack_ranges
 
 NAN, INF = float("nan"), float("inf")
 

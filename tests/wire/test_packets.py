@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from wire.examples import EXAMPLES, GOLDEN, LIDAR_PLACE, ODOMETRY, packet, same
-from wire.strategies import informations, packets
 
 from fcslam.errors import PacketError
 from fcslam.records import Channel, Constraint, Keyscan, Place
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.messages import Kind, Packet
 from fcslam.wire.packets import Label, decode, encode, read_label, unpacked_size
+from tests.wire.examples import EXAMPLES, GOLDEN, LIDAR_PLACE, ODOMETRY, packet, same
+from tests.wire.strategies import informations, packets
 
 
 @settings(max_examples=200)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from wire.examples import EXAMPLES
 
 from fcslam.errors import PacketError
 from fcslam.records import Channel, ConstraintKind
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
 from fcslam.wire.packets import decode, encode
+from tests.wire.examples import EXAMPLES
 
 ROOT = Path(__file__).parents[2]
 SCHEMA = "src/fcslam/wire/fcslam.proto"

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from wire.strategies import codes
 
 from fcslam.errors import PacketError
 from fcslam.records import Channel
@@ -20,6 +19,7 @@ from fcslam.wire.streams import (
     unpack_keypoints,
     unpack_ranges,
 )
+from tests.wire.strategies import codes
 
 CHANNELS = pytest.mark.parametrize("channel", Channel)
 POSITIONS = st.integers(-32767, 32767) | st.integers(-20, 20)

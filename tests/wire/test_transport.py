@@ -1,7 +1,6 @@
 """The in-memory transport: bytes both ways, refusals as values, a ledger that adds up."""
 
 import pytest
-from wire.examples import ACKNOWLEDGEMENT, CORRECTION, EXAMPLES, packet, same
 
 from fcslam.errors import PacketError
 from fcslam.records import Channel
@@ -10,6 +9,7 @@ from fcslam.wire.ledger import Counter, Ledger, Traffic
 from fcslam.wire.messages import Kind
 from fcslam.wire.packets import Label, decode, encode
 from fcslam.wire.transport import InMemoryTransport, Reply, Transport
+from tests.wire.examples import ACKNOWLEDGEMENT, CORRECTION, EXAMPLES, packet, same
 
 DOWNLINK = (encode(packet(ACKNOWLEDGEMENT)), encode(packet(CORRECTION)))
 

@@ -21,10 +21,10 @@ def certificates(
     """Make a certificate authority, certificates of the cloud and of robots, and tokens for robots and people."""
     import datetime
 
-    from fcslam.cloud.credentials import make_credentials
-    from fcslam.cloud.service.authentication import Role
     from fcslam.cloud.sessions import check_robot
     from fcslam.errors import InputError, PacketError
+    from fcslam.service.credentials import make_credentials
+    from fcslam.service.http.authentication import Role
     from fcslam.wire.checks import check_name
 
     wanted = {Role.ROBOT: robot or [], Role.VIEWER: viewer or [], Role.ADMIN: admin or []}

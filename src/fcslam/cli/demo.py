@@ -130,9 +130,9 @@ def _evaluate(output: Path, console: "Console") -> None:
     from rich.console import Console
 
     from fcslam.cli.evaluate_fleet import show_fleet
-    from fcslam.evaluation.fleet import evaluate_fleet
-    from fcslam.evaluation.fleet_metrics import fleet_metrics
-    from fcslam.evaluation.relations import write_metrics
+    from fcslam.evaluation.fleet.metrics import fleet_metrics
+    from fcslam.evaluation.fleet.relations import write_metrics
+    from fcslam.evaluation.fleet.report import evaluate_fleet
 
     _announce(console, 4, "evaluate: compare with the truth")
     with _busy(console, "evaluating"):
@@ -143,8 +143,8 @@ def _evaluate(output: Path, console: "Console") -> None:
 
 
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
-    from fcslam.evaluation.charts import Outline, fleet_charts
-    from fcslam.evaluation.figure import write_figure
+    from fcslam.evaluation.fleet.charts import Outline, fleet_charts
+    from fcslam.evaluation.fleet.figure import write_figure
     from fcslam.simulation.floorplan import Kind
 
     _announce(console, 5, "draw")

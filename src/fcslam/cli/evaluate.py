@@ -14,7 +14,7 @@ from fcslam.cli.evaluate_vocabulary import vocabulary
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.evaluation.closures import ClosureReport
+    from fcslam.evaluation.fleet.closures import ClosureReport
     from fcslam.metrics.closures import ClosureCriteria, Precision
     from fcslam.metrics.relations import RelationErrors
 
@@ -54,7 +54,7 @@ def relations(
     ] = None,
 ) -> None:
     """Errors of a run by the relations metric of Kuemmerle et al. 2009: mean, standard deviation and maximum."""
-    from fcslam.evaluation.relations import (
+    from fcslam.evaluation.fleet.relations import (
         RelationsQuestion,
         evaluate_relations,
         relation_metrics,
@@ -95,8 +95,8 @@ def closures(
     ] = None,
 ) -> None:
     """Precision and recall of a run's closures, stage by stage, against the optimised graph of the relations."""
-    from fcslam.evaluation.closures import closure_metrics, evaluate_closures
-    from fcslam.evaluation.relations import write_metrics
+    from fcslam.evaluation.fleet.closures import closure_metrics, evaluate_closures
+    from fcslam.evaluation.fleet.relations import write_metrics
     from fcslam.metrics.closures import ClosureCriteria
 
     criteria = ClosureCriteria(bridge_s, wrong_m, wrong_deg, reach_m)
@@ -129,7 +129,7 @@ def _show_closures(report: "ClosureReport", criteria: "ClosureCriteria") -> None
 
 def _explain_closures(console: "Console", report: "ClosureReport", criteria: "ClosureCriteria") -> None:
     """What the tables rest on."""
-    from fcslam.evaluation.closures import closure_metrics
+    from fcslam.evaluation.fleet.closures import closure_metrics
     from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S
 
     value = {metric.name: metric.value for metric in closure_metrics(report)}

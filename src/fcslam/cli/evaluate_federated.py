@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from fcslam.evaluation.federated_report import ArmReport
+    from fcslam.evaluation.federated.report import ArmReport
 
 
 def federated(
@@ -29,8 +29,8 @@ def federated(
     from fcslam.errors import EvaluationError
 
     need_torch("flwr", extra="federated")
-    from fcslam.evaluation.federated import Study, StudySettings, run_study
-    from fcslam.evaluation.federated_report import report, write_report
+    from fcslam.evaluation.federated.report import report, write_report
+    from fcslam.evaluation.federated.study import Study, StudySettings, run_study
 
     folders = {folder.resolve().name: folder for folder in robots}
     if len(folders) < max(len(robots), 2):

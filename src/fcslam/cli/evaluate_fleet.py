@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from fcslam.evaluation.closures import Within
-    from fcslam.evaluation.fleet import FleetReport
+    from fcslam.evaluation.fleet.closures import Within
+    from fcslam.evaluation.fleet.report import FleetReport
 
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
@@ -40,9 +40,9 @@ def fleet(
     """A run against the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
     from rich.console import Console
 
-    from fcslam.evaluation.fleet import evaluate_fleet
-    from fcslam.evaluation.fleet_metrics import fleet_metrics
-    from fcslam.evaluation.relations import write_metrics
+    from fcslam.evaluation.fleet.metrics import fleet_metrics
+    from fcslam.evaluation.fleet.relations import write_metrics
+    from fcslam.evaluation.fleet.report import evaluate_fleet
     from fcslam.metrics.closures import ClosureCriteria
 
     report = evaluate_fleet(run, truth, ClosureCriteria(wrong_m=wrong_m, wrong_deg=wrong_deg))
@@ -50,15 +50,15 @@ def fleet(
     if csv is not None:
         write_metrics(fleet_metrics(report), csv)
     if figure is not None:
-        from fcslam.evaluation.charts import fleet_charts
-        from fcslam.evaluation.figure import write_figure
+        from fcslam.evaluation.fleet.charts import fleet_charts
+        from fcslam.evaluation.fleet.figure import write_figure
 
         write_figure(fleet_charts(run, truth), figure)
 
 
 def show_fleet(report: "FleetReport", console: "Console", explained: bool = True) -> None:
     """The report as tables and, if it is to be ``explained``, what they rest on."""
-    from fcslam.evaluation.closures import Within
+    from fcslam.evaluation.fleet.closures import Within
 
     closures = (_closures(report, within) for within in Within)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
@@ -98,7 +98,7 @@ def _closures(report: "FleetReport", within: "Within") -> "Table":
     """Of the channels that closed something; of both together where both did."""
     from rich.table import Table
 
-    from fcslam.evaluation.fleet_closures import BOTH
+    from fcslam.evaluation.fleet.closure_stages import BOTH
 
     table = Table(_KINDS[within], "channel", "all", "wrong", "precision", "recall", "like heading", "at 100 %")
     scores = {(status, channel): score for (kind, status, channel), score in report.closures.items() if kind is within}
@@ -143,8 +143,8 @@ def _findings(report: "FleetReport") -> "Iterator[str]":
 
 
 def _explanations(report: "FleetReport") -> "Iterator[str]":
-    from fcslam.evaluation.closures import Within
-    from fcslam.evaluation.fleet_closures import LIKE_HEADING_DEG
+    from fcslam.evaluation.fleet.closure_stages import LIKE_HEADING_DEG
+    from fcslam.evaluation.fleet.closures import Within
     from fcslam.metrics.grid import TOLERANCE_M
     from fcslam.metrics.revisits import RevisitCriteria
 
@@ -170,7 +170,7 @@ def _explanations(report: "FleetReport") -> "Iterator[str]":
 
 
 def _revisits(report: "FleetReport", within: "Within") -> str:
-    from fcslam.evaluation.fleet_closures import BOTH
+    from fcslam.evaluation.fleet.closure_stages import BOTH
     from fcslam.records import ClosureStatus
 
     score = report.closures[within, ClosureStatus.ACCEPTED, BOTH]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from fcslam.evaluation.homography import HomographyReport, PairResult
+    from fcslam.evaluation.detectors.homography import HomographyReport, PairResult
     from fcslam.metrics.bootstrap import Interval
 
 
@@ -51,11 +51,11 @@ def homography(
     from rich.console import Console
     from rich.progress import Progress
 
-    from fcslam.evaluation.contenders import choose_contenders
-    from fcslam.evaluation.homography import evaluate_homography
-    from fcslam.evaluation.homography_figures import draw_figures
-    from fcslam.evaluation.homography_measures import write_pairs
-    from fcslam.evaluation.scenes import find_scenes
+    from fcslam.evaluation.detectors.contenders import choose_contenders
+    from fcslam.evaluation.detectors.figures import draw_figures
+    from fcslam.evaluation.detectors.homography import evaluate_homography
+    from fcslam.evaluation.detectors.measures import write_pairs
+    from fcslam.evaluation.detectors.scenes import find_scenes
 
     found = find_scenes(scenes)
     contenders = choose_contenders(detector or (), weights or (), features or ())
@@ -98,9 +98,9 @@ def _show(console: "Console", report: "HomographyReport", truth: GroundTruth, se
 def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.homography import LARGE, SMALL
-    from fcslam.evaluation.homography_measures import interval, mean
-    from fcslam.evaluation.scenes import SceneKind
+    from fcslam.evaluation.detectors.homography import LARGE, SMALL
+    from fcslam.evaluation.detectors.measures import interval, mean
+    from fcslam.evaluation.detectors.scenes import SceneKind
 
     table = Table(title="I. Repeatability", title_justify="left")
     for heading in ("", "illumination", "viewpoint", "all", "localisation error, px", "ms 320x240", "ms 640x480"):
@@ -122,9 +122,9 @@ def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":
 def _homography_table(report: "HomographyReport", described: "Sequence[str]", seed: int) -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.homography import MATCHING_NMS_PX
-    from fcslam.evaluation.homography_measures import CORRECT_CORNERS_PX, interval, mean
-    from fcslam.evaluation.scenes import SceneKind
+    from fcslam.evaluation.detectors.homography import MATCHING_NMS_PX
+    from fcslam.evaluation.detectors.measures import CORRECT_CORNERS_PX, interval, mean
+    from fcslam.evaluation.detectors.scenes import SceneKind
 
     table = Table(title="II. Homography estimation", title_justify="left")
     for heading in ("", "NMS", "illumination, e=3", "viewpoint, e=3", *(f"all, e={px}" for px in CORRECT_CORNERS_PX)):
@@ -143,9 +143,9 @@ def _homography_table(report: "HomographyReport", described: "Sequence[str]", se
 def _matching_table(report: "HomographyReport", described: "Sequence[str]") -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.homography import MATCHING_NMS_PX
-    from fcslam.evaluation.homography_measures import mean
-    from fcslam.evaluation.scenes import SceneKind
+    from fcslam.evaluation.detectors.homography import MATCHING_NMS_PX
+    from fcslam.evaluation.detectors.measures import mean
+    from fcslam.evaluation.detectors.scenes import SceneKind
 
     table = Table(title="Matching", title_justify="left")
     accuracy = ("MMA@1", "MMA@3", "MMA@5", "MMA@10", "illumination MMA@3", "viewpoint MMA@3")
@@ -166,7 +166,7 @@ def _matching_table(report: "HomographyReport", described: "Sequence[str]") -> "
 def _scene_table(report: "HomographyReport") -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.homography_measures import mean
+    from fcslam.evaluation.detectors.measures import mean
 
     titles = {
         "repeatability": "repeatability",
@@ -186,7 +186,7 @@ def _scene_table(report: "HomographyReport") -> "Table":
 def _difference_table(report: "HomographyReport", seed: int) -> "Table":
     from rich.table import Table
 
-    from fcslam.evaluation.homography_measures import difference
+    from fcslam.evaluation.detectors.measures import difference
 
     first, *others = report.contenders
     titles = {

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from fcslam.evaluation.places import SetResult
+    from fcslam.evaluation.places.report import SetResult
     from fcslam.metrics.bootstrap import Interval
     from fcslam.places.vocabulary import Strategy
 
@@ -48,8 +48,8 @@ def places(
     """Recall, precision and mismatches of place recognition: each strategy of the vocabulary beside brute force."""
     from rich.console import Console
 
-    from fcslam.evaluation.place_figures import curves_figure, save
-    from fcslam.evaluation.places import write_results
+    from fcslam.evaluation.places.figures import curves_figure, save
+    from fcslam.evaluation.places.report import write_results
 
     strategies = _strategies(strategy or ("static", "windowed", "incremental"))
     results = _evaluate(sets, features, label or (), train_on or (), strategies, seed, verify=verify, sequence=sequence)
@@ -72,11 +72,11 @@ def _evaluate(
     from rich.console import Console
     from rich.progress import Progress
 
-    from fcslam.evaluation.place_checks import PairChecker
-    from fcslam.evaluation.place_features import choose_features, describe_sets, describe_training
-    from fcslam.evaluation.place_scoring import choose_scorers
-    from fcslam.evaluation.place_sequences import in_sequence, plain
-    from fcslam.evaluation.places import evaluate_set
+    from fcslam.evaluation.places.checks import PairChecker
+    from fcslam.evaluation.places.features import choose_features, describe_sets, describe_training
+    from fcslam.evaluation.places.report import evaluate_set
+    from fcslam.evaluation.places.scoring import choose_scorers
+    from fcslam.evaluation.places.sequences import in_sequence, plain
     from fcslam.places.vocabulary import VocabularyConfig
 
     chosen = choose_features(features)

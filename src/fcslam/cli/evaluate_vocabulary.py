@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from fcslam.evaluation.vocabulary_growth import Growth
+    from fcslam.evaluation.places.vocabulary_growth import Growth
 
 
 def vocabulary(
@@ -36,9 +36,9 @@ def vocabulary(
     from rich.progress import Progress
 
     from fcslam.errors import EvaluationError
-    from fcslam.evaluation.growth_figure import write_growth
-    from fcslam.evaluation.place_features import choose_features, describe_sets, describe_training
-    from fcslam.evaluation.vocabulary_growth import BATCH, Arrival, draw_groups, fixed_growths, grow_vocabulary
+    from fcslam.evaluation.places.features import choose_features, describe_sets, describe_training
+    from fcslam.evaluation.places.growth_figure import write_growth
+    from fcslam.evaluation.places.vocabulary_growth import BATCH, Arrival, draw_groups, fixed_growths, grow_vocabulary
     from fcslam.places.vocabulary import Strategy, VocabularyConfig
 
     chosen = choose_features(features)
@@ -76,7 +76,7 @@ def _table(growths: "Mapping[str, Growth]", seed: int) -> "Table":
     import numpy as np
     from rich.table import Table
 
-    from fcslam.evaluation.vocabulary_growth import MEASURES
+    from fcslam.evaluation.places.vocabulary_growth import MEASURES
 
     table = Table("", *MEASURES, "words", "s for 40 places, median", title_justify="left")
     for name, growth in growths.items():

@@ -19,7 +19,7 @@ from fcslam.cli.recordings import (
     show_faults,
     show_notes,
 )
-from fcslam.cloud.strategy import FusionStrategy
+from fcslam.cloud.fusion_strategy import FusionStrategy
 
 if TYPE_CHECKING:
     from rich.console import Console

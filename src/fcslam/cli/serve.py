@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     import uvicorn
     from fastapi import FastAPI
 
-    from fcslam.cloud.service.authentication import Authenticator
-    from fcslam.cloud.service.state import ServiceState
     from fcslam.cloud.settings import CloudConfig
+    from fcslam.service.http.authentication import Authenticator
+    from fcslam.service.http.state import ServiceState
 
 _TLS = "TLS"
 
@@ -47,9 +47,9 @@ def serve(
     import gc
     import logging
 
-    from fcslam.cloud.service.app import create_app
-    from fcslam.cloud.warmup import warm_up_decoding
     from fcslam.errors import ServiceError
+    from fcslam.service.http.app import create_app
+    from fcslam.service.warmup import warm_up_decoding
 
     if tokens is None and client_ca is None and not insecure and not _is_loopback(host):
         raise ServiceError(f"anybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
@@ -72,7 +72,7 @@ def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_c
 
     import uvicorn
 
-    from fcslam.cloud.service.tls import CertifiedProtocol
+    from fcslam.service.http.tls import CertifiedProtocol
 
     return uvicorn.Server(
         uvicorn.Config(
@@ -93,7 +93,7 @@ def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_c
 
 
 def _authenticator(tokens: Path | None, client_ca: Path | None) -> "Authenticator":
-    from fcslam.cloud.service.authentication import Authenticator, read_tokens
+    from fcslam.service.http.authentication import Authenticator, read_tokens
 
     if tokens is None:
         return Authenticator(None if client_ca is None else ())
@@ -103,11 +103,11 @@ def _authenticator(tokens: Path | None, client_ca: Path | None) -> "Authenticato
 def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig") -> "ServiceState":
     import time
 
-    from fcslam.cloud.missions import Missions
-    from fcslam.cloud.service.events import EventStream
-    from fcslam.cloud.service.limits import RateLimit
-    from fcslam.cloud.service.state import ServiceState
-    from fcslam.cloud.supervisor import Supervisor
+    from fcslam.service.http.events import EventStream
+    from fcslam.service.http.limits import RateLimit
+    from fcslam.service.http.state import ServiceState
+    from fcslam.service.missions import Missions
+    from fcslam.service.supervisor import Supervisor
 
     events = EventStream()
     missions = Missions(

@@ -11,19 +11,19 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fcslam.cloud.closure_log import ClosureLedger, Entry
+from fcslam.cloud.correction_quality import Support
+from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.joining import first_estimate, judge
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.journal import Journal
-from fcslam.cloud.ledger import ClosureLedger, Entry
+from fcslam.cloud.reevaluation import reconsider
 from fcslam.cloud.result import FleetResult, Fusion, conclude, map_indices
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.robots import RobotStore
 from fcslam.cloud.sessions import in_session, robot_of, session_name
 from fcslam.cloud.settings import FleetConfig
-from fcslam.cloud.strategy import FusionStrategy
 from fcslam.cloud.submaps import SubmapShelf
-from fcslam.cloud.support import Support
-from fcslam.cloud.verdict import reconsider
 from fcslam.cloud.visits import Visit, visits_near
 from fcslam.errors import PacketError
 from fcslam.geometry import se2

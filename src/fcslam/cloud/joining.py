@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fcslam.cloud.closure_log import Entry
 from fcslam.cloud.joint_graph import JointGraph
-from fcslam.cloud.ledger import Entry
 from fcslam.graph import cluster
 from fcslam.graph.cluster import ClusterVerdict
 from fcslam.graph.consistency import Closures, ConsistencySettings

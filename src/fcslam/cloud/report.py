@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.cloud.fusion import FusedMap, fuse
-from fcslam.cloud.picture import Meeting, map_png
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.map_files import map_yaml, pgm_bytes
+from fcslam.maps.drawing import Meeting, map_png
+from fcslam.maps.fusion import FusedMap, fuse
 from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
+from fcslam.runs.map_files import map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Kind
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.cloud.closure_log import ClosureLedger
 from fcslam.cloud.joint_graph import JointGraph
-from fcslam.cloud.ledger import ClosureLedger
 from fcslam.cloud.robots import RobotStore
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import ClosureStatus, Correction, FloatArray, Keyscan, LaserModel, LoopClosure, frozen

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fcslam.cloud.ledger import ClosureLedger, Entry
+from fcslam.cloud.closure_log import ClosureLedger, Entry
+from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.result import Fusion
-from fcslam.cloud.strategy import FusionStrategy
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment, two_point_alignment
 from fcslam.graph.cluster import DIRECTION_M

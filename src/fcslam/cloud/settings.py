@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from fcslam.cloud.strategy import FusionStrategy
+from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.config import Settings
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.lidar.occupancy import OccupancyConfig

@@ -12,6 +12,7 @@ from fcslam.federated.robot import RobotLearner, secret_noise, seeded_noise
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.task import Task, Watches, run_task
 from fcslam.learning.trainer import Pace
+from fcslam.storage.files import write_file
 
 STATUS_FILE: Final = "status.json"
 WAIT_S: Final = 5.0
@@ -42,9 +43,7 @@ def write_status(folder: Path, state: str, text: str) -> None:
     """
     path = folder / STATUS_FILE
     try:
-        unfinished = path.with_suffix(".part")
-        unfinished.write_text(json.dumps({"state": state, "text": text}), encoding="utf-8")
-        unfinished.replace(path)
+        write_file(path, json.dumps({"state": state, "text": text}))
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error})") from error
 

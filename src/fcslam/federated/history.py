@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.errors import OutputError, TrainingError
+from fcslam.storage.files import write_file
 
 ROUNDS_FILE: Final = "rounds.csv"
 LOSS: Final = "loss_"
@@ -90,11 +91,8 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     writer = csv.DictWriter(content, list(names), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    unfinished = path.with_suffix(".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.write_text(content.getvalue(), encoding="utf-8")
-        unfinished.replace(path)
+        write_file(path, content.getvalue())
     except OSError as error:
-        unfinished.unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot be written ({error}); make room and run the same command again") from error

@@ -10,6 +10,8 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.storage.files import write_file
+
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write a file and its folders; whatever happens, ``path`` holds all of the old file or all of the new one.
@@ -18,15 +20,9 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         OSError: it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".part")
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
-    try:
-        unfinished.write_bytes(content.getbuffer())
-        unfinished.replace(path)
-    except OSError:
-        unfinished.unlink(missing_ok=True)
-        raise
+    write_file(path, content.getbuffer())
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -24,6 +24,7 @@ from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import NETWORK_FORMAT, GreyImage
 from fcslam.features.onnx_runtime import load_onnx_runtime
 from fcslam.learning.network import KeypointNetwork
+from fcslam.storage.files import write_file
 
 OPSET: Final = 17
 CALIBRATION_IMAGES: Final = 64
@@ -151,10 +152,8 @@ def _write(graph: Any, version: str, path: Path) -> None:
     for key, value in (("fcslam_format", NETWORK_FORMAT), ("fcslam_version", version)):
         graph.metadata_props.add(key=key, value=value)
     onnx.checker.check_model(graph)
-    unfinished = path.with_suffix(".part")
     try:
-        unfinished.write_bytes(graph.SerializeToString(deterministic=True))
-        unfinished.replace(path)
+        write_file(path, graph.SerializeToString(deterministic=True))
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
 

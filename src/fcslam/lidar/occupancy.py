@@ -12,8 +12,8 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.map_files import Cells
 from fcslam.records import FloatArray, LaserModel, Ranges
+from fcslam.runs.map_files import Cells
 
 Counts = NDArray[np.uint32]
 

@@ -5,7 +5,6 @@ and what the tree was trained on are kept, so an index that was read goes on exa
 """
 
 import json
-import os
 import zipfile
 from collections.abc import Callable
 from dataclasses import asdict
@@ -21,6 +20,7 @@ from fcslam.features.codes import CODE_WORDS
 from fcslam.places.index import IndexState, PlaceIndex
 from fcslam.places.likeness import PlaceId
 from fcslam.places.vocabulary import Training, TreeState, VocabularyConfig
+from fcslam.storage.files import replacing
 
 FORMAT = "fcslam place index 1"
 
@@ -59,13 +59,10 @@ def save_index(index: PlaceIndex[Any], path: Path) -> None:
         "counts": state.counts, "leaves": state.leaves, "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
     }  # fmt: skip
     portable = {name: np.asarray(array, _SHAPES[name][0]) for name, array in arrays.items()}
-    part = path.with_name(path.name + ".part")
     try:
-        with part.open("wb") as file:
+        with replacing(path) as unfinished, unfinished.open("wb") as file:
             np.savez(file, allow_pickle=False, **portable)
-        os.replace(part, path)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
 
 

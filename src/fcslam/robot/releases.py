@@ -10,6 +10,7 @@ from fcslam.errors import FeatureError, StateError
 from fcslam.records import DetectorFile
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.outbox import Outbox
+from fcslam.storage.files import write_file
 
 
 class Releases:
@@ -37,9 +38,7 @@ class Releases:
         """
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            unfinished = self._path(file).with_suffix(".part")
-            unfinished.write_bytes(content)
-            unfinished.replace(self._path(file))  # in one piece: a recording that is resumed may need the one before
+            write_file(self._path(file), content)  # a recording that is resumed may need the old one
         except OSError as error:
             raise StateError(
                 f"{self._folder}: detector {file.version} cannot be kept there ({error}); make room, and --resume"

@@ -1,6 +1,5 @@
 """A fleet's recordings on disk. What was interrupted goes on to the bytes that it would have had without."""
 
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -16,6 +15,7 @@ from fcslam.records import GroundTruth, RecordedItem
 from fcslam.simulation.fleet import SimulatedRobot, SimulationSettings
 from fcslam.sources import RecordingWriter
 from fcslam.sources.recording.layout import META
+from fcslam.storage.files import write_file
 
 SETTINGS = "simulation.yaml"
 """What a folder's fleet is simulated from; everything in it follows from this."""
@@ -35,12 +35,10 @@ def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int, 
         if (folder / SETTINGS).is_file() and resume:
             _check_same(folder / SETTINGS, yaml.safe_load(text))
             return
-        if any(path.name != f".{SETTINGS}" for path in folder.iterdir()):
+        if any(path.name != f".{SETTINGS}.partial" for path in folder.iterdir()):
             hint = ", or go on with it by --resume" if (folder / SETTINGS).is_file() else ""
             raise OutputError(f"{folder}: is not empty; choose another place{hint}")
-        # Whole or not there.
-        (folder / f".{SETTINGS}").write_text(text, encoding="utf-8")
-        os.replace(folder / f".{SETTINGS}", folder / SETTINGS)
+        write_file(folder / SETTINGS, text)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be used as the output folder ({error})") from error
 

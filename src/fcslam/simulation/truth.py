@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.map_files import Cells, Occupancy, map_yaml, pgm_bytes
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
 from fcslam.records import FloatArray, LaserModel, frozen
+from fcslam.runs.map_files import Cells, Occupancy, map_yaml, pgm_bytes
 from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster

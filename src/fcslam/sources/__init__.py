@@ -2,8 +2,8 @@
 
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
-from fcslam.sources.carmen_writer import write_carmen
 from fcslam.sources.faults import Fault, Faults, Tally
+from fcslam.sources.logs.carmen_writer import write_carmen
 from fcslam.sources.opening import FORMATS, Format, open_source
 from fcslam.sources.recording.reader import Recording
 from fcslam.sources.recording.writer import RecordingWriter, write_recording

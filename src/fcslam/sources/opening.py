@@ -5,18 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fcslam.errors import SourceError
-from fcslam.sources.archive import head, robot_name
 from fcslam.sources.bags.container import is_bag
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag
-from fcslam.sources.carmen import CARMEN
-from fcslam.sources.cmu import CMU
-from fcslam.sources.dialect import Dialect
-from fcslam.sources.duke import DUKE
-from fcslam.sources.mines import MINES
+from fcslam.sources.logs.archive import head, robot_name
+from fcslam.sources.logs.carmen import CARMEN
+from fcslam.sources.logs.cmu import CMU
+from fcslam.sources.logs.dialect import Dialect
+from fcslam.sources.logs.duke import DUKE
+from fcslam.sources.logs.mines import MINES
+from fcslam.sources.logs.textlog import TextLog
 from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
-from fcslam.sources.textlog import TextLog
 
 
 @dataclass(frozen=True, slots=True)

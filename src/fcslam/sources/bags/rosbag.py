@@ -23,7 +23,7 @@ from fcslam.sources.bags.transforms import Mounting, NoTransformError, Transform
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import refuse_misfits, window
 from fcslam.sources.images import check_image
-from fcslam.sources.overview import Track
+from fcslam.sources.logs.overview import Track
 from fcslam.sources.pose import pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 

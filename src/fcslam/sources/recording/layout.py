@@ -5,7 +5,6 @@ damaged is lost alone, and what a crash cut off is told by the file's length. Th
 sequence, which is the order of the recording.
 """
 
-import os
 from dataclasses import dataclass
 from math import isfinite, pi
 from pathlib import Path
@@ -21,6 +20,7 @@ from fcslam.config import Settings
 from fcslam.errors import SourceError
 from fcslam.records import CameraModel, LaserModel
 from fcslam.sources.images import check_camera
+from fcslam.storage.files import write_file
 
 META = "meta.yaml"
 SCANS = "scans.bin"
@@ -118,9 +118,7 @@ def write_meta(folder: Path, meta: Meta) -> None:
     if meta.camera is not None:
         translation_m, rotation = meta.camera.T_base_camera
         content["camera"]["T_base_camera"] = {"translation_m": list(translation_m), "rotation": list(rotation)}
-    unfinished = folder / f".{META}"
-    unfinished.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")
-    os.replace(unfinished, folder / META)
+    write_file(folder / META, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
 def read_meta(folder: Path) -> Meta:

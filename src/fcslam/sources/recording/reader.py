@@ -29,7 +29,7 @@ from fcslam.runs import read_tum
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import ScanGate, refuse_misfits, window
 from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
-from fcslam.sources.overview import Track
+from fcslam.sources.logs.overview import Track
 from fcslam.sources.pose import pose_array
 from fcslam.sources.recording.frames import Frame, frame_count, merged_frames
 from fcslam.sources.recording.layout import (

@@ -1,0 +1,79 @@
+"""Every closure decided anew from all evidence: what a joint map rests on, and what has to go."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from fcslam.cloud.closure_log import ClosureLedger, Entry
+from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.result import Fusion
+from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.joint import HOLDS, JointEvidence, JointSolution, solve_jointly
+from fcslam.records import ClosureStatus, FloatArray, frozen
+
+CONTRADICTS = "contradicts the joint graph"
+VETOED = "vetoed by hand"
+
+
+def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> Fusion:
+    """Solve from the evidence alone; the graph takes the poses over, every entry learns its status.
+
+    No earlier estimate, join or verdict plays a part: what joined two maps once and is outvoted now is revoked.
+    """
+    entries = [entry for entry in ledger if entry.closure.status is not ClosureStatus.CANDIDATE]
+    _enter(graph, (entry for entry in entries if entry.edge is None))
+    solution = solve_jointly(_evidence(graph, entries), settings)
+    graph.take(solution.poses)
+    robots = list(graph.robots())
+    reasons = _reasons(solution, robots)
+    maps = dict(zip(robots, solution.maps, strict=True))
+    for entry in entries:
+        assert entry.edge is not None
+        pair = frozenset((entry.closure.i.robot, entry.closure.j.robot))
+        apart = len({maps[robot] for robot in pair}) > 1
+        _decide(entry, bool(solution.weights[entry.edge] > HOLDS), reasons.get(pair, CONTRADICTS) if apart else "")
+        graph.count(entry.edge, holds=entry.closure.status is ClosureStatus.ACCEPTED)
+    members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
+    T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
+    T_local_base = dict(zip(robots, solution.own, strict=True))
+    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in ledger))
+
+
+def _enter(graph: JointGraph, entries: Iterable[Entry]) -> None:
+    """Give closures that nothing rested on so far an edge, which counts for nothing yet."""
+    for entry in entries:
+        closure = entry.closure
+        entry.edge = graph.close(closure.i, closure.j, closure.T_i_j, closure.information)
+        graph.count(entry.edge, holds=False)
+
+
+def _evidence(graph: JointGraph, entries: list[Entry]) -> JointEvidence:
+    count = len(graph.graph.edges)
+    informative, independent, vetoed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
+    for entry in entries:
+        informative[entry.edge] = entry.closure.informative
+        independent[entry.edge] = entry.independent
+        vetoed[entry.edge] = entry.vetoed
+    return JointEvidence(graph.graph, tuple(graph.robots().values()), informative, independent, vetoed)
+
+
+def _decide(entry: Entry, holds: bool, apart: str) -> None:
+    """The entry's status; ``apart`` says why its robots share no map, if they do not."""
+    accepted_before = entry.closure.status is ClosureStatus.ACCEPTED
+    if entry.vetoed:
+        entry.set(ClosureStatus.REVOKED, VETOED)
+    elif holds:
+        entry.set(ClosureStatus.ACCEPTED, entry.closure.reason if accepted_before else "fits the joint graph")
+    elif accepted_before or entry.closure.status is ClosureStatus.REVOKED:
+        entry.set(ClosureStatus.REVOKED, apart or CONTRADICTS)
+    else:
+        entry.set(ClosureStatus.REJECTED, apart or CONTRADICTS)
+
+
+def _reasons(solution: JointSolution, robots: list[str]) -> dict[frozenset[str], str]:
+    """Why the cluster of two robots is not enough, where it is not."""
+    return {
+        frozenset((robots[link.a], robots[link.b])): link.verdict.reason
+        for link in solution.links
+        if link.verdict.reason
+    }

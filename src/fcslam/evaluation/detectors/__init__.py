@@ -1,0 +1,1 @@
+"""Keypoint detectors on scenes with known homographies."""

@@ -1,0 +1,1 @@
+"""Central, federated and local training compared."""

@@ -1,0 +1,108 @@
+"""What a study of federated training found: gaps to central training, with intervals, and the robot worst off."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fcslam.errors import OutputError
+from fcslam.evaluation.federated.arms import ALONE, CENTRAL, LOCAL
+from fcslam.evaluation.federated.pairs import MEASURES
+from fcslam.evaluation.federated.study import Findings
+from fcslam.metrics.bootstrap import Interval, mean_interval
+from fcslam.records import FloatArray
+
+COLUMNS: Final = (
+    "measure", "arm", "mean", "gap", "low", "high", "closed", "closed_alone", "worst_robot", "worst_gap", "seeds",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ArmReport:
+    """One arm by one measure."""
+
+    arm: str
+    measure: str
+    mean: float
+    gap: Interval
+    """Central, or what else it is compared to, minus this arm on the same pairs and seeds, means over seeds first: the
+    paired bootstrap interval."""
+    closed: float
+    """(arm - local) / (central - local); NaN where central is not clearly better than local, or local is unknown."""
+    closed_alone: float
+    """The same with robots that train alone for no longer than in the fleet."""
+    worst_robot: str
+    worst_gap: float
+    """The gap on that robot's pairs."""
+    seeds: tuple[float, ...]
+    """The mean of each seed."""
+
+
+def report(findings: Findings, seed: int = 1, against: str = CENTRAL) -> list[ArmReport]:
+    """Every arm by every measure, compared to the arm ``against``, which has no fewer seeds than any."""
+    return [
+        _report(findings, arm, index, against, np.random.default_rng(seed))
+        for index in range(len(MEASURES))
+        for arm in findings.measured
+    ]
+
+
+def write_report(reports: list[ArmReport], path: Path) -> None:
+    """As a CSV file.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            rows = csv.writer(file, lineterminator="\n")
+            rows.writerow(COLUMNS)
+            for each in reports:
+                numbers = (each.mean, *each.gap, each.closed, each.closed_alone)
+                seeds = " ".join(f"{mean:.4f}" for mean in each.seeds)
+                cells = [f"{number:.4f}" for number in numbers]
+                rows.writerow((each.measure, each.arm, *cells, each.worst_robot, f"{each.worst_gap:.4f}", seeds))
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error})") from error
+
+
+def _report(findings: Findings, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
+    seeds = len(findings.measured[arm])
+    values, reference, central = (_by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL))
+    gap = mean_interval(reference - values, rng)
+    closed, closed_alone = (
+        _closed(values, _by_pair(findings.measured[own][:seeds], index), central, rng)
+        if own in findings.measured
+        else np.nan
+        for own in (LOCAL, ALONE)
+    )
+    owners = np.array(findings.owners)
+    gaps = [float(np.nanmean((reference - values)[owners == robot])) for robot in range(len(findings.robots))]
+    worst = int(np.argmax(gaps))
+    return ArmReport(
+        arm=arm,
+        measure=MEASURES[index],
+        mean=float(np.nanmean(values)),
+        gap=gap,
+        closed=closed,
+        closed_alone=closed_alone,
+        worst_robot=findings.robots[worst],
+        worst_gap=gaps[worst],
+        seeds=tuple(float(np.nanmean(each[..., index])) for each in findings.measured[arm]),
+    )
+
+
+def _closed(values: FloatArray, low: FloatArray, high: FloatArray, rng: np.random.Generator) -> float:
+    gain = mean_interval(high - low, rng)
+    return float(np.nanmean(values - low)) / gain.mean if gain.low > 0.0 else np.nan
+
+
+def _by_pair(measured: FloatArray, index: int) -> FloatArray:
+    """One measure of every pair, mean over seeds and networks, shape (pairs,); NaN where it is not known."""
+    values = measured[..., index]
+    known = np.isfinite(values)
+    counts = known.sum(axis=(0, 1))
+    sums = np.where(known, values, 0.0).sum(axis=(0, 1))
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)

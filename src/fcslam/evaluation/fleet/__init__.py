@@ -1,0 +1,1 @@
+"""Runs against the ground truth, and pictures of them."""

@@ -1,0 +1,119 @@
+"""A run's closures against the truth: by channel, by stage, within robots and between them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from fcslam.evaluation.fleet.closures import STAGES, Within, closure_rows, closure_sets
+from fcslam.evaluation.fleet.ground_truth import KnownPoses
+from fcslam.metrics.closures import (
+    ClosureCriteria,
+    ClosureErrors,
+    Mask,
+    PlacedReference,
+    Precision,
+    Recall,
+    Rows,
+    closure_errors,
+    precision,
+)
+from fcslam.metrics.relations import PoseTable
+from fcslam.metrics.revisits import RevisitCriteria, Revisits, find_revisits
+from fcslam.records import Channel, ClosureStatus, FloatArray
+from fcslam.runs import Run
+
+BOTH = "both"
+CHANNELS: Mapping[str, frozenset[Channel]] = MappingProxyType(
+    {**{str(channel): frozenset({channel}) for channel in Channel}, BOTH: frozenset(Channel)}
+)
+"""Each channel alone, and both together."""
+
+LIKE_HEADING_DEG = 45.0
+"""Headings that differ by less let cameras of usual width see the same things."""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetClosureScore:
+    """What the truth says of one set of closures."""
+
+    precision: Precision
+    recall: Recall
+    """Of all revisits."""
+    recall_like_heading: Recall
+    """Of the revisits with like headings."""
+    recall_full_precision: Recall
+    """Of all revisits, by those closures alone that are more similar than every wrong one of their channel."""
+
+
+FleetClosures = Mapping[tuple[Within, ClosureStatus, str], FleetClosureScore]
+"""Scores by kind, stage and name in ``CHANNELS``."""
+
+
+def score_closures(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> FleetClosures:
+    """Scores of all sets of closures; one with an end at which the truth is not known is not covered."""
+    judged, sets = _judge(run, known, criteria), closure_sets(run)
+    scores = {}
+    for within in Within:
+        asked = RevisitCriteria(within_gap_s=criteria.within_gap_s)
+        across = within is Within.FLEET
+        revisits = find_revisits(known.truth, asked, across)
+        alike = find_revisits(known.truth, replace(asked, turn_deg=LIKE_HEADING_DEG), across)
+        for status in STAGES:
+            for name, channels in CHANNELS.items():
+                scores[within, status, name] = judged.score(sets[within, status], channels, revisits, alike)
+    return MappingProxyType(scores)
+
+
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """All closures with what the truth says of them; rows are those of the known poses."""
+
+    truth: PoseTable
+    criteria: ClosureCriteria
+    pairs: Rows
+    """Shape (K, 2)."""
+    errors: ClosureErrors
+    similarity: FloatArray
+    """Shape (K,)."""
+    of_channel: Mapping[Channel, Mask]
+    """Shape (K,) each."""
+
+    def score(
+        self, stage: Mask, channels: frozenset[Channel], revisits: Revisits, alike: Revisits
+    ) -> FleetClosureScore:
+        """Of the closures of some channels for which ``stage``, shape (K,), holds."""
+        sets = [stage & self.of_channel[channel] for channel in channels]
+        members: Mask = np.logical_or.reduce(sets)
+        surest: Mask = np.logical_or.reduce([self._at_full_precision(channel_set) for channel_set in sets])
+        return FleetClosureScore(
+            precision(self.errors, members, self.criteria),
+            self._recall(members, revisits),
+            self._recall(members, alike),
+            self._recall(surest, revisits),
+        )
+
+    def _recall(self, members: Mask, revisits: Revisits) -> Recall:
+        correct = self.pairs[members & self.errors.correct(self.criteria)]
+        return revisits.recall(correct, self.truth, self.criteria.reach_m)
+
+    def _at_full_precision(self, members: Mask) -> Mask:
+        """The members that are more similar than every wrong one among them."""
+        wrong = members & self.errors.covered & ~self.errors.correct(self.criteria)
+        surer: Mask = members & (self.similarity > np.max(self.similarity[wrong], initial=-np.inf))
+        return surer
+
+
+def _judge(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> _Judged:
+    truth = known.truth
+    pairs = closure_rows(run, truth)
+    T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
+    every_row, one_frame = np.arange(len(truth.stamps)), np.zeros(len(truth.stamps), dtype=np.int64)
+    # Closures end at stamps at which the truth is known: nothing has to be bridged by what the run believes.
+    reference = PlacedReference(truth, 0.0, every_row, truth.T_map_base, one_frame)
+    return _Judged(
+        truth, criteria, pairs, closure_errors(pairs, T_i_j, truth, reference),
+        np.array([closure.similarity for closure in run.closures]),
+        {channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in Channel},
+    )  # fmt: skip

@@ -1,0 +1,239 @@
+"""Precision and recall of a run's closures, stage by stage, against the optimised graph of reference relations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.errors import EvaluationError
+from fcslam.evaluation.fleet.relation_graph import RelationGraph, build_relation_graph
+from fcslam.evaluation.fleet.relations import pose_table
+from fcslam.metrics.closures import (
+    ClosureCriteria,
+    ClosureErrors,
+    Mask,
+    PlacedReference,
+    Precision,
+    Recall,
+    Rows,
+    SingleRelations,
+    closure_errors,
+    precision,
+    revisits_found,
+)
+from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, PoseTable, read_relations
+from fcslam.records import ClosureStatus, FloatArray
+from fcslam.runs import Metric, Run, open_run
+
+STAGES: Mapping[ClosureStatus, frozenset[ClosureStatus]] = {
+    ClosureStatus.CANDIDATE: frozenset(ClosureStatus),
+    ClosureStatus.VERIFIED: frozenset(ClosureStatus) - {ClosureStatus.CANDIDATE},
+    ClosureStatus.ACCEPTED: frozenset({ClosureStatus.ACCEPTED}),
+}
+"""By which last status a closure has passed a stage. What was rejected or revoked was verified before; what was revoked
+was accepted once or vetoed by hand: the graph does without it."""
+
+TURNED_DOWN = (ClosureStatus.REJECTED, ClosureStatus.REVOKED)
+"""Shown beside the stages."""
+
+
+class Within(StrEnum):
+    """Whether a closure ties two moments of one robot or two robots."""
+
+    ROBOT = "intra_robot"
+    FLEET = "inter_robot"
+
+
+@dataclass(frozen=True, slots=True)
+class ClosureScore:
+    """What the reference says of one set of closures."""
+
+    graph: Precision
+    """Against the optimised graph of the relations."""
+    single: Precision
+    """Against one relation each, the one whose stamps lie nearest."""
+    recall: Recall | None
+    """None for what was turned down."""
+    chain: tuple[float, float]
+    """Median and maximum of the relations that lead from one end to the other; NaN for none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClosureReport:
+    """A run's closures against a file of relations."""
+
+    scores: Mapping[tuple[Within, ClosureStatus], ClosureScore]
+    relations: RelationGraph
+    stamps_in_run: int
+    """Of the relations' stamps, those at which the run has a pose of a robot."""
+
+
+def evaluate_closures(run: Path, relations: Path, criteria: ClosureCriteria) -> ClosureReport:
+    """Precision and recall of the closures in the run folder ``run`` against the file ``relations``.
+
+    Raises:
+        EvaluationError: one of them cannot be read, or no relation names a stamp of the run.
+    """
+    graph = build_relation_graph(read_relations(relations))
+    opened = open_run(run)
+    poses = pose_table(opened)
+    node_rows = poses.find(graph.stamps)
+    if not np.any(node_rows >= 0):
+        raise EvaluationError(f"{relations}: no relation names a stamp of {run}; are they of the same recording?")
+    evidence = _gather(opened, poses, graph, node_rows, criteria)
+    scores = {
+        (within, status): evidence.score(members, within, status in STAGES)
+        for (within, status), members in closure_sets(opened).items()
+    }
+    return ClosureReport(scores, graph, int(np.sum(node_rows >= 0)))
+
+
+def closure_rows(run: Run, poses: PoseTable) -> Rows:
+    """Rows of both keyscans of each closure in the run's pose table, shape (K, 2); -1 where it cannot be told which."""
+    robots = {trajectory.robot: number for number, trajectory in enumerate(run.trajectories)}
+    rows = np.full((len(run.closures), 2), -1, dtype=np.int64)
+    for end, names, stamps in (
+        (0, [c.robot_i for c in run.closures], [c.stamp_i for c in run.closures]),
+        (1, [c.robot_j for c in run.closures], [c.stamp_j for c in run.closures]),
+    ):
+        numbers = np.array([robots.get(name, -1) for name in names], dtype=np.int64)
+        for number in np.unique(numbers[numbers >= 0]):
+            of_robot = np.flatnonzero(poses.robots == number)
+            table = PoseTable.of(poses.stamps[of_robot], poses.T_map_base[of_robot])
+            asked = np.flatnonzero(numbers == number)
+            found = table.find(np.array(stamps)[asked])
+            rows[asked, end] = np.where(found >= 0, of_robot[found], -1)
+    return rows
+
+
+def closure_metrics(report: ClosureReport) -> tuple[Metric, ...]:
+    """The report as named numbers."""
+    graph = report.relations
+    sizes = graph.component_sizes
+    metrics = [
+        Metric("relations", len(graph.relations), "1"),
+        Metric("relations_contradicted", int(np.sum(~graph.holds)), "1"),
+        Metric("relation_residual_translation_median", _quantile(graph.residual_m, 0.5), "m"),
+        Metric("relation_residual_translation_max", _quantile(graph.residual_m, 1.0), "m"),
+        Metric("relation_residual_rotation_median", _quantile(graph.residual_deg, 0.5), "deg"),
+        Metric("relation_residual_rotation_max", _quantile(graph.residual_deg, 1.0), "deg"),
+        Metric("relation_stamps", len(graph.stamps), "1"),
+        Metric("relation_stamps_in_run", report.stamps_in_run, "1"),
+        Metric("relation_components", len(sizes), "1"),
+        Metric("relation_stamps_in_largest_component", int(sizes.max(initial=0)), "1"),
+    ]
+    for (within, status), score in report.scores.items():
+        name = f"{within}_{status}"
+        metrics += _precision_metrics(name, score.graph)
+        if score.recall is not None:
+            metrics.append(Metric(f"{name}_revisits", score.recall.revisits, "1"))
+            metrics.append(Metric(f"{name}_revisits_found", score.recall.found, "1"))
+            metrics.append(Metric(f"{name}_recall", score.recall.recall, "1"))
+        metrics.append(Metric(f"{name}_chain_median", score.chain[0], "relations"))
+        metrics.append(Metric(f"{name}_chain_max", score.chain[1], "relations"))
+        metrics += _precision_metrics(f"{name}_single_relation", score.single)
+    return tuple(metrics)
+
+
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """What is known of all closures together."""
+
+    poses: PoseTable
+    criteria: ClosureCriteria
+    pairs: Rows
+    """Of the closures, shape (K, 2)."""
+    by_graph: ClosureErrors
+    by_one: ClosureErrors
+    chains: FloatArray
+    """Relations from one end of each closure to the other, shape (K,); NaN where none lead there."""
+    revisits: Rows
+    """Pairs of rows that the relations name, shape (R, 2)."""
+
+    def score(self, members: Mask, within: Within, is_stage: bool) -> ClosureScore:
+        """Of the closures for which ``members``, shape (K,), holds."""
+        covered = self.chains[members & self.by_graph.covered]
+        return ClosureScore(
+            precision(self.by_graph, members, self.criteria),
+            precision(self.by_one, members, self.criteria),
+            self._recall(members, within) if is_stage else None,
+            (_quantile(covered, 0.5), _quantile(covered, 1.0)),
+        )
+
+    def _recall(self, members: Mask, within: Within) -> Recall:
+        first, second = self.poses.robots[self.revisits].T
+        revisits = self.revisits[(first == second) == (within is Within.ROBOT)]
+        correct = self.pairs[members & self.by_graph.correct(self.criteria)]
+        found = revisits_found(revisits, correct, self.poses, self.criteria.reach_m)
+        return Recall(len(revisits), int(found.sum()))
+
+
+def _gather(run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows, criteria: ClosureCriteria) -> _Evidence:
+    pairs = closure_rows(run, poses)
+    T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
+    ends = node_rows[graph.ends]
+    usable = np.all(ends >= 0, axis=1) & graph.holds
+    placed = _placed_reference(graph, node_rows, poses, criteria.bridge_s)
+    single = SingleRelations(poses, criteria.bridge_s, ends[usable], graph.relations.T_1_2[usable])
+    by_graph = closure_errors(pairs, T_i_j, poses, placed)
+    return _Evidence(
+        poses, criteria, pairs, by_graph, closure_errors(pairs, T_i_j, poses, single),
+        _chains(graph, node_rows, by_graph), ends[usable & _is_revisit(ends, graph.relations.stamps, poses, criteria)],
+    )  # fmt: skip
+
+
+def _placed_reference(graph: RelationGraph, node_rows: Rows, poses: PoseTable, bridge_s: float) -> PlacedReference:
+    """The graph's poses at which the run has one, too."""
+    known = np.flatnonzero(node_rows >= 0)
+    return PlacedReference(poses, bridge_s, node_rows[known], graph.T_component_base[known], graph.components[known])
+
+
+def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable, criteria: ClosureCriteria) -> Mask:
+    """Which relations join two visits, not two moments of one: shape (R,), for rows and stamps (R, 2)."""
+    across = poses.robots[ends[:, 0]] != poses.robots[ends[:, 1]]
+    least_s = np.where(across, ACROSS_ROBOTS_GAP_S, criteria.within_gap_s)
+    longer: Mask = np.abs(stamps[:, 1] - stamps[:, 0]) > least_s
+    return longer
+
+
+def closure_sets(run: Run) -> dict[tuple[Within, ClosureStatus], Mask]:
+    """The closures of each stage, and those turned down, as masks (K,)."""
+    between = np.array([c.robot_i != c.robot_j for c in run.closures], dtype=np.bool_)
+    sets: dict[tuple[Within, ClosureStatus], Mask] = {}
+    for within, kind in ((Within.ROBOT, ~between), (Within.FLEET, between)):
+        for status in (*STAGES, *TURNED_DOWN):
+            passed = STAGES.get(status, {status})
+            sets[within, status] = kind & np.array([c.status in passed for c in run.closures], dtype=np.bool_)
+    return sets
+
+
+def _chains(graph: RelationGraph, node_rows: Rows, errors: ClosureErrors) -> FloatArray:
+    """Relations from one end of each closure to the other, shape (K,); NaN where the graph covers it not."""
+    number_of = {row: number for number, row in enumerate(node_rows.tolist()) if row >= 0}
+    covered = errors.covered
+    pairs = np.array([(number_of[a], number_of[b]) for a, b in errors.ends[covered].tolist()], dtype=np.int64)
+    chains = np.full(len(covered), np.nan)
+    chains[covered] = graph.chain_lengths(pairs.reshape(-1, 2))
+    return chains
+
+
+def _precision_metrics(name: str, found: Precision) -> list[Metric]:
+    return [
+        Metric(f"{name}_closures", found.closures, "1"),
+        Metric(f"{name}_covered", found.covered, "1"),
+        Metric(f"{name}_coverage", found.coverage, "1"),
+        Metric(f"{name}_wrong", found.wrong, "1"),
+        Metric(f"{name}_precision", found.precision, "1"),
+        Metric(f"{name}_translation_error_median", found.translation_m[0], "m"),
+        Metric(f"{name}_translation_error_max", found.translation_m[1], "m"),
+        Metric(f"{name}_rotation_error_median", found.rotation_deg[0], "deg"),
+        Metric(f"{name}_rotation_error_max", found.rotation_deg[1], "deg"),
+    ]
+
+
+def _quantile(values: FloatArray, share: float) -> float:
+    """Quantile of the values that are numbers; NaN of none."""
+    finite = values[np.isfinite(values)]
+    return float(np.quantile(finite, share)) if len(finite) else np.nan

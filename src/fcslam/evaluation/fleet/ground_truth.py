@@ -1,0 +1,114 @@
+"""The truth of a simulated fleet, or one measured from outside: where robots really were, and the true map.
+
+Truth of a robot is a TUM file, `<folder>/<robot>/ground_truth.tum` or `<folder>/<robot>.tum`; the true map is
+`<folder>/ground_truth/map.yaml`, as ROS map_server writes it. All of it is in one coordinate frame.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from fcslam.errors import EvaluationError
+from fcslam.evaluation.fleet.relations import pose_table
+from fcslam.metrics.grid import LabelledGrid
+from fcslam.metrics.relations import PoseTable
+from fcslam.metrics.trajectory import interpolate
+from fcslam.records import FloatArray, frozen
+from fcslam.runs import RobotTrajectory, Run, read_tum
+
+GAP_S = 0.25
+"""Between true poses further apart in time nothing is interpolated."""
+
+LEAST_COVERED = 0.5
+"""Of a robot's scans. With fewer the truth is probably that of another recording."""
+
+TRUE_MAP = Path("ground_truth", "map.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class KnownPoses:
+    """A run's poses at which the truth is known, row by row."""
+
+    estimate: PoseTable
+    truth: PoseTable
+    """The same rows; its poses are in the frame of the truth, which counts as one map."""
+
+
+def truth_folder(run: Path, named: Path | None) -> Path:
+    """Where to look for the truth of the run folder ``run``: what was named, recordings beside it, or its parent.
+
+    Raises:
+        EvaluationError: there is no such folder.
+    """
+    beside = run.resolve().parent / "recordings"
+    folder = named or (beside if beside.is_dir() else run.resolve().parent)
+    if not folder.is_dir():
+        raise EvaluationError(f"{folder}: no folder with the truth; name one with --truth")
+    return folder
+
+
+def known_poses(run: Run, folder: Path) -> KnownPoses:
+    """The run's poses with the truth at their stamps.
+
+    Raises:
+        EvaluationError: a robot has no truth in ``folder``, it cannot be read, or it is not that of the robot's scans.
+    """
+    if not run.trajectories:
+        raise EvaluationError("the run has no robot, so there is nothing to compare with the truth")
+    estimate = pose_table(run)
+    true = np.empty_like(estimate.T_map_base)
+    for number, trajectory in enumerate(run.trajectories):
+        rows = estimate.robots == number
+        true[rows] = _true_poses(trajectory, estimate.stamps[rows], folder)
+    known = np.isfinite(true[:, 0])
+    stamps, robots = estimate.stamps[known], estimate.robots[known]
+    return KnownPoses(
+        PoseTable.of(stamps, estimate.T_map_base[known], robots, estimate.maps[known]),
+        PoseTable.of(stamps, true[known], robots),
+    )
+
+
+def read_grid(path: Path) -> LabelledGrid:
+    """A map that ROS map_server can read, from its YAML file.
+
+    Raises:
+        EvaluationError: one of the two files is missing, broken, or says what no map can be.
+    """
+    try:
+        meta = yaml.safe_load(path.read_text(encoding="utf-8"))
+        pixels = cv2.imdecode(np.fromfile(path.parent / meta["image"], dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+        if pixels is None:
+            raise ValueError(f"{meta['image']} is no image")
+        resolution_m, origin = float(meta["resolution"]), np.array(meta["origin"], dtype=np.float64)
+        occupied_over, free_under = float(meta["occupied_thresh"]), float(meta["free_thresh"])
+        if not (resolution_m > 0.0 and origin.shape == (3,) and np.isfinite(origin).all()):
+            raise ValueError("resolution or origin is wrong")
+    except (OSError, ValueError, TypeError, KeyError, cv2.error, yaml.YAMLError) as error:
+        raise EvaluationError(f"{path}: not a map of ROS map_server ({error!r})") from error
+    occupancy = (pixels if meta.get("negate") else 255 - pixels)[::-1] / 255.0
+    return LabelledGrid(occupancy > occupied_over, occupancy < free_under, resolution_m, frozen(origin))
+
+
+def _true_poses(trajectory: RobotTrajectory, stamps: FloatArray, folder: Path) -> FloatArray:
+    """Shape (N, 3), NaN where it is not known."""
+    places = folder / trajectory.robot / "ground_truth.tum", folder / f"{trajectory.robot}.tum"
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        raise EvaluationError(
+            f"{folder}: no truth of '{trajectory.robot}', neither {places[0].relative_to(folder)} nor "
+            f"{places[1].name}; name the folder that has it with --truth"
+        )
+    known, poses = read_tum(path)
+    if not len(known):
+        raise EvaluationError(f"{path}: empty, so where '{trajectory.robot}' was is not known")
+    true = interpolate(known, poses, stamps, GAP_S)
+    covered = int(np.isfinite(true[:, 0]).sum())
+    if covered < max(LEAST_COVERED * len(stamps), 1):
+        raise EvaluationError(
+            f"{path}: has poses at only {covered} of the {len(stamps)} scans of '{trajectory.robot}'; "
+            "is it the truth of another recording?"
+        )
+    return true

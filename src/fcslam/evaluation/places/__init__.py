@@ -1,0 +1,1 @@
+"""Place recognition on images and LiDAR recordings."""

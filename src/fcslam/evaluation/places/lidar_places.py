@@ -1,0 +1,79 @@
+"""LiDAR places of one robot's recording, as its frontend describes them, with the truth by its own corrected poses.
+
+Online, as in a fleet of one. Corrected poses are right to centimetres where reference relations judge them, which is
+nothing to the metre that a match may be off.
+"""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.settings import FleetConfig
+from fcslam.errors import EvaluationError
+from fcslam.evaluation.places.scoring import DescribedSet, PlaceFeatures
+from fcslam.evaluation.places.sets import PlaceSet
+from fcslam.features.codes import mutual_matches
+from fcslam.lidar.lost import LostConfig
+from fcslam.metrics.retrieval import PairTruth
+from fcslam.places.hypotheses import HypothesisConfig, propose
+from fcslam.places.motions import MotionConfig
+from fcslam.places.sequence import long_before
+from fcslam.records import Channel, FloatArray, Keyscan, Place
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.sources import open_source
+from fcslam.wire.messages import Packet
+from fcslam.wire.packets import encode
+
+SAME_M: Final = 1.0
+OTHER_M: Final = 10.0
+"""Submaps that are nearer show much of the same."""
+REVISIT_S: Final = 60.0
+"""Places that were described less long ago are not asked for."""
+
+
+def describe_recording(recording: Path) -> DescribedSet:
+    """Every LiDAR place of a recording. Match: within 1 m; different: more than 10 m away; both at least 60 s before.
+
+    Raises:
+        SourceError: the recording cannot be read.
+        EvaluationError: it has no two places.
+    """
+    source = open_source(recording)
+    config = RobotConfig(channels=(Channel.LIDAR,), lost=LostConfig(doubted=0.0))  # one session, whatever happens
+    robot = RobotFrontend(source.name, config)
+    packets: list[Packet] = []
+    for record in source.records():
+        packets += robot.process(record)
+    packets += robot.finish()
+    places = [packet.body for packet in packets if isinstance(packet.body, Place)]
+    if len(places) < 2:
+        raise EvaluationError(f"{recording}: nothing to compare, {len(places)} place in it; give a longer recording")
+    stamps = {packet.body.id: packet.body.stamp for packet in packets if isinstance(packet.body, Keyscan)}
+    poses = _corrected(packets)[[place.id.number for place in places]]
+
+    apart_m = np.linalg.norm(poses[:, None, :2] - poses[:, :2], axis=2)
+    seen = np.array([stamps[place.id] for place in places])
+    admitted = long_before(seen, REVISIT_S)
+    truth = PairTruth(admitted & (apart_m <= SAME_M), admitted & (apart_m > OTHER_M))
+    names = tuple(Path(source.name, str(place.id.number)) for place in places)
+    features = [PlaceFeatures(place.keypoints, place.descriptors) for place in places]
+    return DescribedSet(
+        PlaceSet(source.name, names, names, admitted, {"revisits": truth}), features, features, agreeing_in_plane
+    )
+
+
+def agreeing_in_plane(a: PlaceFeatures, b: PlaceFeatures) -> int:
+    """The most matches of two LiDAR places that one rigid motion explains."""
+    matches = mutual_matches(a.descriptors, b.descriptors, MotionConfig().hamming_limit)
+    found = propose(a.positions, b.positions, matches, HypothesisConfig())
+    return found[0].inlier_count if found else 0
+
+
+def _corrected(packets: list[Packet]) -> FloatArray:
+    """Of every keyscan, after all closures, shape (N, 3)."""
+    cloud = Fleet(FleetConfig(join_maps=False), 0)
+    for packet in packets:
+        cloud.receive(encode(packet))
+    return cloud.finalize().robots[0].T_map_base

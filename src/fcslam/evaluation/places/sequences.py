@@ -1,0 +1,39 @@
+"""What a stream's own order adds to the similarities of its places, whoever computed them."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from fcslam.evaluation.places.scoring import DescribedSet, Scorer
+from fcslam.places.sequence import along_the_way, in_a_row, normalised_by_previous
+from fcslam.records import FloatArray
+
+PLACES: Final = 3
+"""Consecutive places that have to agree, as in DLoopDetector."""
+REACH: Final = 1
+"""Stored places by which a step of the query's way may differ from theirs."""
+
+
+def plain(described: DescribedSet, scorer: Scorer) -> Mapping[str, FloatArray]:
+    """The similarities (Q, G) as they are, under an empty name."""
+    return {"": scorer(described)}
+
+
+def in_sequence(described: DescribedSet, scorer: Scorer) -> Mapping[str, FloatArray]:
+    """The similarities (Q, G) as they are, and, of a stream, what its order makes of them, by name."""
+    place_set = described.place_set
+    if not place_set.is_online:
+        return plain(described, scorer)
+    previous = np.eye(len(place_set.queries), k=-1, dtype=np.bool_)
+    asked = scorer(replace(described, place_set=replace(place_set, admitted=place_set.admitted | previous)))
+    similarity = np.where(place_set.admitted, asked, 0.0)
+    shares = normalised_by_previous(similarity, asked.sum(axis=1, where=previous))
+    return {
+        "": similarity,
+        "NSS": shares,
+        f"{PLACES} in a row": in_a_row(similarity, PLACES, REACH),
+        f"along {PLACES}": along_the_way(similarity, PLACES, REACH),
+        f"NSS along {PLACES}": along_the_way(shares, PLACES, REACH),
+    }

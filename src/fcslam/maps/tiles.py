@@ -1,0 +1,60 @@
+"""Squares of a map, for viewers that show parts of it."""
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from fastapi import HTTPException
+from fastapi.responses import Response
+from numpy.typing import NDArray
+
+from fcslam.runs.map_files import PIXELS, Occupancy
+
+WORLD_M = 256.0
+"""Side of a tile at zoom 0; each zoom halves it."""
+TILE_PX = 256
+DEEPEST_ZOOM = 8
+
+
+def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> Response:
+    """The tile whose lower left corner lies at (column, row) * side; unknown where the map ends.
+
+    Refuses (HTTPException 404): there is no such map.
+    """
+    if not (folder / f"{stem}.pgm").is_file():
+        raise HTTPException(404, f"there is no {stem}")
+    pixels, resolution_m, origin = _grid(folder, stem)
+    side_m = WORLD_M / 2**zoom
+    canvas = np.full((TILE_PX, TILE_PX), PIXELS[Occupancy.UNKNOWN], np.uint8)
+    # first and one past the last cell in the tile, per axis (x, y)
+    corner = np.array((column, row)) * side_m - origin
+    low = np.clip(np.floor(corner / resolution_m), 0, pixels.shape[::-1]).astype(int)
+    high = np.clip(np.ceil((corner + side_m) / resolution_m), 0, pixels.shape[::-1]).astype(int)
+    scale = TILE_PX / side_m
+    left, bottom = np.rint((low * resolution_m - corner) * scale).astype(int)
+    right, top = np.rint((high * resolution_m - corner) * scale).astype(int)
+    if right > left and top > bottom:
+        cells = pixels[low[1] : high[1], low[0] : high[0]]
+        shrinks = cells.shape[0] > top - bottom
+        drawn = cv2.resize(
+            cells, (int(right - left), int(top - bottom)),
+            interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST,
+        )  # fmt: skip
+        inside = (slice(max(bottom, 0), min(top, TILE_PX)), slice(max(left, 0), min(right, TILE_PX)))
+        canvas[inside] = drawn[
+            inside[0].start - bottom : inside[0].stop - bottom, inside[1].start - left : inside[1].stop - left
+        ]
+    return Response(bytes(cv2.imencode(".png", canvas[::-1])[1]), media_type="image/png")
+
+
+@lru_cache(maxsize=8)
+def _grid(folder: Path, stem: str) -> tuple[NDArray[np.uint8], float, NDArray[np.float64]]:
+    """Pixels with row 0 at the lowest y, side of a cell, lower left corner (2,). A snapshot never changes."""
+    data = (folder / f"{stem}.pgm").read_bytes()
+    _, size, _, cells = data.split(b"\n", 3)
+    width, height = map(int, size.split())
+    told = yaml.safe_load((folder / f"{stem}.yaml").read_text(encoding="utf-8"))
+    pixels = np.frombuffer(cells, np.uint8).reshape(height, width)[::-1]
+    return pixels, float(told["resolution"]), np.array(told["origin"][:2], dtype=np.float64)

@@ -1,0 +1,164 @@
+"""The run folder: what a mission leaves behind. Writer and reader stand side by side.
+
+    trajectories/<robot>.tum   stamp x y z qx qy qz qw: pose of base in the robot's map at every laser scan
+    robots.csv                 robot, map, path_length_m, scans
+    closures.csv               every loop closure considered, with its status and reason
+    pose_graph.g2o             the optimised pose graph
+    metrics.json               [{name, value, unit}]
+    config.yaml                the complete configuration of the run
+    map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
+    local/<robot>.tum          as trajectories/, in the robot's own map, which nothing but its own measurements made
+    local/<robot>.pgm, .yaml   that map
+
+A run folder is whole or not there: it is written into a hidden folder beside its place and renamed at the end.
+"""
+
+import csv
+import os
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from fcslam.errors import EvaluationError, OutputError
+from fcslam.runs.records import LocalMap, RobotTrajectory, Run
+from fcslam.runs.tables import (
+    metrics_json,
+    read_closures,
+    read_metrics,
+    read_robots,
+    write_closures,
+    write_robots,
+)
+from fcslam.runs.trajectories import read_tum, write_tum
+from fcslam.storage.files import replacing_folder
+
+TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
+METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
+
+_SAFE_NAME = re.compile(r"\w[\w.+-]*")
+
+
+def prepare_output(path: Path, force: bool = False) -> Path:
+    """Check, before the long work, that a run folder can be put at ``path``; its parents are made.
+
+    Raises:
+        OutputError: something else is there, a run is there and ``force`` is not given, or it cannot be written.
+    """
+    place = path.resolve()
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        occupied = place.exists() and (not place.is_dir() or any(place.iterdir()))
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be used as the output folder ({error})") from error
+    if not os.access(place.parent, os.W_OK):
+        raise OutputError(f"{path}: no permission to write in {place.parent}")
+    if place == Path.cwd() or os.path.ismount(place):
+        raise OutputError(f"{path}: cannot be replaced as a whole; name a new folder inside it")
+    if occupied and not (place.is_dir() and is_run_folder(place)):
+        raise OutputError(f"{path}: exists and is no run folder; name a new folder")
+    if occupied and not force:
+        raise OutputError(f"{path}: already holds a run; name a new folder or give --force to replace it")
+    return place
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Check, before the long work, that robots' names can be file names.
+
+    Raises:
+        OutputError: one cannot.
+    """
+    for name in names:
+        if not _SAFE_NAME.fullmatch(name):
+            raise OutputError(f"{name!r} cannot be a file name; use letters, digits, '_', '-', '+' and '.'")
+
+
+def is_run_folder(path: Path) -> bool:
+    """Whether ``path`` has the two entries that every run folder has."""
+    return (path / ROBOTS).is_file() and (path / TRAJECTORIES).is_dir()
+
+
+def write_run(run: Run, path: Path, force: bool = False) -> None:
+    """Write ``run`` as the folder ``path``, whole or not at all.
+
+    Raises:
+        OutputError: as in ``prepare_output``, a name cannot be a file's, or writing fails.
+    """
+    robots = [trajectory.robot for trajectory in run.trajectories] + [local.robot for local in run.local_maps]
+    check_names([*robots, *run.map_files])
+    with _staged(prepare_output(path, force)) as folder:
+        (folder / TRAJECTORIES).mkdir()
+        for trajectory in run.trajectories:
+            write_tum(_tum_path(folder, trajectory.robot), trajectory.stamps, trajectory.T_map_base)
+        if run.local_maps:
+            (folder / LOCAL).mkdir()
+        for local in run.local_maps:
+            _write_local_map(folder / LOCAL, local)
+        write_robots(folder / ROBOTS, run.trajectories)
+        write_closures(folder / CLOSURES, run.closures)
+        (folder / METRICS).write_text(metrics_json(run.metrics), encoding="utf-8")
+        (folder / CONFIG).write_text(run.config_yaml, encoding="utf-8")
+        (folder / POSE_GRAPH).write_text(run.pose_graph_g2o, encoding="utf-8")
+        for name, content in run.map_files.items():
+            (folder / name).write_bytes(content)
+
+
+def open_run(path: Path) -> Run:
+    """Read a run folder back.
+
+    Raises:
+        EvaluationError: ``path`` is no run folder, or a file of it is missing or broken.
+    """
+    if not is_run_folder(path):
+        raise EvaluationError(
+            f"{path}: no run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one"
+        )
+    try:
+        trajectories = tuple(_read_trajectory(path, *row) for row in read_robots(path / ROBOTS))
+        return Run(
+            trajectories=trajectories,
+            closures=read_closures(path / CLOSURES),
+            metrics=read_metrics(path / METRICS),
+            config_yaml=(path / CONFIG).read_text(encoding="utf-8"),
+            pose_graph_g2o=(path / POSE_GRAPH).read_text(encoding="utf-8"),
+            map_files={file.name: file.read_bytes() for file in sorted(path.glob("map*.*"))},
+            local_maps=_read_local_maps(path / LOCAL, [trajectory.robot for trajectory in trajectories]),
+        )
+    except (OSError, ValueError, csv.Error) as error:
+        raise EvaluationError(f"{path}: a broken run folder ({error})") from error
+
+
+@contextmanager
+def _staged(place: Path) -> Iterator[Path]:
+    try:
+        with replacing_folder(place) as folder:
+            yield folder
+    except OSError as error:
+        raise OutputError(f"{place}: cannot write the run ({error})") from error
+
+
+def _tum_path(folder: Path, robot: str) -> Path:
+    return folder / TRAJECTORIES / f"{robot}.tum"
+
+
+def _read_trajectory(folder: Path, robot: str, map_index: int) -> RobotTrajectory:
+    if not _SAFE_NAME.fullmatch(robot):
+        raise ValueError(f"{ROBOTS}: {robot!r} is no robot's name")
+    stamps, poses = read_tum(_tum_path(folder, robot))
+    return RobotTrajectory(robot, map_index, stamps, poses)
+
+
+def _write_local_map(folder: Path, local: LocalMap) -> None:
+    write_tum(folder / f"{local.robot}.tum", local.stamps, local.T_local_base)
+    (folder / f"{local.robot}.pgm").write_bytes(local.pgm)
+    (folder / f"{local.robot}.yaml").write_text(local.yaml, encoding="utf-8")
+
+
+def _read_local_maps(folder: Path, robots: Iterable[str]) -> tuple[LocalMap, ...]:
+    return tuple(_read_local_map(folder, robot) for robot in robots) if folder.exists() else ()
+
+
+def _read_local_map(folder: Path, robot: str) -> LocalMap:
+    stamps, poses = read_tum(folder / f"{robot}.tum")
+    pgm, yaml = (folder / f"{robot}.pgm").read_bytes(), (folder / f"{robot}.yaml").read_text(encoding="utf-8")
+    return LocalMap(robot, stamps, poses, pgm, yaml)

@@ -1,0 +1,137 @@
+"""The tables of a run folder: robots, closures, metrics; and lists of vetoes, which are lines of a closure table."""
+
+import csv
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from fcslam.errors import ConfigError
+from fcslam.records import Channel, ClosureStatus, Veto, frozen
+from fcslam.runs.records import ClosureRow, Metric, RobotTrajectory
+
+_ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
+_CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
+_CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", "reason"]
+
+
+def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
+    """Write robots.csv."""
+    _write_csv(path, _ROBOT_COLUMNS, map(_robot_fields, trajectories))
+
+
+def read_robots(path: Path) -> list[tuple[str, int]]:
+    """Robot and map index of every line of robots.csv.
+
+    Raises:
+        ValueError: a column is missing or a map index is no number.
+    """
+    return [(row["robot"], int(row["map"])) for row in _read_csv(path, _ROBOT_COLUMNS)]
+
+
+def write_closures(path: Path, closures: Iterable[ClosureRow]) -> None:
+    """Write closures.csv."""
+    _write_csv(path, _CLOSURE_COLUMNS, map(_closure_fields, closures))
+
+
+def read_closures(path: Path) -> tuple[ClosureRow, ...]:
+    """Every line of closures.csv.
+
+    Raises:
+        ValueError: a column is missing or a value is not what the column holds.
+    """
+    return tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS))
+
+
+def read_vetoes(path: Path) -> tuple[Veto, ...]:
+    """Closures that must not count: lines of a run's closures.csv, of which only the two ends are read.
+
+    A line without stamps speaks of every closure between the two robots.
+
+    Raises:
+        ConfigError: the file cannot be read, a column is missing, or a stamp is no number.
+    """
+    try:
+        return tuple(_read_veto(number, row) for number, row in enumerate(_read_csv(path, _CLOSURE_ENDS), start=2))
+    except (OSError, ValueError, csv.Error) as error:
+        raise ConfigError(f"{path}: no list of vetoes ({error}); copy lines of a run's closures.csv") from error
+
+
+def _read_veto(number: int, row: dict[str, str]) -> Veto:
+    stamps = [row["stamp_i"].strip(), row["stamp_j"].strip()]
+    if not any(stamps):
+        return Veto(row["robot_i"], row["robot_j"])
+    try:
+        stamp_i, stamp_j = map(float, stamps)
+    except ValueError:
+        stamp_i = stamp_j = math.nan
+    if not (math.isfinite(stamp_i) and math.isfinite(stamp_j)):
+        raise ValueError(f"line {number}: two stamps or none are needed, not '{stamps[0]}' and '{stamps[1]}'")
+    return Veto(row["robot_i"], row["robot_j"], (stamp_i, stamp_j))
+
+
+def metrics_json(metrics: Iterable[Metric]) -> str:
+    """JSON has no NaN: a metric without a value is null."""
+    rows = [
+        {"name": metric.name, "value": metric.value if math.isfinite(metric.value) else None, "unit": metric.unit}
+        for metric in metrics
+    ]
+    return json.dumps(rows, indent=2) + "\n"
+
+
+def read_metrics(path: Path) -> tuple[Metric, ...]:
+    """Every metric of metrics.json; null is NaN.
+
+    Raises:
+        ValueError: it is not a list of name, value, unit.
+    """
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        values = [math.nan if row["value"] is None else float(row["value"]) for row in rows]
+        return tuple(Metric(row["name"], value, row["unit"]) for row, value in zip(rows, values, strict=True))
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path.name} is not a list of name, value, unit") from error
+
+
+def _robot_fields(trajectory: RobotTrajectory) -> list[Any]:
+    return [trajectory.robot, trajectory.map_index, f"{trajectory.path_length_m:.3f}", len(trajectory.stamps)]
+
+
+def _closure_fields(closure: ClosureRow) -> list[Any]:
+    ends = [closure.robot_i, f"{closure.stamp_i:.9f}", closure.robot_j, f"{closure.stamp_j:.9f}"]
+    numbers = [f"{number:.6f}" for number in (closure.similarity, *closure.T_i_j)]
+    return [*ends, closure.channel.value, *numbers, closure.status.value, closure.reason]
+
+
+def _read_closure(row: dict[str, str]) -> ClosureRow:
+    return ClosureRow(
+        robot_i=row["robot_i"],
+        stamp_i=float(row["stamp_i"]),
+        robot_j=row["robot_j"],
+        stamp_j=float(row["stamp_j"]),
+        channel=Channel(row["channel"]),
+        similarity=float(row["similarity"]),
+        T_i_j=frozen([float(row[axis]) for axis in ("x", "y", "theta")]),
+        status=ClosureStatus(row["status"]),
+        reason=row["reason"],
+    )
+
+
+def _write_csv(path: Path, columns: list[str], rows: Iterable[list[Any]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _read_csv(path: Path, columns: list[str]) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        rows, heading = list(reader), list(reader.fieldnames or ())
+    if not rows and not set(columns) <= set(heading):
+        raise ValueError(f"{path.name}, line 1: expected the columns {', '.join(columns)}")
+    for number, row in enumerate(rows, start=2):
+        if any(row.get(column) is None for column in columns):
+            raise ValueError(f"{path.name}, line {number}: expected the columns {', '.join(columns)}")
+    return rows

@@ -1,0 +1,135 @@
+"""Development credentials: a certificate authority, the cloud's certificate, tokens. Keys never leave the folder.
+
+ca.pem, ca.key          the authority; robots and viewers get ca.pem
+cloud.pem, cloud.key    the cloud's certificate
+tokens.yaml             name, role and SHA-256 of every token: for the cloud
+tokens/<name>           the token itself: for whoever is named
+robots/<name>.pem, .key a robot's certificate, instead of a token
+"""
+
+import datetime
+import hashlib
+import ipaddress
+import secrets
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import yaml
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from fcslam.errors import OutputError
+from fcslam.service.http.authentication import Role, TokenEntry, TokensFile, read_tokens
+from fcslam.storage.files import write_file
+
+AUTHORITY_DAYS, LEAF_DAYS = 3650, 397
+"""Clients believe no server certificate that holds for longer."""
+TOKEN_BYTES = 32
+
+Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
+
+
+def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Role], now: datetime.datetime) -> None:
+    """Make what is missing: the authority and tokens that are there stay; certificates of the cloud and of the robots
+    in ``names`` are made anew.
+
+    Raises:
+        OutputError: the folder cannot be used, or what is in it cannot be read.
+        ConfigError: the tokens file in it is broken.
+    """
+    try:
+        for part in ("tokens", "robots"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        authority = _authority(folder, now)
+        served = [_host(host) for host in dict.fromkeys([*hosts, "localhost", "127.0.0.1", "::1"])]
+        _make_leaf(folder / "cloud", "fcslam cloud", ExtendedKeyUsageOID.SERVER_AUTH, served, authority, now)
+        for name in (name for name, role in names.items() if role is Role.ROBOT):
+            _make_leaf(folder / "robots" / name, name, ExtendedKeyUsageOID.CLIENT_AUTH, (), authority, now)
+        _add_tokens(folder, names)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{folder}: cannot keep credentials there ({error}); name a new folder") from error
+
+
+def _authority(folder: Path, now: datetime.datetime) -> Authority:
+    """The authority of the folder, made if there is none."""
+    if (folder / "ca.key").exists():
+        found = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), None)
+        if not isinstance(found, ec.EllipticCurvePrivateKey):
+            raise ValueError("ca.key is no key of ours")
+        return x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes()), found
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fcslam development authority")])
+    builder = _builder(name, name, key, now, AUTHORITY_DAYS)
+    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+    usage = dict.fromkeys(_USAGES, False) | {"key_cert_sign": True, "crl_sign": True}
+    certificate = builder.add_extension(x509.KeyUsage(**usage), critical=True).sign(key, hashes.SHA256())
+    _write_pair(folder / "ca", certificate, key)
+    return certificate, key
+
+
+def _make_leaf(
+    stem: Path, common_name: str, purpose: x509.ObjectIdentifier, hosts: Sequence[x509.GeneralName],
+    authority: Authority, now: datetime.datetime,
+) -> None:  # fmt: skip
+    """A certificate of the authority's, good for one purpose; that of a host names it."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+    builder = _builder(name, authority[0].subject, key, now, LEAF_DAYS)
+    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True}
+    builder = builder.add_extension(x509.KeyUsage(**usage), critical=True)
+    builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+    if hosts:
+        builder = builder.add_extension(x509.SubjectAlternativeName(hosts), critical=False)
+    signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority[1].public_key())
+    certificate = builder.add_extension(signer, critical=False).sign(authority[1], hashes.SHA256())
+    _write_pair(stem, certificate, key)
+
+
+_USAGES = (
+    "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
+    "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
+)  # fmt: skip
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: datetime.datetime, days: int
+) -> x509.CertificateBuilder:
+    builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
+    builder = builder.serial_number(x509.random_serial_number())
+    # clocks of robots may be behind
+    builder = builder.not_valid_before(now - datetime.timedelta(days=1))
+    builder = builder.not_valid_after(now + datetime.timedelta(days=days))
+    return builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
+    path = folder / "tokens.yaml"
+    entries = list(read_tokens(path)) if path.exists() else []
+    known = {entry.name for entry in entries}
+    for name, role in names.items():
+        if name not in known:
+            token = secrets.token_urlsafe(TOKEN_BYTES)
+            write_file(folder / "tokens" / name, f"{token}\n".encode(), private=True)
+            entries.append(TokenEntry(name=name, role=role, sha256=hashlib.sha256(token.encode()).hexdigest()))
+    content = TokensFile(tokens=tuple(entries)).model_dump(mode="json")
+    write_file(path, yaml.safe_dump(content, sort_keys=False).encode())
+
+
+def _write_pair(stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
+    form, encryption = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    write_file(
+        stem.with_name(f"{stem.name}.key"),
+        key.private_bytes(serialization.Encoding.PEM, form, encryption),
+        private=True,
+    )
+    write_file(stem.with_name(f"{stem.name}.pem"), certificate.public_bytes(serialization.Encoding.PEM))

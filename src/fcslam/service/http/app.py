@@ -1,0 +1,78 @@
+"""The ASGI application; what it needs is given to it."""
+
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from typing import Any
+
+from fastapi import APIRouter, FastAPI
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+import fcslam
+from fcslam.service.http.decisions import decision_router
+from fcslam.service.http.event_stream import event_router
+from fcslam.service.http.missions import file_router, mission_router
+from fcslam.service.http.operations import operations_router
+from fcslam.service.http.problems import add_handlers
+from fcslam.service.http.prometheus import Measures
+from fcslam.service.http.robots import network_router, robot_router
+from fcslam.service.http.state import ServiceState
+from fcslam.service.http.viewers import fleet_router, map_router
+
+PREFIX = "/api/v1"
+ROUTERS = (
+    robot_router, network_router, fleet_router, map_router, mission_router, file_router, decision_router, event_router,
+)  # fmt: skip
+
+
+class Service(FastAPI):
+    """Describes what it does: FastAPI adds to every route a refusal that this service words otherwise."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The interface, in OpenAPI 3.1."""
+        described = super().openapi()
+        for operation in (one for path in described["paths"].values() for one in path.values()):
+            operation["responses"].pop("422", None)
+        for unused in ("HTTPValidationError", "ValidationError"):
+            described["components"]["schemas"].pop(unused, None)
+        return described
+
+
+def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool = False) -> FastAPI:
+    """The service; ``more`` routers come from rooms that this one does not know. Closes the missions at its end."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        state.closing = True
+        state.missions.close()
+
+    app = Service(
+        title="fcslam",
+        version=fcslam.__version__,
+        docs_url="/docs" if docs else None,
+        redoc_url=None,
+        lifespan=lifespan,
+    )
+    add_handlers(app)
+    for make in ROUTERS:
+        app.include_router(make(state), prefix=PREFIX)
+    app.include_router(operations_router(state))
+    for router in more:
+        app.include_router(router)
+    app.add_middleware(_RefusalCounter, measures=state.measures)
+    return app
+
+
+class _RefusalCounter:
+    """Counts answers that refuse. Plain ASGI: a middleware of Starlette's own base runs a task for every request."""
+
+    def __init__(self, app: ASGIApp, measures: Measures) -> None:
+        self._app, self._measures = app, measures
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def watched(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] >= 400:
+                self._measures.refuse(message["status"])
+            await send(message)
+
+        await self._app(scope, receive, watched)

@@ -1,0 +1,80 @@
+"""How much one robot may ask for."""
+
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from fastapi import HTTPException, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
+
+from fcslam.service.http.responses import content
+
+BYTES_PER_S = 8.0 * 2**20
+"""A thousand times what a robot sends while it drives: so fast it may send what an outage kept back."""
+BURST_BYTES = 32.0 * 2**20
+REQUEST_BYTES = 16.0 * 2**10
+"""What a request costs besides its bytes."""
+LONGEST_JSON_BYTES = 64 * 2**10
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+class RateLimit:
+    """A bucket for each robot, which requests empty and time fills. Any thread may ask."""
+
+    def __init__(
+        self, clock: Callable[[], float], bytes_per_s: float = BYTES_PER_S, burst: float = BURST_BYTES
+    ) -> None:
+        self._clock, self._rate, self._burst = clock, bytes_per_s, burst
+        self._level: dict[str, tuple[float, float]] = {}
+        """What is left in each bucket, and when that was."""
+        self._lock = threading.Lock()
+
+    @property
+    def largest(self) -> int:
+        """Bytes that a request may have at all."""
+        return int(self._burst - REQUEST_BYTES)
+
+    def wait_s(self, robot: str, size: int) -> float:
+        """Count a request of ``size`` bytes; if it is over the limit, how long to wait, and it is not counted."""
+        with self._lock:
+            now = self._clock()
+            level, then = self._level.get(robot, (self._burst, now))
+            level = min(self._burst, level + (now - then) * self._rate) - REQUEST_BYTES - size
+            if level < 0.0:
+                return -level / self._rate
+            self._level[robot] = level, now
+            return 0.0
+
+
+async def read_body(request: Request, longest: int) -> bytes:
+    """A request's body, refused (HTTPException 413) before more than ``longest`` bytes of it are read."""
+    announced = request.headers.get("content-length", "0")
+    too_long = HTTPException(413, f"the body is over {longest} bytes; send less at once")
+    if announced.isdecimal() and int(announced) > longest:
+        raise too_long
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > longest:
+            raise too_long
+    return bytes(body)
+
+
+async def read_json(request: Request, model: type[_Model]) -> _Model:
+    """A request's body as ``model``. For handlers: FastAPI itself would read it all before it asks who sends it.
+
+    Refuses: 413 (HTTPException) over 64 KiB, 400 (RequestValidationError) what is no such thing.
+    """
+    body = await read_body(request, LONGEST_JSON_BYTES)
+    try:
+        return model.model_validate_json(body)
+    except ValidationError as error:
+        found = error.errors(include_url=False, include_context=False, include_input=False)
+        raise RequestValidationError([{**one, "loc": ("body", *one["loc"])} for one in found]) from error
+
+
+def json_body(model: type[BaseModel]) -> dict[str, Any]:
+    """What OpenAPI is told of a body that ``read_json`` reads."""
+    return {"requestBody": {"required": True, **content("application/json", model=model.model_json_schema())}}

@@ -1,0 +1,141 @@
+"""Missions: begin, open, take away, bring in."""
+
+import tempfile
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Query, Request
+from fastapi.responses import Response, StreamingResponse
+from pydantic import Field
+from starlette.concurrency import run_in_threadpool
+
+from fcslam.config import Settings
+from fcslam.errors import StoreError
+from fcslam.records import NAME
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.limits import json_body, read_json
+from fcslam.service.http.responses import MissionList, content, refusals
+from fcslam.service.http.robots import Name
+from fcslam.service.http.state import ServiceState
+from fcslam.service.mission_store import check_mission
+from fcslam.service.missions import EXPORT, IMPORT
+from fcslam.storage.database import told
+
+FILE = "application/vnd.sqlite3"
+"""Media type of an exported mission."""
+CHUNK_BYTES = 2**20
+LONGEST_IMPORT_BYTES = 64 * 2**30
+
+MissionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
+
+
+class NewMission(Settings):
+    """A mission to begin."""
+
+    name: MissionName
+
+
+def mission_router(state: ServiceState) -> APIRouter:
+    """All missions of the service, and which one is open."""
+    router = APIRouter(tags=["missions"], responses=refusals(401, 403, 503))
+    as_admin = state.require(Role.ADMIN)
+
+    @router.get("/missions", dependencies=state.require(Role.VIEWER, Role.ADMIN))
+    def list_missions() -> MissionList:
+        """All missions, and which one is open."""
+        return _missions(state)
+
+    @router.post(
+        "/missions",
+        status_code=201,
+        dependencies=as_admin,
+        openapi_extra=json_body(NewMission),
+        responses=refusals(400, 409, 413, 507),
+    )
+    async def create_mission(request: Request) -> MissionList:
+        """Begin a mission and open it."""
+        mission = await read_json(request, NewMission)
+        async with state.changing:
+            await run_in_threadpool(state.missions.create, mission.name)
+        return _missions(state)
+
+    @router.post("/missions/{name}/open", dependencies=as_admin, responses=refusals(400, 404, 507))
+    async def open_mission(name: Name) -> MissionList:
+        """Let robots' packets go to this mission from now on."""
+        if name not in state.missions.names:
+            raise HTTPException(404, f"there is no mission '{name}'")
+        async with state.changing:
+            await run_in_threadpool(state.missions.open, name)
+        return _missions(state)
+
+    return router
+
+
+def file_router(state: ServiceState) -> APIRouter:
+    """Missions as files."""
+    router = APIRouter(tags=["missions"], dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503))
+
+    @router.post(
+        "/missions/import",
+        status_code=201,
+        openapi_extra={"requestBody": {"required": True, **content(FILE)}},
+        responses=refusals(400, 409, 413, 507),
+    )
+    async def import_mission(request: Request, name: Annotated[MissionName, Query()]) -> MissionList:
+        """Make a mission of a file that an export gave; the open one stays open."""
+        with tempfile.TemporaryDirectory(dir=state.missions.root, prefix=IMPORT) as folder:
+            path = Path(folder) / "mission.sqlite"
+            await _receive(request, path)
+            try:
+                await run_in_threadpool(check_mission, path)
+            except StoreError as error:
+                raise HTTPException(400, f"what was sent is no exported mission ({error})") from error
+            async with state.changing:
+                await run_in_threadpool(state.missions.take_in, name, path)
+        return _missions(state)
+
+    @router.get(
+        "/missions/{name}/export",
+        response_class=Response,
+        responses={**refusals(400, 404, 507), 200: content(FILE)},
+    )
+    async def export_mission(name: Name) -> StreamingResponse:
+        """A mission as one file."""
+        if name not in state.missions.names:
+            raise HTTPException(404, f"there is no mission '{name}'")
+        folder = tempfile.TemporaryDirectory(dir=state.missions.root, prefix=EXPORT)
+        path = Path(folder.name) / f"{name}.sqlite"
+        try:
+            await run_in_threadpool(state.missions.export, name, path)
+        except BaseException:
+            folder.cleanup()
+            raise
+        headers = {"Content-Disposition": f'attachment; filename="{name}.sqlite"'}
+        return StreamingResponse(_content(path, folder), media_type=FILE, headers=headers)
+
+    return router
+
+
+def _missions(state: ServiceState) -> MissionList:
+    return MissionList(open=state.mission.folder.name, missions=state.missions.names)
+
+
+async def _receive(request: Request, path: Path) -> None:
+    size = 0
+    with path.open("wb") as file:
+        async for chunk in request.stream():
+            size += len(chunk)
+            if size > LONGEST_IMPORT_BYTES:
+                raise HTTPException(413, f"the file is over {LONGEST_IMPORT_BYTES} bytes")
+            with told(path):
+                await run_in_threadpool(file.write, chunk)
+
+
+async def _content(path: Path, folder: "tempfile.TemporaryDirectory[str]") -> AsyncIterator[bytes]:
+    try:
+        with path.open("rb") as file:
+            while chunk := await run_in_threadpool(file.read, CHUNK_BYTES):
+                yield chunk
+    finally:
+        folder.cleanup()

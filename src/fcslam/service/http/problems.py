@@ -1,0 +1,73 @@
+"""Every refusal is one line of JSON: {"error": what, where, what to do}."""
+
+from collections.abc import Mapping
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import iter_route_contexts
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse
+from starlette.routing import Match
+
+from fcslam.errors import FcslamError, FeatureError, PacketConflictError, PacketError, ServiceError, StoreError
+from fcslam.service.intake import RETRY_AFTER_S, BusyError, LeaseError, RefusedPacketError
+
+STATUS: dict[type[FcslamError], int] = {
+    BusyError: 429,
+    LeaseError: 409,
+    RefusedPacketError: 400,
+    PacketConflictError: 409,
+    PacketError: 400,
+    StoreError: 507,
+    ServiceError: 409,
+    FeatureError: 400,
+}
+"""Of what goes wrong below HTTP; the nearest class of an error counts."""
+
+
+def problem(status: int, error: str, headers: Mapping[str, str] | None = None, **more: object) -> JSONResponse:
+    """The answer to a request that is refused."""
+    return JSONResponse({"error": " ".join(error.split()), **more}, status, headers)
+
+
+def add_handlers(app: FastAPI) -> None:
+    """Let errors become answers."""
+    app.add_exception_handler(FcslamError, _on_fcslam_error)
+    app.add_exception_handler(HTTPException, _on_http_exception)
+    app.add_exception_handler(RequestValidationError, _on_validation_error)
+    app.add_exception_handler(Exception, _on_anything_else)
+
+
+def _on_fcslam_error(_: Request, error: Exception) -> JSONResponse:
+    status = next((STATUS[kind] for kind in type(error).mro() if kind in STATUS), 500)
+    headers = {"Retry-After": str(RETRY_AFTER_S)} if status == 429 else None
+    index = getattr(error, "index", None)
+    return problem(status, str(error), headers, **({} if index is None else {"index": index}))
+
+
+def _on_http_exception(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    headers = {"Allow": _allowed(request)} if error.status_code == 405 else error.headers
+    return problem(error.status_code, str(error.detail), headers)
+
+
+def _allowed(request: Request) -> str:
+    """Methods of all routes with this path: Starlette looks at the first one only."""
+    routes = [
+        route
+        for route in iter_route_contexts(request.app.routes)
+        if route.matches(dict(request.scope))[0] is not Match.NONE
+    ]
+    return ", ".join(sorted({method for route in routes for method in route.methods or ()}))
+
+
+def _on_validation_error(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return problem(400, f"{where}: {first['msg']}")
+
+
+def _on_anything_else(_: Request, error: Exception) -> JSONResponse:
+    """A fault of the service: it is in the log, and nobody else is shown how it is made."""
+    return problem(500, f"the service failed on it ({type(error).__name__}); its log says more")

@@ -1,0 +1,124 @@
+"""What robots ask."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Header, HTTPException, Path, Request
+from fastapi.responses import FileResponse, Response
+from starlette.concurrency import run_in_threadpool
+
+from fcslam.records import NAME, Channel
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.limits import RateLimit, read_body
+from fcslam.service.http.responses import PacketProblem, PacketRefusal, RobotState, content, refusals
+from fcslam.service.http.state import ServiceState
+from fcslam.service.intake import Answer
+from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, REFUSED_HEADER, read_batch
+from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
+from fcslam.wire.packets import unpacked_size
+
+NETWORK = "application/octet-stream"
+"""Media type of a detector's file."""
+_REFUSED = {
+    REFUSED_HEADER: {
+        "schema": {"type": "integer", "minimum": 0}, "required": True, "description": "packets that count for nothing",
+    }
+}  # fmt: skip
+Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
+
+
+def robot_router(state: ServiceState) -> APIRouter:
+    """Packets in, acknowledgements and corrections out."""
+    router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
+    as_robot = state.require(Role.ROBOT)
+    taken = {status: {**told, "model": PacketProblem} for status, told in refusals(400, 409).items()}
+
+    @router.post(
+        "/robots/{robot}/packets",
+        dependencies=as_robot,
+        response_class=Response,
+        responses={**refusals(413, 429, 507), **taken, 200: {**content(MEDIA_TYPE), "headers": _REFUSED}},
+        openapi_extra={"requestBody": content(MEDIA_TYPE)},
+    )
+    async def send_packets(
+        request: Request,
+        robot: Name,
+        agent: Annotated[str, Header(alias=AGENT_HEADER, max_length=64)] = "",
+        correction: Annotated[int, Header(alias=CORRECTION_HEADER, ge=-1)] = -1,
+    ) -> Response:
+        """Store a batch of packets; the answer acknowledges what is on disk."""
+        body = await read_body(request, MAXIMUM_BATCH_BYTES)
+        mission = state.mission
+
+        def take() -> Answer:
+            _check_rate(state.rate, robot, body)
+            return mission.intake.take(robot, agent, body, correction)
+
+        answer = await run_in_threadpool(take)
+        mission.worker.ring()
+        state.measures.answer(robot, answer.batch)
+        return Response(answer.batch, media_type=MEDIA_TYPE, headers={REFUSED_HEADER: str(answer.refused)})
+
+    @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
+    def get_state(robot: Name) -> RobotState:
+        """Where a robot that starts again goes on, and which of its packets were refused."""
+        store = state.mission.store
+        sessions = store.sessions(robot)
+        newest = sessions[-1].epoch if sessions else None
+        correction = None if newest is None else store.correction(robot, newest)
+        return RobotState(
+            robot=robot,
+            epoch=newest,
+            next={str(session.epoch): session.next for session in sessions},
+            correction=correction.correction.version if correction else -1,
+            map=correction.correction.map_index if correction else None,
+            refused=refused_packets(state, robot),
+        )
+
+    return router
+
+
+def network_router(state: ServiceState) -> APIRouter:
+    """Detectors for robots."""
+    router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
+
+    @router.get(
+        "/detectors/{channel}/{version}",
+        dependencies=state.require(*Role),
+        response_class=Response,
+        responses={**refusals(404), 200: content(NETWORK)},
+    )
+    def get_detector(channel: Channel, version: Name) -> FileResponse:
+        """The network of a detector version."""
+        path = state.detectors.path(channel, version)
+        if not path.is_file():
+            raise HTTPException(404, f"there is no {channel} detector '{version}'")
+        return FileResponse(path, media_type=NETWORK)
+
+    return router
+
+
+def refused_packets(state: ServiceState, robot: str) -> list[PacketRefusal]:
+    """Packets of a robot that count for nothing."""
+    return [
+        PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
+        for epoch, sequence, reason in state.mission.store.refusals(robot)
+    ]
+
+
+def _check_rate(rate: RateLimit, robot: str, body: bytes) -> None:
+    """Refuse (HTTPException 413, 429) more than the robot may send."""
+    size = _unpacked_size(body)
+    if size > rate.largest:
+        raise HTTPException(413, f"the batch unpacks to {size} bytes; send fewer packets at once")
+    wait_s = rate.wait_s(robot, size)
+    if wait_s > 0.0:
+        raise HTTPException(429, "too much at once; wait", {"Retry-After": str(int(wait_s) + 1)})
+
+
+def _unpacked_size(body: bytes) -> int:
+    """What a batch counts in its robot's rate: it takes time to unpack, however short it travels.
+
+    Raises:
+        PacketError: it is no batch.
+    """
+    return sum(LENGTH.size + unpacked_size(packet) for packet in read_batch(body))

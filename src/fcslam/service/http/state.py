@@ -1,0 +1,70 @@
+"""What all parts of the HTTP service share."""
+
+import asyncio
+from dataclasses import dataclass, field
+
+from fastapi import Depends, HTTPException, Request, Security
+from fastapi.params import Depends as Dependency
+from fastapi.security import HTTPBearer
+
+from fcslam.service.detectors import DetectorShelf
+from fcslam.service.http.authentication import Authenticator, Role
+from fcslam.service.http.events import EventStream
+from fcslam.service.http.limits import RateLimit
+from fcslam.service.http.prometheus import Measures
+from fcslam.service.missions import Missions, OpenMission
+
+_BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
+
+
+@dataclass(slots=True)
+class ServiceState:
+    """Handed to every router."""
+
+    missions: Missions
+    authenticator: Authenticator
+    rate: RateLimit
+    events: EventStream
+    measures: Measures = field(default_factory=Measures)
+    closing: bool = False
+    """Nothing new is begun any more."""
+    changing: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """Whoever has it may begin, open and bring in missions."""
+
+    @property
+    def mission(self) -> OpenMission:
+        """The one that robots' packets go to."""
+        return self.missions.open_mission
+
+    @property
+    def detectors(self) -> DetectorShelf:
+        """Networks that robots may fetch."""
+        return self.missions.detectors
+
+    def require(self, *roles: Role) -> list[Dependency]:
+        """Dependencies of a route: whoever asks has one of the roles, and a robot that of itself alone.
+
+        Refuses (HTTPException): 401 without a token that is known, 403 with another one's, 429 too many requests.
+        """
+
+        async def check(request: Request) -> None:
+            if self.closing:
+                raise HTTPException(503, "the service is stopping; try again")
+            if self.authenticator.is_open:
+                return
+            tls = request.scope.get("extensions", {}).get("tls", {})
+            who = self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
+            if who is None:
+                headers = {"WWW-Authenticate": "Bearer"}
+                raise HTTPException(
+                    401, "no known token and no robot's certificate; send Authorization: Bearer TOKEN", headers
+                )
+            if who.role not in roles:
+                needed = " or ".join(roles)
+                raise HTTPException(403, f"'{who.name}' is a {who.role}; this is for a {needed}")
+            robot = request.path_params.get("robot")
+            if who.role is Role.ROBOT and robot not in (None, who.name):
+                raise HTTPException(403, f"robot '{who.name}' does not speak for robot '{robot}'")
+
+        # the second one tells OpenAPI of tokens, and does nothing else
+        return [Depends(check)] if self.authenticator.is_open else [Depends(check), Security(_BEARER)]

@@ -1,0 +1,212 @@
+"""What everybody may see: the live run, as numbers and as files."""
+
+import math
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Query
+from fastapi import Path as PathParameter
+from fastapi.responses import FileResponse, Response
+
+from fcslam.cloud.sessions import session_name
+from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
+from fcslam.records import Channel, ClosureStatus
+from fcslam.runs import POSE_GRAPH, TRAJECTORIES, ClosureRow, Run, open_run
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.responses import (
+    Closure,
+    DetectorSummary,
+    FleetSummary,
+    MapSummary,
+    RobotSession,
+    RobotSummary,
+    content,
+    refusals,
+)
+from fcslam.service.http.robots import Name, refused_packets
+from fcslam.service.http.state import ServiceState
+
+MOST = 2**31 - 1
+"""No map and no square has a larger number."""
+Index = Annotated[int, PathParameter(ge=0, le=MOST)]
+Square = Annotated[int, PathParameter(ge=-MOST, le=MOST)]
+TEXT = "text/plain"
+MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "application/yaml"}
+
+
+def fleet_router(state: ServiceState) -> APIRouter:
+    """Robots, closures, words."""
+    router = APIRouter(
+        tags=["fleet"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503, 507)
+    )
+
+    @router.get("/fleet")
+    def get_fleet() -> FleetSummary:
+        """Counts."""
+        store, run = state.mission.store, _live_run(state)
+        return FleetSummary(
+            mission=state.mission.folder.name,
+            packets=store.turn_count(),
+            applied=store.applied(),
+            waiting=store.waiting_count(),
+            robots=[robot.robot for robot in run.trajectories],
+            maps=len({robot.map_index for robot in run.trajectories}),
+            # JSON has no NaN
+            metrics={metric.name: metric.value if math.isfinite(metric.value) else None for metric in run.metrics},
+        )
+
+    @router.get("/robots")
+    def get_robots() -> list[RobotSession]:
+        """All robots' sessions."""
+        return [
+            robot
+            for name in dict.fromkeys(s.robot for s in state.mission.store.sessions())
+            for robot in _sessions(state, name)
+        ]
+
+    @router.get("/robots/{robot}", responses=refusals(400, 404))
+    def get_robot(robot: Name) -> RobotSummary:
+        """One robot's sessions, and packets of it that were refused."""
+        sessions = _sessions(state, robot)
+        if not sessions:
+            raise HTTPException(404, f"there is no robot '{robot}'")
+        return RobotSummary(robot=robot, sessions=sessions, refused=refused_packets(state, robot))
+
+    @router.get("/closures", responses=refusals(400))
+    def get_closures(
+        status: ClosureStatus | None = None, limit: Annotated[int, Query(ge=1, le=10_000)] = 1000
+    ) -> list[Closure]:
+        """The newest closures."""
+        chosen = [closure for closure in _live_run(state).closures if status in (None, closure.status)]
+        return [_closure(closure) for closure in chosen[-limit:]]
+
+    @router.get("/vocabulary")
+    def get_vocabulary() -> dict[str, float]:
+        """Words by channel and detector version."""
+        prefix = "words_"
+        return {m.name.removeprefix(prefix): m.value for m in _live_run(state).metrics if m.name.startswith(prefix)}
+
+    @router.get("/detectors")
+    def get_detectors() -> list[DetectorSummary]:
+        """Networks that robots may fetch, and whether they are told of them."""
+        return _detectors(state)
+
+    return router
+
+
+def map_router(state: ServiceState) -> APIRouter:
+    """The live run's files."""
+    router = APIRouter(
+        tags=["maps"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503)
+    )
+
+    @router.get("/maps")
+    def get_maps() -> list[MapSummary]:
+        """Which robots share which map."""
+        robots = _live_run(state).trajectories
+        numbers = sorted({robot.map_index for robot in robots})
+        return [MapSummary(map=k, robots=[r.robot for r in robots if r.map_index == k]) for k in numbers]
+
+    @router.get(
+        "/maps/{k}.{suffix}", response_class=Response, responses={**refusals(400, 404), 200: content(*MEDIA.values())}
+    )
+    def get_map(k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml)$")]) -> FileResponse:
+        """A map: picture, occupancy, and what map_server needs to know of it."""
+        return _file(state, f"{_stem(k)}.{suffix}", MEDIA[suffix])
+
+    @router.get(
+        "/maps/{k}/tiles/{z}/{x}/{y}.png",
+        response_class=Response,
+        responses={**refusals(400, 404), 200: content(MEDIA["png"])},
+    )
+    def get_tile(k: Index, z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)], x: Square, y: Square) -> Response:
+        """A square of a map: at zoom z it has 256 m / 2^z; x and y count squares from the origin, y upwards."""
+        return tile_png(_live_folder(state), _stem(k), z, x, y)
+
+    @router.get("/pose_graph.g2o", response_class=Response, responses={**refusals(404), 200: content(TEXT)})
+    def get_pose_graph() -> FileResponse:
+        """The pose graph."""
+        return _file(state, POSE_GRAPH)
+
+    @router.get(
+        "/trajectories/{session}.tum", response_class=Response, responses={**refusals(400, 404), 200: content(TEXT)}
+    )
+    def get_trajectory(session: Name) -> FileResponse:
+        """Poses of a session's keyscans in its map."""
+        return _file(state, f"{TRAJECTORIES}/{session}.tum")
+
+    return router
+
+
+def _live_folder(state: ServiceState) -> Path:
+    """The live run folder as it is now.
+
+    Refuses (HTTPException 404): there is none yet.
+    """
+    live = state.mission.folder.live
+    if not live.exists():
+        raise HTTPException(404, "there is no map yet")
+    return live.resolve()
+
+
+def _live_run(state: ServiceState) -> Run:
+    return _run(_live_folder(state)) if state.mission.folder.live.exists() else Run(())
+
+
+def _file(state: ServiceState, name: str, media_type: str = TEXT) -> FileResponse:
+    path = _live_folder(state) / name
+    if not path.is_file():
+        raise HTTPException(404, f"there is no {name}")
+    return FileResponse(path, media_type=media_type)
+
+
+def _detectors(state: ServiceState) -> list[DetectorSummary]:
+    told = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
+    return [
+        DetectorSummary(channel=Channel(channel), version=version, announced=(channel, version) in told)
+        for channel, version in state.detectors.versions()
+    ]
+
+
+def _sessions(state: ServiceState, robot: str) -> list[RobotSession]:
+    store, mapped = state.mission.store, {robot.robot: robot for robot in _live_run(state).trajectories}
+    told = []
+    for session in store.sessions(robot):
+        name = session_name(robot, session.epoch)
+        known, correction = mapped.get(name), store.correction(robot, session.epoch)
+        told.append(
+            RobotSession(
+                robot=robot,
+                session=name,
+                epoch=session.epoch,
+                packets=session.next,
+                map=known.map_index if known else None,
+                path_length_m=known.path_length_m if known else 0.0,
+                keyscans=len(known.stamps) if known else 0,
+                T_map_base=known.T_map_base[-1].tolist() if known else None,
+                T_map_odom=correction.correction.T_map_odom.tolist() if correction else None,
+                correction=correction.correction.version if correction else -1,
+                quality=correction.correction.quality if correction else 0.0,
+                last_heard_s=state.mission.intake.last_heard_s(robot),
+            )
+        )
+    return told
+
+
+@lru_cache(maxsize=4)
+def _run(folder: Path) -> Run:
+    """A snapshot; it never changes."""
+    return open_run(folder)
+
+
+def _stem(k: int) -> str:
+    return f"map_{k}" if k else "map"
+
+
+def _closure(closure: ClosureRow) -> Closure:
+    return Closure(
+        robot_i=closure.robot_i, stamp_i=closure.stamp_i, robot_j=closure.robot_j, stamp_j=closure.stamp_j,
+        channel=closure.channel, similarity=closure.similarity, T_i_j=closure.T_i_j.tolist(), status=closure.status,
+        reason=closure.reason,
+    )  # fmt: skip

@@ -1,0 +1,186 @@
+"""The missions of one service: one is open, the others rest."""
+
+import fcntl
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO
+
+from fcslam.cloud.settings import CloudConfig
+from fcslam.errors import ServiceError
+from fcslam.service.detectors import STAGING, DetectorShelf
+from fcslam.service.intake import Intake
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.mission_store import CONFIG, MissionStore
+from fcslam.service.supervisor import RunningWorker
+from fcslam.storage.database import told
+from fcslam.storage.files import replacing, write_file
+from fcslam.wire.checks import check_name
+
+FIRST = "mission"
+"""Name of the mission that is open when there was none."""
+IMPORT, EXPORT = ".import", ".export"
+"""How folders are called of missions on their way in and out."""
+
+Launch = Callable[[MissionFolder], RunningWorker]
+"""Starts the worker of a mission."""
+
+
+class OpenMission:
+    """A mission that takes packets in and has a worker."""
+
+    def __init__(
+        self, folder: MissionFolder, config: CloudConfig, clock: Callable[[], float],
+        wall_clock: Callable[[], float], launch: Launch, detectors: DetectorShelf,
+    ) -> None:  # fmt: skip
+        self.folder = folder
+        self.store = MissionStore(folder.store)
+        if self.store.fact(CONFIG) is None:
+            self.store.remember(CONFIG, config.model_dump_json())
+        self.intake = Intake(self.store, clock, wall_clock, detectors.announced)
+        self.worker = launch(folder)
+
+    def close(self) -> None:
+        """Stop the worker, then let go of the file."""
+        self.worker.stop()
+        self.store.close()
+
+
+class Missions:
+    """All missions below one folder, which no other service may use."""
+
+    def __init__(
+        self, root: Path, config: CloudConfig, clock: Callable[[], float], wall_clock: Callable[[], float],
+        launch: Launch,
+    ) -> None:  # fmt: skip
+        """Open the mission that was open last, or a first one.
+
+        Raises:
+            ServiceError: the folder cannot be used, or another service uses it.
+            StoreError: the mission cannot be opened.
+        """
+        self.root = root
+        self._config, self._clock, self._wall_clock, self._launch = config, clock, wall_clock, launch
+        self._lock = _locked(root)
+        _sweep(root)
+        self.detectors = DetectorShelf(root / "detectors")
+        named = self._open_file.read_text(encoding="utf-8").strip() if self._open_file.exists() else FIRST
+        self.open_mission = self._opened(named)
+
+    @property
+    def names(self) -> list[str]:
+        """All missions."""
+        return sorted(path.parent.name for path in (self.root / "missions").glob("*/mission.sqlite"))
+
+    def folder(self, name: str) -> MissionFolder:
+        """Files of a mission, there or not.
+
+        Raises:
+            PacketError: it is no name.
+        """
+        check_name(name, "mission")
+        return MissionFolder(self.root / "missions" / name)
+
+    def create(self, name: str) -> None:
+        """Begin a mission and open it.
+
+        Raises:
+            ServiceError: there is one of this name.
+        """
+        if self.folder(name).store.exists():
+            raise ServiceError(f"mission '{name}' is there already; open it or choose another name")
+        self.open(name, create=True)
+
+    def open(self, name: str, create: bool = False) -> None:
+        """Let robots' packets go to this mission from now on; the one that is open now rests, as it is.
+
+        Raises:
+            ServiceError: there is none of this name.
+        """
+        if not create and not self.folder(name).store.exists():
+            raise ServiceError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+        if name == self.open_mission.folder.name:
+            return
+        before = self.open_mission
+        self.open_mission = self._opened(name)
+        before.close()
+
+    def export(self, name: str, path: Path) -> None:
+        """Write a mission as one new file.
+
+        Raises:
+            ServiceError: there is none of this name.
+            StoreError: it cannot be written.
+        """
+        folder = self.folder(name)
+        if name == self.open_mission.folder.name:
+            self.open_mission.store.export(path)
+            return
+        if not folder.store.exists():
+            raise ServiceError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+        store = MissionStore(folder.store)
+        try:
+            store.export(path)
+        finally:
+            store.close()
+
+    def take_in(self, name: str, path: Path) -> None:
+        """Make a mission of a file that ``export`` wrote and ``check_mission`` passed; the open one stays open.
+
+        Raises:
+            ServiceError: there is one of this name.
+            StoreError: it cannot be written.
+        """
+        folder = self.folder(name)
+        if folder.store.exists():
+            raise ServiceError(f"mission '{name}' is there already; choose another name")
+        with told(folder.store):
+            folder.path.mkdir(parents=True, exist_ok=True)
+            with replacing(folder.store) as unfinished:
+                shutil.copyfile(path, unfinished)
+
+    def close(self) -> None:
+        """Stop the open mission and let others use the folder."""
+        self.open_mission.close()
+        self._lock.close()
+
+    @property
+    def _open_file(self) -> Path:
+        return self.root / "open"
+
+    def _opened(self, name: str) -> OpenMission:
+        folder = self.folder(name)
+        with told(folder.path):
+            folder.path.mkdir(parents=True, exist_ok=True)
+        mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._launch, self.detectors)
+        try:
+            with told(self._open_file):
+                write_file(self._open_file, name + "\n")
+        except BaseException:
+            mission.close()
+            raise
+        return mission
+
+
+def _sweep(root: Path) -> None:
+    """Remove what a service left half done that was killed; nobody else uses the folder."""
+    left = [*root.glob(f"{IMPORT}*"), *root.glob(f"{EXPORT}*"), *(root / "detectors").glob(f"{STAGING}*")]
+    for path in left:
+        shutil.rmtree(path, ignore_errors=True)
+    for path in root.glob("missions/*/.*.partial"):
+        path.unlink(missing_ok=True)
+
+
+def _locked(root: Path) -> IO[str]:
+    """The folder's lock file, held until it is closed."""
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        file = (root / "lock").open("w")
+    except OSError as error:
+        raise ServiceError(f"{root}: cannot keep missions there ({error}); name a folder to write in") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise ServiceError(f"{root}: another service uses this folder; stop it or name another folder") from error
+    return file

@@ -1,0 +1,213 @@
+"""The worker: the process in which the fleet of one mission lives. Taking packets in never waits for it.
+
+It reads the store by turn, keeps the fleet in memory, and leaves what it made of the packets on disk: corrections in
+the store, the live run folder, the run folders that were asked for. Killed at any moment it begins again at turn 0,
+and says nothing new before it is where it was.
+
+    python -m fcslam.service.worker MISSION_FOLDER
+
+A byte on stdin says that there is something to do, its end that the service is gone. On stdout there is a line when it
+is ready, for every change of the live run folder and for every answered request.
+"""
+
+import fcntl
+import gc
+import json
+import logging
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO
+
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.journal import StoredJournal
+from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
+from fcslam.cloud.result import FleetResult
+from fcslam.cloud.sessions import session_name
+from fcslam.cloud.settings import CloudConfig
+from fcslam.config import dump
+from fcslam.errors import PacketError
+from fcslam.runs import Metric, Run, write_run
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, SessionCorrection, StoredPacket
+from fcslam.service.supervisor import READY
+from fcslam.service.warmup import warm_up_fleet
+
+AT_ONCE = 64
+AT_ONCE_S = 0.25
+"""Packets, and about the time, between two looks at what else there is to do. Corrections leave in between, so a robot
+does not wait for its own while there is a queue."""
+LIVE_SHARE = 0.1
+"""Of the worker's time, for the live run folder."""
+PAUSE_S = 30.0
+"""After the live run folder could not be written."""
+LIVE_EVERY_S = 1.0
+"""The live run folder is not written more often than this."""
+
+_log = logging.getLogger(__name__)
+
+Tell = Callable[[str, int], None]
+"""Is told of an event and its number."""
+
+
+class Worker:
+    """One mission's fleet; ``step`` by ``step`` it follows what the store holds."""
+
+    def __init__(self, folder: MissionFolder, store: MissionStore, clock: Callable[[], float], tell: Tell) -> None:
+        config = store.fact(CONFIG)
+        self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
+        self._folder, self._store, self._clock, self._tell = folder, store, clock, tell
+        self._fleet = Fleet(self._config.fleet, self._config.seed, StoredJournal(store.packet))
+        self._turn = self._vetoes = 0
+        self._resumed_at = store.applied()
+        """Turns that took effect before a restart: what they bring is known already."""
+        self._times: dict[tuple[str, int], float] = {}
+        """Newest time of each session."""
+        self._published = -1
+        self._publish_at = clock()
+
+    def step(self) -> bool:
+        """Do one piece of work; False: there is none."""
+        return self._take_vetoes() or self._take_packets() or self._finalize() or self._publish()
+
+    def wait_s(self) -> float:
+        """How long there is nothing to do unless something comes in."""
+        return max(self._publish_at - self._clock(), 0.0) if self._published < self._turn else LIVE_EVERY_S
+
+    def _take_vetoes(self) -> bool:
+        vetoes = self._store.vetoes()[self._vetoes :]
+        for veto in vetoes:
+            self._fleet.veto(veto)
+        self._vetoes += len(vetoes)
+        if vetoes:
+            self._published = -1
+        return bool(vetoes)
+
+    def _take_packets(self) -> bool:
+        began = self._clock()
+        packets = self._store.turns(self._turn, AT_ONCE)
+        for packet in packets:
+            self._take(packet)
+            self._turn += 1
+            if self._clock() > began + AT_ONCE_S:
+                break
+        if packets and self._turn > self._resumed_at:
+            self._store.progress(self._turn, self._corrections())
+        return bool(packets)
+
+    def _take(self, packet: StoredPacket) -> None:
+        """One packet takes effect, or is refused and from now on counts as refused."""
+        if packet.refusal is None:
+            try:
+                self._fleet.receive(packet.data)
+            except PacketError as error:
+                self._store.refuse(self._turn, str(error))
+            except MemoryError:
+                raise  # the machine's fault, not the packet's: the next worker tries again
+            except Exception as error:
+                # Nobody knows what it left behind: the next worker begins anew and without it.
+                self._store.refuse(self._turn, f"the cloud failed on it: {type(error).__name__}: {error}")
+                raise
+            else:
+                self._times[packet.robot, packet.epoch] = packet.time
+                return
+        self._fleet.skip(packet.robot, packet.epoch, packet.sequence)
+
+    def _corrections(self) -> list[SessionCorrection]:
+        by_session = {correction.robot: correction for correction in self._fleet.corrections()}
+        return [
+            SessionCorrection(robot, epoch, time_s, by_session[name])
+            for (robot, epoch), time_s in self._times.items()
+            if (name := session_name(robot, epoch)) in by_session
+        ]
+
+    def _finalize(self) -> bool:
+        """Answer the oldest request whose packets and vetoes have all taken effect."""
+        for asked in self._store.finalizations():
+            if asked.run or asked.failure or asked.turns > self._turn or asked.vetoes > self._vetoes:
+                continue
+            self._answer(asked)
+            return True
+        return False
+
+    def _answer(self, asked: Finalization) -> None:
+        name = str(asked.number)
+        try:
+            write_run(self._run(self._fleet.finalize()), self._folder.run(name), force=True)
+        except (
+            Exception
+        ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
+            _log.exception("result %s failed", name)
+            self._store.answer(asked.number, None, str(error) or type(error).__name__)
+        else:
+            self._store.answer(asked.number, name)
+        self._published = -1
+        self._tell("finalized", asked.number)
+
+    def _publish(self) -> bool:
+        """Write the live run folder, if something is new and the last time is long enough ago."""
+        now = self._clock()
+        if self._published == self._turn or self._turn < self._resumed_at or now < self._publish_at:
+            return False
+        try:
+            self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False))
+        except Exception as error:  # packets matter more, and the disk may be freed
+            _log.error("the live map stays as it was: %s: %s", type(error).__name__, error)
+            self._publish_at = now + PAUSE_S
+            return False
+        self._published = self._turn
+        self._publish_at = self._clock() + max((self._clock() - now) / LIVE_SHARE, LIVE_EVERY_S)
+        self._tell("live", self._turn)
+        return True
+
+    def _run(self, result: FleetResult, with_local_maps: bool = True) -> Run:
+        words = [
+            Metric(f"words_{state.channel}_{state.detector_version}", state.words, "1")
+            for state in self._fleet.vocabularies()
+        ]
+        tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+        metrics = [Metric("turns", self._turn, "1"), *words, *traffic_metrics(self._store.traffic(), tracks)]
+        return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Work until stdin ends."""
+    # Who stops the service stops it first; its end ends stdin. It sends a signal as well, for nobody has to wait for a
+    # compiler.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    warm_up_fleet()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    gc.freeze()
+    gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
+    folder = MissionFolder(Path(arguments[0]))
+    alone = _alone(folder)
+    worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print)
+    _print(READY, 0)
+    while True:
+        wait_s = 0.0 if worker.step() else worker.wait_s()
+        if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
+            alone.close()
+            return 0
+
+
+def _alone(folder: MissionFolder) -> IO[str]:
+    """Wait until no other worker has this mission: one whose service was killed may still be at its last step.
+
+    The lock is this worker's until the file is closed.
+    """
+    file = folder.worker_lock.open("w")
+    fcntl.flock(file, fcntl.LOCK_EX)
+    return file
+
+
+def _print(event: str, number: int) -> None:
+    sys.stdout.write(json.dumps({"event": event, "number": number}) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

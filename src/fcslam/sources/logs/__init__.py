@@ -1,0 +1,1 @@
+"""Text logs: CARMEN, CMU, DP-SLAM, CoreSLAM."""

@@ -1,0 +1,106 @@
+"""CARMEN logs: one message a line, metres and radians.
+
+    PARAM name value ipc_hostname logger_timestamp
+    ODOM x y theta tv rv accel ipc_timestamp ipc_hostname logger_timestamp
+    FLASER n r1..rn x y theta odom_x odom_y odom_theta ipc_timestamp ipc_hostname logger_timestamp
+    ROBOTLASER1 type start_angle fov resolution max_range accuracy remission_mode n r1..rn n_remission [..]
+        laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward_safety side_safety turn_axis
+        ipc_timestamp ipc_hostname logger_timestamp
+
+A scan's stamp is the IPC timestamp. Both poses are in ``odom``: the first the laser's, the second the robot's.
+Other messages (rear lasers, SYNC, TRUEPOS ...) are passed over; a line that starts with no message name is broken.
+"""
+
+import re
+from collections.abc import Callable
+from math import isfinite, pi
+
+from fcslam.sources.logs.dialect import (
+    Dialect,
+    Line,
+    OdometryLine,
+    ParameterLine,
+    ScanLine,
+    StatedLaser,
+    check_beams,
+    pose_of,
+    stamp_of,
+)
+from fcslam.sources.logs.laser import SICK_MAX_RANGE_M
+
+SICK_TYPES = (0, 1)
+"""Values of ROBOTLASER1's ``type`` that mean a SICK LMS or PLS."""
+
+_MESSAGE = re.compile(rb"\s*(#|$|[A-Z][A-Z0-9_-]*(?=\s|$))")
+_KNOWN = re.compile(
+    rb"^[ \t]*(#.*CARMEN|(PARAM|SYNC|ODOM|[FR]LASER|RAWLASER\d|ROBOTLASER\d|NEFF|TRUEPOS)\s)", re.MULTILINE
+)
+
+
+def _parse(line: bytes) -> Line | None:
+    message = _MESSAGE.match(line)
+    if message is None:
+        raise ValueError("no CARMEN message")
+    parser = _PARSERS.get(message[1])
+    return parser(line) if parser else None
+
+
+def _parse_flaser(line: bytes) -> ScanLine:
+    front, *tail = line.rsplit(None, 9)
+    _, count, range_text = front.split(None, 2)
+    beam_count = int(count)
+    check_beams(range_text, beam_count)
+    return ScanLine(stamp_of(tail[6]), pose_of(tail[3:6]), pose_of(tail[:3]), beam_count, range_text)
+
+
+def _parse_robotlaser(line: bytes) -> ScanLine:
+    front, *tail = line.rsplit(None, 14)
+    _, kind, start, fov, resolution, max_range, _, _, count, body = front.split(None, 9)
+    beam_count = int(count)
+    range_text = _without_remissions(body, beam_count)
+    check_beams(range_text, beam_count)
+    stated = _stated_laser(int(kind), [float(token) for token in (start, fov, resolution, max_range)], beam_count)
+    return ScanLine(stamp_of(tail[11]), pose_of(tail[3:6]), pose_of(tail[:3]), beam_count, range_text, stated)
+
+
+def _without_remissions(body: bytes, beam_count: int) -> bytes:
+    if body.endswith(b" 0") and body.count(b" ") == beam_count:
+        return body[:-2]
+    words = body.split()
+    if not 0 < beam_count < len(words) or len(words) != beam_count + 1 + int(words[beam_count]):
+        raise ValueError("not as many ranges and remissions as stated")
+    return b" ".join(words[:beam_count])
+
+
+def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> StatedLaser:
+    start_rad, fov_rad, resolution_rad, max_range_m = numbers
+    increment_rad = resolution_rad if resolution_rad > 0.0 else fov_rad / (beam_count - 1)
+    if not (isfinite(start_rad) and 0.0 < increment_rad * (beam_count - 1) < 2.0 * pi + 0.1):
+        raise ValueError("no sane field of view")
+    if not 0.0 < max_range_m < float("inf"):
+        max_range_m = SICK_MAX_RANGE_M
+    if kind in SICK_TYPES:
+        max_range_m = min(max_range_m, SICK_MAX_RANGE_M)
+    return StatedLaser(start_rad, increment_rad, max_range_m)
+
+
+def _parse_odometry(line: bytes) -> OdometryLine:
+    words = line.split()
+    if len(words) < 10:
+        raise ValueError("too few words")
+    return OdometryLine(stamp_of(words[7]), pose_of(words[1:4]))
+
+
+def _parse_parameter(line: bytes) -> ParameterLine:
+    _, name, value, *_ = line.decode("ascii", errors="replace").split()
+    return ParameterLine(name, value)
+
+
+_PARSERS: dict[bytes, Callable[[bytes], Line]] = {
+    b"FLASER": _parse_flaser,
+    b"ROBOTLASER1": _parse_robotlaser,
+    b"ODOM": _parse_odometry,
+    b"PARAM": _parse_parameter,
+}
+
+CARMEN = Dialect("CARMEN log", lambda head: _KNOWN.search(head) is not None, lambda: _parse)

@@ -1,0 +1,127 @@
+"""What one pass over a text log shows, and whether the log can be mapped."""
+
+from dataclasses import dataclass
+from math import hypot, inf
+from pathlib import Path
+from typing import NamedTuple
+
+from fcslam.errors import SourceError
+from fcslam.sources.faults import Faults
+from fcslam.sources.gate import TOLERATED_SHARE, refuse_misfits
+from fcslam.sources.logs.dialect import Line, OdometryLine, ParameterLine, ScanLine
+from fcslam.sources.logs.laser import laser_model, parameter
+from fcslam.sources.pose import Pose, relative_pose
+from fcslam.sources.source import Survey
+
+SCANS_THAT_MUST_MOVE = 10
+
+_MOUNTING_TOLERANCE = 0.01
+"""Metres or radians between two scans' words on where the laser sits."""
+
+
+class Reading(NamedTuple):
+    """How a log is to be read."""
+
+    survey: Survey
+    pose_from_odometry: bool
+    """Scans take the pose of the latest odometry message: their own never changes."""
+
+
+@dataclass(slots=True)
+class Track:
+    """Stamps and poses along the way."""
+
+    count: int = 0
+    length_m: float = 0.0
+    moves: bool = False
+    earliest: float = inf
+    latest: float = -inf
+    _pose: Pose | None = None
+
+    def add(self, stamp: float, pose: Pose) -> None:
+        """Go on to ``pose``."""
+        if self._pose is not None and pose != self._pose:
+            self.moves = True
+            self.length_m += hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
+        self._pose = pose
+        self.count += 1
+        self.earliest = min(self.earliest, stamp)
+        self.latest = max(self.latest, stamp)
+
+    @property
+    def duration_s(self) -> float:
+        """Between the earliest and the latest stamp."""
+        return max(0.0, self.latest - self.earliest)
+
+
+class Mounting:
+    """Where the laser sits on the robot, from the two poses of every scan."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._first: Pose | None = None
+        self._differing = 0
+
+    def add(self, scan: ScanLine) -> None:
+        """Take one scan's word."""
+        pose = (0.0, 0.0, 0.0)
+        if scan.T_odom_laser != scan.T_odom_base:
+            pose = relative_pose(scan.T_odom_base, scan.T_odom_laser)
+        self._count += 1
+        self._first = self._first or pose
+        if pose != self._first and max(map(abs, relative_pose(self._first, pose))) > _MOUNTING_TOLERANCE:
+            self._differing += 1
+
+    def T_base_laser(self, offset_m: float) -> Pose:
+        """The pose that the scans agree on, to 0.1 mm; else ``offset_m`` ahead of the base.
+
+        Scans do not agree where one of the poses was corrected and the other was not, and say nothing where the
+        same pose was written twice.
+        """
+        assert self._first is not None
+        agreed = tuple(round(value, 4) + 0.0 for value in self._first)
+        if self._differing > TOLERATED_SHARE * self._count or not any(agreed):
+            return (offset_m, 0.0, 0.0)
+        return agreed[0], agreed[1], agreed[2]
+
+
+class Overview:
+    """Gathers what the lines of a log say together."""
+
+    def __init__(self) -> None:
+        self._scans = Track()
+        self._odometry = Track()
+        self._mounting = Mounting()
+        self._parameters: dict[str, str] = {}
+        self._scan: ScanLine | None = None
+
+    def add(self, line: Line) -> None:
+        """Take the next line."""
+        if isinstance(line, ScanLine):
+            self._scans.add(line.stamp, line.T_odom_base)
+            self._mounting.add(line)
+            if self._scan is None or (self._scan.stated is None and line.stated is not None):
+                self._scan = line
+        elif isinstance(line, OdometryLine):
+            self._odometry.add(line.stamp, line.T_odom_base)
+        elif isinstance(line, ParameterLine):
+            self._parameters[line.name] = line.value
+
+    def conclude(self, path: Path, faults: Faults) -> Reading:
+        """How to read the log at ``path``.
+
+        Raises:
+            SourceError: it cannot be mapped.
+        """
+        assert self._scan is not None
+        refuse_misfits(path, faults, self._scans.count, self._odometry.count, self._scan.beam_count)
+        pose_from_odometry = not self._scans.moves and self._odometry.moves
+        if not (self._scans.moves or pose_from_odometry) and self._scans.count >= SCANS_THAT_MUST_MOVE:
+            raise SourceError(
+                f"{path}: no odometry: the robot's pose is the same in all {self._scans.count} scans; "
+                "give a log with wheel odometry, of a robot that moves"
+            )
+        offset_m = parameter(self._parameters, "robot_frontlaser_offset") or 0.0
+        laser = laser_model(self._scan, self._parameters, self._mounting.T_base_laser(offset_m))
+        length_m = self._odometry.length_m if pose_from_odometry else self._scans.length_m
+        return Reading(Survey(self._scans.count, self._scans.duration_s, length_m, laser, faults), pose_from_odometry)

@@ -1,0 +1,71 @@
+"""Atomic writes: a file or a folder holds all of its old content or all of the new one, whatever happens."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def write_file(path: Path, content: bytes | memoryview | str, *, private: bool = False) -> None:
+    """Replace a file atomically.
+
+    Args:
+        path: the file; its folder exists.
+        content: what it holds afterwards; text is encoded as UTF-8.
+        private: only the owner may read it, from the first moment.
+
+    Raises:
+        OSError: the file cannot be written; the old one is unchanged.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    with replacing(path) as unfinished:
+        mode = 0o600 if private else 0o666
+        with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(data)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a path beside ``path`` for a file to be written; it replaces ``path`` when the block succeeds.
+
+    Raises:
+        OSError: the file cannot be replaced; the old one is unchanged.
+    """
+    unfinished = path.with_name(f".{path.name}.partial")
+    unfinished.unlink(missing_ok=True)
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Give a new folder beside ``path``; it replaces ``path`` when the block succeeds and is removed otherwise.
+
+    Raises:
+        OSError: the folder cannot be written or replaced; the old one is unchanged.
+    """
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    retired = path.with_name(f".{path.name}.{os.getpid()}.retired")
+    try:
+        unfinished.mkdir()
+        yield unfinished
+        _exchange(path, unfinished, retired)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+        shutil.rmtree(retired, ignore_errors=True)
+
+
+def _exchange(path: Path, unfinished: Path, retired: Path) -> None:
+    """Put ``unfinished`` in the place of ``path``; if that fails, the old folder comes back."""
+    if path.exists():
+        path.rename(retired)
+    try:
+        unfinished.rename(path)
+    except BaseException:
+        if retired.exists():
+            retired.rename(path)
+        raise

@@ -1,0 +1,360 @@
+"""What the service answers: robots, viewers, administrators; and what it does not let happen."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fcslam.errors import ServiceError
+from fcslam.features.detector import SHIPPED_NETWORK
+from fcslam.records import Channel, Correction, Keyscan
+from fcslam.runs import open_run
+from fcslam.service import intake
+from fcslam.service.http import prometheus as measures
+from fcslam.service.mission_store import MissionStore
+from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.batches import read_batch
+from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
+from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
+from fcslam.wire.packets import decode, encode, readdress
+from tests.scripted import LASER
+from tests.service.http.desk import POSES, A, B, Desk, put_detector
+
+API = "/api/v1"
+PACKETS = f"{API}/robots/a/packets"
+
+
+@pytest.fixture
+def mapped(desk):
+    for robot, data in (("a", A), ("b", B)):
+        desk.told(desk.send(robot, data))
+    return desk
+
+
+def get(desk, path, as_="eye"):
+    response = desk.ask("GET", f"{API}/{path}", as_)
+    assert response.status_code == 200, response.text
+    return response
+
+
+def test_a_robot_hears_what_is_stored_and_where_it_is(mapped):
+    told = mapped.told(mapped.send("b", B[-1:]))
+    assert told[0] == Acknowledgement("b", 0, len(B) - 1)
+    assert isinstance(told[1], Correction)
+    known = {"Fcslam-Correction": str(told[1].version)}
+    assert mapped.told(mapped.send("b", [], **known)) == told[:1]
+    state = mapped.ask("GET", f"{API}/robots/b/state", "b").json()
+    assert state == {
+        "robot": "b", "epoch": 0, "next": {"0": len(B)}, "correction": told[1].version, "map": 0, "refused": [],
+    }  # fmt: skip
+    assert mapped.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
+
+
+def test_a_robot_that_is_not_known_has_nothing_stored(desk):
+    state = desk.ask("GET", f"{API}/robots/a/state", "a").json()
+    assert state == {"robot": "a", "epoch": None, "next": {}, "correction": -1, "map": None, "refused": []}
+    assert desk.told(desk.send("a", [])) == []
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [([A[0], b"no packet", A[2]], 400), ([A[0], B[0]], 400), ([A[0], A[1][:-1]], 400)],
+)
+def test_a_refused_packet_has_an_index_and_a_reason(desk, data, status):
+    response = desk.send("a", data)
+    assert response.status_code == status
+    assert response.json()["index"] == 1
+    assert response.json()["error"]
+    assert desk.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": 1}
+
+
+def test_what_the_worker_refuses_later_is_told_with_every_answer_and_why_on_asking(desk):
+    assert desk.send("a", A[:9]).headers["Fcslam-Refused"] == "0"
+    again = next(k for k, data in enumerate(A) if isinstance(decode(data).body, Keyscan))
+    desk.told(desk.send("a", [readdress(A[again], 0, 9)]))
+    assert desk.send("a", []).headers["Fcslam-Refused"] == "1"
+    (refused,) = desk.ask("GET", f"{API}/robots/a/state", "a").json()["refused"]
+    assert (refused["epoch"], refused["sequence"], "keyscan" in refused["reason"]) == (0, 9, True)
+    assert get(desk, "robots/a").json()["refused"] == [refused]
+    assert desk.send("b", B[:2]).headers["Fcslam-Refused"] == "0", "it is not its own"
+
+
+def test_a_second_agent_is_refused(desk):
+    desk.told(desk.send("a", A[:2]))
+    response = desk.send("a", A[2:4], **{"Fcslam-Agent": "y"})
+    assert (response.status_code, "another agent" in response.json()["error"]) == (409, True)
+    desk.now += 31.0
+    desk.told(desk.send("a", A[2:4], **{"Fcslam-Agent": "y"}))
+
+
+@pytest.mark.parametrize("announced", [True, False])
+def test_a_body_that_is_too_long_is_not_read(desk, announced):
+    body = b"\0" * (MAXIMUM_BATCH_BYTES + 1)
+    content = body if announced else iter([body[: 2**19], body[2**19 :]])
+    response = desk.ask("POST", PACKETS, "a", content=content)
+    assert response.status_code == 413
+    assert desk.state.mission.store.turn_count() == 0
+
+
+def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
+    statuses = [desk.ask("POST", PACKETS, "a", content=b"").status_code for _ in range(200)]
+    limit = statuses.index(429)
+    assert set(statuses[:limit]) == {200}
+    response = desk.ask("POST", PACKETS, "a", content=b"")
+    assert desk.ask("POST", f"{API}/robots/b/packets", "b", content=b"").status_code == 200
+    desk.now += int(response.headers["Retry-After"])
+    assert desk.ask("POST", PACKETS, "a", content=b"").status_code == 200
+
+
+def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk, monkeypatch):
+    """A place of 2,048 keypoints at one point, whose descriptors are what is most to be expected: a few bytes."""
+
+    def unread(*_):
+        raise AssertionError("it is unpacked")
+
+    def batch(first, count):
+        numbers = range(first, first + count)
+        body = {"number": 0, "channel": 1, "count": 2048, "detector_version": "test-1"}
+        return [pb.Packet(version=1, robot="a", sequence=k, place=body).SerializeToString() for k in numbers]
+
+    assert sum(map(len, batch(0, 100))) < 4000
+    monkeypatch.setattr(intake, "decode", unread)
+    assert desk.send("a", batch(0, 100)).status_code == 413
+    monkeypatch.undo()
+    statuses = [desk.send("a", batch(0, 5)).status_code for _ in range(9)]
+    assert (statuses[0], statuses[-1]) == (400, 429)
+
+
+def test_a_full_disk_is_507_and_nothing_is_acknowledged(desk):
+    desk.told(desk.send("a", A[:3]))
+    database = desk.state.mission.store._database
+    pages = database.value("PRAGMA page_count")
+    database.share(lambda connection: connection.execute(f"PRAGMA max_page_count={pages}"))
+    response = desk.send("a", A[3:])
+    assert response.status_code == 507
+    assert "full" in response.json()["error"]
+    database.share(lambda connection: connection.execute("PRAGMA max_page_count=1000000"))
+    assert desk.told(desk.send("a", A[3:]))[0] == Acknowledgement("a", 0, len(A) - 1)
+
+
+def test_viewers_see_the_fleet(mapped):
+    fleet = get(mapped, "fleet").json()
+    assert (fleet["robots"], fleet["maps"], fleet["packets"]) == (["a", "b"], 1, len(A) + len(B))
+    robots = get(mapped, "robots").json()
+    assert [(robot["session"], robot["map"], robot["packets"]) for robot in robots] == [
+        ("a", 0, len(A)),
+        ("b", 0, len(B)),
+    ]
+    assert get(mapped, "robots/a").json()["refused"] == []
+    assert mapped.ask("GET", f"{API}/robots/c", "eye").status_code == 404
+    accepted = get(mapped, "closures?status=accepted").json()
+    assert len(accepted) == 4
+    assert {(c["robot_i"], c["robot_j"]) for c in accepted} == {("a", "b")}
+    assert get(mapped, "closures?status=accepted&limit=3").json() == accepted[1:]
+    assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a", "b"]}]
+
+
+def test_viewers_get_the_files_of_the_live_run(mapped):
+    live = mapped.state.mission.folder.live
+    for path, name in {
+        "maps/0.png": "map.png",
+        "maps/0.pgm": "map.pgm",
+        "maps/0.yaml": "map.yaml",
+        "pose_graph.g2o": "pose_graph.g2o",
+        "trajectories/b.tum": "trajectories/b.tum",
+    }.items():
+        assert get(mapped, path).content == (live / name).read_bytes()
+    for path in ("maps/1.png", "trajectories/c.tum", "maps/0.exe", "trajectories/..%2F..%2Fmission.tum"):
+        assert mapped.ask("GET", f"{API}/{path}", "eye").status_code in (400, 404)
+
+
+@pytest.mark.parametrize("path", [f"maps/{10**300}.png", f"maps/0/tiles/0/{10**30}/0.png"])
+def test_numbers_that_no_map_has_are_refused_and_no_fault_of_the_service(mapped, path):
+    assert mapped.ask("GET", f"{API}/{path}", "eye").status_code == 400
+
+
+def test_before_the_first_map_there_is_none(desk):
+    assert get(desk, "fleet").json()["robots"] == []
+    assert get(desk, "maps").json() == []
+    assert desk.ask("GET", f"{API}/maps/0.png", "eye").status_code == 404
+
+
+def test_tiles_show_what_the_map_shows(mapped):
+    import cv2
+
+    fine = get(mapped, "maps/0/tiles/8/0/0.png")
+    assert fine.headers["content-type"] == "image/png"
+    picture = cv2.imdecode(np.frombuffer(fine.content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture.shape == (256, 256)
+    far = cv2.imdecode(
+        np.frombuffer(get(mapped, "maps/0/tiles/8/5000/-5000.png").content, np.uint8), cv2.IMREAD_GRAYSCALE
+    )
+    assert set(np.unique(far)) == {205}, "where the map ends nothing is known"
+    assert mapped.ask("GET", f"{API}/maps/0/tiles/9/0/0.png", "eye").status_code == 400
+
+
+def test_a_result_is_a_run_folder(mapped):
+    answer = mapped.ask("POST", f"{API}/finalize", "boss").json()
+    run = open_run(Path(answer["run"]))
+    assert sum(len(t.stamps) for t in run.trajectories) == 2 * len(POSES)
+    assert mapped.ask("POST", f"{API}/finalize", "boss").json()["number"] == answer["number"] + 1
+
+
+def test_a_veto_parts_what_only_it_held_together(mapped):
+    assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b"}).status_code == 201
+    assert len(get(mapped, "maps").json()) == 2
+    both = {"robot_i": "a", "robot_j": "b"}
+    for wrong, status in (
+        ({"robot_i": "a", "robot_j": "x"}, 404), ({"robot_i": "a"}, 400), ({**both, "stamps": [1.0]}, 400),
+        ({**both, "stamps": [1.0, None]}, 400), ({"robot_i": "a", "robot_j": ""}, 400), ({**both, "more": 1}, 400),
+    ):  # fmt: skip
+        assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == status
+    assert "b+x" in mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+x"}).text
+    assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+1"}).status_code == 201
+
+
+def test_missions_are_begun_opened_and_rest_as_they_were(mapped):
+    assert mapped.ask("POST", f"{API}/missions", "boss", json={"name": "next"}).json() == {
+        "open": "next",
+        "missions": ["mission", "next"],
+    }
+    assert get(mapped, "fleet").json()["packets"] == 0
+    mapped.told(mapped.send("a", A[:5]))
+    mapped.ask("POST", f"{API}/missions/mission/open", "boss")
+    assert get(mapped, "fleet").json()["packets"] == len(A) + len(B)
+    mapped.ask("POST", f"{API}/missions/next/open", "boss")
+    assert get(mapped, "fleet").json()["packets"] == 5
+    long = mapped.ask("POST", f"{API}/missions", "boss", json={"name": "x" * 70_000})
+    assert (long.status_code, "over" in long.json()["error"]) == (413, True)
+    for wrong in ("next", "../x", "", ".hidden"):
+        assert mapped.ask("POST", f"{API}/missions", "boss", json={"name": wrong}).status_code in (400, 409)
+    assert mapped.ask("POST", f"{API}/missions/none/open", "boss").status_code == 404
+
+
+def test_a_mission_travels_as_one_file(mapped, tmp_path, scripted):
+    content = mapped.ask("GET", f"{API}/missions/mission/export", "boss").content
+    with Desk(tmp_path / "elsewhere") as other:
+        response = other.ask("POST", f"{API}/missions/import?name=brought", "boss", content=content)
+        assert response.json() == {"open": "mission", "missions": ["brought", "mission"]}
+        other.ask("POST", f"{API}/missions/brought/open", "boss")
+        other.state.mission.worker.ring()
+        assert get(other, "maps").json() == get(mapped, "maps").json()
+        assert other.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
+        for name, wrong, status in (
+            ("brought", content, 409),
+            ("broken", content[:1000], 400),
+            ("text", b"hello", 400),
+        ):
+            refused = other.ask("POST", f"{API}/missions/import?name={name}", "boss", content=wrong)
+            assert refused.status_code == status
+        assert other.state.missions.names == ["brought", "mission"]
+
+
+def test_the_open_mission_is_open_again_when_the_service_starts_again(tmp_path, scripted):
+    scripted()
+    with Desk(tmp_path / "data") as desk:
+        desk.ask("POST", f"{API}/missions", "boss", json={"name": "next"})
+        desk.told(desk.send("a", A[:5]))
+    with Desk(tmp_path / "data") as again:
+        assert again.state.mission.folder.name == "next"
+        assert again.told(again.send("a", A[5:6]))[:1] == [Acknowledgement("a", 0, 5)]
+
+
+def test_two_services_do_not_share_a_folder(desk):
+    with pytest.raises(ServiceError, match="another service"):
+        Desk(desk.state.missions.root)
+
+
+def measured(desk):
+    text = get(desk, "../../metrics").text
+    told = (line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+    return {name: float(value) for name, value in told}
+
+
+def uplink(desk, robot):
+    """Bytes of one robot, by the measures."""
+    lines = measured(desk).items()
+    return sum(value for name, value in lines if name.startswith("fcslam_bytes_total{") and f'robot="{robot}"' in name)
+
+
+def test_measures_say_what_came_in(mapped):
+    lines = measured(mapped)
+    assert lines['fcslam_packets_total{channel="lidar",kind="place",mission="mission",robot="a"}'] > 0
+    assert uplink(mapped, "a") == sum(map(len, A))
+    assert lines["fcslam_packets_stored"] == len(A) + len(B)
+    assert lines["fcslam_packets_queued"] == 0
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 10_000])
+def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, scripted, monkeypatch, at_once):
+    monkeypatch.setattr(measures, "_AT_ONCE", at_once)
+    scripted()
+    with Desk(tmp_path / "data") as desk:
+        desk.told(desk.send("a", A[:5]))
+        before = uplink(desk, "a")
+        desk.told(desk.send("a", A[3:9]))
+        assert (before, uplink(desk, "a")) == (sum(map(len, A[:5])), sum(map(len, A[:9]))), "again is not new"
+        assert desk.send("a", [A[9][:-1]]).status_code == 400
+        refused = uplink(desk, "a")
+    with Desk(tmp_path / "data") as again:
+        assert uplink(again, "a") == refused >= before
+        again.told(again.send("b", B[:4]))
+        assert (uplink(again, "a"), uplink(again, "b")) == (refused, sum(map(len, B[:4])))
+        again.ask("POST", f"{API}/missions", "boss", json={"name": "next"})
+        again.told(again.send("a", A[:2]))
+        assert uplink(again, "a") == refused + sum(map(len, A[:2])), "missions are told apart, and none is forgotten"
+
+
+def test_measures_say_what_robots_were_told_by_kind(mapped):
+    def measured(kind):
+        line = f'fcslam_answer_bytes_total{{kind="{kind}",robot="a"}} '
+        found = [row for row in get(mapped, "../../metrics").text.splitlines() if row.startswith(line)]
+        return float(found[0].removeprefix(line)) if found else 0.0
+
+    before = [measured(kind) for kind in ("acknowledgement", "correction")]
+    told = [data for _ in range(3) for data in read_batch(mapped.send("a", A[-1:]).content)]
+    sizes = Counter()
+    for data in told:
+        sizes[type(decode(data).body)] += len(data)
+    after = [measured(kind) for kind in ("acknowledgement", "correction")]
+    assert [b - a for a, b in zip(before, after, strict=True)] == [sizes[Acknowledgement], sizes[Correction]]
+    assert all(sizes.values())
+
+
+def test_the_interface_describes_itself(desk):
+    told = desk.ask("GET", "/openapi.json").json()
+    assert PACKETS.replace("/a/", "/{robot}/") in told["paths"]
+    assert desk.ask("GET", "/docs").status_code == 404
+
+
+def test_a_robot_can_fetch_a_detector(desk):
+    put_detector(desk, b"network")
+    assert desk.ask("GET", f"{API}/detectors/camera/v1", "a").content == b"network"
+    assert get(desk, "detectors").json() == [{"channel": "camera", "version": "v1", "announced": False}]
+    assert desk.ask("GET", f"{API}/detectors/camera/v2", "a").status_code == 404
+    assert desk.ask("GET", f"{API}/detectors/smell/v1", "a").status_code == 400
+
+
+def test_robots_with_a_camera_are_told_of_a_newer_detector_until_they_have_it(desk):
+    network = SHIPPED_NETWORK.read_bytes()
+    version = desk.ask("POST", f"{API}/detectors", "boss", content=network).json()["version"]
+    hello = Hello("a", 0, LASER, {Channel.CAMERA: "orb-1", Channel.LIDAR: "test-1"})
+    told = desk.told(desk.send("a", [encode(Packet("a", 0, 0, 0.0, hello))]))
+    release = next(body for body in told if isinstance(body, Release))
+    assert (release.file.version, release.file.size) == (version, len(network))
+    assert desk.ask("GET", f"{API}/detectors/camera/{version}", "a").content == network
+    assert any(isinstance(body, Release) for body in desk.told(desk.send("a", [])))
+    again = replace(hello, detector_versions={**hello.detector_versions, Channel.CAMERA: version})
+    assert desk.told(desk.send("a", [encode(Packet("a", 0, 1, 0.0, again))])) == [Acknowledgement("a", 0, 1)]
+    assert not any(isinstance(body, Release) for body in desk.told(desk.send("b", B[:2]))), "it has no camera"
+    assert get(desk, "detectors").json() == [{"channel": "camera", "version": version, "announced": True}]
+    assert desk.ask("POST", f"{API}/detectors", "boss", content=b"no network").status_code == 400
+
+
+def test_packets_are_on_disk_before_they_are_acknowledged(desk):
+    desk.told(desk.send("a", A[:7]))
+    seen = MissionStore(desk.state.mission.folder.store)
+    assert [packet.data for packet in seen.turns(0, 100)] == A[:7]
+    seen.close()

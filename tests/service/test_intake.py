@@ -1,0 +1,163 @@
+"""Batches: stored before they are acknowledged, refused with a reason, one agent at a time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fcslam.errors import PacketConflictError, PacketError
+from fcslam.records import Correction, frozen
+from fcslam.service import intake as module
+from fcslam.service.intake import LEASE_S, BusyError, Intake, LeaseError, RefusedPacketError
+from fcslam.service.mission_store import MissionStore, SessionCorrection
+from fcslam.wire.batches import read_batch, write_batch
+from fcslam.wire.messages import Acknowledgement, Hello, Packet
+from fcslam.wire.packets import decode, encode
+from tests.scripted import rectangle, stream
+
+PACKETS = stream("a", rectangle(9), start_s=0.0)
+DATA = [encode(packet) for packet in PACKETS]
+
+
+class Desk:
+    """An intake over a store, with a clock that stands still."""
+
+    def __init__(self, path):
+        self.now = 100.0
+        self.store = MissionStore(path)
+        self.intake = Intake(self.store, lambda: self.now, lambda: 1e9)
+
+    def take(self, *data, robot="a", agent="x", known=-1):
+        batch = self.intake.take(robot, agent, write_batch(data), known).batch
+        return [decode(packet).body for packet in read_batch(batch)]
+
+
+@pytest.fixture
+def desk(tmp_path):
+    desk = Desk(tmp_path / "mission.sqlite")
+    yield desk
+    desk.store.close()
+
+
+@given(data=st.data())
+def test_what_is_acknowledged_is_stored_without_a_gap(data, tmp_path_factory):
+    desk = Desk(tmp_path_factory.mktemp("intake") / "mission.sqlite")
+    sent = set()
+    for _ in range(data.draw(st.integers(1, 5))):
+        numbers = data.draw(st.lists(st.integers(0, len(DATA) - 1), max_size=10))
+        answer = desk.take(*(DATA[k] for k in numbers))
+        sent |= set(numbers)
+        missing = next(n for n in range(len(DATA) + 1) if n not in sent)
+        expected = [Acknowledgement("a", 0, missing - 1)] if missing else []
+        assert answer == expected
+        assert [p.data for p in desk.store.turns(0, 100)] == DATA[:missing]
+    desk.store.close()
+
+
+def test_every_epoch_in_a_batch_is_acknowledged(desk):
+    later = replace(PACKETS[0], epoch=4, body=replace(PACKETS[0].body, epoch=4))
+    told = desk.take(DATA[0], encode(later))
+    assert told == [Acknowledgement("a", 0, 0), Acknowledgement("a", 4, 0)]
+    assert desk.take() == [Acknowledgement("a", 4, 0)], "a robot that only asks hears of its newest session"
+
+
+def test_a_correction_is_told_once(desk):
+    desk.take(*DATA[:5])
+    pose = frozen(np.array([1.0, 2.0, 0.5]))
+    desk.store.progress(5, [SessionCorrection("a", 0, 3.0, Correction("a", 0, 2, pose))])
+    first = desk.take(DATA[5])[-1]
+    assert (first.map_index, first.T_map_odom.tolist()) == (2, pose.tolist())
+    assert desk.take(DATA[6], known=first.version) == [Acknowledgement("a", 0, 6)]
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        (b"\x00\x01\x02", "protobuf"),
+        (DATA[3][:-1], "protobuf"),
+        (encode(stream("b", rectangle(9), 0.0)[3]), "robot b, sent by a"),
+        (encode(Packet("a", 0, 3, 0.0, Acknowledgement("a", 0, 3))), "goes to a robot"),
+        (DATA[3] + b"\xc0\x3e\x01", "unknown"),
+    ],
+)
+def test_a_bad_packet_is_refused_and_those_before_it_are_stored(desk, bad, reason):
+    for _ in range(2):  # a second attempt fares no better
+        with pytest.raises(RefusedPacketError, match=reason) as caught:
+            desk.take(*DATA[:3], bad, *DATA[4:6])
+        assert caught.value.index == 3
+    assert [p.data for p in desk.store.turns(0, 100) if p.refusal is None] == DATA[:3]
+
+
+def test_the_number_of_a_refused_packet_is_used_up_so_the_next_ones_are_acknowledged(desk):
+    with pytest.raises(RefusedPacketError):
+        desk.take(*DATA[:3], DATA[3] + b"\xc0\x3e\x01")
+    assert desk.take(DATA[4]) == [Acknowledgement("a", 0, 4)]
+    assert [(number, bool(reason)) for _, number, reason in desk.store.refusals("a")] == [(3, True)]
+
+
+def test_two_packets_with_one_number_are_a_conflict(desk):
+    desk.take(*DATA[:3])
+    with pytest.raises(PacketConflictError):
+        desk.take(encode(replace(PACKETS[3], sequence=2)))
+
+
+def test_bytes_that_are_no_batch_change_nothing(desk):
+    with pytest.raises(PacketError, match="batch"):
+        desk.intake.take("a", "x", write_batch(DATA[:2])[:-1], -1)
+    assert desk.store.turn_count() == 0
+
+
+def test_a_second_agent_waits_until_the_first_is_silent_long_enough(desk):
+    desk.take(DATA[0], agent="x")
+    desk.take(robot="b", agent="y")  # another robot is another matter
+    with pytest.raises(LeaseError, match="another agent"):
+        desk.take(DATA[1], agent="y")
+    desk.now += LEASE_S - 1.0
+    desk.take(DATA[1], agent="x")
+    desk.now += LEASE_S - 1.0
+    with pytest.raises(LeaseError):
+        desk.take(DATA[2], agent="y")
+    desk.now += 1.0
+    assert desk.take(DATA[2], agent="y") == [Acknowledgement("a", 0, 2)]
+    with pytest.raises(LeaseError):
+        desk.take(DATA[3], agent="x")
+
+
+def test_what_cannot_be_taken_in_now_has_to_wait(desk, monkeypatch):
+    monkeypatch.setattr(module, "LONGEST_QUEUE", 4)
+    desk.take(*DATA[:5])
+    with pytest.raises(BusyError, match="5 packets"):
+        desk.take(DATA[5])
+    desk.store.progress(3, [])
+    assert desk.take(DATA[5]) == [Acknowledgement("a", 0, 5)]
+
+
+def test_a_packet_far_ahead_has_to_wait_for_those_before_it(desk, monkeypatch):
+    monkeypatch.setattr(module, "FURTHEST_AHEAD", 3)
+    with pytest.raises(BusyError, match="send packet 0 first"):
+        desk.take(DATA[4])
+    assert desk.take(DATA[3]) == []
+    assert desk.store.waiting_count() == 1
+
+
+def test_packets_that_wait_for_one_before_them_keep_out_neither_it_nor_other_robots(desk, monkeypatch):
+    monkeypatch.setattr(module, "LONGEST_QUEUE", 20)
+    monkeypatch.setattr(module, "MOST_EARLY", 6)
+    in_epoch = [encode(replace(p, epoch=1)) for p in PACKETS[1:9] if not isinstance(p.body, Hello)]
+    desk.take(*DATA[1:5])
+    desk.take(*in_epoch[:2])
+    for data in (DATA[5:6], in_epoch[2:3]):
+        with pytest.raises(BusyError, match="send packet 0 of epoch"):
+            desk.take(*data)
+    other = [encode(packet) for packet in stream("b", rectangle(9), start_s=0.0)]
+    assert desk.take(*other[:5], robot="b") == [Acknowledgement("b", 0, 4)]
+    assert desk.take(DATA[0])[0] == Acknowledgement("a", 0, 4)
+    assert desk.take(DATA[5])[0] == Acknowledgement("a", 0, 5)
+
+
+@pytest.mark.parametrize("name", ["a+1", "a+12"])
+def test_a_robot_that_is_called_like_a_session_is_refused(desk, name):
+    with pytest.raises(PacketError, match="session of 'a'"):
+        desk.take(robot=name)

@@ -1,0 +1,231 @@
+"""What is stored is there once, as it came, whatever the order; its turns follow the numbers of each session."""
+
+import os
+import sqlite3
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fcslam.errors import PacketConflictError, StoreError
+from fcslam.records import Channel, Correction, Veto, frozen
+from fcslam.service.mission_store import NEWS_M, NEWS_RAD, MissionStore, SessionCorrection, StoredPacket, check_mission
+from fcslam.wire.messages import Kind
+
+NUMBERS = st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 2), st.integers(0, 12))
+BATCHES = st.lists(st.lists(NUMBERS, max_size=8), max_size=12)
+
+
+def packet(robot="a", epoch=0, sequence=0, data=None) -> StoredPacket:
+    content = f"{robot} {epoch} {sequence}".encode() if data is None else data
+    return StoredPacket(robot, epoch, sequence, 0.5 * sequence, Kind.PLACE, Channel.CAMERA, content)
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = MissionStore(tmp_path / "mission.sqlite")
+    yield store
+    store.close()
+
+
+def correction(robot, x, epoch=0, y=0.0, theta=0.0, map_index=0, quality=0.25):
+    return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, map_index, frozen((x, y, theta)), quality))
+
+
+@given(batches=BATCHES)
+def test_any_order_and_any_repetition_give_the_same_set_and_the_same_acknowledgement(batches, tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "mission.sqlite"
+    store = MissionStore(path)
+    seen: set[tuple[str, int, int]] = set()
+    turns: list[tuple[str, int, int]] = []
+    for batch in batches:
+        new = store.put([packet(*number) for number in batch], received_s=1.0)
+        assert new == len(set(batch) - seen)
+        seen |= set(batch)
+        told = [(p.robot, p.epoch, p.sequence) for p in store.turns(0, 1000)]
+        assert told[: len(turns)] == turns, "what has a turn keeps it"
+        turns = told
+        for robot, epoch in {number[:2] for number in seen}:
+            missing = next(n for n in range(14) if (robot, epoch, n) not in seen)
+            assert store.next_sequence(robot, epoch) == missing
+            assert [n for *session, n in turns if session == [robot, epoch]] == list(range(missing))
+    assert store.turn_count() + store.waiting_count() == len(seen)
+    kept = store.turns(0, 1000)
+    assert all(p == packet(p.robot, p.epoch, p.sequence) for p in kept)
+    store.close()
+    again = MissionStore(path)
+    assert again.turns(0, 1000) == kept
+    again.close()
+
+
+def test_turns_can_be_read_in_pieces(store):
+    store.put([packet(sequence=k) for k in range(7)], 0.0)
+    assert [p.sequence for after in (0, 3, 6) for p in store.turns(after, 3)] == list(range(7))
+
+
+def test_another_packet_with_the_same_number_is_a_conflict_and_those_before_it_are_stored(store):
+    store.put([packet(sequence=1)], 0.0)
+    with pytest.raises(PacketConflictError, match="other content") as caught:
+        store.put([packet(sequence=0), packet(sequence=1, data=b"other"), packet(sequence=2)], 0.0)
+    assert caught.value.index == 1
+    assert [p.data for p in store.turns(0, 10)] == [b"a 0 0", b"a 0 1"]
+
+
+def test_a_batch_that_fails_in_the_middle_leaves_nothing(store, monkeypatch):
+    store.put([packet(sequence=0)], 0.0)
+    with pytest.raises(StoreError, match="full"):
+        store.put([packet(sequence=1), replace(packet(sequence=2), data=None)], 0.0)  # type: ignore[arg-type]
+    assert store.next_sequence("a", 0) == 1
+    assert store.waiting_count() == 0
+    store.put([packet(sequence=1)], 0.0)
+    assert store.turn_count() == 2
+
+
+def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
+    store = MissionStore(tmp_path / "mission.sqlite")
+    store.put([packet()], 0.0)
+    pages = store._database.value("PRAGMA page_count")
+    store._database.share(lambda database: database.execute(f"PRAGMA max_page_count={pages + 2}"))
+    with pytest.raises(StoreError, match="is the disk full"):
+        store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
+    assert store.turns(0, 10) == [packet()]
+    store._database.share(lambda database: database.execute("PRAGMA max_page_count=100000"))
+    store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
+    assert store.turn_count() == 9
+    store.close()
+
+
+def test_what_another_process_wrote_is_seen(store, tmp_path):
+    other = MissionStore(tmp_path / "mission.sqlite")
+    other.put([packet()], 0.0)
+    other.refuse(0, "no good")
+    assert store.refusals("a") == [(0, 0, "no good")]
+    assert store.turns(0, 1)[0].refusal == "no good"
+    other.close()
+
+
+@pytest.mark.parametrize("reopened", [False, True])
+def test_versions_of_corrections_grow_with_every_change_and_with_nothing_else(tmp_path, reopened):
+    path = tmp_path / "mission.sqlite"
+    store = MissionStore(path)
+    told = []
+    for x in (0.0, 0.0, 1.0, 1.0, 0.0):
+        store.progress(5, [correction("a", x), correction("b", 3.0)])
+        if reopened:
+            store.close()
+            store = MissionStore(path)
+        versions = {robot: store.correction(robot, 0).correction.version for robot in "ab"}
+        told.append((x, versions["a"], versions["b"]))
+    assert [x for x, *_ in told] == [0.0, 0.0, 1.0, 1.0, 0.0]
+    a = [version for _, version, _ in told]
+    assert a[0] == a[1] < a[2] == a[3] < a[4]
+    assert len({b for *_, b in told}) == 1
+    assert np.array_equal(store.correction("a", 0).correction.T_map_odom, (0.0, 0.0, 0.0))
+    assert store.correction("a", 1) is None
+    assert store.applied() == 5
+    store.close()
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "theta"])
+def test_what_a_robot_believes_creeps_no_further_away_than_what_is_news(store, axis):
+    """Many steps, each too small to be told of, are told of when they have become news together."""
+    limit = NEWS_RAD if axis == "theta" else NEWS_M
+    versions = []
+    for step in range(100):
+        truth = {"x": 3.0, axis: -0.3 * limit * step}
+        store.progress(step, [correction("a", **truth)])
+        told = store.correction("a", 0).correction
+        assert np.abs(told.T_map_odom - correction("a", **truth).correction.T_map_odom).max() < limit
+        versions.append(told.version)
+    assert 20 < len(set(versions)) < 35
+    assert versions == sorted(versions)
+
+
+def test_half_a_turn_to_the_left_is_half_a_turn_to_the_right(store):
+    store.put([], 0.0)
+    store.progress(1, [correction("a", 0.0, theta=np.pi)])
+    told = store.correction("a", 0).correction.version
+    store.progress(2, [correction("a", 0.0, theta=-np.pi)])
+    assert store.correction("a", 0).correction.version == told
+    store.progress(3, [correction("a", 0.0, theta=-np.pi + 2 * NEWS_RAD)])
+    assert store.correction("a", 0).correction.version > told
+
+
+def test_another_map_is_news_wherever_it_lies(store):
+    for map_index in (0, 1):
+        store.progress(1, [correction("a", 1.0, map_index=map_index)])
+        assert store.correction("a", 0).correction.map_index == map_index
+
+
+def test_vetoes_and_requests_are_kept_in_their_order(store):
+    vetoes = [Veto("a", "b"), Veto("a", "a", (1.5, 2.5))]
+    for veto in vetoes:
+        store.veto(veto)
+    store.put([packet()], 0.0)
+    number = store.ask_to_finalize()
+    asked = store.finalization(number)
+    assert (asked.turns, asked.vetoes, asked.run) == (1, 2, None)
+    store.answer(number, "1")
+    assert store.finalization(number).run == "1"
+    assert store.vetoes() == vetoes
+
+
+def test_an_export_is_the_mission_and_nothing_else_is(store, tmp_path):
+    store.put([packet(sequence=k) for k in (0, 1, 5)], 0.0)
+    store.export(tmp_path / "out.sqlite")
+    check_mission(tmp_path / "out.sqlite")
+    copy = MissionStore(tmp_path / "out.sqlite")
+    assert copy.turns(0, 10) == store.turns(0, 10)
+    assert copy.waiting_count() == 1
+    copy.close()
+    with pytest.raises(StoreError):
+        store.export(tmp_path / "out.sqlite")
+
+
+def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypatch):
+    store.put([packet()], 0.0)
+    link = os.link
+
+    def meanwhile(*paths):
+        storing = threading.Thread(target=store.put, args=([packet(sequence=1)], 0.0), daemon=True)
+        storing.start()
+        storing.join(20.0)
+        assert not storing.is_alive()
+        link(*paths)
+
+    monkeypatch.setattr(os, "link", meanwhile)
+    store.export(tmp_path / "out.sqlite")
+    assert store.turn_count() == 2
+    copy = MissionStore(tmp_path / "out.sqlite")
+    assert copy.turn_count() == 1
+    copy.close()
+
+
+@pytest.mark.parametrize("harm", ["text", "trigger", "view", "version", "torn", "kind", "channel", "none", "config"])
+def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
+    path = tmp_path / "out.sqlite"
+    store.put([packet(sequence=k, data=bytes(4000)) for k in range(20)], 0.0)
+    store.export(path)
+    content = path.read_bytes()
+    if harm == "text":
+        path.write_text("no database at all" * 100)
+    elif harm == "torn":
+        path.write_bytes(content[: len(content) // 2])
+    else:
+        connection = sqlite3.connect(path)
+        connection.execute({
+            "trigger": "CREATE TRIGGER t AFTER INSERT ON vetoes BEGIN DELETE FROM packets; END",
+            "view": "CREATE VIEW v AS SELECT 1",
+            "version": "PRAGMA user_version=99",
+            "kind": "UPDATE packets SET kind = 'rumour' WHERE sequence = 3",
+            "channel": "UPDATE packets SET channel = 'smell' WHERE sequence = 3",
+            "none": "UPDATE packets SET kind = NULL WHERE sequence = 3",
+            "config": "INSERT INTO facts VALUES ('config', '{\"seed\": \"x\"}')",
+        }[harm])  # fmt: skip
+        connection.commit()
+        connection.close()
+    with pytest.raises(StoreError):
+        check_mission(path)

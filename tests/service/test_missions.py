@@ -1,0 +1,68 @@
+"""Missions of one service: begun, opened, brought in, whatever the disk says."""
+
+import pytest
+
+from fcslam.cloud.settings import CloudConfig
+from fcslam.errors import StoreError
+from fcslam.service.missions import Missions
+
+
+class Launched:
+    """A worker that only counts."""
+
+    pid, starts, is_ready = None, 1, False
+
+    def __init__(self, folder):
+        self.folder, self.stopped = folder, False
+
+    def ring(self):
+        pass
+
+    def stop(self):
+        self.stopped = True
+
+
+@pytest.fixture
+def service(tmp_path):
+    """Missions, and the workers that they started."""
+    workers = []
+
+    def launch(folder):
+        workers.append(Launched(folder))
+        return workers[-1]
+
+    missions = Missions(tmp_path / "data", CloudConfig(), lambda: 0.0, lambda: 1e9, launch)
+    yield missions, workers
+    missions.close()
+
+
+def test_a_mission_that_cannot_be_opened_leaves_no_worker_and_the_other_one_open(service):
+    missions, workers = service
+    blocked = missions.root / ".open.partial"
+    blocked.mkdir()
+    with pytest.raises(StoreError, match="disk full"):
+        missions.create("next")
+    assert [(worker.folder.name, worker.stopped) for worker in workers] == [("mission", False), ("next", True)]
+    assert missions.open_mission.folder.name == "mission"
+    blocked.rmdir()
+    missions.open("next")
+    assert missions.open_mission.folder.name == "next"
+    assert [worker.stopped for worker in workers] == [True, True, False]
+
+
+def test_what_was_left_half_done_is_swept_away_and_the_rest_is_not(tmp_path):
+    root = tmp_path / "data"
+    left = [root / ".importx1", root / ".exportx2", root / "detectors" / ".stagingx3"]
+    kept = [root / "detectors" / "lost+found", root / "missions" / "old"]
+    for folder in (*left, *kept):
+        folder.mkdir(parents=True)
+        (folder / "network.onnx").write_text("x")
+    (kept[0] / "announced").write_text("v1")
+    (kept[1] / ".import.partial").write_text("half")
+    missions = Missions(root, CloudConfig(), lambda: 0.0, lambda: 1e9, Launched)
+    assert not any(folder.exists() for folder in left)
+    assert all((folder / "network.onnx").exists() for folder in kept)
+    assert not (kept[1] / ".import.partial").exists()
+    assert missions.detectors.versions() == []
+    assert missions.detectors.announced() == {}
+    missions.close()

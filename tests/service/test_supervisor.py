@@ -1,0 +1,113 @@
+"""The supervisor outlives its workers, however they end and whatever they say."""
+
+import sys
+import threading
+import time
+
+import pytest
+
+from fcslam.service import supervisor as module
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.supervisor import Supervisor
+
+SAYS = 'import sys; print(\'{"event": "live", "number": 7}\', flush=True);'
+STAYS = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
+"""As a worker that is ready."""
+WAITS = (
+    "import time, pathlib; go = pathlib.Path(sys.argv[1], 'go');"
+    "[time.sleep(0.02 * (not go.exists())) for _ in range(1000)];"
+)
+"""For the file ``go``, at most 20 s."""
+
+
+@pytest.fixture
+def supervised(tmp_path, monkeypatch):
+    """Starts a supervisor over workers that run the given code."""
+    monkeypatch.setattr(module, "LONGEST_PAUSE_S", 0.01)
+    started = []
+
+    def start(code, command=None):
+        told = []
+        chosen = command or (sys.executable, "-c", code)
+        supervisor = Supervisor(MissionFolder(tmp_path), time.monotonic, lambda *event: told.append(event), chosen)
+        started.append(supervisor)
+        return supervisor, told
+
+    yield start
+    for supervisor in started:
+        supervisor.stop()
+
+
+def wait(condition):
+    until = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.005)
+
+
+def test_rings_to_workers_that_die_do_not_keep_the_next_one_from_starting(supervised):
+    supervisor, told = supervised(SAYS + "import os; os.close(0); print(flush=True); os._exit(3)")
+
+    def rung():
+        supervisor.ring()
+        return supervisor.starts >= 4
+
+    wait(rung)
+    assert told[:2] == [("live", 7)] * 2
+
+
+def test_rings_that_are_not_read_keep_nobody_waiting(supervised, tmp_path):
+    supervisor, told = supervised(SAYS + WAITS + "sys.stdin.buffer.read(1);" + SAYS + "sys.stdin.buffer.read()")
+    wait(lambda: told)
+    for _ in range(100_000):
+        supervisor.ring()
+    assert len(told) == 1, "it reads nothing yet"
+    (tmp_path / "go").touch()
+    wait(lambda: len(told) == 2)
+
+
+def test_what_nobody_understands_is_left_out(supervised):
+    supervisor, told = supervised("print('oh'); print('[1]'); print('{}');" + SAYS + "sys.stdin.read()")
+    wait(lambda: told)
+    assert (told, supervisor.starts) == ([("live", 7)], 1)
+
+
+def test_a_worker_that_cannot_be_started_is_tried_again(supervised, tmp_path):
+    command = tmp_path / "worker"
+    _, told = supervised("", (str(command),))
+    time.sleep(0.05)
+    command.write_text('#!/bin/sh\necho \'{"event": "live", "number": 7}\'\n')
+    command.chmod(0o755)
+    wait(lambda: told)
+
+
+def test_a_ring_while_a_worker_ends_or_after_it_is_not_heard(supervised, tmp_path):
+    supervisor, told = supervised(STAYS + SAYS + "sys.stdin.buffer.read();" + SAYS + WAITS)
+    wait(lambda: told)
+    stopping = threading.Thread(target=supervisor.stop)
+    stopping.start()
+    wait(lambda: len(told) == 2)
+    supervisor.ring()
+    (tmp_path / "go").touch()
+    stopping.join()
+    supervisor.ring()
+    assert supervisor.pid is None
+
+
+def test_a_worker_is_ready_when_it_says_so_and_no_longer_when_it_is_gone(supervised, tmp_path):
+    ready = 'print(\'{"event": "ready", "number": 0}\', flush=True);'
+    supervisor, told = supervised(SAYS + WAITS + ready + "sys.stdin.buffer.read()")
+    wait(lambda: told)
+    assert not supervisor.is_ready
+    (tmp_path / "go").touch()
+    wait(lambda: supervisor.is_ready)
+    assert told == [("live", 7)], "that is for nobody else"
+    supervisor.stop()
+    assert not supervisor.is_ready
+
+
+def test_a_worker_that_is_not_ready_keeps_nobody_waiting(supervised):
+    supervisor, told = supervised(SAYS + "import time; time.sleep(1000)")
+    wait(lambda: told)
+    supervisor.stop()
+    assert (supervisor.pid, supervisor.starts) == (None, 1)

@@ -1,0 +1,61 @@
+"""After the warm-up nothing is left to be compiled, whatever robots send."""
+
+import json
+import subprocess
+import sys
+
+from fcslam.wire.packets import encode
+
+SCRIPT = """
+import json, sys
+from pathlib import Path
+from numba.core.dispatcher import Dispatcher
+from fcslam.service.warmup import warm_up_decoding, warm_up_fleet
+
+def compiled():
+    found = {}
+    for module in [module for name, module in sys.modules.items() if name.startswith("fcslam.")]:
+        for value in vars(module).values():
+            if isinstance(value, Dispatcher):
+                found[f"{value.py_func.__module__}.{value.py_func.__name__}"] = set(map(str, value.signatures))
+    return found
+
+def news(before):
+    return {name: sorted(kinds - before.get(name, set())) for name, kinds in compiled().items()
+            if kinds - before.get(name, set())}
+
+from fcslam.cloud.fleet import Fleet
+
+from fcslam.cloud.settings import FleetConfig
+from fcslam.cloud.report import keyscan_track, run_of
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.wire.packets import decode
+
+stream = [bytes.fromhex(data) for data in json.loads(Path(sys.argv[1]).read_text())]
+cold = compiled()
+warm_up_decoding()
+decoding = compiled()
+for data in stream:
+    decode(data)
+of_decoding = news(decoding)
+warm_up_fleet()
+warm = compiled()
+fleet = Fleet(FleetConfig(), seed=1)
+for data in stream:
+    fleet.receive(data)
+result = fleet.finalize()
+tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False)
+between = sum(c.i.robot != c.j.robot for c in result.closures)
+print(json.dumps([sum(map(len, cold.values())), sum(map(len, warm.values())), of_decoding, news(warm), between]))
+"""
+
+
+def test_after_the_warm_up_a_fleet_finds_all_its_code_compiled(tmp_path, packets):
+    stream = tmp_path / "stream.json"
+    stream.write_text(json.dumps([encode(packet).hex() for packet in packets]))
+    done = subprocess.run([sys.executable, "-c", SCRIPT, stream], capture_output=True, text=True, check=True)
+    cold, warm, of_decoding, of_fleet, between = json.loads(done.stdout)
+    assert warm > cold, "the warm-up compiles something"
+    assert between > 0, "the fleet gives the matcher and the verification something to do"
+    assert (of_decoding, of_fleet) == ({}, {})

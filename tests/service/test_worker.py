@@ -1,0 +1,380 @@
+"""The worker: what it makes of a store is what the mission makes of the recordings, whatever happens on the way."""
+
+import fcntl
+import gc
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.cloud.settings import CloudConfig
+from fcslam.mission import MissionConfig, run_mission
+from fcslam.records import ClosureStatus, Veto
+from fcslam.robot.frontend import RobotFrontend
+from fcslam.runs import open_run
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.mission_store import CONFIG, MissionStore, StoredPacket
+from fcslam.service.worker import AT_ONCE, Worker
+from fcslam.sources import open_source
+from fcslam.wire.messages import Packet
+from fcslam.wire.packets import encode, read_label
+from tests.scripted import closures, rectangle, stream
+from tests.small_fleet import in_order
+
+POSES = rectangle(29)
+SCRIPT = closures(("a", POSES), ("b", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)])
+
+
+def stored(packet, data=None):
+    content = encode(packet) if data is None else data
+    label = read_label(content)
+    return StoredPacket(packet.robot, packet.epoch, packet.sequence, packet.time, label.kind, label.channel, content)
+
+
+def sent(source, config):
+    frontend = RobotFrontend(source.name, config)
+    return [packet for record in source.records() for packet in frontend.process(record)] + frontend.finish()
+
+
+class Cloud:
+    """A store and a worker over it, as often as it is restarted; its clock moves by a second a look."""
+
+    def __init__(self, path, config=None):
+        self.folder = MissionFolder(path)
+        path.mkdir()
+        self.store = MissionStore(self.folder.store)
+        if config:
+            self.store.remember(CONFIG, config.model_dump_json())
+        self.now, self.told = 0.0, []
+        self.restart()
+
+    def restart(self):
+        self.worker = Worker(self.folder, self.store, self.clock, lambda *told: self.told.append(told))
+
+    def clock(self):
+        self.now += 1.0
+        return self.now
+
+    def put(self, packets):
+        self.store.put([stored(packet) for packet in packets], 0.0)
+
+    def work(self):
+        while self.worker.step():
+            pass
+
+    def finalize(self):
+        number = self.store.ask_to_finalize()
+        self.work()
+        asked = self.store.finalization(number)
+        assert asked.failure is None
+        return open_run(self.folder.run(asked.run))
+
+
+@pytest.fixture
+def cloud(tmp_path, scripted):
+    scripted(SCRIPT)
+    cloud = Cloud(tmp_path / "mission")
+    yield cloud
+    cloud.store.close()
+
+
+def two_robots():
+    return in_order([*stream("a", POSES, start_s=0.0), *stream("b", POSES, start_s=500.0)])
+
+
+def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_path, logs, rng_order):
+    config = MissionConfig(seed=3)
+    packets = in_order(packet for log in logs for packet in sent(open_source(log), config.robot))
+    expected = run_mission([open_source(log) for log in logs], config)
+    cloud = Cloud(tmp_path / "mission", CloudConfig(seed=3, fleet=config.fleet, map=config.map))
+    for batch in rng_order(packets):
+        cloud.put(batch)
+        cloud.worker.step()
+    run = cloud.finalize()
+    assert run.pose_graph_g2o == expected.pose_graph_g2o
+    assert {name: run.map_files[name] for name in run.map_files if not name.endswith("png")} == {
+        name: expected.map_files[name] for name in expected.map_files if not name.endswith("png")
+    }
+    assert [str(c) for c in run.closures if c.status is ClosureStatus.ACCEPTED] != []
+    told = [(c.robot_i, c.robot_j, c.status, c.reason) for c in run.closures]
+    assert told == [(c.robot_i, c.robot_j, c.status, c.reason) for c in expected.closures]
+    for robot, same in zip(run.trajectories, sorted(expected.trajectories, key=lambda t: t.robot), strict=True):
+        assert robot.robot == same.robot
+        assert set(np.round(robot.stamps, 6)) <= set(np.round(same.stamps, 6))
+    cloud.store.close()
+
+
+@pytest.fixture
+def rng_order():
+    """Batches of shuffled packets, some of them twice."""
+
+    def batches(packets):
+        rng = np.random.default_rng(11)
+        order = rng.permutation(np.concatenate([np.arange(len(packets)), rng.integers(0, len(packets), 50)]))
+        return [[packets[k] for k in part] for part in np.array_split(order, 9)]
+
+    return batches
+
+
+def test_a_worker_that_starts_again_goes_on_as_if_nothing_had_been(cloud, tmp_path, scripted):
+    packets = two_robots()
+    undisturbed = Cloud(tmp_path / "undisturbed")
+    undisturbed.put(packets)
+    undisturbed.work()
+    expected = undisturbed.finalize()
+    for part in np.array_split(np.arange(len(packets)), 4):
+        cloud.put([packets[k] for k in part])
+        cloud.worker.step()
+        cloud.restart()
+    run = cloud.finalize()
+    assert run.pose_graph_g2o == expected.pose_graph_g2o
+    assert run.map_files == expected.map_files
+    for robot in "ab":
+        told, same = (store.correction(robot, 0).correction for store in (cloud.store, undisturbed.store))
+        assert np.array_equal(told.T_map_odom, same.T_map_odom)
+    undisturbed.store.close()
+
+
+def test_a_worker_says_nothing_old_while_it_catches_up(cloud):
+    packets = two_robots()
+    cloud.put(packets)
+    cloud.work()
+    version, live = cloud.store.correction("b", 0).correction.version, cloud.folder.live.resolve()
+    cloud.restart()
+    while cloud.worker.step():
+        assert cloud.store.correction("b", 0).correction.version == version
+        assert cloud.store.applied() == len(packets)
+    assert cloud.folder.live.resolve() != live, "when it has caught up, it publishes once"
+    assert open_run(cloud.folder.live).pose_graph_g2o == open_run(live).pose_graph_g2o
+
+
+def test_a_packet_that_does_not_fit_is_refused_with_its_reason_and_the_session_goes_on(cloud):
+    packets = stream("a", POSES, start_s=0.0)
+    wrong = packets[1]
+    shifted = [*packets[:5], type(wrong)("a", 0, 5, packets[4].time, wrong.body)]
+    shifted += [type(p)("a", 0, p.sequence + 1, p.time, p.body) for p in packets[5:]]
+    cloud.put(shifted)
+    run = cloud.finalize()
+    assert [(epoch, number) for epoch, number, _ in cloud.store.refusals("a")] == [(0, 5)]
+    assert "keyscan 0 where" in cloud.store.refusals("a")[0][2]
+    assert len(run.trajectories[0].stamps) == len(POSES)
+    cloud.restart()
+    assert cloud.finalize().pose_graph_g2o == run.pose_graph_g2o
+
+
+def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkeypatch):
+    packets = stream("a", POSES, start_s=0.0)
+    cloud.put(packets)
+    fleet = type(cloud.worker._fleet)
+    receive = fleet.receive
+
+    def fragile(self, data):
+        if data == encode(packets[-1]):
+            raise ZeroDivisionError("oh")
+        return receive(self, data)
+
+    monkeypatch.setattr(fleet, "receive", fragile)
+    with pytest.raises(ZeroDivisionError):
+        cloud.work()
+    cloud.restart()
+    run = cloud.finalize()
+    assert len(run.trajectories) == 1
+    assert "ZeroDivisionError" in cloud.store.refusals("a")[0][2]
+
+
+def test_corrections_leave_while_there_is_still_a_queue(cloud):
+    cloud.put(two_robots())
+    waiting = []
+    while cloud.store.applied() < cloud.store.turn_count():
+        cloud.worker.step()
+        if cloud.store.correction("a", 0) is not None:
+            waiting.append(cloud.store.turn_count() - cloud.store.applied())
+    assert waiting[0] > len(waiting) // 2, "most packets wait when the first correction is there"
+    assert waiting == list(range(waiting[0], -1, -1)), "a packet takes longer than a look here: each is a step"
+
+
+def test_a_quick_worker_looks_after_a_number_of_packets_all_the_same(cloud, monkeypatch):
+    cloud.put(two_robots())
+    monkeypatch.setattr(cloud.worker, "_clock", lambda: 0.0)
+    cloud.worker.step()
+    assert cloud.store.applied() == AT_ONCE < cloud.store.turn_count()
+
+
+def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch):
+    cloud.put(stream("a", POSES, start_s=0.0))
+
+    def hungry(self, data):
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(cloud.worker._fleet), "receive", hungry)
+        with pytest.raises(MemoryError):
+            cloud.work()
+    assert cloud.store.refusals("a") == []
+    cloud.restart()
+    assert len(cloud.finalize().trajectories[0].stamps) == len(POSES)
+
+
+def test_a_worker_waits_until_the_one_before_is_gone(cloud):
+    command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
+    cloud.put(stream("a", POSES, start_s=0.0))
+    with cloud.folder.worker_lock.open("w") as before:
+        fcntl.flock(before, fcntl.LOCK_EX)
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            time.sleep(3.0)
+            assert cloud.store.applied() == 0
+            fcntl.flock(before, fcntl.LOCK_UN)
+            assert b"ready" in process.stdout.readline()
+            assert b"live" in process.stdout.readline()
+            process.stdin.close()
+            assert process.wait(60) == 0
+
+
+def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cloud):
+    command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.terminate()
+        assert process.wait(60) == -signal.SIGTERM
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert b"ready" in process.stdout.readline()
+        process.terminate()
+        process.stdin.close()
+        assert process.wait(60) == 0
+
+
+def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
+    cloud.put(two_robots())
+    assert {t.map_index for t in cloud.finalize().trajectories} == {0}
+    cloud.store.veto(Veto("a", "b"))
+    for _ in range(2):
+        run = cloud.finalize()
+        assert {t.map_index for t in run.trajectories} == {0, 1}
+        assert {c.status for c in run.closures} == {ClosureStatus.REVOKED}
+        cloud.restart()
+
+
+def test_a_result_waits_for_the_packets_that_were_there_when_it_was_asked_for(cloud):
+    packets = two_robots()
+    cloud.put(packets)
+    number = cloud.store.ask_to_finalize()
+    assert cloud.worker.step()
+    assert cloud.store.finalization(number).run is None
+    cloud.work()
+    run = open_run(cloud.folder.run(cloud.store.finalization(number).run))
+    assert sum(len(t.stamps) for t in run.trajectories) == 2 * len(POSES)
+    assert ("finalized", number) in cloud.told
+
+
+def test_the_live_run_follows_and_is_always_whole(cloud):
+    packets, seen = two_robots(), []
+    for part in np.array_split(np.arange(len(packets)), 5):
+        cloud.put([packets[k] for k in part])
+        cloud.work()
+        cloud.now += 1000.0
+        cloud.work()
+        seen.append(sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories))
+    assert seen == sorted(seen)
+    assert seen[-1] == 2 * len(POSES)
+    assert len(list((cloud.folder.path / "snapshots").iterdir())) <= 2
+
+
+def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):
+    packets = two_robots()
+    cloud.put(packets[:20])
+    cloud.work()
+    blocked = cloud.folder.path / "snapshots" / "2"
+    blocked.write_text("in the way")
+    cloud.put(packets[20:])
+    cloud.now += 1000.0
+    cloud.work()
+    assert cloud.store.applied() == len(packets)
+    assert cloud.folder.live.resolve().name == "1"
+    blocked.unlink()
+    cloud.now += 1000.0
+    cloud.work()
+    assert sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories) == 2 * len(POSES)
+
+
+def test_more_robots_join_a_mission_that_was_finished(cloud, tmp_path):
+    packets = two_robots()
+    half = [p for p in packets if p.robot == "a"]
+    cloud.put(half)
+    assert {t.robot for t in cloud.finalize().trajectories} == {"a"}
+    cloud.restart()
+    cloud.put(packets)
+    late = cloud.finalize()
+    together = Cloud(tmp_path / "together")
+    together.put(packets)
+    assert late.pose_graph_g2o == together.finalize().pose_graph_g2o
+    together.store.close()
+
+
+def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scripted):
+    scripted(closures(("a", POSES), ("a+1", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)]))
+    first, again = stream("a", POSES, start_s=0.0), stream("a", POSES, start_s=600_000.0)
+    cloud.put(first)
+    assert {t.robot: t.map_index for t in cloud.finalize().trajectories} == {"a": 0}
+    cloud.restart()
+    hello = replace(again[0], epoch=1, body=replace(again[0].body, epoch=1))
+    cloud.put([hello, *(replace(packet, epoch=1) for packet in again[1:])])
+    run = cloud.finalize()
+    assert {t.robot: t.map_index for t in run.trajectories} == {"a": 0, "a+1": 0}
+    assert {"map.pgm", "map.yaml", "map.png"} == set(run.map_files)
+
+
+def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
+    """What is replayed in the end is read from the store again."""
+
+    def in_memory():
+        gc.collect()
+        return sum(type(each) is Packet for each in gc.get_objects())
+
+    cloud.put(two_robots())
+    before = in_memory()
+    first = cloud.finalize()
+    assert in_memory() == before
+    assert cloud.finalize().pose_graph_g2o == first.pose_graph_g2o
+    assert in_memory() == before
+
+
+@pytest.mark.parametrize(("step_m", "kept"), [(1e6, 1), (1e5, 3)])
+def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same(cloud, step_m, kept):
+    far = np.cumsum(np.full((13, 3), (step_m, 0.0, 0.0)), axis=0)
+    cloud.put(stream("c", far, start_s=0.0))
+    run = cloud.finalize()
+    assert "m from the start" in cloud.store.refusals("c")[0][2]
+    assert {t.robot: len(t.stamps) for t in run.trajectories} == {"c": kept}
+    assert cloud.folder.live.exists()
+
+
+def test_corrections_number_maps_as_the_live_run_does(cloud):
+    alone = stream("c", POSES, start_s=-500.0)
+    cloud.put(in_order([*alone, *two_robots()]))
+    run = cloud.finalize()
+    assert {t.robot: t.map_index for t in run.trajectories} == {"a": 0, "b": 0, "c": 1}
+    cloud.restart()
+    cloud.work()
+    cloud.put(stream("d", POSES, start_s=2000.0))
+    cloud.work()
+    told = {robot: cloud.store.correction(robot, 0).correction.map_index for robot in "abcd"}
+    assert told == {"a": 0, "b": 0, "c": 1, "d": 2}
+
+
+def test_a_result_or_live_map_that_fails_stops_nothing(cloud, monkeypatch, caplog):
+    def broken(self, *_, **__):
+        raise ValueError("a pose is not finite")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Worker, "_run", broken)
+        cloud.put(two_robots())
+        number = cloud.store.ask_to_finalize()
+        cloud.work()
+    assert cloud.store.finalization(number).failure == "a pose is not finite"
+    assert "the live map stays as it was: ValueError" in caplog.text
+    cloud.now += 1000.0
+    assert len(cloud.finalize().trajectories) == 2
+    assert cloud.folder.live.exists()
