@@ -31,7 +31,7 @@ from fcslam.records import ClosureStatus, Place
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import Source, open_source, split
 from fcslam.wire.ledger import Ledger
-from fcslam.wire.messages import UPLINK, Kind, Packet
+from fcslam.wire.messages import UPLINK, Packet, PacketKind
 from fcslam.wire.packets import encode
 from fcslam.wire.transport import InMemoryTransport
 
@@ -39,7 +39,7 @@ STATED_DESCRIPTORS = 300
 SPACINGS_M = (2.0, 4.0, 8.0, 16.0)
 KINDS = {"log": "", "kind": "", "packets": ",", "bytes": ",", "bytes a packet": ".0f", "share": ".1%",
          "B/s a robot": ".1f", "B/m": ".0f"}  # fmt: skip
-ROBOTS = {"robot": "", "recorded, s": ".0f", "path, m": ".0f", **{f"{kind}, kB": ".1f" for kind in Kind},
+ROBOTS = {"robot": "", "recorded, s": ".0f", "path, m": ".0f", **{f"{kind}, kB": ".1f" for kind in PacketKind},
           "up, B/s": ".0f", "up, B/m": ".0f", "down, B/s": ".0f", "down, B/m": ".0f"}  # fmt: skip
 PLACES = {"log": "", "places": "", "descriptors: least": "", "mean": ".0f", "most": "", "bytes a place": ".0f",
           "bytes a descriptor": ".1f", "places with 300": "", "kB a place with 300 descriptors": ".2f",
@@ -98,7 +98,7 @@ def packets(source: Source, robot: RobotFrontend) -> Iterator[Packet]:
 def kind_rows(log: str, ledger: Ledger, seconds: float, metres: float) -> list[tuple]:
     whole = ledger.total()
     rows = []
-    for kind in (*Kind, None):
+    for kind in (*PacketKind, None):
         total = ledger.total(kind=kind)
         name = "all" if kind is None else kind.value
         figures = (total.bytes / max(total.count, 1), total.bytes / whole.bytes)
@@ -107,7 +107,7 @@ def kind_rows(log: str, ledger: Ledger, seconds: float, metres: float) -> list[t
 
 
 def robot_row(robot: str, ledger: Ledger, seconds: float, metres: float) -> tuple:
-    by_kind = {kind: ledger.total(robot, kind).bytes for kind in Kind}
+    by_kind = {kind: ledger.total(robot, kind).bytes for kind in PacketKind}
     up = ledger.uplink(robot).bytes
     down = sum(by_kind.values()) - up
     kilobytes = [count / 1e3 for count in by_kind.values()]

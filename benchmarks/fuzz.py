@@ -37,7 +37,7 @@ from fcslam.records import (
 )
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS
-from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, read_label
 from fcslam.wire.quantisation import dequantise
 
@@ -177,7 +177,7 @@ def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
         yield Place(KeyscanId("alice", size), channel, "light-1", size, size + 9, keypoints, codes)
     yield Correction("alice", size, 0, motion)
     yield Acknowledgement("alice", 7, size)
-    yield Release("alice", DetectorFile(Channel.CAMERA, "light-2", 1, size, rng.bytes(32)))
+    yield DetectorUpdate("alice", DetectorFile(Channel.CAMERA, "light-2", 1, size, rng.bytes(32)))
 
 
 def flip(rng: random.Random, corpus: list[bytes]) -> bytes:

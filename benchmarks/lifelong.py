@@ -146,11 +146,11 @@ def state(fleet: Any, drivers: list[Any], grid: Any, costs: tuple[float, ...]) -
 
 def take_session(fleet: Any, store: Any, epoch: int, turn: int, watches: Watches) -> int:
     """A session's packets take effect; returns the next turn."""
-    from fcslam.wire.messages import Kind
+    from fcslam.wire.messages import PacketKind
 
     while packets := [packet for packet in store.turns(turn, 64) if packet.epoch == epoch]:
         for packet in packets:
-            with watches.place() if packet.kind is Kind.PLACE else ExitStack():
+            with watches.place() if packet.kind is PacketKind.PLACE else ExitStack():
                 fleet.receive(packet.data)
         turn += len(packets)
     return turn

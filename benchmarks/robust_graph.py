@@ -40,7 +40,6 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.graph.alone import solve_alone
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.factors import FactorCache, from_values, to_values
 from fcslam.graph.g2o import read_g2o
@@ -48,6 +47,7 @@ from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.joint import JointEvidence, solve_jointly
 from fcslam.graph.optimizer import Solution, SolveStats, optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph, anchors
+from fcslam.graph.single_robot import solve_single_robot
 from fcslam.records import FloatArray
 
 ROBOTS = 3
@@ -248,7 +248,7 @@ def csail_row(folder: Path) -> tuple:
 def loop_rows(clean: PoseGraph, chosen: argparse.Namespace) -> list[tuple]:
     truth = optimize_gnc(clean).poses
     solvers: dict[str, Callable[[PoseGraph], Solution]] = {
-        "ours": lambda graph: solve_alone(graph, ConsistencySettings()),
+        "ours": lambda graph: solve_single_robot(graph, ConsistencySettings()),
         "GNC from odometry": lambda graph: optimize_gnc(graph, odometry(graph)),
         "least squares": lambda graph: optimize(graph, odometry(graph)),
     }

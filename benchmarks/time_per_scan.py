@@ -17,7 +17,7 @@ import numpy as np
 from fcslam.records import LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
-from fcslam.wire.messages import Kind
+from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import encode, read_label
 
 TENTHS = {"tenth": "", "scans": "", "odometry so far, m": ".0f", "keyscans so far": "", "mean CPU, ms": ".3f",
@@ -63,7 +63,7 @@ def drive(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if isinstance(record, LaserScan):
             last, before = record.T_odom_base, record.T_odom_base if last is None else last
             path_m += float(np.hypot(*(last - before)[:2]))
-            keyscans += sum(read_label(packet).kind == Kind.KEYSCAN for packet in packets)
+            keyscans += sum(read_label(packet).kind == PacketKind.KEYSCAN for packet in packets)
             cpu_ms.append(1e3 * spent[0])
             wall_ms.append(1e3 * spent[1])
             state.append((path_m, keyscans, resident_mb()))

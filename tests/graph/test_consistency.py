@@ -7,13 +7,19 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.graph.clique import maximum_clique
-from fcslam.graph.cluster import apart, dominant_cluster
-from fcslam.graph.consistency import Closures, ConsistencySettings, loop_chi2, pairwise_consistency, witnesses
-from fcslam.graph.trajectory import Trajectory, trajectory
+from fcslam.graph.cluster import count_separate_places, dominant_cluster
+from fcslam.graph.consistency import (
+    Closures,
+    ConsistencySettings,
+    count_supporting_closures,
+    loop_chi2,
+    pairwise_consistency,
+)
+from fcslam.graph.trajectory import Trajectory, build_trajectory
 from tests.graph.graph_worlds import INFORMATION, manhattan, measured, walk
 
 SETTINGS = ConsistencySettings(position_drift_m=0.03, heading_drift_rad=0.01)
-STILL = trajectory(np.zeros((1, 3)), SETTINGS)
+STILL = build_trajectory(np.zeros((1, 3)), SETTINGS)
 T_A_B = np.array([4.0, -7.0, 2.2])
 
 
@@ -48,7 +54,7 @@ def two_robots(seed: int, true: int = 20, false: int = 30, aliases: int = 0) -> 
         T_i_j=np.array([row[2] for row in rows]).reshape(-1, 3),
         information=np.tile(INFORMATION, (len(rows), 1, 1)),
     )
-    return *(trajectory(drifted(generator, truth), SETTINGS) for truth in (truth_a, truth_b)), closures
+    return *(build_trajectory(drifted(generator, truth), SETTINGS) for truth in (truth_a, truth_b)), closures
 
 
 def pairwise_chi2(a: Trajectory, b: Trajectory, closures: Closures) -> np.ndarray:
@@ -116,14 +122,16 @@ def test_drift_is_that_of_simulated_trajectories() -> None:
     ends = np.array([5, 55])
     exact = Closures(ends, np.zeros(2, dtype=np.int64), se2.inverse(truth[ends]), np.tile(np.eye(3) * 1e10, (2, 1, 1)))
     generator = np.random.default_rng(0)
-    chi2 = [pairwise_chi2(trajectory(drifted(generator, truth), SETTINGS), STILL, exact)[0, 1] for _ in range(300)]
+    chi2 = [
+        pairwise_chi2(build_trajectory(drifted(generator, truth), SETTINGS), STILL, exact)[0, 1] for _ in range(300)
+    ]
     assert np.mean(chi2) == pytest.approx(3.0, abs=0.5)
 
 
 def test_consistency_ignores_the_frames_and_the_order() -> None:
     a, b, closures = two_robots(2)
     here = pairwise_chi2(a, b, closures)
-    moved = [trajectory(se2.compose(T, x.poses), SETTINGS) for T, x in ((T_A_B, a), ((1.0, 90.0, -3.0), b))]
+    moved = [build_trajectory(se2.compose(T, x.poses), SETTINGS) for T, x in ((T_A_B, a), ((1.0, 90.0, -3.0), b))]
     there = pairwise_chi2(*moved, closures)
     assert there == pytest.approx(here, rel=1e-5, abs=1e-6)
     assert np.array_equal(here, here.T)
@@ -152,7 +160,7 @@ def test_covariance_turns_with_the_path_between_the_closures() -> None:
     for shift, agrees in (((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)):
         T = np.stack((b[0], se2.compose(b[1], shift)))
         closures = Closures(np.array([0, 0]), np.array([0, 1]), T, np.stack((tight, wide)))
-        assert bool(pairwise_consistency(STILL, trajectory(b, SETTINGS), closures, SETTINGS)[0, 1]) is agrees
+        assert bool(pairwise_consistency(STILL, build_trajectory(b, SETTINGS), closures, SETTINGS)[0, 1]) is agrees
 
 
 def test_as_many_closures_from_fewer_places_lead_nothing() -> None:
@@ -175,7 +183,7 @@ def test_supporters_are_places_that_lie_apart_and_one_must_inform() -> None:
     informative = np.array([False, True, False, False, False, False])
     assert dominant_cluster(agree, far, informative, SETTINGS).dominant
     one_place = dominant_cluster(agree, near, informative, SETTINGS)
-    assert (one_place.supporters, one_place.dominant) == (1, False)
+    assert (one_place.separate_places, one_place.dominant) == (1, False)
     assert "1 supporters" in one_place.reason
     corridor = dominant_cluster(agree, far, np.zeros(6, dtype=bool), SETTINGS)
     assert "information in every direction" in corridor.reason
@@ -184,16 +192,16 @@ def test_supporters_are_places_that_lie_apart_and_one_must_inform() -> None:
 def test_places_apart_are_counted_at_their_best() -> None:
     """Taken in the order of the robot's way, the middle place would spoil both ends."""
     line = np.array([[(x, 0.0), (x, 5.0)] for x in (2.0, 0.0, 4.0)])
-    assert apart(line, 3.0) == 2
+    assert count_separate_places(line, 3.0) == 2
     same_on_one_side = line.copy()
     same_on_one_side[:, 1] = 0.0
-    assert apart(same_on_one_side, 3.0) == 1
-    assert apart(line[:0], 3.0) == 0
+    assert count_separate_places(same_on_one_side, 3.0) == 1
+    assert count_separate_places(line[:0], 3.0) == 0
 
 
 def test_a_keyscan_out_of_range_is_refused() -> None:
     a, b, closures = two_robots(0)
-    short = [trajectory(x.poses[:50], SETTINGS) for x in (a, b)]
+    short = [build_trajectory(x.poses[:50], SETTINGS) for x in (a, b)]
     for cut_a, cut_b, name in ((short[0], b, "a"), (a, short[1], "b")):
         with pytest.raises(ValueError, match=f"trajectory {name} has keyscans 0 to 49"):
             pairwise_consistency(cut_a, cut_b, closures, SETTINGS)
@@ -205,21 +213,21 @@ def test_pairs_in_parts_are_pairs_in_one(monkeypatch: pytest.MonkeyPatch) -> Non
     assert np.array_equal(whole, pairwise_chi2(a, b, closures) <= SETTINGS.limit)
     monkeypatch.setattr("fcslam.graph.consistency._PAIRS_AT_ONCE", 7)
     assert np.array_equal(pairwise_consistency(a, b, closures, SETTINGS), whole)
-    none = closures.only(np.zeros(0, dtype=np.int64))
+    none = closures.select(np.zeros(0, dtype=np.int64))
     assert pairwise_consistency(a, b, none, SETTINGS).shape == (0, 0)
 
 
 def test_a_closure_says_the_same_from_both_ends() -> None:
     """Told from the other end, closures agree with the same others and make the same errors."""
     a, b, closures = two_robots(3)
-    there = closures.turned(np.ones(len(closures), dtype=bool))
+    there = closures.reversed(np.ones(len(closures), dtype=bool))
     assert pairwise_chi2(b, a, there)[0] == pytest.approx(pairwise_chi2(a, b, closures)[0], rel=0.2, abs=1.0)
     off = 1e-4 * np.array([1.0, -2.0, 3.0])
     for k in range(len(closures)):
         T = se2.compose(closures.T_i_j[k], se2.exp(off))
         error = se2.log(se2.between(there.T_i_j[k], se2.inverse(T)))
         assert error @ there.information[k] @ error == pytest.approx(off @ closures.information[k] @ off, rel=1e-5)
-    back = there.turned(np.ones(len(closures), dtype=bool))
+    back = there.reversed(np.ones(len(closures), dtype=bool))
     assert np.allclose(back.T_i_j, closures.T_i_j)
     assert np.allclose(back.information, closures.information)
     assert np.array_equal(back.i, closures.i)
@@ -231,15 +239,15 @@ def test_a_steps_own_covariance_counts_with_the_drift() -> None:
     tight = np.tile(np.eye(3) * 1e6, (2, 1, 1))
     closures = Closures(np.array([0, 1]), np.array([0, 0]), np.array([(0, 0, 0), (-1.3, 0, 0)], dtype=float), tight)
     for variance, agrees in ((0.04, True), (1e-6, False)):
-        path = trajectory(poses, SETTINGS, variance * np.eye(3)[None])
+        path = build_trajectory(poses, SETTINGS, variance * np.eye(3)[None])
         assert bool(pairwise_consistency(path, STILL, closures, SETTINGS)[0, 1]) is agrees
 
 
 def test_drift_does_not_depend_on_where_the_frame_lies() -> None:
     """Map coordinates may be those of a country: levers of a million metres would eat the digits."""
     truth = walk(0, 80)
-    here = trajectory(truth, SETTINGS)
-    there = trajectory(se2.compose((4.5e5, 5.2e6, 1.0), truth), SETTINGS)
+    here = build_trajectory(truth, SETTINGS)
+    there = build_trajectory(se2.compose((4.5e5, 5.2e6, 1.0), truth), SETTINGS)
     ends = np.array([3, 70]), np.array([60, 10])
     assert there.drift(*ends) == pytest.approx(here.drift(*ends), rel=1e-6)
 
@@ -249,12 +257,12 @@ def test_false_closures_have_no_witness_and_true_ones_mostly_do() -> None:
     edges = graph.arrays()
     rows = edges.robust
     closures = Closures(edges.i[rows], edges.j[rows], edges.T_i_j[rows], edges.information[rows])
-    path = trajectory(graph.poses(), SETTINGS, np.linalg.inv(edges.information[~rows]))
-    counts = witnesses(path, path, closures, SETTINGS)
+    path = build_trajectory(graph.poses(), SETTINGS, np.linalg.inv(edges.information[~rows]))
+    counts = count_supporting_closures(path, path, closures, SETTINGS)
     assert np.mean(counts[true[rows]] > 0) > 0.7
     assert np.mean(counts[~true[rows]] > 0) < 0.05
-    other_end = closures.turned(np.arange(len(closures)) % 2 == 0)
-    again = witnesses(path, path, other_end, SETTINGS)
+    other_end = closures.reversed(np.arange(len(closures)) % 2 == 0)
+    again = count_supporting_closures(path, path, other_end, SETTINGS)
     assert np.array_equal(again, counts), "it does not matter which end is told first"
 
 

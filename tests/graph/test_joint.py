@@ -11,7 +11,7 @@ from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.joint import JointEvidence, JointSolution, solve_jointly
 from fcslam.graph.optimizer import Solution, SolveStats, optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.graph.trajectory import trajectory
+from fcslam.graph.trajectory import build_trajectory
 from tests.graph.graph_worlds import INFORMATION, measured, walk
 
 SETTINGS = ConsistencySettings()
@@ -123,7 +123,7 @@ def test_without_the_robust_steps_the_same_world_is_lost(monkeypatch: pytest.Mon
         return optimize(graph, initial)
 
     monkeypatch.setattr(joint, "optimize_gnc", least_squares)
-    monkeypatch.setattr(joint, "settle", least_squares)
+    monkeypatch.setattr(joint, "refine_inliers", least_squares)
     solution = solve_jointly(evidence, SETTINGS)
     assert solution.maps == (0, 0, 0)
     assert world.error_m(solution) > 1.0
@@ -136,7 +136,7 @@ def test_without_pairwise_consistency_liars_join_two_maps(monkeypatch: pytest.Mo
         return np.ones((len(closures), len(closures)), dtype=bool)
 
     monkeypatch.setattr("fcslam.graph.cluster.pairwise_consistency", everything_agrees)
-    monkeypatch.setattr(joint, "_lasts", lambda *_: True)
+    monkeypatch.setattr(joint, "_is_confirmed", lambda *_: True)
     assert solve_jointly(world_of_two_truths().evidence(), SETTINGS).maps == (0, 0, 1)
 
 
@@ -151,7 +151,7 @@ def test_a_group_of_liars_as_large_as_the_truth_joins_nobody() -> None:
     solution = solve_jointly((world := world_of_two_truths()).evidence(), SETTINGS)
     assert solution.maps == (0, 1, 2)
     (link,) = solution.links
-    assert link.verdict.contested
+    assert link.decision.contested
     robust = world.evidence().graph.arrays().robust
     between = robust & (np.arange(len(robust)) >= len(robust) - 24)
     assert solution.weights[between].sum() == 0.0
@@ -224,7 +224,7 @@ def test_a_link_that_the_joint_solution_takes_apart_is_taken_back(monkeypatch: p
     """Two maps do not stay joined on what is left when their cluster falls."""
     world = World(2)
     world.meet(0, 1, 15)
-    real = joint.settle
+    real = joint.refine_inliers
 
     def keeps_one(graph, initial, weights, **options):
         solution = real(graph, initial, weights, **options)
@@ -234,7 +234,7 @@ def test_a_link_that_the_joint_solution_takes_apart_is_taken_back(monkeypatch: p
         kept[np.flatnonzero(between)[1:]] = 0.0
         return replace(solution, weights=kept)
 
-    monkeypatch.setattr(joint, "settle", keeps_one)
+    monkeypatch.setattr(joint, "refine_inliers", keeps_one)
     assert solve_jointly(world.evidence(), SETTINGS).maps == (0, 1, 2)
 
 
@@ -250,15 +250,15 @@ def test_a_link_lasts_on_most_of_its_cluster_from_enough_places(dropped: int, la
     ones, zeros = np.ones(len(edges), bool), np.zeros(len(edges), bool)
     evidence = JointEvidence(graph, robots, ones, ones, zeros)
     (link,) = solve_jointly(evidence, SETTINGS).links
-    assert link.verdict.supporters == 4
+    assert link.decision.separate_places == 4
     weights = np.ones(len(edges))
     weights[len(edges) - dropped :] = 0.0
-    own = [trajectory(truth, SETTINGS)] * 2
+    own = [build_trajectory(truth, SETTINGS)] * 2
     solution = Solution(graph.poses(), weights, SolveStats(0, 0.0, 0.0))
-    assert joint._lasts(link, own, solution, ones, SETTINGS) is lasts
+    assert joint._is_confirmed(link, own, solution, ones, SETTINGS) is lasts
     one_place = np.ones(len(edges))
     one_place[-5:] = 0.0
-    assert not joint._lasts(link, own, replace(solution, weights=one_place), ones, SETTINGS)
+    assert not joint._is_confirmed(link, own, replace(solution, weights=one_place), ones, SETTINGS)
 
 
 def test_the_same_evidence_gives_the_same_bytes() -> None:

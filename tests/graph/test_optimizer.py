@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.graph.alone import solve_alone
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.initialization import initialize, initialize_robust
-from fcslam.graph.optimizer import GncSettings, Solution, optimize, optimize_gnc, settle
+from fcslam.graph.optimizer import GncSettings, Solution, optimize, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.graph.single_robot import solve_single_robot
 from tests.graph.graph_worlds import INFORMATION, gauss_newton, manhattan
 
 
@@ -67,7 +67,7 @@ def test_order_of_edges_does_not_matter_and_repetition_gives_the_same_bytes(solv
 @pytest.mark.parametrize("seed", range(3))
 def test_a_robot_alone_rejects_false_closures(seed: int, share: float) -> None:
     graph, truth, true = manhattan(seed, closures=60, outlier_share=share)
-    solution = solve_alone(graph, ConsistencySettings())
+    solution = solve_single_robot(graph, ConsistencySettings())
     clean = optimize(PoseGraph(graph.poses(), [e for e, known in zip(graph.edges, true, strict=True) if known]))
     assert (solution.weights[~true] == 0.0).all()
     assert (solution.weights[true] == 0.0).sum() <= 4
@@ -76,7 +76,7 @@ def test_a_robot_alone_rejects_false_closures(seed: int, share: float) -> None:
 
 
 def test_what_stays_of_the_witnessed_start_is_the_cheaper_solution() -> None:
-    """A robot that meets each place but once has no witnesses: all its closures count nevertheless."""
+    """A robot that meets each place but once has no supporting closures: all its closures count nevertheless."""
     truth = np.array([(10.0 * np.cos(a), 10.0 * np.sin(a), a + np.pi / 2) for a in np.linspace(0.0, 2.0 * np.pi, 63)])
     edges = [
         Edge(k, k + 1, se2.compose(se2.between(*truth[k : k + 2]), (0.0, 0.0, 0.002)), INFORMATION, False)
@@ -84,7 +84,7 @@ def test_what_stays_of_the_witnessed_start_is_the_cheaper_solution() -> None:
     ]
     edges.append(Edge(0, 62, se2.between(truth[0], truth[62]), INFORMATION, True))
     graph = PoseGraph(truth, edges)
-    solution = solve_alone(graph, ConsistencySettings())
+    solution = solve_single_robot(graph, ConsistencySettings())
     assert solution.weights[-1] == 1.0
     assert np.abs(se2.between(solution.poses[0], solution.poses[62])[:2]).max() < 0.05
 
@@ -93,12 +93,12 @@ def test_settling_starts_from_what_is_trusted() -> None:
     """With seven of ten closures false, the true ones as a start find everything; the false ones find no more."""
     graph, _, true = manhattan(1, closures=60, outlier_share=0.7)
     clean = optimize(PoseGraph(graph.poses(), [e for e, known in zip(graph.edges, true, strict=True) if known]))
-    settled = settle(graph, clean.poses, true)
+    settled = refine_inliers(graph, clean.poses, true)
     assert (settled.weights[~true] == 0.0).all()
     assert (settled.weights[true] == 0.0).sum() <= 4
-    assert settle(graph, clean.poses, ~true).stats.final_cost > settled.stats.final_cost
+    assert refine_inliers(graph, clean.poses, ~true).stats.final_cost > settled.stats.final_cost
     with pytest.raises(ValueError, match="weights must be of shape"):
-        settle(graph, clean.poses, true[:-1])
+        refine_inliers(graph, clean.poses, true[:-1])
 
 
 def test_closures_that_are_left_out_count_for_nothing() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import DetectorFile
 from fcslam.wire.http_transport import Answer, CloudState, Refusal
-from fcslam.wire.messages import Acknowledgement, Release
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate
 from fcslam.wire.packets import decode, encode, readdress
 from tests.wire.examples import CLOSURE, CORRECTION, HELLO, packet
 
@@ -29,13 +29,15 @@ class FakeCloud:
     most: int = 1024
     """Packets that it takes at once."""
 
-    releases: dict[DetectorFile, bytes] = field(default_factory=dict)
+    detector_updates: dict[DetectorFile, bytes] = field(default_factory=dict)
     """Detectors that it announces all the time, and their contents; one without cannot be had."""
     fetched: list[str] = field(default_factory=list)
 
     def detector(self, channel, version):
         self.fetched.append(version)
-        content = {(file.channel, file.version): content for file, content in self.releases.items()}[channel, version]
+        content = {(file.channel, file.version): content for file, content in self.detector_updates.items()}[
+            channel, version
+        ]
         if content is None:
             raise CloudError("there is none")
         return content
@@ -66,7 +68,7 @@ class FakeCloud:
             acknowledgement = Acknowledgement("alice", epoch, self.next(epoch) - 1)
             answer.append(encode(replace(packet(acknowledgement), epoch=epoch)))
         if self.stored:  # nobody knows what detectors a robot has that never said hello
-            answer += [encode(packet(Release("alice", file))) for file in self.releases]
+            answer += [encode(packet(DetectorUpdate("alice", file))) for file in self.detector_updates]
         if self.correction > correction:
             answer.append(encode(replace(packet(replace(CORRECTION, version=self.correction)), epoch=epoch)))
         return Answer(tuple(answer), refused=len(self.refused))

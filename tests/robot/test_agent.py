@@ -188,7 +188,7 @@ def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tm
     def patient(records):
         for number, record in enumerate(records):
             if number == 20:
-                cloud.releases = {file: (tmp_path / "tiny.onnx").read_bytes()}
+                cloud.detector_updates = {file: (tmp_path / "tiny.onnx").read_bytes()}
             while number == 20 and not list((tmp_path / "detectors").glob("*.onnx")):
                 threading.Event().wait(0.01)
             yield record

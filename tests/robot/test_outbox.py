@@ -57,7 +57,7 @@ class Deliveries(RuleBasedStateMachine):
         self.path = Path(tempfile.mkdtemp()) / "outbox"
         self.outbox = Outbox(self.path, "alice", LIMIT)
         self.outbox.begin("r", resume=False)
-        self.outbox.meet({})
+        self.outbox.synchronize({})
         self.said, self.cloud = [], 0
 
     @rule(body=st.sampled_from(BODIES), count=st.integers(1, 4))
@@ -89,7 +89,7 @@ class Deliveries(RuleBasedStateMachine):
         self.outbox.close()
         self.outbox = Outbox(self.path, "alice", LIMIT)
         assert self.outbox.begin("r", resume=True) == len(self.said)
-        self.outbox.meet({0: self.cloud} if self.cloud else {})
+        self.outbox.synchronize({0: self.cloud} if self.cloud else {})
         self.outbox.acknowledge(0, self.cloud - 1)
         assert self.outbox.put(self.said) == 0
 
@@ -117,7 +117,7 @@ def test_oldest_first_one_epoch_a_batch_and_within_the_limits(outbox, path):
     assert again.epoch == 1
     again.put([said(k, LIDAR_PLACE) for k in range(3)])
     assert again.batch(MAXIMUM_BATCH_BYTES, 100) is None, "whose epochs these are the cloud has not said"
-    again.meet({})
+    again.synchronize({})
     first = again.batch(MAXIMUM_BATCH_BYTES, 100)
     assert (first.epoch, first.first, len(first.packets)) == (0, 0, 5)
     size = len(first.packets[1]) + 4
@@ -131,12 +131,12 @@ def of_part(part, *ordinals):
 
 
 def test_a_robot_that_was_lost_goes_on_in_the_next_epoch(outbox, path):
-    outbox.meet({})
+    outbox.synchronize({})
     outbox.put([*of_part(0, 0, 1), *of_part(1, 0)])
-    assert (outbox.epoch, outbox.is_met) == (1, False)
+    assert (outbox.epoch, outbox.is_synchronized) == (1, False)
     assert list(drain(outbox)) == [(0, 0), (0, 1)], "of the new one the cloud does not know yet"
-    outbox.meet({0: 2, 1: 5})
-    assert (outbox.epoch, outbox.is_met) == (2, True), "another state folder had that one"
+    outbox.synchronize({0: 2, 1: 5})
+    assert (outbox.epoch, outbox.is_synchronized) == (2, True), "another state folder had that one"
     assert [outbox.part(epoch) for epoch in (0, 1, 2)] == [0, None, 1]
     assert list(drain(outbox)) == [(2, 0)]
     outbox.close()
@@ -144,7 +144,7 @@ def test_a_robot_that_was_lost_goes_on_in_the_next_epoch(outbox, path):
     assert again.begin("r", resume=True) == 3
     assert again.epoch == 2
     again.put([*of_part(0, 0, 1), *of_part(1, 0, 1), *of_part(2, 0)])
-    again.meet({0: 2, 1: 5, 2: 1})
+    again.synchronize({0: 2, 1: 5, 2: 1})
     assert list(drain(again)) == [(2, 1), (3, 0)]
     again.close()
     anew = Outbox(path, "alice", LIMIT)
@@ -158,10 +158,10 @@ def test_a_robot_that_was_lost_goes_on_in_the_next_epoch(outbox, path):
 
 def test_an_epoch_that_the_cloud_knows_from_before_is_not_taken_again(outbox):
     outbox.put([said(0, HELLO), said(1)])
-    outbox.meet({0: 7, 3: 2})
+    outbox.synchronize({0: 7, 3: 2})
     assert outbox.epoch == 4
     outbox.put([said(2)])
-    outbox.meet({0: 7, 3: 2})
+    outbox.synchronize({0: 7, 3: 2})
     stored = drain(outbox)
     assert list(stored) == [(4, 0), (4, 1), (4, 2)]
     assert decode(stored[4, 0]).body.epoch == 4
@@ -177,7 +177,7 @@ def test_starts_that_never_met_the_cloud_keep_their_order(path, starts, known, e
         outbox.put([replace(said(0), time=2000.0 + start)])
         outbox.close()
     outbox = Outbox(path, "alice", LIMIT)
-    outbox.meet(known)
+    outbox.synchronize(known)
     assert {epoch: decode(data).time for (epoch, _), data in drain(outbox).items()} == {
         epoch: 2000.0 + start for start, epoch in enumerate(epochs)
     }
@@ -186,26 +186,26 @@ def test_starts_that_never_met_the_cloud_keep_their_order(path, starts, known, e
 
 def test_a_cloud_that_lost_what_it_confirmed_is_found_out(outbox):
     outbox.put([said(k) for k in range(5)])
-    outbox.meet({})
+    outbox.synchronize({})
     outbox.acknowledge(0, 3)
-    outbox.meet({0: 4})
+    outbox.synchronize({0: 4})
     with pytest.raises(StateError, match="has 2 of 4 packets of epoch 0"):
-        outbox.meet({0: 2})
+        outbox.synchronize({0: 2})
     assert outbox.waiting.packets == 1
 
 
 def test_what_an_earlier_start_left_for_another_mission_waits_in_vain(outbox):
     outbox.put([said(k) for k in range(6)])
-    outbox.meet({})
+    outbox.synchronize({})
     outbox.acknowledge(0, 3)
     outbox.begin("r", resume=False)
     outbox.put([said(0)])
-    assert outbox.meet({}) == [(0, 4), (0, 5)]
-    assert outbox.meet({0: 4}) == [], "it is the same mission after all"
-    assert outbox.meet({0: 1}) == [(0, 4), (0, 5)]
-    for epoch, sequence in outbox.meet({0: 1}):
+    assert outbox.synchronize({}) == [(0, 4), (0, 5)]
+    assert outbox.synchronize({0: 4}) == [], "it is the same mission after all"
+    assert outbox.synchronize({0: 1}) == [(0, 4), (0, 5)]
+    for epoch, sequence in outbox.synchronize({0: 1}):
         outbox.drop(epoch, sequence)
-    assert outbox.meet({}) == [], "what is over is over"
+    assert outbox.synchronize({}) == [], "what is over is over"
     assert list(drain(outbox)) == [(1, 0)]
 
 
@@ -221,7 +221,7 @@ def test_a_full_outbox_leaves_places_out_and_keeps_the_chain(path):
     outbox.close()
     outbox = Outbox(path, "alice", 20 * size)
     assert outbox.begin("r", resume=True) == 23
-    outbox.meet({})
+    outbox.synchronize({})
     stored = drain(outbox)
     assert list(stored) == [(0, number) for number in range(21)], "no gap where places were left out"
     assert not any(decode(data).body == LIDAR_PLACE for data in stored.values())
@@ -301,7 +301,7 @@ def test_a_killed_robot_has_all_that_it_put(path):
             writer.send_signal(signal.SIGKILL)
         most = max(most, put)
         outbox = Outbox(path, "alice", LIMIT)
-        outbox.meet({})
+        outbox.synchronize({})
         (first, *_, last) = (decode(data).sequence for data in outbox.batch(10**9, 10**9).packets)
         assert (first, last + 1) == (0, outbox.waiting.packets)
         assert last >= most

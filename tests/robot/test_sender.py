@@ -14,7 +14,7 @@ from fcslam.robot.sender import ASK_AFTER_S, EVERY_S, LONGEST_RETRY_S, Sender, r
 from fcslam.wire.http_transport import Answer
 from fcslam.wire.packets import decode, encode
 from tests.robot.fake_cloud import FakeCloud, Network, content, said
-from tests.wire.examples import HELLO, LIDAR_PLACE, RELEASE
+from tests.wire.examples import DETECTOR_UPDATE, HELLO, LIDAR_PLACE
 
 
 class Robot:
@@ -312,13 +312,13 @@ def test_a_cloud_that_turns_the_robot_away_ends_the_sender(robot):
 
 def test_a_detector_is_fetched_once_and_one_that_is_not_there_not_asked_for_again(robot):
     cloud = robot.sender._transport.cloud
-    missing = replace(RELEASE.file, version="gone")
-    cloud.releases = {RELEASE.file: b"network", missing: None}
+    missing = replace(DETECTOR_UPDATE.file, version="gone")
+    cloud.detector_updates = {DETECTOR_UPDATE.file: b"network", missing: None}
     for ordinal in range(5):
         robot.outbox.put([said(ordinal)])
         robot.step()
-    assert robot.kept == [(RELEASE.file, b"network")]
-    assert cloud.fetched == [RELEASE.file.version, "gone"]
+    assert robot.kept == [(DETECTOR_UPDATE.file, b"network")]
+    assert cloud.fetched == [DETECTOR_UPDATE.file.version, "gone"]
     assert robot.outbox.waiting.packets == 0
 
 

@@ -14,7 +14,7 @@ from fcslam.records import CameraImage, Channel, DetectorFile, LaserScan, Place
 from fcslam.robot.album import AlbumConfig
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.views import ViewsConfig
-from fcslam.wire.messages import Hello, Release
+from fcslam.wire.messages import DetectorUpdate, Hello
 from fcslam.wire.packets import decode, encode
 from tests.features.networks import tiny_network
 from tests.robot.test_views import records_of
@@ -179,9 +179,9 @@ def test_codes_of_different_versions_are_not_compared(fleet):
     assert between(apart) == []
 
 
-def releases(cloud, packet):
+def detector_updates(cloud, packet):
     replies = [decode(reply).body for reply in cloud.receive(encode(packet))]
-    return [body.file for body in replies if isinstance(body, Release)]
+    return [body.file for body in replies if isinstance(body, DetectorUpdate)]
 
 
 def test_the_cloud_tells_of_a_release_until_it_is_taken(fleet):
@@ -189,11 +189,11 @@ def test_the_cloud_tells_of_a_release_until_it_is_taken(fleet):
     other = DetectorFile(Channel.CAMERA, "other-1", 1, 5, bytes(32))
     cloud.announce(other)
     cloud.announce(SHIPPED)
-    told = [(packet.body, releases(cloud, packet)) for packet in fleet["switched"]]
+    told = [(packet.body, detector_updates(cloud, packet)) for packet in fleet["switched"]]
     orb = places(fleet["stayed"], told[0][0].detector_versions[Channel.CAMERA])[0].detector_version
     for body, files in told:
         asks = isinstance(body, Hello) and body.detector_versions[Channel.CAMERA] == orb
         asks |= isinstance(body, Place) and body.detector_version == orb
         assert files == ([SHIPPED] if asks else [])
     hello = Hello("blind", 0, told[0][0].laser, {Channel.LIDAR: "birdseye-1"})  # it has no camera
-    assert releases(cloud, replace(fleet["new"][0], robot="blind", body=hello)) == []
+    assert detector_updates(cloud, replace(fleet["new"][0], robot="blind", body=hello)) == []

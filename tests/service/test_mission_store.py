@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fcslam.errors import PacketConflictError, StoreError
 from fcslam.records import Channel, Correction, Veto, frozen
 from fcslam.service.mission_store import NEWS_M, NEWS_RAD, MissionStore, SessionCorrection, StoredPacket, check_mission
-from fcslam.wire.messages import Kind
+from fcslam.wire.messages import PacketKind
 
 NUMBERS = st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 2), st.integers(0, 12))
 BATCHES = st.lists(st.lists(NUMBERS, max_size=8), max_size=12)
@@ -21,7 +21,7 @@ BATCHES = st.lists(st.lists(NUMBERS, max_size=8), max_size=12)
 
 def packet(robot="a", epoch=0, sequence=0, data=None) -> StoredPacket:
     content = f"{robot} {epoch} {sequence}".encode() if data is None else data
-    return StoredPacket(robot, epoch, sequence, 0.5 * sequence, Kind.PLACE, Channel.CAMERA, content)
+    return StoredPacket(robot, epoch, sequence, 0.5 * sequence, PacketKind.PLACE, Channel.CAMERA, content)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from fcslam.records import (
     Place,
     frozen,
 )
-from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet, Release
+from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import encode
 from fcslam.wire.quantisation import dequantise
 
@@ -66,7 +66,9 @@ CAMERA_PLACE = Place(
 )
 CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]), 0.75)
 ACKNOWLEDGEMENT = Acknowledgement("alice", 7, 41)
-RELEASE = Release("alice", DetectorFile(Channel.CAMERA, "light-0a1b2c3d4e5f", 1, 1588335, bytes(range(32))))
+DETECTOR_UPDATE = DetectorUpdate(
+    "alice", DetectorFile(Channel.CAMERA, "light-0a1b2c3d4e5f", 1, 1588335, bytes(range(32)))
+)
 
 
 def packet(body: Body) -> Packet:
@@ -82,7 +84,7 @@ EXAMPLES = {
     "camera_place": packet(CAMERA_PLACE),
     "correction": packet(CORRECTION),
     "acknowledgement": packet(ACKNOWLEDGEMENT),
-    "release": packet(RELEASE),
+    "detector_update": packet(DETECTOR_UPDATE),
 }
 
 

@@ -16,7 +16,7 @@ from fcslam.records import (
     Place,
 )
 from fcslam.wire.limits import KEYPOINT_AXES
-from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import dequantise, quantise_keypoints
 from fcslam.wire.streams import ascending
 
@@ -106,7 +106,7 @@ def bodies(robot, epoch, time):
         places(robot),
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),
         st.builds(Acknowledgement, st.just(robot), SEQUENCES, SEQUENCES),
-        st.builds(Release, st.just(robot), detector_files()),
+        st.builds(DetectorUpdate, st.just(robot), detector_files()),
     )
 
 

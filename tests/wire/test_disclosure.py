@@ -2,7 +2,7 @@
 
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.disclosure import PLAIN, REVEALS, disclosures
-from fcslam.wire.messages import Kind
+from fcslam.wire.messages import PacketKind
 
 
 def test_every_field_has_its_words():
@@ -14,7 +14,7 @@ def test_every_field_has_its_words():
 
 def test_every_message_is_told_with_its_direction():
     told = {message.name: message for message in disclosures()}
-    assert list(told) == ["every packet", *Kind]
+    assert list(told) == ["every packet", *PacketKind]
     assert (told["place"].direction, told["correction"].direction) == ("robot to cloud", "cloud to robot")
     assert [field.name for field in told["hello"].fields][-3:] == [
         "detectors",

@@ -15,11 +15,11 @@ from tests.wire.examples import (
     ACKNOWLEDGEMENT,
     CLOSURE,
     CORRECTION,
+    DETECTOR_UPDATE,
     EXAMPLES,
     HELLO,
     KEYSCAN,
     LIDAR_PLACE,
-    RELEASE,
     packet,
     same,
 )
@@ -45,8 +45,8 @@ def hello(**laser):
     return replace(HELLO, laser=replace(HELLO.laser, **laser))
 
 
-def release(**changes):
-    return replace(RELEASE, file=replace(RELEASE.file, **changes))
+def detector_update(**changes):
+    return replace(DETECTOR_UPDATE, file=replace(DETECTOR_UPDATE.file, **changes))
 
 
 REFUSED_BODIES = [
@@ -118,11 +118,11 @@ REFUSED_BODIES = [
     (replace(CORRECTION, T_map_odom=np.array([NAN, 0.0, 0.0])), "not within"),
     (replace(ACKNOWLEDGEMENT, epoch=-1), "epoch"),
     (replace(ACKNOWLEDGEMENT, sequence=2**63), "sequence"),
-    (release(version="a b"), "detector version"),
-    (release(format=-1), "format"),
-    (release(size=0), "0 bytes"),
-    (release(size=2**26 + 1), "67108865 bytes"),
-    (release(sha256=bytes(31)), "31 bytes"),
+    (detector_update(version="a b"), "detector version"),
+    (detector_update(format=-1), "format"),
+    (detector_update(size=0), "0 bytes"),
+    (detector_update(size=2**26 + 1), "67108865 bytes"),
+    (detector_update(sha256=bytes(31)), "31 bytes"),
 ]
 
 
@@ -163,7 +163,7 @@ ALLOWED_BODIES = [
     place(0),
     place(2048),
     replace(ACKNOWLEDGEMENT, sequence=2**63 - 1),
-    release(size=2**26, format=2**31 - 1),
+    detector_update(size=2**26, format=2**31 - 1),
 ]
 
 
@@ -248,9 +248,9 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
         ("correction", {"t_map_odom": pb.Pose(y_m=2e6)}, "not within"),
         ("correction", {"t_map_odom": None}, "t_map_odom is missing"),
         ("acknowledgement", {"robot": "a" * 65}, "no name"),
-        ("release", {"channel": 0}, "channel 0 is unknown"),
-        ("release", {"size": 2**63}, "bytes, not of"),
-        ("release", {"sha256": b""}, "0 bytes"),
+        ("detector_update", {"channel": 0}, "channel 0 is unknown"),
+        ("detector_update", {"size": 2**63}, "bytes, not of"),
+        ("detector_update", {"sha256": b""}, "0 bytes"),
     ],
 )
 def test_a_message_beyond_a_limit_is_not_read(name, fields, reason):

@@ -6,7 +6,7 @@ from fcslam.errors import PacketError
 from fcslam.records import Channel
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.ledger import Counter, Ledger, Traffic
-from fcslam.wire.messages import Kind
+from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import Label, decode, encode
 from fcslam.wire.transport import InMemoryTransport, Reply, Transport
 from tests.wire.examples import ACKNOWLEDGEMENT, CORRECTION, EXAMPLES, packet, same
@@ -38,13 +38,17 @@ def test_the_ledger_adds_up():
         transport.send(data)
     ledger = transport.ledger()
     assert dict(ledger.accepted) == {
-        Label("alice", Kind.KEYSCAN): Traffic(2, 2 * len(keyscan)),
-        Label("alice", Kind.CONSTRAINT): Traffic(1, len(closure)),
-        Label("alice", Kind.ACKNOWLEDGEMENT): Traffic(3, 3 * len(DOWNLINK[0])),
-        Label("alice", Kind.CORRECTION): Traffic(3, 3 * len(DOWNLINK[1])),
+        Label("alice", PacketKind.KEYSCAN): Traffic(2, 2 * len(keyscan)),
+        Label("alice", PacketKind.CONSTRAINT): Traffic(1, len(closure)),
+        Label("alice", PacketKind.ACKNOWLEDGEMENT): Traffic(3, 3 * len(DOWNLINK[0])),
+        Label("alice", PacketKind.CORRECTION): Traffic(3, 3 * len(DOWNLINK[1])),
     }
     assert ledger.total() == Traffic(9, 2 * len(keyscan) + len(closure) + 3 * sum(map(len, DOWNLINK)))
-    assert ledger.total("alice", Kind.KEYSCAN) == ledger.total(kind=Kind.KEYSCAN) == Traffic(2, 2 * len(keyscan))
+    assert (
+        ledger.total("alice", PacketKind.KEYSCAN)
+        == ledger.total(kind=PacketKind.KEYSCAN)
+        == Traffic(2, 2 * len(keyscan))
+    )
     assert ledger.total("bob") == Traffic()
     assert ledger.refused == Traffic()
 
@@ -57,7 +61,7 @@ def test_places_are_counted_by_channel_and_what_goes_up_by_robot():
     ledger = transport.ledger()
     assert ledger.total(channel=Channel.LIDAR) == Traffic(1, len(lidar))
     assert ledger.total(channel=Channel.CAMERA) == Traffic(2, 2 * len(camera))
-    assert ledger.total(kind=Kind.PLACE) == Traffic(3, len(lidar) + 2 * len(camera))
+    assert ledger.total(kind=PacketKind.PLACE) == Traffic(3, len(lidar) + 2 * len(camera))
     assert ledger.uplink("alice") == Traffic(4, len(lidar) + 2 * len(camera) + len(hello)), "not what comes back"
     assert ledger.downlink("alice") == Traffic(8, 4 * sum(map(len, DOWNLINK)))
     assert ledger.uplink("alice") + ledger.downlink("alice") == ledger.total("alice")
@@ -75,7 +79,7 @@ def test_a_ledger_shown_does_not_change():
     transport.send(encode(EXAMPLES["hello"]))
     assert before.total() == Traffic()
     with pytest.raises(TypeError):
-        before.accepted[Label("eve", Kind.HELLO)] = Traffic()
+        before.accepted[Label("eve", PacketKind.HELLO)] = Traffic()
 
 
 @pytest.mark.parametrize("data", [b"", b"noise", encode(EXAMPLES["keyscan"])[:-1], bytes(200_000)])
@@ -116,5 +120,5 @@ def test_a_broken_answer_is_a_fault_and_no_refusal():
 def test_counting_is_addition():
     counter = Counter()
     for size in (3, 4, 5):
-        counter.accept(Label("bob", Kind.PLACE), size)
+        counter.accept(Label("bob", PacketKind.PLACE), size)
     assert counter.ledger().total() == Traffic(3, 12)

@@ -43,7 +43,7 @@ from fcslam.records import (
     Veto,
     frozen,
 )
-from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode
 
 
@@ -214,7 +214,7 @@ class Fleet:
             case Place() as place:
                 self._store.add_place(place)
                 self._add_place(place)  # place recognition and map fusion
-            case Correction() | Acknowledgement() | Release():
+            case Correction() | Acknowledgement() | DetectorUpdate():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
 
     def _add_place(self, place: Place) -> None:
@@ -314,7 +314,7 @@ class Fleet:
             return
         if not joined:
             self._join(members, a, b)
-        reason = f"in the dominant cluster of {len(members)} closures ({verdict.supporters} places apart)"
+        reason = f"in the dominant cluster of {len(members)} closures ({verdict.separate_places} places apart)"
         fresh = [entry for entry in members if entry.closure.status is not ClosureStatus.ACCEPTED]
         for entry in fresh:
             self._accept(entry, reason)
@@ -364,11 +364,11 @@ class Fleet:
     def _replies(self, packet: Packet) -> list[bytes]:
         """Acknowledgement; after a place, where the robot's odometry lies in the map; newer detectors."""
         robot, epoch, session = packet.robot, packet.epoch, session_name(packet.robot, packet.epoch)
-        bodies: list[Acknowledgement | Correction | Release] = [Acknowledgement(robot, epoch, packet.sequence)]
+        bodies: list[Acknowledgement | Correction | DetectorUpdate] = [Acknowledgement(robot, epoch, packet.sequence)]
         if isinstance(packet.body, Place) and self._graph.keyscan_count(session):
             bodies.append(replace(self._correction(session, map_indices(self._maps)[session]), robot=robot))
         if isinstance(packet.body, Hello | Place):
-            bodies += [Release(robot, file) for file in self._newer_detectors(session)]
+            bodies += [DetectorUpdate(robot, file) for file in self._newer_detectors(session)]
         first = self._store.number_replies(session, len(bodies))
         return [encode(Packet(robot, epoch, first + k, packet.time, body)) for k, body in enumerate(bodies)]
 

@@ -7,18 +7,18 @@ import numpy as np
 from fcslam.cloud.closure_log import Entry
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.graph import cluster
-from fcslam.graph.cluster import ClusterVerdict
+from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.consistency import Closures, ConsistencySettings
 from fcslam.records import FloatArray
 
 
 def judge(
     entries: Sequence[Entry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
-) -> ClusterVerdict:
+) -> ClusterDecision:
     """The dominant cluster among the closures of two robots, on the trajectories as they are estimated now."""
     a, b = (graph.path(robot, settings) for robot in robots)
     informative = [entry.closure.informative for entry in entries]
-    return cluster.judge(a, b, _closures(entries, robots[0]), informative, settings)
+    return cluster.decide_cluster(a, b, _closures(entries, robots[0]), informative, settings)
 
 
 def first_estimate(
@@ -38,4 +38,4 @@ def _closures(entries: Sequence[Entry], robot_a: str) -> Closures:
         np.array([closure.T_i_j for closure in told]).reshape(-1, 3),
         np.array([closure.information for closure in told]).reshape(-1, 3, 3),
     )
-    return closures.turned(np.array([closure.i.robot != robot_a for closure in told], dtype=bool))
+    return closures.reversed(np.array([closure.i.robot != robot_a for closure in told], dtype=bool))

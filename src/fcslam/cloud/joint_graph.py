@@ -9,7 +9,7 @@ from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.graph.trajectory import DriftSettings, Trajectory, trajectory
+from fcslam.graph.trajectory import DriftSettings, Trajectory, build_trajectory
 from fcslam.records import Constraint, FloatArray, KeyscanId
 
 
@@ -47,7 +47,7 @@ class JointGraph:
     def path(self, robot: str, settings: DriftSettings) -> Trajectory:
         """The robot's trajectory as consistency sees it, with the drift that its odometry claims."""
         steps = np.array(self._step_covariance[robot]).reshape(-1, 3, 3)
-        return trajectory(self.trajectory(robot), settings, steps)
+        return build_trajectory(self.trajectory(robot), settings, steps)
 
     def chain(self, robot: str, first: int = 0, last: int | None = None) -> FloatArray:
         """T_odom_base of keyscans first to last (inclusive): the robot's motions alone, before any correction."""

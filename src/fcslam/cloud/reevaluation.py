@@ -8,7 +8,7 @@ from fcslam.cloud.closure_log import ClosureLedger, Entry
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
 from fcslam.graph.consistency import ConsistencySettings
-from fcslam.graph.joint import HOLDS, JointEvidence, JointSolution, solve_jointly
+from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
 from fcslam.records import ClosureStatus, FloatArray, frozen
 
 CONTRADICTS = "contradicts the joint graph"
@@ -31,7 +31,9 @@ def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySe
         assert entry.edge is not None
         pair = frozenset((entry.closure.i.robot, entry.closure.j.robot))
         apart = len({maps[robot] for robot in pair}) > 1
-        _decide(entry, bool(solution.weights[entry.edge] > HOLDS), reasons.get(pair, CONTRADICTS) if apart else "")
+        _decide(
+            entry, bool(solution.weights[entry.edge] > INLIER_WEIGHT), reasons.get(pair, CONTRADICTS) if apart else ""
+        )
         graph.count(entry.edge, holds=entry.closure.status is ClosureStatus.ACCEPTED)
     members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
     T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
@@ -73,7 +75,7 @@ def _decide(entry: Entry, holds: bool, apart: str) -> None:
 def _reasons(solution: JointSolution, robots: list[str]) -> dict[frozenset[str], str]:
     """Why the cluster of two robots is not enough, where it is not."""
     return {
-        frozenset((robots[link.a], robots[link.b])): link.verdict.reason
+        frozenset((robots[link.a], robots[link.b])): link.decision.reason
         for link in solution.links
-        if link.verdict.reason
+        if link.decision.reason
     }

@@ -18,7 +18,7 @@ from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
-from fcslam.wire.messages import Kind
+from fcslam.wire.messages import PacketKind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +75,7 @@ def traffic_metrics(ledger: Ledger, tracks: Mapping[str, Track]) -> list[Metric]
     says nothing about the other.
     """
     traffic = {str(kind): ledger.total(kind=kind) for kind in sorted({label.kind for label in ledger.accepted})}
-    traffic |= {f"{channel}_{Kind.PLACE}": ledger.total(channel=channel) for channel in Channel}
+    traffic |= {f"{channel}_{PacketKind.PLACE}": ledger.total(channel=channel) for channel in Channel}
     robots = sorted({label.robot for label in ledger.accepted})
     return [
         *(Metric(f"{name}_packets", total.count, "1") for name, total in traffic.items()),

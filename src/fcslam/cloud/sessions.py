@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from fcslam.errors import PacketError
 from fcslam.records import Constraint, Correction, Keyscan, KeyscanId, Place
-from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet, Release
+from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 
 _SESSION = re.compile(r"(.+)\+(\d+)", re.ASCII)
 
@@ -58,5 +58,5 @@ def _renamed(body: Body, session: str) -> Body:
     match body:
         case Keyscan() | Place():
             return replace(body, id=KeyscanId(session, body.id.number))
-        case Hello() | Constraint() | Correction() | Acknowledgement() | Release():
+        case Hello() | Constraint() | Correction() | Acknowledgement() | DetectorUpdate():
             return replace(body, robot=session)

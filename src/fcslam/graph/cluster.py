@@ -1,4 +1,4 @@
-"""When is the agreement of closures enough to say how two robots' maps lie to each other? The dominant cluster."""
+"""The dominant cluster: when consistent closures are enough to fix the transform between the maps of two robots."""
 
 from dataclasses import dataclass
 
@@ -13,49 +13,67 @@ from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray
 
 DIRECTION_M = 1.0
-"""Two points as far apart as this, each known to a few centimetres, give a direction."""
+"""Least distance between two matched points that fixes a rotation: each point is known to a few centimetres."""
 
-_APART_BUDGET = 500
-"""Branches looked at for the largest set of places that lie apart; a set that is not proven is a lower bound."""
+_SEPARATE_BUDGET = 500
+"""Branches searched for the largest set of separate places; beyond them the result is a lower bound."""
 
 
 @dataclass(frozen=True, slots=True)
-class ClusterVerdict:
-    """Whether one group of closures is dominant."""
+class ClusterDecision:
+    """Whether one cluster of closures is dominant."""
 
     members: tuple[int, ...]
     """Largest cluster of pairwise consistent closures."""
     runner_up: tuple[int, ...]
-    """Largest cluster that contradicts it: of closures that disagree with at least half of its members."""
-    supporters: int
-    """Members from places that lie apart."""
-    runner_up_supporters: int
+    """Largest cluster that contradicts it: its closures are inconsistent with at least half of the members."""
+    separate_places: int
+    """Number of members from separate places."""
+    runner_up_separate_places: int
     exact: bool
     """Whether both clusters are proven to be the largest."""
     dominant: bool
     contested: bool
-    """Whether a cluster that would be enough to join two maps, too, contradicts it and is not clearly smaller."""
+    """Whether the runner-up would be enough to join two maps as well, and the cluster is not clearly larger."""
     reason: str
-    """One clause; empty if dominant."""
+    """Why the cluster is not dominant, one clause; empty if it is."""
 
 
-def judge(
+def decide_cluster(
     a: Trajectory, b: Trajectory, closures: Closures, informative: ArrayLike, settings: ConsistencySettings
-) -> ClusterVerdict:
-    """The verdict on the closures between two robots; ``informative`` as in :func:`dominant_cluster`."""
+) -> ClusterDecision:
+    """Decide whether the closures between two robots have a dominant cluster.
+
+    Args:
+        a, b: trajectories of the robots, each in its own coordinate frame.
+        closures: K closures from a to b.
+        informative: whether each closure fixes the pose in every direction, shape (K,).
+        settings: drift, and what a cluster needs.
+
+    Returns:
+        The decision; its members are rows of ``closures``.
+    """
     consistent = pairwise_consistency(a, b, closures, settings)
-    return dominant_cluster(consistent, places_of(a, b, closures), informative, settings)
+    return dominant_cluster(consistent, closure_positions(a, b, closures), informative, settings)
 
 
-def places_of(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
-    """Where both ends of each closure lie, (K, 2, 2), metres, each in its own trajectory's frame."""
+def closure_positions(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
+    """Positions of both ends of K closures, shape (K, 2, 2), metres; row 0 in the frame of a, row 1 in that of b."""
     return np.stack((a.poses[closures.i, :2], b.poses[closures.j, :2]), axis=1)
 
 
 def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
-    """T_a_b of two trajectories' frames from the two matched places that lie farthest apart, eqs. (5)-(6).
+    """Estimate ``T_a_b`` of the frames of two trajectories from the two matched places that lie farthest apart.
 
-    Places too near to each other to tell a direction leave it to the first closure alone.
+    Implements eqs. (5)-(6) of FC-SLAM. If these places are too close to each other to fix a rotation, the first
+    closure alone gives the transform.
+
+    Args:
+        a, b: trajectories, each in its own coordinate frame.
+        closures: at least one closure from a to b.
+
+    Returns:
+        ``T_a_b``, shape (3,), metres and radians.
     """
     T_a_j = se2.compose(a.poses[closures.i], closures.T_i_j)
     in_a, in_b = T_a_j[:, :2], b.poses[closures.j, :2]
@@ -68,48 +86,64 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
 
 def dominant_cluster(
     consistent: NDArray[np.bool_], places: ArrayLike, informative: ArrayLike, settings: ConsistencySettings
-) -> ClusterVerdict:
-    """The largest consistent cluster, and whether it is enough to join two maps.
+) -> ClusterDecision:
+    """Find the largest consistent cluster and decide whether it is enough to join two maps.
 
-    ``consistent`` (K, K) from :func:`pairwise_consistency`; ``places`` (K, 2), or (K, S, 2) as seen by S
-    trajectories, where each closure is (metres, each side in one frame); ``informative`` (K,) whether it fixes the
-    pose in every direction. Aliases agree with one another, too: so the cluster must have enough supporters from
-    different places, an informative one, and a clear lead over the largest one that contradicts it: in closures, and
-    no less in places.
+    False closures from repeated structure are consistent with one another, too. So the cluster must have members from
+    enough separate places, an informative member, and a clear lead over the largest cluster that contradicts it:
+    ``lead`` times as many closures, and no fewer separate places.
+
+    Args:
+        consistent: which pairs of closures are consistent, shape (K, K), from :func:`pairwise_consistency`.
+        places: positions of the closures in metres, shape (K, 2), or (K, S, 2) as seen by S trajectories, each side in
+            one coordinate frame.
+        informative: whether each closure fixes the pose in every direction, shape (K,).
+        settings: what a cluster needs.
+
+    Returns:
+        The decision; its members are rows of ``consistent``.
     """
     xy, informs = np.asarray(places, dtype=np.float64), np.asarray(informative, dtype=bool)
     xy = xy.reshape(len(xy), xy.size // (2 * max(1, len(xy))), 2)
-    first = maximum_clique(consistent)
-    members = list(first.members)
+    largest = maximum_clique(consistent)
+    members = list(largest.members)
     others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))
     others = np.setdiff1d(others, members)
     second = maximum_clique(consistent[np.ix_(others, others)])
     runner_up = others[list(second.members)]
-    supporters, rivals = apart(xy[members], settings.separation_m), apart(xy[runner_up], settings.separation_m)
-    behind = len(members) < settings.lead * len(runner_up) or supporters < rivals
+    separate = count_separate_places(xy[members], settings.separation_m)
+    rivals = count_separate_places(xy[runner_up], settings.separation_m)
+    has_no_lead = len(members) < settings.lead * len(runner_up) or separate < rivals
     reason = ""
-    if supporters < settings.minimum_closures:
-        reason = f"{supporters} supporters {settings.separation_m:g} m apart, {settings.minimum_closures} needed"
+    if separate < settings.minimum_closures:
+        reason = f"{separate} supporters {settings.separation_m:g} m apart, {settings.minimum_closures} needed"
     elif not informs[members].any():
         reason = "no supporter with information in every direction"
-    elif behind:
-        reason = f"{len(members)} closures from {supporters} places, but {len(runner_up)} from {rivals} disagree"
-    return ClusterVerdict(
-        members=first.members,
+    elif has_no_lead:
+        reason = f"{len(members)} closures from {separate} places, but {len(runner_up)} from {rivals} disagree"
+    return ClusterDecision(
+        members=largest.members,
         runner_up=tuple(runner_up.tolist()),
-        supporters=supporters,
-        runner_up_supporters=rivals,
-        exact=first.exact and second.exact,
+        separate_places=separate,
+        runner_up_separate_places=rivals,
+        exact=largest.exact and second.exact,
         dominant=not reason,
-        contested=behind and rivals >= settings.minimum_closures,
+        contested=has_no_lead and rivals >= settings.minimum_closures,
         reason=reason,
     )
 
 
-def apart(places: FloatArray, separation_m: float) -> int:
-    """How many of the places (K, S, 2) lie ``separation_m`` or more from one another, on every side.
+def count_separate_places(places: FloatArray, separation_m: float) -> int:
+    """Count the places that lie at least ``separation_m`` from one another, on every side.
 
-    One place of b that looks like three of a is one witness, not three.
+    A place of b that looks like three places of a counts once.
+
+    Args:
+        places: positions of K closures as seen by S trajectories, shape (K, S, 2), metres.
+        separation_m: least distance between two places, metres.
+
+    Returns:
+        Size of the largest such set.
     """
     gaps = np.hypot(*np.moveaxis(places[:, None] - places[None], -1, 0)).min(axis=-1, initial=np.inf)
-    return len(maximum_clique(gaps >= separation_m, _APART_BUDGET).members)
+    return len(maximum_clique(gaps >= separation_m, _SEPARATE_BUDGET).members)

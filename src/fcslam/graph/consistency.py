@@ -1,7 +1,8 @@
 """Pairwise consistency of closures between two trajectories (PCM, Mangelson et al., ICRA 2018).
 
-Two closures agree if the loop they form with the two stretches of trajectory between them closes, within their own
-covariances and the drift of both stretches. Which frame the trajectories have to each other plays no part.
+Two closures are consistent if the loop that they form with the two stretches of trajectory between them closes, within
+the covariances of the closures and the drift of both stretches. The transform between the frames of the two
+trajectories plays no part.
 """
 
 from dataclasses import dataclass
@@ -12,23 +13,38 @@ from pydantic import Field
 from scipy.special import gammaincinv
 
 from fcslam.geometry import se2
-from fcslam.graph.trajectory import DriftSettings, Trajectory, carried
+from fcslam.graph.trajectory import DriftSettings, Trajectory, transport_covariance
 from fcslam.records import FloatArray
 
 _PAIRS_AT_ONCE = 100_000
+"""Pairs of closures tested in one go: memory must not grow with the square of the number of closures."""
 
 
 class ConsistencySettings(DriftSettings):
-    """When closures between two trajectories agree, and when their agreement is enough to join two maps."""
+    """When closures between two trajectories are consistent, and when they are enough to join two maps."""
 
     probability: float = Field(
-        default=0.99, gt=0.0, lt=1.0, description="Two true closures pass the chi-square test with this probability"
+        default=0.99,
+        gt=0.0,
+        lt=1.0,
+        description="probability with which two true closures pass the chi-square test of consistency",
     )
-    minimum_closures: int = Field(default=3, ge=1, description="Supporters needed, from places that lie apart")
-    separation_m: float = Field(default=3.0, ge=0.0, description="Distance from which two places lie apart")
-    lead: float = Field(default=2.0, ge=1.0, description="Size needed, as a multiple of the second largest cluster")
-    witness_m: float = Field(
-        default=10.0, ge=0.0, description="Closures are witnesses to each other up to this path length at both ends"
+    minimum_closures: int = Field(
+        default=3, ge=1, description="closures from separate places that a cluster needs to join two maps"
+    )
+    separation_m: float = Field(
+        default=3.0, ge=0.0, description="least distance between two separate places, in the maps of both robots [m]"
+    )
+    lead: float = Field(
+        default=2.0,
+        ge=1.0,
+        description="least ratio of the size of the largest cluster to that of the largest one that contradicts it",
+    )
+    support_m: float = Field(
+        default=10.0,
+        ge=0.0,
+        description="largest path length between the ends of two closures, on both trajectories, "
+        "at which consistent closures support each other [m]",
     )
 
     @property
@@ -46,15 +62,15 @@ class Closures:
     j: NDArray[np.int64]
     """Keyscan of b, shape (K,)."""
     T_i_j: FloatArray
-    """Shape (K, 3)."""
+    """Pose of keyscan j in keyscan i, shape (K, 3), metres and radians."""
     information: FloatArray
-    """Shape (K, 3, 3), in the tangent space at T_i_j."""
+    """Information of T_i_j in the tangent space at T_i_j, shape (K, 3, 3)."""
 
     def __len__(self) -> int:
         return len(self.i)
 
-    def turned(self, rows: NDArray[np.bool_]) -> "Closures":
-        """The same closures, those in ``rows`` (K,) told from their other end."""
+    def reversed(self, rows: NDArray[np.bool_]) -> "Closures":
+        """The same closures; those where ``rows``, shape (K,), is true lead from j to i."""
         # The tangent space moves from j to i: v_i = -Ad(T_i_j) v_j.
         back = np.linalg.inv(se2.adjoint(self.T_i_j[rows]))
         i, j = np.where(rows, self.j, self.i), np.where(rows, self.i, self.j)
@@ -63,15 +79,23 @@ class Closures:
         information[rows] = back.swapaxes(-1, -2) @ self.information[rows] @ back
         return Closures(i, j, T_i_j, information)
 
-    def only(self, rows: NDArray[np.int64]) -> "Closures":
-        """Some of them."""
+    def select(self, rows: NDArray[np.int64]) -> "Closures":
+        """The closures with the indices ``rows``, shape (S,)."""
         return Closures(self.i[rows], self.j[rows], self.T_i_j[rows], self.information[rows])
 
 
 def pairwise_consistency(
     a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings
 ) -> NDArray[np.bool_]:
-    """Which closures agree, (K, K), symmetric, true on the diagonal.
+    """Test every pair of closures for consistency.
+
+    Args:
+        a, b: trajectories, each in its own coordinate frame.
+        closures: K closures from a to b.
+        settings: drift and probability of the test.
+
+    Returns:
+        Which pairs are consistent, shape (K, K), symmetric, true on the diagonal.
 
     Raises:
         ValueError: a closure names a keyscan that its trajectory does not have.
@@ -79,33 +103,53 @@ def pairwise_consistency(
     _check(closures.i, len(a), "a")
     _check(closures.j, len(b), "b")
     k, m = np.triu_indices(len(closures), 1)
-    agree = np.eye(len(closures), dtype=bool)
-    for part in np.array_split(np.arange(len(k)), len(k) // _PAIRS_AT_ONCE + 1):  # memory must not follow K^2
-        agree[k[part], m[part]] = loop_chi2(a, b, closures, k[part], m[part]) <= settings.limit
-    return agree | agree.T
+    consistent = np.eye(len(closures), dtype=bool)
+    for part in np.array_split(np.arange(len(k)), len(k) // _PAIRS_AT_ONCE + 1):
+        consistent[k[part], m[part]] = loop_chi2(a, b, closures, k[part], m[part]) <= settings.limit
+    return consistent | consistent.T
 
 
-def witnesses(a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings) -> NDArray[np.int64]:
-    """How many other closures bear each one out, shape (K,). For closures within one robot, a and b are its path.
+def count_supporting_closures(
+    a: Trajectory, b: Trajectory, closures: Closures, settings: ConsistencySettings
+) -> NDArray[np.int64]:
+    """Count the closures that support each closure.
 
-    A witness agrees and is near along the path at both ends, where hardly any drift could explain an agreement:
-    where robots meet they close more than one loop, while a false closure stands alone.
+    Two closures support each other if they are consistent and their ends are near each other along both paths, where
+    drift can hardly explain the agreement. Robots that visit the same place close several loops there; a false closure
+    is usually isolated.
+
+    Args:
+        a, b: trajectories; the same object for closures within one robot.
+        closures: K closures from a to b.
+        settings: drift, probability of the test, and ``support_m``.
+
+    Returns:
+        Number of supporting closures of each closure, shape (K,).
     """
     if a is b:
-        closures = closures.turned(closures.i > closures.j)
+        closures = closures.reversed(closures.i > closures.j)
     near = np.ones((len(closures), len(closures)), dtype=bool)
     for path, end in ((a, closures.i), (b, closures.j)):
-        metres = path.metres[end]
-        near &= np.abs(metres[:, None] - metres[None]) <= settings.witness_m
+        travel_m = path.travel_m[end]
+        near &= np.abs(travel_m[:, None] - travel_m[None]) <= settings.support_m
     k, m = np.nonzero(np.triu(near, 1))
-    agree = loop_chi2(a, b, closures, k, m) <= settings.limit
-    return np.bincount(np.concatenate((k[agree], m[agree])), minlength=len(closures))
+    consistent = loop_chi2(a, b, closures, k, m) <= settings.limit
+    return np.bincount(np.concatenate((k[consistent], m[consistent])), minlength=len(closures))
 
 
 def loop_chi2(
     a: Trajectory, b: Trajectory, closures: Closures, k: NDArray[np.int64], m: NDArray[np.int64]
 ) -> FloatArray:
-    """Squared Mahalanobis length (P,) of the loops: back over closure k, along a, over closure m, back along b."""
+    """Squared Mahalanobis length of loops: back over closure k, along a, over closure m, back along b.
+
+    Args:
+        a, b: trajectories, each in its own coordinate frame.
+        closures: K closures from a to b.
+        k, m: rows of the two closures of each loop, shape (P,).
+
+    Returns:
+        Chi-square with three degrees of freedom, shape (P,).
+    """
     i, j, T_i_j = closures.i, closures.j, closures.T_i_j
     along_a = se2.between(a.poses[i[k]], a.poses[i[m]])
     along_b = se2.between(b.poses[j[m]], b.poses[j[k]])
@@ -113,8 +157,8 @@ def loop_chi2(
     residual = se2.log(se2.compose(se2.between(T_i_j[k], along_a), over_b))
     # First-order covariance in the tangent space at the loop's end, as if it closed.
     covariance = np.linalg.inv(closures.information).astype(np.float64)
-    spread = covariance[k] + carried(covariance[m], along_b)
-    spread += carried(a.drift(i[k], i[m]), over_b) + b.drift(j[m], j[k])
+    spread = covariance[k] + transport_covariance(covariance[m], along_b)
+    spread += transport_covariance(a.drift(i[k], i[m]), over_b) + b.drift(j[m], j[k])
     chi2: FloatArray = np.einsum("pa,pa->p", residual, np.linalg.solve(spread, residual[..., None])[..., 0])
     return chi2
 

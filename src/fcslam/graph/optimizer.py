@@ -129,7 +129,7 @@ def optimize_gnc(
     return _concluded(graph, start, steps, weights, limit)
 
 
-def settle(
+def refine_inliers(
     graph: PoseGraph,
     initial: ArrayLike | None,
     weights: ArrayLike,

@@ -1,4 +1,4 @@
-"""A robot's path as consistency sees it: poses, and how uncertain the motion between any two of them is."""
+"""A robot's trajectory with drift: poses, and the covariance of the motion between any two of them."""
 
 from dataclasses import dataclass
 
@@ -12,41 +12,59 @@ from fcslam.records import FloatArray
 
 
 class DriftSettings(Settings):
-    """What a robot's path may be off beyond what its own measurements say: a random walk per metre."""
+    """Drift of a trajectory on top of the covariance of its odometry: a random walk along the path."""
 
     position_drift_m: float = Field(
-        default=0.02, gt=0.0, description="Standard deviation of a trajectory's position after one metre"
+        default=0.02, gt=0.0, description="standard deviation of the drift in position after one metre of travel [m]"
     )
     heading_drift_rad: float = Field(
-        default=0.005, gt=0.0, description="Standard deviation of a trajectory's heading after one metre"
+        default=0.005, gt=0.0, description="standard deviation of the drift in heading after one metre of travel [rad]"
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Poses of one robot in the order of its path, in a frame of its own."""
+    """Poses of one robot in the order of its path, in the robot's own coordinate frame."""
 
     poses: FloatArray
-    """Shape (N, 3)."""
-    metres: FloatArray
-    """Path length up to each pose, shape (N,)."""
-    _walk: FloatArray
-    """Covariance of the path up to each pose, in the tangent space at the poses' centre, shape (N, 3, 3)."""
+    """Shape (N, 3): x, y, theta in metres and radians."""
+    travel_m: FloatArray
+    """Path length up to each pose, metres, shape (N,)."""
+    _covariance: FloatArray
+    """Covariance accumulated up to each pose, in the tangent space at ``_centre``, shape (N, 3, 3)."""
     _centre: FloatArray
+    """Pose at the mean position of the trajectory, shape (3,)."""
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def drift(self, start: NDArray[np.int64], end: NDArray[np.int64]) -> FloatArray:
-        """Covariance (P, 3, 3) of the motions from ``start`` to ``end`` (P,), in the tangent space at the end."""
+        """Covariance of the motions between pairs of poses.
+
+        Args:
+            start: rows of the first poses, shape (P,).
+            end: rows of the second poses, shape (P,).
+
+        Returns:
+            Covariances, shape (P, 3, 3), over (x, y, theta) in metres and radians, in the tangent space at ``end``.
+        """
         low, high = np.minimum(start, end), np.maximum(start, end)
-        return carried(self._walk[high] - self._walk[low], se2.between(self._centre, self.poses[end]))
+        return transport_covariance(
+            self._covariance[high] - self._covariance[low], se2.between(self._centre, self.poses[end])
+        )
 
 
-def trajectory(poses: ArrayLike, settings: DriftSettings, step_covariance: ArrayLike | None = None) -> Trajectory:
-    """A trajectory of ``poses`` (N, 3) that drifts as its steps' covariance (N - 1, 3, 3) and ``settings`` say.
+def build_trajectory(poses: ArrayLike, settings: DriftSettings, step_covariance: ArrayLike | None = None) -> Trajectory:
+    """Accumulate the covariance along a path.
 
-    A step's covariance is in the tangent space at its end; without one the steps themselves count as exact.
+    Args:
+        poses: shape (N, 3), metres and radians, in the robot's own coordinate frame.
+        settings: drift per metre, added to the covariance of each step.
+        step_covariance: covariance of each step in the tangent space at its end, shape (N - 1, 3, 3); None takes the
+            steps as exact.
+
+    Returns:
+        The trajectory.
     """
     x = np.asarray(poses, dtype=np.float64).reshape(-1, 3)
     length = np.hypot(*np.diff(x[:, :2], axis=0).T)
@@ -54,16 +72,24 @@ def trajectory(poses: ArrayLike, settings: DriftSettings, step_covariance: Array
     spread = length[:, None, None] * np.diag(per_metre)
     if step_covariance is not None:
         spread += np.asarray(step_covariance, dtype=np.float64)
-    # Levers are taken from the middle of the path: from a far origin they would eat the digits.
+    # Lever arms start at the middle of the path: from a distant origin they would cost precision.
     centre = np.append(x[:, :2].mean(axis=0), 0.0) if len(x) else np.zeros(3)
     adjoint = se2.adjoint(se2.between(centre, x[1:]))
     steps = adjoint @ spread @ adjoint.swapaxes(-1, -2)
-    walk = np.concatenate((np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)))
-    return Trajectory(x, np.append(0.0, np.cumsum(length)), walk, centre)
+    accumulated = np.concatenate((np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)))
+    return Trajectory(x, np.append(0.0, np.cumsum(length)), accumulated, centre)
 
 
-def carried(covariance: FloatArray, T: FloatArray) -> FloatArray:
-    """Covariance (..., 3, 3) in the tangent space before the motion ``T``, in the one after it."""
+def transport_covariance(covariance: FloatArray, T: FloatArray) -> FloatArray:
+    """Move a covariance from one tangent space to another.
+
+    Args:
+        covariance: shape (..., 3, 3), in the tangent space before the motion.
+        T: the motion, shape (..., 3).
+
+    Returns:
+        The same covariance in the tangent space after the motion, shape (..., 3, 3).
+    """
     adjoint = se2.adjoint(se2.inverse(T))
     moved: FloatArray = adjoint @ covariance @ adjoint.swapaxes(-1, -2)
     return moved

@@ -16,10 +16,10 @@ import numpy as np
 from fcslam.errors import StateError
 from fcslam.records import Constraint, ConstraintKind, Correction, FloatArray, Keyscan, LaserScan, SensorRecord
 from fcslam.robot.budget import Budget
+from fcslam.robot.detector_updates import DetectorUpdates
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.localization import Localizer
 from fcslam.robot.outbox import Outbox, Waiting
-from fcslam.robot.releases import Releases
 from fcslam.robot.sender import Sender
 from fcslam.wire.http_transport import BatchTransport
 from fcslam.wire.messages import Packet
@@ -117,11 +117,13 @@ class Agent:
         self._refused = folder / "refused"
         self._sleep = sleep
         self._budget = budget
-        self._releases = Releases(folder / "detectors", outbox, frontend)
+        self._detector_updates = DetectorUpdates(folder / "detectors", outbox, frontend)
         self._clock = clock
         self._localizers: dict[int, Localizer] = {}
         """Of every part of this start: each has a frame of its own."""
-        self._sender = Sender(outbox, transport, rng, clock, self._correct, self._releases.keep, self._keep_refused)
+        self._sender = Sender(
+            outbox, transport, rng, clock, self._correct, self._detector_updates.keep, self._keep_refused
+        )
         self._kept: int | None = None
         """Files of refused packets, once they were counted: there may be many."""
         self._known = self._said = self._keyscans = self._crowded_out = 0
@@ -135,10 +137,10 @@ class Agent:
             SourceError: the recording cannot be read.
         """
         self._known = known
-        self._releases.resume()
+        self._detector_updates.resume()
         with self._sending():
             for number, record in enumerate(records):
-                self._releases.take(number, self._said < known)
+                self._detector_updates.take(number, self._said < known)
                 if isinstance(record, LaserScan) and self._said >= known:
                     pace.wait(record.stamp)
                 self._say(self._frontend.process(record))
@@ -150,7 +152,7 @@ class Agent:
     def progress(self) -> AgentProgress:
         """Where the robot is now."""
         sender = self._sender
-        notices = tuple(filter(None, (sender.notice, sender.refused_notice, self._releases.notice)))
+        notices = tuple(filter(None, (sender.notice, sender.refused_notice, self._detector_updates.notice)))
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
             sum(map(len, self._frontend.tracks)), self._keyscans, self._outbox.waiting, sender.confirmed,

@@ -119,7 +119,7 @@ class Outbox:
             return int(self._one("SELECT count(*) FROM packets WHERE epoch >= ?", self._first)[0])
 
     @property
-    def is_met(self) -> bool:
+    def is_synchronized(self) -> bool:
         """Whether the cloud knows every session: packets of others do not travel."""
         with self._transaction():
             return self._one("SELECT 1 FROM sessions WHERE met = 0") is None
@@ -163,13 +163,13 @@ class Outbox:
                 self.waiting = Waiting(self.waiting.packets + 1, self.waiting.bytes + len(sent))
         return left_out
 
-    def take_release(self, record: int, file: DetectorFile) -> None:
+    def record_detector_update(self, record: int, file: DetectorFile) -> None:
         """Remember that the front end takes a detector before this record of the session."""
         told = (self.epoch, record, file.channel.value, file.version, file.format, file.size, file.sha256)
         with self._transaction():
             self._database.execute("INSERT INTO releases VALUES (?, ?, ?, ?, ?, ?, ?)", told)
 
-    def releases(self) -> dict[int, DetectorFile]:
+    def detector_updates(self) -> dict[int, DetectorFile]:
         """What the start has taken, by record."""
         columns = "record, channel, version, format, size, sha256"
         with self._transaction():
@@ -192,7 +192,7 @@ class Outbox:
                 chosen.append(row)
         return Batch(chosen[0][0], chosen[0][1], tuple(data for _, _, data in chosen)) if chosen else None
 
-    def meet(self, expected: Mapping[int, int]) -> list[tuple[int, int]]:
+    def synchronize(self, expected: Mapping[int, int]) -> list[tuple[int, int]]:
         """Learn what the cloud has of this robot: the next sequence that it expects, by epoch.
 
         Sessions that it has not seen move to epochs above all that it has: the robot may have had another state folder.

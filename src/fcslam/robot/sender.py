@@ -11,7 +11,7 @@ from fcslam.records import Correction, DetectorFile
 from fcslam.robot.outbox import Batch, Outbox
 from fcslam.wire.http_transport import Answer, BatchTransport, CloudState
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
-from fcslam.wire.messages import Acknowledgement, Release
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate
 from fcslam.wire.packets import decode
 
 EVERY_S = 1.0
@@ -47,7 +47,7 @@ class Sender:
         self._correct = correct
         self._keep = keep
         self._refused = refused
-        self._met = False
+        self._is_synchronized = False
         self._most = MAXIMUM_BATCH_PACKETS
         """In a batch."""
         self._refused_there = 0
@@ -89,15 +89,15 @@ class Sender:
         try:
             return self._step()
         except UnavailableError as error:
-            self._met = False  # its mission may be another one
+            self._is_synchronized = False  # its mission may be another one
             self.trouble = str(error)
             self._failures += 1
             return error.retry_after_s + retry_delay_s(self._failures, self._rng)
 
     def _step(self) -> float:
-        if not self._met or not self._outbox.is_met:
-            self._meet()
-            self._met = True
+        if not self._is_synchronized or not self._outbox.is_synchronized:
+            self._synchronize()
+            self._is_synchronized = True
             self.trouble = None
         batch = self._outbox.batch(MAXIMUM_BATCH_BYTES, self._most)
         if batch is None:
@@ -114,9 +114,9 @@ class Sender:
             return 0.0
         return EVERY_S if is_all else 0.0
 
-    def _meet(self) -> None:
+    def _synchronize(self) -> None:
         state = self._transport.state()
-        in_vain = self._outbox.meet(state.expected)
+        in_vain = self._outbox.synchronize(state.expected)
         for epoch, sequence in in_vain:
             self._set_aside(epoch, sequence, f"epoch {epoch} is of another mission: the cloud lacks its beginning")
         if in_vain:
@@ -174,7 +174,7 @@ class Sender:
                 case Correction() as news if packet.epoch == self._outbox.epoch and news.version > self._correction:
                     self._correction = news.version
                     self._correct(packet.epoch, news)
-                case Release(file=file) if file not in self._known:
+                case DetectorUpdate(file=file) if file not in self._known:
                     self._fetch(file)
 
     def _fetch(self, file: DetectorFile) -> None:

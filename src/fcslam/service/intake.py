@@ -9,7 +9,7 @@ from fcslam.errors import FcslamError, PacketError
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.service.mission_store import MissionStore, StoredPacket
 from fcslam.wire.batches import read_batch, write_batch
-from fcslam.wire.messages import UPLINK, Acknowledgement, Body, Hello, Kind, Packet, Release
+from fcslam.wire.messages import UPLINK, Acknowledgement, Body, DetectorUpdate, Hello, Packet, PacketKind
 from fcslam.wire.packets import decode, encode, read_label, read_number
 
 LEASE_S = 30.0
@@ -130,7 +130,9 @@ class Intake:
         if news and news.correction.version > known_correction:
             told.append((news.epoch, news.time, news.correction))
         if epochs:
-            told += [(epochs[-1], 0.0, Release(robot, file)) for file in self._newer_detectors(robot, epochs[-1])]
+            told += [
+                (epochs[-1], 0.0, DetectorUpdate(robot, file)) for file in self._newer_detectors(robot, epochs[-1])
+            ]
         return write_batch(
             encode(Packet(robot, epoch, number, time_s, body)) for number, (epoch, time_s, body) in enumerate(told)
         )
@@ -178,4 +180,4 @@ def _read(robot: str, data: bytes) -> StoredPacket:
     if kind not in UPLINK:
         raise PacketError(f"{robot}: a {kind} goes to a robot, not to the cloud")
     channel = packet.body.channel if isinstance(packet.body, Place) else None
-    return StoredPacket(robot, packet.epoch, packet.sequence, packet.time, Kind(kind), channel, data)
+    return StoredPacket(robot, packet.epoch, packet.sequence, packet.time, PacketKind(kind), channel, data)

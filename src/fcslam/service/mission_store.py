@@ -17,7 +17,7 @@ from fcslam.errors import PacketConflictError, StoreError
 from fcslam.records import Channel, Correction, Veto, frozen
 from fcslam.storage.database import Database, check_file, told
 from fcslam.wire.ledger import Ledger, Traffic
-from fcslam.wire.messages import Kind
+from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import Label
 
 APPLIED = "applied"
@@ -67,7 +67,7 @@ class StoredPacket:
     epoch: int
     sequence: int
     time: float
-    kind: Kind | None
+    kind: PacketKind | None
     """None: it could not be read, and was refused."""
     channel: Channel | None
     """Of a place."""
@@ -150,7 +150,9 @@ class MissionStore:
         columns = "robot, epoch, sequence, time, kind, channel, data, refusal"
         statement = f"SELECT {columns} FROM packets WHERE turn >= ? ORDER BY turn LIMIT ?"
         return [
-            StoredPacket(robot, epoch, sequence, time, kind and Kind(kind), channel and Channel(channel), data, refusal)
+            StoredPacket(
+                robot, epoch, sequence, time, kind and PacketKind(kind), channel and Channel(channel), data, refusal
+            )
             for robot, epoch, sequence, time, kind, channel, data, refusal in self._database.rows(
                 statement, (after, limit)
             )
@@ -292,12 +294,12 @@ class MissionStore:
         refused = Traffic()
         for robot, kind, channel, counts, packets, size in self._database.rows(statement):
             if counts:
-                accepted[Label(robot, Kind(kind), channel and Channel(channel))] = Traffic(packets, size)
+                accepted[Label(robot, PacketKind(kind), channel and Channel(channel))] = Traffic(packets, size)
             else:
                 refused += Traffic(packets, size)
         return Ledger(accepted, refused)
 
-    def arrived(self, after: int, limit: int) -> list[tuple[int, str, Kind | None, Channel | None, Traffic]]:
+    def arrived(self, after: int, limit: int) -> list[tuple[int, str, PacketKind | None, Channel | None, Traffic]]:
         """What came in after a row of the file (0: all), at most ``limit`` packets.
 
         Last row, robot, kind, channel and traffic of each of its parts; refused packets count, too.
@@ -306,7 +308,7 @@ class MissionStore:
         parts = "max(rowid), robot, kind, channel, count(*), sum(size)"
         statement = f"SELECT {parts} FROM ({chosen} LIMIT ?) GROUP BY robot, kind, channel"
         return [
-            (row, robot, kind and Kind(kind), channel and Channel(channel), Traffic(count, size))
+            (row, robot, kind and PacketKind(kind), channel and Channel(channel), Traffic(count, size))
             for row, robot, kind, channel, count, size in self._database.rows(statement, (after, limit))
         ]
 
@@ -332,7 +334,7 @@ def check_mission(path: Path) -> None:
     try:
         for kind, channel, counts in labels:
             if counts or kind is not None:
-                Label("", Kind(kind), None if channel is None else Channel(channel))
+                Label("", PacketKind(kind), None if channel is None else Channel(channel))
         CloudConfig.model_validate_json(facts.get(CONFIG, "{}"))
         int(facts.get(APPLIED, "0"))
     except ValueError as error:

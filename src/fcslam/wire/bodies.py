@@ -23,7 +23,7 @@ from fcslam.records import (
 )
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS
-from fcslam.wire.messages import Acknowledgement, Hello, Kind, Release
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, PacketKind
 from fcslam.wire.quantisation import (
     dequantise,
     dequantise_keypoints,
@@ -169,17 +169,17 @@ def _read_acknowledgement(message: pb.Acknowledgement, envelope: pb.Packet) -> A
     return Acknowledgement(envelope.robot, message.epoch, message.sequence)
 
 
-def _write_release(release: Release) -> pb.Release:
-    file = release.file
-    return pb.Release(
+def _write_detector_update(update: DetectorUpdate) -> pb.DetectorUpdate:
+    file = update.file
+    return pb.DetectorUpdate(
         channel=_CHANNELS[file.channel], version=file.version, format=file.format, size=file.size, sha256=file.sha256
     )
 
 
-def _read_release(message: pb.Release, envelope: pb.Packet) -> Release:
+def _read_detector_update(message: pb.DetectorUpdate, envelope: pb.Packet) -> DetectorUpdate:
     channel = read_channel(message.channel)
     file = DetectorFile(channel, message.version, message.format, message.size, message.sha256)
-    return Release(envelope.robot, file)
+    return DetectorUpdate(envelope.robot, file)
 
 
 def _write_pose(pose: FloatArray) -> pb.Pose:
@@ -216,12 +216,12 @@ class Codec(NamedTuple):
 
 
 CODECS = {
-    Kind.HELLO: Codec(Hello, _write_hello, _read_hello),
-    Kind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan),
-    Kind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint),
-    Kind.PLACE: Codec(Place, _write_place, _read_place),
-    Kind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
-    Kind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
-    Kind.RELEASE: Codec(Release, _write_release, _read_release),
+    PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello),
+    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan),
+    PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint),
+    PacketKind.PLACE: Codec(Place, _write_place, _read_place),
+    PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
+    PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
+    PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),
 }
 CODEC_OF_TYPE = {codec.type: (kind, codec) for kind, codec in CODECS.items()}

@@ -23,7 +23,7 @@ from fcslam.wire.limits import (
     MINIMUM_CORRELATION_EIGENVALUE,
     MINIMUM_INFORMATION,
 )
-from fcslam.wire.messages import Acknowledgement, Body, Hello, Packet, Release
+from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise, unpack_information
 
 FULL_TURN_RAD = 2.0 * math.pi
@@ -140,13 +140,15 @@ def _check_acknowledgement(acknowledgement: Acknowledgement, _: Packet) -> None:
     _check_count(acknowledgement.sequence, "acknowledgement: sequence", MAXIMUM_SEQUENCE)
 
 
-def _check_release(release: Release, _: Packet) -> None:
-    file = release.file
-    check_name(file.version, "release: detector version")
-    _check_count(file.format, "release: format", MAXIMUM_NUMBER)
+def _check_detector_update(update: DetectorUpdate, _: Packet) -> None:
+    file = update.file
+    check_name(file.version, "detector update: detector version")
+    _check_count(file.format, "detector update: format", MAXIMUM_NUMBER)
     within = 0 < file.size <= MAXIMUM_NETWORK_BYTES
-    _require(within, f"release: a file of {file.size} bytes, not of 1..{MAXIMUM_NETWORK_BYTES}")
-    _require(len(file.sha256) == DIGEST_BYTES, f"release: sha256 has {len(file.sha256)} bytes, not {DIGEST_BYTES}")
+    _require(within, f"detector update: a file of {file.size} bytes, not of 1..{MAXIMUM_NETWORK_BYTES}")
+    _require(
+        len(file.sha256) == DIGEST_BYTES, f"detector update: sha256 has {len(file.sha256)} bytes, not {DIGEST_BYTES}"
+    )
 
 
 _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
@@ -156,7 +158,7 @@ _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     Place: _check_place,
     Correction: _check_correction,
     Acknowledgement: _check_acknowledgement,
-    Release: _check_release,
+    DetectorUpdate: _check_detector_update,
 }
 
 

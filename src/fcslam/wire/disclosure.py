@@ -8,7 +8,7 @@ from typing import Any
 from google.protobuf.descriptor import FieldDescriptor
 
 from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.messages import UPLINK, Kind
+from fcslam.wire.messages import UPLINK, PacketKind
 
 REVEALS: Mapping[str, str] = MappingProxyType(
     {
@@ -47,11 +47,11 @@ REVEALS: Mapping[str, str] = MappingProxyType(
         "Correction.map_index": "whether the robot has met others",
         "Correction.t_map_odom": "where the robot is in the building's map",
         "Correction.quality": "how much of what it sees others have seen",
-        "Release.channel": "nothing of the robot",
-        "Release.version": "that the fleet has trained",
-        "Release.format": "nothing of the robot",
-        "Release.size": "nothing of the robot",
-        "Release.sha256": "nothing of the robot",
+        "DetectorUpdate.channel": "nothing of the robot",
+        "DetectorUpdate.version": "that the fleet has trained",
+        "DetectorUpdate.format": "nothing of the robot",
+        "DetectorUpdate.size": "nothing of the robot",
+        "DetectorUpdate.sha256": "nothing of the robot",
         "Acknowledgement.epoch": "nothing by itself",
         "Acknowledgement.sequence": "how much the cloud has",
     }
@@ -105,7 +105,7 @@ def disclosures() -> list[Disclosure]:
 
 
 def _disclosure(body: Any) -> Disclosure:
-    direction = "robot to cloud" if Kind(body.name) in UPLINK else "cloud to robot"
+    direction = "robot to cloud" if PacketKind(body.name) in UPLINK else "cloud to robot"
     return Disclosure(body.name, direction, tuple(_walk(body.message_type, "")))
 
 

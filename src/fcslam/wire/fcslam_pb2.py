@@ -24,35 +24,35 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18\x66\x63slam/wire/fcslam.proto\x12\tfcslam.v1\"\x84\x03\n\x06Packet\x12\x0f\n\x07version\x18\x01 \x01(\r\x12\r\n\x05robot\x18\x02 \x01(\t\x12\r\n\x05\x65poch\x18\x03 \x01(\x04\x12\x10\n\x08sequence\x18\x04 \x01(\x04\x12\x0c\n\x04time\x18\x05 \x01(\x01\x12!\n\x05hello\x18\n \x01(\x0b\x32\x10.fcslam.v1.HelloH\x00\x12%\n\x07keyscan\x18\x0b \x01(\x0b\x32\x12.fcslam.v1.KeyscanH\x00\x12+\n\nconstraint\x18\x0c \x01(\x0b\x32\x15.fcslam.v1.ConstraintH\x00\x12!\n\x05place\x18\r \x01(\x0b\x32\x10.fcslam.v1.PlaceH\x00\x12+\n\ncorrection\x18\x14 \x01(\x0b\x32\x15.fcslam.v1.CorrectionH\x00\x12\x35\n\x0f\x61\x63knowledgement\x18\x15 \x01(\x0b\x32\x1a.fcslam.v1.AcknowledgementH\x00\x12%\n\x07release\x18\x16 \x01(\x0b\x32\x12.fcslam.v1.ReleaseH\x00\x42\x06\n\x04\x62ody\"3\n\x04Pose\x12\x0b\n\x03x_m\x18\x01 \x01(\x01\x12\x0b\n\x03y_m\x18\x02 \x01(\x01\x12\x11\n\ttheta_rad\x18\x03 \x01(\x01\"\xb3\x01\n\x05Hello\x12\x12\n\nbeam_count\x18\x01 \x01(\r\x12\x15\n\rangle_min_rad\x18\x02 \x01(\x01\x12\x1b\n\x13\x61ngle_increment_rad\x18\x03 \x01(\x01\x12\x13\n\x0bmax_range_m\x18\x04 \x01(\x01\x12%\n\x0ct_base_laser\x18\x05 \x01(\x0b\x32\x0f.fcslam.v1.Pose\x12&\n\tdetectors\x18\x06 \x03(\x0b\x32\x13.fcslam.v1.Detector\"@\n\x08\x44\x65tector\x12#\n\x07\x63hannel\x18\x01 \x01(\x0e\x32\x12.fcslam.v1.Channel\x12\x0f\n\x07version\x18\x02 \x01(\t\"G\n\x07Keyscan\x12\x0e\n\x06number\x18\x01 \x01(\r\x12\r\n\x05stamp\x18\x02 \x01(\x01\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x0e\n\x06ranges\x18\x04 \x01(\x0c\"\x80\x01\n\nConstraint\x12\t\n\x01i\x18\x01 \x01(\r\x12\t\n\x01j\x18\x02 \x01(\r\x12\'\n\x04kind\x18\x03 \x01(\x0e\x32\x19.fcslam.v1.ConstraintKind\x12\x1e\n\x05t_i_j\x18\x04 \x01(\x0b\x32\x0f.fcslam.v1.Pose\x12\x13\n\x0binformation\x18\x05 \x03(\x02\"\xaa\x01\n\x05Place\x12\x0e\n\x06number\x18\x01 \x01(\r\x12#\n\x07\x63hannel\x18\x02 \x01(\x0e\x32\x12.fcslam.v1.Channel\x12\x18\n\x10\x64\x65tector_version\x18\x03 \x01(\t\x12\r\n\x05\x66irst\x18\x04 \x01(\r\x12\x0c\n\x04last\x18\x05 \x01(\r\x12\r\n\x05\x63ount\x18\x06 \x01(\r\x12\x11\n\tkeypoints\x18\x07 \x01(\x0c\x12\x13\n\x0b\x64\x65scriptors\x18\x08 \x01(\x0c\"f\n\nCorrection\x12\x0f\n\x07version\x18\x01 \x01(\r\x12\x11\n\tmap_index\x18\x02 \x01(\r\x12#\n\nt_map_odom\x18\x03 \x01(\x0b\x32\x0f.fcslam.v1.Pose\x12\x0f\n\x07quality\x18\x04 \x01(\x02\"2\n\x0f\x41\x63knowledgement\x12\r\n\x05\x65poch\x18\x01 \x01(\x04\x12\x10\n\x08sequence\x18\x02 \x01(\x04\"m\n\x07Release\x12#\n\x07\x63hannel\x18\x01 \x01(\x0e\x32\x12.fcslam.v1.Channel\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x0e\n\x06\x66ormat\x18\x03 \x01(\r\x12\x0c\n\x04size\x18\x04 \x01(\x04\x12\x0e\n\x06sha256\x18\x05 \x01(\x0c*I\n\x07\x43hannel\x12\x17\n\x13\x43HANNEL_UNSPECIFIED\x10\x00\x12\x11\n\rCHANNEL_LIDAR\x10\x01\x12\x12\n\x0e\x43HANNEL_CAMERA\x10\x02*l\n\x0e\x43onstraintKind\x12\x1f\n\x1b\x43ONSTRAINT_KIND_UNSPECIFIED\x10\x00\x12\x1c\n\x18\x43ONSTRAINT_KIND_ODOMETRY\x10\x01\x12\x1b\n\x17\x43ONSTRAINT_KIND_CLOSURE\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18\x66\x63slam/wire/fcslam.proto\x12\tfcslam.v1\"\x93\x03\n\x06Packet\x12\x0f\n\x07version\x18\x01 \x01(\r\x12\r\n\x05robot\x18\x02 \x01(\t\x12\r\n\x05\x65poch\x18\x03 \x01(\x04\x12\x10\n\x08sequence\x18\x04 \x01(\x04\x12\x0c\n\x04time\x18\x05 \x01(\x01\x12!\n\x05hello\x18\n \x01(\x0b\x32\x10.fcslam.v1.HelloH\x00\x12%\n\x07keyscan\x18\x0b \x01(\x0b\x32\x12.fcslam.v1.KeyscanH\x00\x12+\n\nconstraint\x18\x0c \x01(\x0b\x32\x15.fcslam.v1.ConstraintH\x00\x12!\n\x05place\x18\r \x01(\x0b\x32\x10.fcslam.v1.PlaceH\x00\x12+\n\ncorrection\x18\x14 \x01(\x0b\x32\x15.fcslam.v1.CorrectionH\x00\x12\x35\n\x0f\x61\x63knowledgement\x18\x15 \x01(\x0b\x32\x1a.fcslam.v1.AcknowledgementH\x00\x12\x34\n\x0f\x64\x65tector_update\x18\x16 \x01(\x0b\x32\x19.fcslam.v1.DetectorUpdateH\x00\x42\x06\n\x04\x62ody\"3\n\x04Pose\x12\x0b\n\x03x_m\x18\x01 \x01(\x01\x12\x0b\n\x03y_m\x18\x02 \x01(\x01\x12\x11\n\ttheta_rad\x18\x03 \x01(\x01\"\xb3\x01\n\x05Hello\x12\x12\n\nbeam_count\x18\x01 \x01(\r\x12\x15\n\rangle_min_rad\x18\x02 \x01(\x01\x12\x1b\n\x13\x61ngle_increment_rad\x18\x03 \x01(\x01\x12\x13\n\x0bmax_range_m\x18\x04 \x01(\x01\x12%\n\x0ct_base_laser\x18\x05 \x01(\x0b\x32\x0f.fcslam.v1.Pose\x12&\n\tdetectors\x18\x06 \x03(\x0b\x32\x13.fcslam.v1.Detector\"@\n\x08\x44\x65tector\x12#\n\x07\x63hannel\x18\x01 \x01(\x0e\x32\x12.fcslam.v1.Channel\x12\x0f\n\x07version\x18\x02 \x01(\t\"G\n\x07Keyscan\x12\x0e\n\x06number\x18\x01 \x01(\r\x12\r\n\x05stamp\x18\x02 \x01(\x01\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x0e\n\x06ranges\x18\x04 \x01(\x0c\"\x80\x01\n\nConstraint\x12\t\n\x01i\x18\x01 \x01(\r\x12\t\n\x01j\x18\x02 \x01(\r\x12\'\n\x04kind\x18\x03 \x01(\x0e\x32\x19.fcslam.v1.ConstraintKind\x12\x1e\n\x05t_i_j\x18\x04 \x01(\x0b\x32\x0f.fcslam.v1.Pose\x12\x13\n\x0binformation\x18\x05 \x03(\x02\"\xaa\x01\n\x05Place\x12\x0e\n\x06number\x18\x01 \x01(\r\x12#\n\x07\x63hannel\x18\x02 \x01(\x0e\x32\x12.fcslam.v1.Channel\x12\x18\n\x10\x64\x65tector_version\x18\x03 \x01(\t\x12\r\n\x05\x66irst\x18\x04 \x01(\r\x12\x0c\n\x04last\x18\x05 \x01(\r\x12\r\n\x05\x63ount\x18\x06 \x01(\r\x12\x11\n\tkeypoints\x18\x07 \x01(\x0c\x12\x13\n\x0b\x64\x65scriptors\x18\x08 \x01(\x0c\"f\n\nCorrection\x12\x0f\n\x07version\x18\x01 \x01(\r\x12\x11\n\tmap_index\x18\x02 \x01(\r\x12#\n\nt_map_odom\x18\x03 \x01(\x0b\x32\x0f.fcslam.v1.Pose\x12\x0f\n\x07quality\x18\x04 \x01(\x02\"2\n\x0f\x41\x63knowledgement\x12\r\n\x05\x65poch\x18\x01 \x01(\x04\x12\x10\n\x08sequence\x18\x02 \x01(\x04\"t\n\x0e\x44\x65tectorUpdate\x12#\n\x07\x63hannel\x18\x01 \x01(\x0e\x32\x12.fcslam.v1.Channel\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x0e\n\x06\x66ormat\x18\x03 \x01(\r\x12\x0c\n\x04size\x18\x04 \x01(\x04\x12\x0e\n\x06sha256\x18\x05 \x01(\x0c*I\n\x07\x43hannel\x12\x17\n\x13\x43HANNEL_UNSPECIFIED\x10\x00\x12\x11\n\rCHANNEL_LIDAR\x10\x01\x12\x12\n\x0e\x43HANNEL_CAMERA\x10\x02*l\n\x0e\x43onstraintKind\x12\x1f\n\x1b\x43ONSTRAINT_KIND_UNSPECIFIED\x10\x00\x12\x1c\n\x18\x43ONSTRAINT_KIND_ODOMETRY\x10\x01\x12\x1b\n\x17\x43ONSTRAINT_KIND_CLOSURE\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'fcslam.wire.fcslam_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_CHANNEL']._serialized_start=1375
-  _globals['_CHANNEL']._serialized_end=1448
-  _globals['_CONSTRAINTKIND']._serialized_start=1450
-  _globals['_CONSTRAINTKIND']._serialized_end=1558
+  _globals['_CHANNEL']._serialized_start=1397
+  _globals['_CHANNEL']._serialized_end=1470
+  _globals['_CONSTRAINTKIND']._serialized_start=1472
+  _globals['_CONSTRAINTKIND']._serialized_end=1580
   _globals['_PACKET']._serialized_start=40
-  _globals['_PACKET']._serialized_end=428
-  _globals['_POSE']._serialized_start=430
-  _globals['_POSE']._serialized_end=481
-  _globals['_HELLO']._serialized_start=484
-  _globals['_HELLO']._serialized_end=663
-  _globals['_DETECTOR']._serialized_start=665
-  _globals['_DETECTOR']._serialized_end=729
-  _globals['_KEYSCAN']._serialized_start=731
-  _globals['_KEYSCAN']._serialized_end=802
-  _globals['_CONSTRAINT']._serialized_start=805
-  _globals['_CONSTRAINT']._serialized_end=933
-  _globals['_PLACE']._serialized_start=936
-  _globals['_PLACE']._serialized_end=1106
-  _globals['_CORRECTION']._serialized_start=1108
-  _globals['_CORRECTION']._serialized_end=1210
-  _globals['_ACKNOWLEDGEMENT']._serialized_start=1212
-  _globals['_ACKNOWLEDGEMENT']._serialized_end=1262
-  _globals['_RELEASE']._serialized_start=1264
-  _globals['_RELEASE']._serialized_end=1373
+  _globals['_PACKET']._serialized_end=443
+  _globals['_POSE']._serialized_start=445
+  _globals['_POSE']._serialized_end=496
+  _globals['_HELLO']._serialized_start=499
+  _globals['_HELLO']._serialized_end=678
+  _globals['_DETECTOR']._serialized_start=680
+  _globals['_DETECTOR']._serialized_end=744
+  _globals['_KEYSCAN']._serialized_start=746
+  _globals['_KEYSCAN']._serialized_end=817
+  _globals['_CONSTRAINT']._serialized_start=820
+  _globals['_CONSTRAINT']._serialized_end=948
+  _globals['_PLACE']._serialized_start=951
+  _globals['_PLACE']._serialized_end=1121
+  _globals['_CORRECTION']._serialized_start=1123
+  _globals['_CORRECTION']._serialized_end=1225
+  _globals['_ACKNOWLEDGEMENT']._serialized_start=1227
+  _globals['_ACKNOWLEDGEMENT']._serialized_end=1277
+  _globals['_DETECTORUPDATE']._serialized_start=1279
+  _globals['_DETECTORUPDATE']._serialized_end=1395
 # @@protoc_insertion_point(module_scope)

@@ -26,7 +26,7 @@ CONSTRAINT_KIND_ODOMETRY: ConstraintKind
 CONSTRAINT_KIND_CLOSURE: ConstraintKind
 
 class Packet(_message.Message):
-    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "correction", "acknowledgement", "release")
+    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "correction", "acknowledgement", "detector_update")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     ROBOT_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
@@ -38,7 +38,7 @@ class Packet(_message.Message):
     PLACE_FIELD_NUMBER: _ClassVar[int]
     CORRECTION_FIELD_NUMBER: _ClassVar[int]
     ACKNOWLEDGEMENT_FIELD_NUMBER: _ClassVar[int]
-    RELEASE_FIELD_NUMBER: _ClassVar[int]
+    DETECTOR_UPDATE_FIELD_NUMBER: _ClassVar[int]
     version: int
     robot: str
     epoch: int
@@ -50,8 +50,8 @@ class Packet(_message.Message):
     place: Place
     correction: Correction
     acknowledgement: Acknowledgement
-    release: Release
-    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., release: _Optional[_Union[Release, _Mapping]] = ...) -> None: ...
+    detector_update: DetectorUpdate
+    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
 
 class Pose(_message.Message):
     __slots__ = ("x_m", "y_m", "theta_rad")
@@ -153,7 +153,7 @@ class Acknowledgement(_message.Message):
     sequence: int
     def __init__(self, epoch: _Optional[int] = ..., sequence: _Optional[int] = ...) -> None: ...
 
-class Release(_message.Message):
+class DetectorUpdate(_message.Message):
     __slots__ = ("channel", "version", "format", "size", "sha256")
     CHANNEL_FIELD_NUMBER: _ClassVar[int]
     VERSION_FIELD_NUMBER: _ClassVar[int]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from fcslam.records import Channel
-from fcslam.wire.messages import UPLINK, Kind
+from fcslam.wire.messages import UPLINK, PacketKind
 from fcslam.wire.packets import Label
 
 
@@ -29,7 +29,9 @@ class Ledger:
     refused: Traffic
     """Not by robot: whom refused bytes come from is not known."""
 
-    def total(self, robot: str | None = None, kind: Kind | None = None, channel: Channel | None = None) -> Traffic:
+    def total(
+        self, robot: str | None = None, kind: PacketKind | None = None, channel: Channel | None = None
+    ) -> Traffic:
         """Accepted traffic of one robot or of all, of one kind or of all, of places of one channel or of everything."""
         chosen = (
             traffic
@@ -44,7 +46,7 @@ class Ledger:
 
     def downlink(self, robot: str) -> Traffic:
         """What the cloud sent to one robot."""
-        return sum((self.total(robot, kind) for kind in Kind if kind not in UPLINK), Traffic())
+        return sum((self.total(robot, kind) for kind in PacketKind if kind not in UPLINK), Traffic())
 
 
 class Counter:

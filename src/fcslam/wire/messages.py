@@ -7,7 +7,7 @@ from enum import StrEnum
 from fcslam.records import Channel, Constraint, Correction, DetectorFile, Keyscan, LaserModel, Place
 
 
-class Kind(StrEnum):
+class PacketKind(StrEnum):
     """What a packet carries; the names of the fields of ``Packet.body`` in fcslam.proto."""
 
     HELLO = "hello"
@@ -16,10 +16,10 @@ class Kind(StrEnum):
     PLACE = "place"
     CORRECTION = "correction"
     ACKNOWLEDGEMENT = "acknowledgement"
-    RELEASE = "release"
+    DETECTOR_UPDATE = "detector_update"
 
 
-UPLINK = frozenset({Kind.HELLO, Kind.KEYSCAN, Kind.CONSTRAINT, Kind.PLACE})
+UPLINK = frozenset({PacketKind.HELLO, PacketKind.KEYSCAN, PacketKind.CONSTRAINT, PacketKind.PLACE})
 """What robots send; the other kinds come back from the cloud."""
 
 
@@ -45,14 +45,14 @@ class Acknowledgement:
 
 
 @dataclass(frozen=True, slots=True)
-class Release:
+class DetectorUpdate:
     """What the cloud tells a robot: there is a newer detector, to be fetched and used from then on."""
 
     robot: str
     file: DetectorFile
 
 
-Body = Hello | Keyscan | Constraint | Place | Correction | Acknowledgement | Release
+Body = Hello | Keyscan | Constraint | Place | Correction | Acknowledgement | DetectorUpdate
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,14 +19,14 @@ from fcslam.wire.limits import (
     MAXIMUM_SEQUENCE,
     PROTOCOL_VERSION,
 )
-from fcslam.wire.messages import Kind, Packet
+from fcslam.wire.messages import Packet, PacketKind
 
 
 class Label(NamedTuple):
     """What a packet's traffic is counted by."""
 
     robot: str
-    kind: Kind
+    kind: PacketKind
     channel: Channel | None = None
     """Of a place; None for every other kind."""
 
@@ -83,7 +83,7 @@ def read_label(data: bytes) -> Label:
     """
     message, kind = _parse(data)
     check_name(message.robot, "robot")
-    return Label(message.robot, kind, read_channel(message.place.channel) if kind is Kind.PLACE else None)
+    return Label(message.robot, kind, read_channel(message.place.channel) if kind is PacketKind.PLACE else None)
 
 
 def unpacked_size(data: bytes) -> int:
@@ -96,9 +96,9 @@ def unpacked_size(data: bytes) -> int:
         message, kind = _parse(data)
     except PacketError:
         return len(data)
-    if kind is Kind.KEYSCAN:
+    if kind is PacketKind.KEYSCAN:
         return len(data) + BYTES_PER_RANGE * min(message.keyscan.count, MAXIMUM_BEAMS)
-    if kind is Kind.PLACE:
+    if kind is PacketKind.PLACE:
         axes = max(KEYPOINT_AXES.values())
         return len(data) + (BYTES_PER_AXIS * axes + CODE_BYTES) * min(message.place.count, MAXIMUM_KEYPOINTS)
     return len(data)
@@ -116,7 +116,7 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
     return (message.robot, message.epoch, message.sequence) if known else None
 
 
-def _parse(data: bytes) -> tuple[pb.Packet, Kind]:
+def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
     if len(data) > MAXIMUM_PACKET_BYTES:
         raise PacketError(f"{len(data)} bytes, at most {MAXIMUM_PACKET_BYTES}")
     message = pb.Packet()
@@ -132,4 +132,4 @@ def _parse(data: bytes) -> tuple[pb.Packet, Kind]:
     kind = message.WhichOneof("body")
     if kind is None:
         raise PacketError("the packet is empty")
-    return message, Kind(kind)
+    return message, PacketKind(kind)

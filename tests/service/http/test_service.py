@@ -17,7 +17,7 @@ from fcslam.service.mission_store import MissionStore
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.batches import read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
-from fcslam.wire.messages import Acknowledgement, Hello, Packet, Release
+from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, readdress
 from tests.scripted import LASER
 from tests.service.http.desk import POSES, A, B, Desk, put_detector
@@ -342,13 +342,13 @@ def test_robots_with_a_camera_are_told_of_a_newer_detector_until_they_have_it(de
     version = desk.ask("POST", f"{API}/detectors", "boss", content=network).json()["version"]
     hello = Hello("a", 0, LASER, {Channel.CAMERA: "orb-1", Channel.LIDAR: "test-1"})
     told = desk.told(desk.send("a", [encode(Packet("a", 0, 0, 0.0, hello))]))
-    release = next(body for body in told if isinstance(body, Release))
+    release = next(body for body in told if isinstance(body, DetectorUpdate))
     assert (release.file.version, release.file.size) == (version, len(network))
     assert desk.ask("GET", f"{API}/detectors/camera/{version}", "a").content == network
-    assert any(isinstance(body, Release) for body in desk.told(desk.send("a", [])))
+    assert any(isinstance(body, DetectorUpdate) for body in desk.told(desk.send("a", [])))
     again = replace(hello, detector_versions={**hello.detector_versions, Channel.CAMERA: version})
     assert desk.told(desk.send("a", [encode(Packet("a", 0, 1, 0.0, again))])) == [Acknowledgement("a", 0, 1)]
-    assert not any(isinstance(body, Release) for body in desk.told(desk.send("b", B[:2]))), "it has no camera"
+    assert not any(isinstance(body, DetectorUpdate) for body in desk.told(desk.send("b", B[:2]))), "it has no camera"
     assert get(desk, "detectors").json() == [{"channel": "camera", "version": version, "announced": True}]
     assert desk.ask("POST", f"{API}/detectors", "boss", content=b"no network").status_code == 400
 

@@ -1,16 +1,16 @@
 """A detector is taken between two records, and a resumed recording takes it at the same one."""
 
+import os
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from fcslam.errors import FeatureError, StateError
+from fcslam.robot.detector_updates import DetectorUpdates
 from fcslam.robot.outbox import Outbox
-from fcslam.robot.releases import Releases
-from tests.wire.examples import RELEASE
+from tests.wire.examples import DETECTOR_UPDATE
 
-FIRST, SECOND = RELEASE.file, replace(RELEASE.file, version="second")
+FIRST, SECOND = DETECTOR_UPDATE.file, replace(DETECTOR_UPDATE.file, version="second")
 
 
 class Frontend:
@@ -33,39 +33,39 @@ def start(tmp_path):
         opened.append(Outbox(tmp_path / "outbox", "alice", 10**6))
         opened[-1].begin("r", resume)
         frontend = Frontend()
-        releases = Releases(tmp_path / "detectors", opened[-1], frontend)
-        releases.resume()
-        return releases, frontend
+        updates = DetectorUpdates(tmp_path / "detectors", opened[-1], frontend)
+        updates.resume()
+        return updates, frontend
 
     yield start
     for outbox in opened:
         outbox.close()
 
 
-def drive(releases, frontend, records, catching_up=0):
+def drive(updates, frontend, records, catching_up=0):
     """What was taken before each record."""
     taken = {}
     for number in records:
         before = len(frontend.took)
-        releases.take(number, number < catching_up)
+        updates.take(number, number < catching_up)
         if frontend.took[before:]:
             (taken[number],) = frontend.took[before:]
     return taken
 
 
 def test_what_was_fetched_is_taken_before_the_next_record(start):
-    releases, frontend = start()
-    assert drive(releases, frontend, range(3)) == {}
-    releases.keep(FIRST, b"network")
-    releases.keep(SECOND, b"network")
-    assert drive(releases, frontend, range(3, 9)) == {3: FIRST.version, 4: "second"}
-    assert releases.notice == "detector second from now on"
+    updates, frontend = start()
+    assert drive(updates, frontend, range(3)) == {}
+    updates.keep(FIRST, b"network")
+    updates.keep(SECOND, b"network")
+    assert drive(updates, frontend, range(3, 9)) == {3: FIRST.version, 4: "second"}
+    assert updates.notice == "detector second from now on"
 
 
 def test_a_resumed_recording_takes_the_same_at_the_same_place(start):
-    releases, frontend = start()
-    releases.keep(FIRST, b"network")
-    drive(releases, frontend, range(5, 9))
+    updates, frontend = start()
+    updates.keep(FIRST, b"network")
+    drive(updates, frontend, range(5, 9))
     again, frontend = start(resume=True)
     again.keep(FIRST, b"network")  # it is announced again
     again.keep(SECOND, b"network")
@@ -76,41 +76,40 @@ def test_a_resumed_recording_takes_the_same_at_the_same_place(start):
 
 def test_news_wait_for_what_was_taken_before(start):
     """Even if nothing was said since then."""
-    releases, frontend = start()
-    releases.keep(FIRST, b"network")
-    drive(releases, frontend, range(5, 9))
+    updates, frontend = start()
+    updates.keep(FIRST, b"network")
+    drive(updates, frontend, range(5, 9))
     again, frontend = start(resume=True)
     again.keep(SECOND, b"network")
     assert drive(again, frontend, range(20)) == {5: FIRST.version, 6: "second"}
 
 
 def test_one_that_cannot_be_used_is_said_and_nothing_stops(start):
-    releases, frontend = start()
-    releases.keep(FIRST, b"broken")
-    assert drive(releases, frontend, range(3)) == {}
-    assert releases.notice == f"detector {FIRST.version} not taken: it is broken"
+    updates, frontend = start()
+    updates.keep(FIRST, b"broken")
+    assert drive(updates, frontend, range(3)) == {}
+    assert updates.notice == f"detector {FIRST.version} not taken: it is broken"
 
 
 def test_one_that_cannot_be_kept_is_one_line(start, tmp_path):
-    releases, frontend = start()
+    updates, frontend = start()
     (tmp_path / "detectors").touch()
     with pytest.raises(StateError, match=f"detectors: detector {FIRST.version} cannot be kept there"):
-        releases.keep(FIRST, b"network")
-    assert drive(releases, frontend, range(3)) == {}
+        updates.keep(FIRST, b"network")
+    assert drive(updates, frontend, range(3)) == {}
 
 
 def test_one_that_is_kept_again_replaces_the_file_in_one_piece(start, tmp_path, monkeypatch):
     """A resumed recording may need it, whatever interrupts the writing."""
-    releases, frontend = start()
-    releases.keep(FIRST, b"network")
-    drive(releases, frontend, range(5, 9))
+    updates, frontend = start()
+    updates.keep(FIRST, b"network")
+    drive(updates, frontend, range(5, 9))
     again, frontend = start(resume=True)
 
-    def full(path, content):
-        path.open("wb").close()
+    def full(source, target):
         raise OSError("no space left")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(StateError, match="no space left"):
         again.keep(FIRST, b"network")
     assert [file.read_bytes() for file in (tmp_path / "detectors").glob("*.onnx")] == [b"network"]

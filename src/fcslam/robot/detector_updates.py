@@ -13,7 +13,7 @@ from fcslam.robot.outbox import Outbox
 from fcslam.storage.files import write_file
 
 
-class Releases:
+class DetectorUpdates:
     """From the thread that hears of a detector to the one that uses it."""
 
     def __init__(self, folder: Path, outbox: Outbox, frontend: RobotFrontend) -> None:
@@ -28,7 +28,7 @@ class Releases:
 
     def resume(self) -> None:
         """Look up what the session, once begun, took before it was stopped."""
-        self._taken = self._outbox.releases()
+        self._taken = self._outbox.detector_updates()
 
     def keep(self, file: DetectorFile, content: bytes) -> None:
         """Called by the sender: here is what was announced.
@@ -53,7 +53,7 @@ class Releases:
             file = self._fetched.get()
             if file in self._taken.values():
                 return
-            self._outbox.take_release(record, file)
+            self._outbox.record_detector_update(record, file)
             self._taken[record] = file
         if file is None:
             return

@@ -1,0 +1,74 @@
+"""The graph of one robot alone: its odometry and its own loop closures, many of which may be false."""
+
+import numpy as np
+
+from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
+from fcslam.graph.initialization import initialize, initialize_robust
+from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, refine_inliers
+from fcslam.graph.pose_graph import PoseGraph
+from fcslam.graph.trajectory import DriftSettings, Trajectory, build_trajectory
+from fcslam.records import FloatArray
+
+_UNMEASURED_VARIANCE = 1e6
+"""Variance of a step that no odometry measured, m^2 and rad^2."""
+
+
+def solve_single_robot(graph: PoseGraph, consistency: ConsistencySettings, gnc: GncSettings | None = None) -> Solution:
+    """Optimise the graph of one robot robustly; its variables are in the order of its path.
+
+    Returns the cheapest of three solutions; the value of the truncated loss, which has many minima, ranks them:
+
+    - Odometry decides which closures are inliers. Correct while odometry has drifted less than closures are uncertain.
+    - Graduated non-convexity with every closure, from odometry. Correct while false closures are few, or small.
+    - Graduated non-convexity with the closures that have supporting closures
+      (:func:`fcslam.graph.consistency.count_supporting_closures`), whose solution then decides which of all closures
+      are inliers. Correct where false closures are isolated, however many and however far they reach.
+
+    Args:
+        graph: N variables and E edges of one robot.
+        consistency: when closures support each other.
+        gnc: settings of graduated non-convexity.
+
+    Returns:
+        Poses (N, 3) in the frame of the first variable, and weights (E,).
+    """
+    robust = graph.arrays().robust
+    odometry = initialize(graph, (~robust).astype(float))
+    by_odometry = refine_inliers(graph, odometry, ~robust, settings=gnc)
+    if not robust.any():
+        return by_odometry
+    supported = ~robust
+    edges = graph.arrays()
+    closures = Closures(edges.i[robust], edges.j[robust], edges.T_i_j[robust], edges.information[robust])
+    path = robot_trajectory(graph, odometry, consistency)
+    supported[robust] = count_supporting_closures(path, path, closures, consistency) > 0
+    supported_graph = PoseGraph(
+        graph.poses(), [edge for edge, kept in zip(graph.edges, supported, strict=True) if kept]
+    )
+    first = optimize_gnc(supported_graph, initialize_robust(supported_graph), settings=gnc)
+    weights = np.zeros(len(robust))
+    weights[supported] = first.weights
+    solutions = (
+        by_odometry,
+        refine_inliers(graph, first.poses, weights, settings=gnc),
+        optimize_gnc(graph, odometry, settings=gnc),
+    )
+    return min(solutions, key=lambda solution: solution.stats.final_cost)
+
+
+def robot_trajectory(graph: PoseGraph, poses: FloatArray, settings: DriftSettings) -> Trajectory:
+    """The trajectory of one robot, with the covariance that the odometry edges of its graph state.
+
+    Args:
+        graph: N variables of one robot in the order of its path.
+        poses: poses of the variables, shape (N, 3), metres and radians, in one coordinate frame.
+        settings: drift per metre.
+
+    Returns:
+        The trajectory through ``poses``.
+    """
+    edges = graph.arrays()
+    covariance = np.tile(_UNMEASURED_VARIANCE * np.eye(3), (max(0, len(graph) - 1), 1, 1))
+    steps = ~edges.robust & (edges.j == edges.i + 1)
+    covariance[edges.i[steps]] = np.linalg.inv(edges.information[steps])
+    return build_trajectory(poses, settings, covariance)
