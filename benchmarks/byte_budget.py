@@ -27,7 +27,6 @@ from fcslam.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import RobotFrontend
-from fcslam.runs import write_run
 from fcslam.sources import open_source, split
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
@@ -84,7 +83,7 @@ def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: floa
     result = fleet.finalize()
     tracks = {robot: track(frontend) for robot, (frontend, _) in robots.items()}
     with tempfile.TemporaryDirectory() as place:
-        write_run(run_of(result, tracks, (), dump(config), config.map, with_local_maps=False), Path(place) / "run")
+        run_of(result, tracks, (), dump(config), config.map, with_local_maps=False).save(Path(place) / "run")
         errors = evaluate_relations(Path(place) / "run", relations, RelationsQuestion(across_robots=True))
     sent = sum(len(encode(packet)) for stream in streams for packet in stream)
     seconds = sum(float(np.ptp(track.stamps)) for track in tracks.values())

@@ -75,7 +75,7 @@ def row(name: str, source: Source, seed: int) -> tuple:
     run = run_mission([Recording(name, scans)], MissionConfig())
     cpu_s = time.process_time() - began
     path_m = np.hypot(*np.diff(reference[:, :2], axis=0).T).sum()
-    errors = (*position_errors(odometry, reference), *position_errors(run.trajectories[0].T_map_base, reference))
+    errors = (*position_errors(odometry, reference), *position_errors(run.trajectories[name].T_map_base, reference))
     return name, seed, len(scans), path_m, *errors, *closure_counts(run, reference), cpu_s
 
 

@@ -61,7 +61,7 @@ def main() -> None:
 
 def verdict(run: Run, cost: common.Cost) -> tuple:
     logs = len(run.trajectories)
-    maps = len({trajectory.map_index for trajectory in run.trajectories})
+    maps = len({trajectory.map_index for trajectory in run.trajectories.values()})
     between = closures_between(run)
     touched = len({frozenset((c.robot_i, c.robot_j)) for c in between})
     verified = [c for c in between if was_verified(c)]

@@ -212,9 +212,9 @@ class Placed(NamedTuple):
 
 def placed(alone: Run, together: Run, folder: Path) -> dict[str, Placed]:
     """Every run, by the best fit of its two trajectories on each other."""
-    joint = {trajectory.robot: trajectory for trajectory in together.trajectories}
+    joint = together.trajectories
     runs = {}
-    for own in alone.trajectories:
+    for own in alone.trajectories.values():
         other = joint[own.robot]
         T_map_alone = n_point_alignment(other.T_map_base[:, :2], own.T_map_base[:, :2])
         plan = own_plan(folder, own.map_index)
@@ -282,7 +282,7 @@ def draw(plan: Plan, together: Run, reference: Plan, T_reference_map: FloatArray
     pixels = cv2.imread(str(picture), cv2.IMREAD_COLOR)[top:-bottom, left:-right]
     pixels[np.ptp(pixels, axis=2) > 40] = PAPER[::-1]
     height_m, width_m = (size * reference.cell_m for size in pixels.shape[:2])
-    joined = [trajectory for trajectory in together.trajectories if trajectory.map_index == 0]
+    joined = [trajectory for trajectory in together.trajectories.values() if trajectory.map_index == 0]
     figure, (upper, lower) = plt.subplots(2, 1, figsize=(9.0, 10.2), layout="constrained")
     ours = f"fcslam: {len(joined)} of {len(RUNS)} runs in one map"
     for axes, title in ((upper, ours), (lower, "reference map, same scale")):
@@ -316,7 +316,7 @@ def main() -> None:
     pairs = pair_rows(runs, together)
     reference, T_reference_map = scaled_reference(folder / PICTURE, plan)
     share = near_share(plan.points(plan.walls), T_reference_map, reference)
-    maps = len({trajectory.map_index for trajectory in together.trajectories})
+    maps = len({trajectory.map_index for trajectory in together.trajectories.values()})
     report.say(
         f"{maps} map{'s' if maps > 1 else ''}, {cost.cpu_s:.1f} s of CPU. A cell of the picture is "
         f"{reference.cell_m} m wide; {share:.0%} of the largest map's walls lie within {NEAR_M} m of the reference's."

@@ -10,7 +10,6 @@ from fcslam import mission
 from fcslam.errors import FcslamError, PacketError, SourceError
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus, Veto
-from fcslam.runs import write_run
 from fcslam.sources import open_source, write_carmen
 from tests.robot.kidnapping import kidnapping
 
@@ -26,8 +25,8 @@ def files(folder):
 
 def test_the_same_seed_gives_the_same_bytes(run, logs, tmp_path):
     again = run_mission([open_source(log) for log in logs], MissionConfig(seed=3))
-    write_run(run, tmp_path / "one")
-    write_run(again, tmp_path / "two")
+    run.save(tmp_path / "one")
+    again.save(tmp_path / "two")
     one, two = files(tmp_path / "one"), files(tmp_path / "two")
     assert one.keys() == two.keys()
     assert [name for name in one if one[name] != two[name]] == []
@@ -50,9 +49,9 @@ def test_a_robot_that_was_lost_is_two_sessions_that_a_veto_may_name():
     robot = settings.robot.model_copy(update={"channels": (Channel.LIDAR,)})
     seen = []
     run = run_mission([Kidnapped()], settings.model_copy(update={"robot": robot}), seen.append, [Veto("r", "r+1")])
-    assert {metric.name: metric.value for metric in run.metrics}["keyscans"] == seen[-1].keyscans
+    assert run.metrics["keyscans"].value == seen[-1].keyscans
     scans, moment = kidnapping()
-    first, second = run.trajectories
+    first, second = run.trajectories.values()
     assert (first.robot, second.robot) == ("r", "r+1")
     assert [*first.stamps, *second.stamps] == [scan.stamp for scan in scans]
     assert first.stamps[-1] == moment
@@ -64,7 +63,7 @@ def test_the_watcher_sees_all_scans_and_then_that_the_cloud_fuses(logs):
     run = run_mission([open_source(log) for log in logs], MissionConfig(seed=3), seen.append)
     assert [now.fusing for now in seen] == [False] * (len(seen) - 1) + [True]
     assert [now.scans for now in seen] == sorted(now.scans for now in seen)
-    assert seen[-1].scans == sum(len(trajectory.stamps) for trajectory in run.trajectories)
+    assert seen[-1].scans == sum(len(trajectory.stamps) for trajectory in run.trajectories.values())
 
 
 def test_the_order_of_the_recordings_does_not_matter(run, logs):
@@ -73,34 +72,34 @@ def test_the_order_of_the_recordings_does_not_matter(run, logs):
     assert [str(c) for c in turned.closures] == [str(c) for c in run.closures]
     assert turned.pose_graph_g2o == run.pose_graph_g2o
     assert turned.map_files["map.pgm"] == run.map_files["map.pgm"]
-    poses = {t.robot: t.T_map_base.tobytes() for t in run.trajectories}
-    assert {t.robot: t.T_map_base.tobytes() for t in turned.trajectories} == poses
+    poses = {t.robot: t.T_map_base.tobytes() for t in run.trajectories.values()}
+    assert {t.robot: t.T_map_base.tobytes() for t in turned.trajectories.values()} == poses
 
 
 def test_trajectories_have_every_scan_of_the_recording(run, drawn):
-    assert [t.robot for t in run.trajectories] == [robot.name for robot in drawn.robots]
-    for trajectory, robot in zip(run.trajectories, drawn.robots, strict=True):
+    assert list(run.trajectories) == [robot.name for robot in drawn.robots]
+    for trajectory, robot in zip(run.trajectories.values(), drawn.robots, strict=True):
         assert np.allclose(trajectory.stamps, robot.stamps, atol=1e-6)
         assert trajectory.T_map_base.shape == (len(robot.stamps), 3)
 
 
 def test_a_robots_own_map_is_what_it_would_have_mapped_alone(run, logs):
     """To the last bit: no other robot has a say in it, and its trajectory starts at the origin."""
-    for log, local in zip(logs, run.local_maps, strict=True):
-        (alone,) = run_mission([open_source(log)], MissionConfig(seed=3)).local_maps
+    for log, local in zip(logs, run.local_maps.values(), strict=True):
+        (alone,) = run_mission([open_source(log)], MissionConfig(seed=3)).local_maps.values()
         assert (local.robot, local.pgm, local.yaml) == (alone.robot, alone.pgm, alone.yaml)
         assert local.T_local_base.tobytes() == alone.T_local_base.tobytes()
         assert np.array_equal(local.T_local_base[0], np.zeros(3))
-    for local, joint in zip(run.local_maps, run.trajectories, strict=True):
+    for local, joint in zip(run.local_maps.values(), run.trajectories.values(), strict=True):
         assert np.array_equal(local.stamps, joint.stamps)
-    second = run.local_maps[1]
-    assert np.abs(second.T_local_base - run.trajectories[1].T_map_base).max() > 0.5, "another frame"
+    second = run.local_maps["robot_2"]
+    assert np.abs(second.T_local_base - run.trajectories["robot_2"].T_map_base).max() > 0.5, "another frame"
 
 
 def test_numbers_add_up(run, drawn):
-    values = {metric.name: metric.value for metric in run.metrics}
+    values = {name: metric.value for name, metric in run.metrics.items()}
     assert values["robots"] == 3
-    assert values["maps"] == len({t.map_index for t in run.trajectories})
+    assert values["maps"] == len({t.map_index for t in run.trajectories.values()})
     assert values["scans"] == sum(len(robot.stamps) for robot in drawn.robots)
     assert values["recorded_time"] == pytest.approx(sum(r.stamps[-1] - r.stamps[0] for r in drawn.robots))
     assert values["keyscans"] == values["keyscan_packets"] == run.pose_graph_g2o.count("VERTEX_SE2")
@@ -125,7 +124,7 @@ def test_numbers_add_up(run, drawn):
 
 
 def test_closures_tell_where_and_why(run):
-    stamps = {t.robot: set(np.round(t.stamps, 6)) for t in run.trajectories}
+    stamps = {t.robot: set(np.round(t.stamps, 6)) for t in run.trajectories.values()}
     for closure in run.closures:
         assert round(closure.stamp_i, 6) in stamps[closure.robot_i]
         assert round(closure.stamp_j, 6) in stamps[closure.robot_j]

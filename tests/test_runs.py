@@ -20,7 +20,6 @@ from fcslam.runs import (
     open_run,
     prepare_output,
     read_vetoes,
-    write_run,
 )
 from fcslam.storage import files
 
@@ -39,16 +38,18 @@ def run():
     )  # fmt: skip
     trajectories = (trajectory(), trajectory("b-2", 1, count=1, seed=1), trajectory("étage.0", 2, count=0))
     return Run(
-        trajectories=trajectories,
+        trajectories={t.robot: t for t in trajectories},
         closures=(closure,),
-        metrics=(Metric("uplink", 4.5, "kB/s"), Metric("error", float("nan"), "m")),
+        metrics={"uplink": Metric("uplink", 4.5, "kB/s"), "error": Metric("error", float("nan"), "m")},
         config_yaml="seed: 1\n",
         pose_graph_g2o="VERTEX_SE2 0 0 0 0\n",
         map_files={"map.pgm": b"P5\x00\xff", "map_1.yaml": b"image: map_1.pgm\n"},
-        local_maps=tuple(
-            LocalMap(t.robot, t.stamps, t.T_map_base[::-1], b"P5 \x00" + t.robot.encode(), f"image: {t.robot}.pgm\n")
+        local_maps={
+            t.robot: LocalMap(
+                t.robot, t.stamps, t.T_map_base[::-1], b"P5 \x00" + t.robot.encode(), f"image: {t.robot}.pgm\n"
+            )
             for t in trajectories
-        ),
+        },
     )
 
 
@@ -57,9 +58,9 @@ def hidden(folder):
 
 
 def test_what_is_written_is_read_back(tmp_path, run):
-    write_run(run, tmp_path / "deep" / "run")
+    run.save(tmp_path / "deep" / "run")
     back = open_run(tmp_path / "deep" / "run")
-    for given, read in zip(run.trajectories, back.trajectories, strict=True):
+    for given, read in zip(run.trajectories.values(), back.trajectories.values(), strict=True):
         assert (given.robot, given.map_index, len(given.stamps)) == (read.robot, read.map_index, len(read.stamps))
         np.testing.assert_allclose(read.stamps, given.stamps, atol=1e-6, rtol=0)
         np.testing.assert_allclose(se2.between(given.T_map_base, read.T_map_base), 0.0, atol=1e-7)
@@ -67,24 +68,24 @@ def test_what_is_written_is_read_back(tmp_path, run):
     np.testing.assert_allclose(closure.T_i_j, given.T_i_j, atol=1e-6)
     for name in ("robot_i", "stamp_i", "robot_j", "stamp_j", "channel", "similarity", "status", "reason"):
         assert getattr(closure, name) == getattr(given, name)
-    assert back.metrics[0] == run.metrics[0]
-    assert np.isnan(back.metrics[1].value)
+    assert back.metrics["uplink"] == run.metrics["uplink"]
+    assert np.isnan(back.metrics["error"].value)
     assert (back.config_yaml, back.pose_graph_g2o) == (run.config_yaml, run.pose_graph_g2o)
     assert dict(back.map_files) == dict(run.map_files)
-    for given, read in zip(run.local_maps, back.local_maps, strict=True):
+    for given, read in zip(run.local_maps.values(), back.local_maps.values(), strict=True):
         assert (given.robot, given.pgm, given.yaml) == (read.robot, read.pgm, read.yaml)
         np.testing.assert_allclose(read.stamps, given.stamps, atol=1e-6, rtol=0)
         np.testing.assert_allclose(se2.between(given.T_local_base, read.T_local_base), 0.0, atol=1e-7)
 
 
 def test_local_maps_may_be_left_out_as_a_whole(tmp_path, run):
-    write_run(replace(run, local_maps=()), tmp_path / "run")
+    replace(run, local_maps={}).save(tmp_path / "run")
     assert not (tmp_path / "run" / "local").exists()
-    assert open_run(tmp_path / "run").local_maps == ()
+    assert open_run(tmp_path / "run").local_maps == {}
 
 
 def test_tables_have_the_columns_promised(tmp_path, run):
-    write_run(run, tmp_path / "run")
+    run.save(tmp_path / "run")
     robots = (tmp_path / "run" / "robots.csv").read_text().splitlines()
     assert robots[0] == "robot,map,path_length_m,scans"
     assert robots[2] == "b-2,1,0.000,1"
@@ -103,11 +104,11 @@ def test_path_length_is_that_of_the_polygon():
 
 
 def test_a_second_run_needs_force_and_leaves_nothing_of_the_first(tmp_path, run):
-    write_run(run, tmp_path / "run")
+    run.save(tmp_path / "run")
     with pytest.raises(OutputError, match="--force"):
-        write_run(run, tmp_path / "run")
-    write_run(Run((trajectory("other"),)), tmp_path / "run", force=True)
-    assert [t.robot for t in open_run(tmp_path / "run").trajectories] == ["other"]
+        run.save(tmp_path / "run")
+    Run({"other": trajectory("other")}).save(tmp_path / "run", force=True)
+    assert [t.robot for t in open_run(tmp_path / "run").trajectories.values()] == ["other"]
     assert not (tmp_path / "run" / "map.pgm").exists()
     assert hidden(tmp_path) == []
 
@@ -117,13 +118,13 @@ def test_a_folder_that_is_no_run_is_never_replaced(tmp_path, run, force):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
     with pytest.raises(OutputError, match="no run folder"):
-        write_run(run, tmp_path / "thesis", force=force)
+        run.save(tmp_path / "thesis", force=force)
     assert (tmp_path / "thesis" / "chapter1.tex").read_text() == "years of work"
 
 
 def test_an_empty_folder_may_be_used(tmp_path, run):
     (tmp_path / "run").mkdir()
-    write_run(run, tmp_path / "run")
+    run.save(tmp_path / "run")
     assert len(open_run(tmp_path / "run").trajectories) == 3
 
 
@@ -144,7 +145,7 @@ def test_the_working_folder_is_refused(tmp_path, monkeypatch):
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError, MemoryError])
 @pytest.mark.parametrize(("module", "step"), [(folder, "write_tum"), (folder, "metrics_json"), (files, "_exchange")])
 def test_an_interrupted_writer_leaves_the_place_as_it_was(tmp_path, run, monkeypatch, failure, module, step):
-    write_run(Run((trajectory("first"),)), tmp_path / "run")
+    Run({"first": trajectory("first")}).save(tmp_path / "run")
 
     def interrupted(*_arguments):
         raise failure
@@ -152,13 +153,13 @@ def test_an_interrupted_writer_leaves_the_place_as_it_was(tmp_path, run, monkeyp
     monkeypatch.setattr(module, step, interrupted)
     for place in ("run", "fresh"):
         with pytest.raises(OutputError if failure is OSError else failure):
-            write_run(run, tmp_path / place, force=True)
+            run.save(tmp_path / place, force=True)
     assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
-    assert [t.robot for t in open_run(tmp_path / "run").trajectories] == ["first"]
+    assert [t.robot for t in open_run(tmp_path / "run").trajectories.values()] == ["first"]
 
 
 def test_the_old_run_comes_back_if_the_last_rename_fails(tmp_path, run, monkeypatch):
-    write_run(Run((trajectory("first"),)), tmp_path / "run")
+    Run({"first": trajectory("first")}).save(tmp_path / "run")
     rename = Path.rename
 
     def failing(self, target):
@@ -168,23 +169,23 @@ def test_the_old_run_comes_back_if_the_last_rename_fails(tmp_path, run, monkeypa
 
     monkeypatch.setattr(Path, "rename", failing)
     with pytest.raises(KeyboardInterrupt):
-        write_run(run, tmp_path / "run", force=True)
-    assert [t.robot for t in open_run(tmp_path / "run").trajectories] == ["first"]
+        run.save(tmp_path / "run", force=True)
+    assert [t.robot for t in open_run(tmp_path / "run").trajectories.values()] == ["first"]
     assert hidden(tmp_path) == []
 
 
 @pytest.mark.parametrize("name", ["", "..", ".hidden", "a/b", "../../etc/passwd", "a\nb", "-"])
 def test_names_that_are_no_file_names_are_refused(tmp_path, name):
     with pytest.raises(OutputError, match="file name"):
-        write_run(Run((trajectory(name),)), tmp_path / "run")
+        Run({name: trajectory(name)}).save(tmp_path / "run")
     with pytest.raises(OutputError, match="file name"):
-        write_run(Run((), map_files={name: b""}), tmp_path / "run")
+        Run({}, map_files={name: b""}).save(tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
 def test_the_folder_has_the_permissions_of_any_new_folder(tmp_path, run):
     (tmp_path / "other").mkdir()
-    write_run(run, tmp_path / "run")
+    run.save(tmp_path / "run")
     assert os.stat(tmp_path / "run").st_mode == os.stat(tmp_path / "other").st_mode
 
 
@@ -218,7 +219,7 @@ def test_what_is_no_run_folder_is_refused(tmp_path):
     ],
 )
 def test_a_broken_run_folder_is_refused_in_one_line(tmp_path, run, file, content, message):
-    write_run(run, tmp_path / "run")
+    run.save(tmp_path / "run")
     path = tmp_path / "run" / file
     if content is None:
         path.unlink()
@@ -230,7 +231,7 @@ def test_a_broken_run_folder_is_refused_in_one_line(tmp_path, run, file, content
 
 
 def test_lines_of_closures_csv_are_vetoes(tmp_path, run):
-    write_run(run, tmp_path / "run")
+    run.save(tmp_path / "run")
     (veto, *_) = read_vetoes(tmp_path / "run" / "closures.csv")
     row = run.closures[0]
     ends = (row.robot_i, row.stamp_i), (row.robot_j, row.stamp_j)

@@ -15,17 +15,17 @@ from fcslam import __version__, cli
 from fcslam.cli import main
 from fcslam.config import Settings
 from fcslam.records import Channel, ClosureStatus
-from fcslam.runs import ClosureRow, RobotTrajectory, Run, open_run, write_run
+from fcslam.runs import ClosureRow, RobotTrajectory, Run, open_run
 
 
 @pytest.fixture
 def run_and_relations(tmp_path, monkeypatch):
     """Two robots that stand 1 m apart, one relation that says 1.25 m, one that nothing answers; in an own folder."""
     monkeypatch.chdir(tmp_path)
-    trajectories = [
-        RobotTrajectory(f"r{k}", 0, np.array([100.0 * k]), np.array([[float(k), 0.0, 0.0]])) for k in (0, 1)
-    ]
-    write_run(Run(tuple(trajectories)), tmp_path / "run")
+    trajectories = {
+        f"r{k}": RobotTrajectory(f"r{k}", 0, np.array([100.0 * k]), np.array([[float(k), 0.0, 0.0]])) for k in (0, 1)
+    }
+    Run(trajectories).save(tmp_path / "run")
     (tmp_path / "relations").write_text("0 100 1.25 0 0 0 0 0\n0 999 0 0 0 0 0 0\n")
     return str(tmp_path / "run"), str(tmp_path / "relations")
 
@@ -86,7 +86,7 @@ def test_closures_tables(run_and_relations, capsys, tmp_path):
         ClosureRow(*ends, Channel.LIDAR, 0.5, np.array([x, 0.0, 0.0]), status, "")
         for x, status in ((1.0, ClosureStatus.ACCEPTED), (2.0, ClosureStatus.REVOKED))
     ]
-    write_run(Run(open_run(Path(run)).trajectories, tuple(closures)), Path(run), force=True)
+    Run(open_run(Path(run)).trajectories, tuple(closures)).save(Path(run), force=True)
     assert main(["evaluate", "closures", run, relations, "--csv", str(tmp_path / "table.csv")]) == 0
     out = capsys.readouterr().out
     assert "between, verified  │ 2   │ 2, 100.0% │ 1     │ 50.0%     │ 1/1, 100.0%" in out
@@ -170,7 +170,7 @@ def test_faults_of_the_program_are_not_hidden(monkeypatch):
 
 def test_ctrl_c_is_one_line_and_130(tmp_path):
     """The installed entry point, interrupted while it waits for the relations on a pipe that nobody writes."""
-    write_run(Run(()), tmp_path / "run")
+    Run({}).save(tmp_path / "run")
     os.mkfifo(tmp_path / "relations")
     # What runs in the background ignores Ctrl-C, and its children inherit that.
     heeds = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"

@@ -41,8 +41,8 @@ def shown(tmp_path_factory):
 
 def test_it_ends_with_a_run_a_figure_and_a_table(shown):
     run = open_run(shown / "run")
-    assert [trajectory.robot for trajectory in run.trajectories] == ["robot_1", "robot_2"]
-    assert min(trajectory.path_length_m for trajectory in run.trajectories) > 20.0
+    assert [trajectory.robot for trajectory in run.trajectories.values()] == ["robot_1", "robot_2"]
+    assert min(trajectory.path_length_m for trajectory in run.trajectories.values()) > 20.0
     assert cv2.imread(str(shown / "figure.png")).shape[1] == 2000
     figures = told(shown)
     assert figures["maps"] == 1

@@ -47,7 +47,7 @@ def test_a_simulated_fleet_is_mapped(simulated, tmp_path):
     recordings = [str(simulated / name) for name in ("robot_1", "robot_2")]
     assert main(["map", *recordings, "--output", str(tmp_path / "run")]) == 0
     run = open_run(tmp_path / "run")
-    assert [trajectory.robot for trajectory in run.trajectories] == ["robot_1", "robot_2"]
+    assert [trajectory.robot for trajectory in run.trajectories.values()] == ["robot_1", "robot_2"]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from fcslam.metrics.grid import LabelledGrid, grid_agreement
 from fcslam.metrics.trajectory import align, position_errors
 from fcslam.places.matcher import MatcherConfig
 from fcslam.records import Channel, Place, Veto
-from fcslam.runs import open_run, write_run
+from fcslam.runs import open_run
 from fcslam.runs.map_files import Occupancy
 from fcslam.simulation.truth import true_map
 from fcslam.wire.messages import Hello, Packet
@@ -159,10 +159,10 @@ def test_a_session_of_which_everything_was_forgotten_still_has_its_trajectory_an
         fleet.veto(Veto(empty, other))
     result = fleet.estimate()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-    write_run(run_of(result, tracks, [], "", OccupancyConfig()), tmp_path / "run")
+    run_of(result, tracks, [], "", OccupancyConfig()).save(tmp_path / "run")
     run = open_run(tmp_path / "run")
-    (alone,) = [trajectory for trajectory in run.trajectories if trajectory.robot == empty]
-    assert [t.robot for t in run.trajectories if t.map_index == alone.map_index] == [empty]
+    (alone,) = [trajectory for trajectory in run.trajectories.values() if trajectory.robot == empty]
+    assert [t.robot for t in run.trajectories.values() if t.map_index == alone.map_index] == [empty]
     assert len(alone.stamps) == len(tracks[empty].stamps) > 0
     assert run.map_files[f"map_{alone.map_index}.pgm"].startswith(b"P5")
     whole = {robot.robot: robot for robot in fleet.finalize().robots}[empty]

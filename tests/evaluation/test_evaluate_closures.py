@@ -16,7 +16,7 @@ from fcslam.geometry import se2
 from fcslam.metrics.closures import ClosureCriteria
 from fcslam.metrics.relations import Relations, write_relations
 from fcslam.records import Channel, ClosureStatus, frozen
-from fcslam.runs import ClosureRow, RobotTrajectory, Run, write_run
+from fcslam.runs import ClosureRow, RobotTrajectory, Run
 
 CRITERIA = ClosureCriteria()
 ROUND = 50
@@ -46,8 +46,10 @@ def closure(i, j, status, off=(0.0, 0.0, 0.0)):
 
 def write(folder, closures):
     steps = np.arange(2 * ROUND)
-    robots = [RobotTrajectory(f"r{k}", k, stamp(k, steps), se2.compose(FRAMES[k], truth(steps))) for k in (0, 1)]
-    write_run(Run(tuple(robots), tuple(closures)), folder, force=True)
+    robots = {
+        f"r{k}": RobotTrajectory(f"r{k}", k, stamp(k, steps), se2.compose(FRAMES[k], truth(steps))) for k in (0, 1)
+    }
+    Run(robots, tuple(closures)).save(folder, force=True)
     return folder
 
 
@@ -199,7 +201,7 @@ def test_a_stamp_that_the_run_lacks_still_joins_the_others(tmp_path):
 def test_robots_of_one_clock_are_told_apart_by_name():
     stamps = np.arange(5.0)
     poses = np.zeros((5, 3))
-    both = RobotTrajectory("a", 0, stamps, poses), RobotTrajectory("b", 0, stamps, poses)
+    both = {robot: RobotTrajectory(robot, 0, stamps, poses) for robot in "ab"}
     rows = [ClosureRow("a", 1.0, "b", 1.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, "")]
     rows += [ClosureRow("nobody", 1.0, "b", 9.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, "")]
     run = Run(both, tuple(rows))

@@ -14,7 +14,7 @@ from fcslam.evaluation.fleet.metrics import fleet_metrics
 from fcslam.evaluation.fleet.report import evaluate_fleet
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, frozen
-from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_run, write_tum
+from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
 
 STEPS = 151
 """Of each robot: 15 m, 0.5 m/s."""
@@ -64,21 +64,24 @@ def room():
 
 
 RUN = Run(
-    tuple(RobotTrajectory(f"r{k}", 0, stamps(k), in_map(truth(k))) for k in range(3)),
-    metrics=(
-        *(Metric(f"uplink_bytes_r{k}", 1000.0 * (k + 1), "B") for k in range(3)),
-        Metric("lidar_place_packets", 4, "1"),
-        Metric("lidar_place_bytes", 8000, "B"),
-    ),
+    {f"r{k}": RobotTrajectory(f"r{k}", 0, stamps(k), in_map(truth(k))) for k in range(3)},
+    metrics={
+        metric.name: metric
+        for metric in (
+            *(Metric(f"uplink_bytes_r{k}", 1000.0 * (k + 1), "B") for k in range(3)),
+            Metric("lidar_place_packets", 4, "1"),
+            Metric("lidar_place_bytes", 8000, "B"),
+        )
+    },
     map_files=map_files("map", *room(), in_map(np.array([1.0, 2.0, 0.0]))),
 )
 
 
 def changed(robot, moved=(0.0, 0.0, 0.0), map_index=0):
     """RUN with one robot moved within the map, or put into another."""
-    old = RUN.trajectories[robot]
+    old = RUN.trajectories[f"r{robot}"]
     new = replace(old, T_map_base=se2.compose(moved, old.T_map_base), map_index=map_index)
-    return replace(RUN, trajectories=tuple(new if t is old else t for t in RUN.trajectories))
+    return replace(RUN, trajectories={**RUN.trajectories, old.robot: new})
 
 
 @pytest.fixture
@@ -95,7 +98,7 @@ def folder(tmp_path):
 
 
 def report_of(run, folder, *closures):
-    write_run(replace(run, closures=closures), folder, force=True)
+    replace(run, closures=closures).save(folder, force=True)
     return evaluate_fleet(folder)
 
 
@@ -194,7 +197,7 @@ def test_where_the_truth_ends_nothing_is_judged(folder):
 
 
 def test_truth_may_be_one_file_a_robot_and_beside_the_run(folder, tmp_path):
-    write_run(RUN, folder)
+    RUN.save(folder)
     for robot in range(3):
         write_tum(tmp_path / f"r{robot}.tum", stamps(robot), se2.compose((9.0, 9.0, 1.0), truth(robot)))
     report = evaluate_fleet(folder, tmp_path)
@@ -262,7 +265,7 @@ def spoil_yaml(recordings):
     ],
 )
 def test_bad_truth_is_one_line_and_exit_code_2(folder, capsys, spoil, message):
-    write_run(RUN, folder)
+    RUN.save(folder)
     spoil(folder.parent / "recordings")
     assert main(["evaluate", "fleet", str(folder)]) == 2
     error = capsys.readouterr().err
@@ -272,7 +275,7 @@ def test_bad_truth_is_one_line_and_exit_code_2(folder, capsys, spoil, message):
 
 
 def test_bad_folders_are_one_line_and_exit_code_2(folder, capsys, tmp_path):
-    write_run(RUN, folder)
+    RUN.save(folder)
     for arguments, message in (
         ([str(tmp_path / "nothing")], "no run folder"),
         ([str(folder), "--truth", str(tmp_path / "nowhere")], "nowhere: no folder with the truth"),
@@ -282,7 +285,7 @@ def test_bad_folders_are_one_line_and_exit_code_2(folder, capsys, tmp_path):
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
-    write_run(Run(()), folder, force=True)
+    Run({}).save(folder, force=True)
     with pytest.raises(EvaluationError, match="no robot"):
         evaluate_fleet(folder)
 

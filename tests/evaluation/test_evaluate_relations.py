@@ -15,7 +15,7 @@ from fcslam.evaluation.fleet.relations import (
     write_metrics,
 )
 from fcslam.geometry import se2
-from fcslam.runs import RobotTrajectory, Run, write_run
+from fcslam.runs import RobotTrajectory, Run
 
 ACROSS = RelationsQuestion(across_robots=True)
 
@@ -26,16 +26,16 @@ def folders(tmp_path):
     rng = np.random.default_rng(4)
     stamps = 976052857.33753 + np.arange(90.0)
     truth = np.column_stack((rng.uniform(0, 20, (90, 2)), rng.uniform(-3, 3, 90)))
-    single = Run((RobotTrajectory("all", 0, stamps, truth),))
+    single = Run({"all": RobotTrajectory("all", 0, stamps, truth)})
     frames = ((0.0, 0.0, 0.0), (0.0, 0.1, 0.0), (5.0, 5.0, 1.0))
     several = Run(
-        tuple(
-            RobotTrajectory(f"robot_{k}", int(k == 2), stamps[k::3], se2.compose(frames[k], truth[k::3]))
+        {
+            f"robot_{k}": RobotTrajectory(f"robot_{k}", int(k == 2), stamps[k::3], se2.compose(frames[k], truth[k::3]))
             for k in range(3)
-        )
+        }
     )
-    write_run(single, tmp_path / "single")
-    write_run(several, tmp_path / "several")
+    single.save(tmp_path / "single")
+    several.save(tmp_path / "several")
     pairs = np.array([(i, j) for i in range(90) for j in range(i + 1, 90, 7)])
     relations = np.column_stack((stamps[pairs], se2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])))
     lines = [f"{a:.6f} {b:.6f} {x:.9f} {y:.9f} 0 0 0 {theta:.9f}\n" for a, b, x, y, theta in relations]
@@ -78,8 +78,8 @@ def test_one_robot_has_no_relations_across_robots(folders):
 
 def test_a_run_of_no_robot_matches_nothing(folders):
     folder, _ = folders
-    write_run(Run(()), folder / "empty")
-    assert len(pose_table(Run(())).stamps) == 0
+    Run({}).save(folder / "empty")
+    assert len(pose_table(Run({})).stamps) == 0
     with pytest.raises(EvaluationError, match="same recording"):
         evaluate_relations(folder / "empty", folder / "relations", RelationsQuestion())
 

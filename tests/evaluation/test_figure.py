@@ -15,7 +15,7 @@ from fcslam.geometry import se2
 from fcslam.maps import palette
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, ClosureStatus
-from fcslam.runs import ClosureRow, LocalMap, RobotTrajectory, Run, write_run, write_tum
+from fcslam.runs import ClosureRow, LocalMap, RobotTrajectory, Run, write_tum
 
 SIDE_M = 0.05
 SIZE_M = np.array((6.0, 4.0))
@@ -203,15 +203,15 @@ def run_folder(tmp_path):
     """Robots a and b in one map, c alone; the truth of all of them beside it."""
     stamps = np.array((10.0, 11.0, 12.0))
     poses = {robot: np.array([(x, float(k), 0.0) for x in (0.0, 1.0, 2.0)]) for k, robot in enumerate(ROBOTS)}
-    trajectories = [RobotTrajectory(robot, k // 2, stamps, poses[robot]) for k, robot in enumerate(ROBOTS)]
-    own = [LocalMap(robot, stamps, poses[robot] - poses[robot][0], PGM, YAML.format(robot)) for robot in ROBOTS]
+    trajectories = {robot: RobotTrajectory(robot, k // 2, stamps, poses[robot]) for k, robot in enumerate(ROBOTS)}
+    own = {robot: LocalMap(robot, stamps, poses[robot] - poses[robot][0], PGM, YAML.format(robot)) for robot in ROBOTS}
     closures = [
         ClosureRow(i, 11.0, j, 12.0, Channel.CAMERA, 0.5, np.zeros(3), status, "")
         for i, j, status in (("b", "a", "accepted"), ("a", "a", "accepted"), ("a", "b", "rejected"))
         for status in [ClosureStatus(status)]
     ]
     files = {"map.pgm": PGM, "map.yaml": YAML.format("map").encode()}
-    write_run(Run(tuple(trajectories), tuple(closures), map_files=files, local_maps=tuple(own)), tmp_path / "run")
+    Run(trajectories, tuple(closures), map_files=files, local_maps=own).save(tmp_path / "run")
     truth = tmp_path / "recordings" / "ground_truth"
     truth.mkdir(parents=True)
     (truth / "map.pgm").write_bytes(PGM)

@@ -63,7 +63,7 @@ def test_map_server_reads_back_every_cell_where_it_was():
     fused = fuse(*fleet(), LASERS, CONFIG)
     served = MapServer(pgm_bytes(fused), map_yaml(fused, "map.pgm"))
     meaning = {Occupancy.UNKNOWN: -1, Occupancy.FREE: 0, Occupancy.OCCUPIED: 100}
-    side, (left, bottom) = fused.grid.resolution_m, fused.grid.origin_xy
+    side, (left, bottom) = fused.resolution_m, fused.origin_xy
     for (row, column), cell in np.ndenumerate(fused.cells):
         assert served.at(left + (column + 0.5) * side, bottom + (row + 0.5) * side) == meaning[Occupancy(cell)]
     assert set(np.unique(fused.cells)) == set(Occupancy)

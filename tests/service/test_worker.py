@@ -102,7 +102,9 @@ def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_pat
     assert [str(c) for c in run.closures if c.status is ClosureStatus.ACCEPTED] != []
     told = [(c.robot_i, c.robot_j, c.status, c.reason) for c in run.closures]
     assert told == [(c.robot_i, c.robot_j, c.status, c.reason) for c in expected.closures]
-    for robot, same in zip(run.trajectories, sorted(expected.trajectories, key=lambda t: t.robot), strict=True):
+    for robot, same in zip(
+        run.trajectories.values(), sorted(expected.trajectories.values(), key=lambda t: t.robot), strict=True
+    ):
         assert robot.robot == same.robot
         assert set(np.round(robot.stamps, 6)) <= set(np.round(same.stamps, 6))
     cloud.store.close()
@@ -161,7 +163,7 @@ def test_a_packet_that_does_not_fit_is_refused_with_its_reason_and_the_session_g
     run = cloud.finalize()
     assert [(epoch, number) for epoch, number, _ in cloud.store.refusals("a")] == [(0, 5)]
     assert "keyscan 0 where" in cloud.store.refusals("a")[0][2]
-    assert len(run.trajectories[0].stamps) == len(POSES)
+    assert len(run.trajectories["a"].stamps) == len(POSES)
     cloud.restart()
     assert cloud.finalize().pose_graph_g2o == run.pose_graph_g2o
 
@@ -216,7 +218,7 @@ def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch)
             cloud.work()
     assert cloud.store.refusals("a") == []
     cloud.restart()
-    assert len(cloud.finalize().trajectories[0].stamps) == len(POSES)
+    assert len(cloud.finalize().trajectories["a"].stamps) == len(POSES)
 
 
 def test_a_worker_waits_until_the_one_before_is_gone(cloud):
@@ -248,11 +250,11 @@ def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cl
 
 def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
     cloud.put(two_robots())
-    assert {t.map_index for t in cloud.finalize().trajectories} == {0}
+    assert {t.map_index for t in cloud.finalize().trajectories.values()} == {0}
     cloud.store.veto(Veto("a", "b"))
     for _ in range(2):
         run = cloud.finalize()
-        assert {t.map_index for t in run.trajectories} == {0, 1}
+        assert {t.map_index for t in run.trajectories.values()} == {0, 1}
         assert {c.status for c in run.closures} == {ClosureStatus.REVOKED}
         cloud.restart()
 
@@ -265,7 +267,7 @@ def test_a_result_waits_for_the_packets_that_were_there_when_it_was_asked_for(cl
     assert cloud.store.finalization(number).run is None
     cloud.work()
     run = open_run(cloud.folder.run(cloud.store.finalization(number).run))
-    assert sum(len(t.stamps) for t in run.trajectories) == 2 * len(POSES)
+    assert sum(len(t.stamps) for t in run.trajectories.values()) == 2 * len(POSES)
     assert ("finalized", number) in cloud.told
 
 
@@ -276,7 +278,7 @@ def test_the_live_run_follows_and_is_always_whole(cloud):
         cloud.work()
         cloud.now += 1000.0
         cloud.work()
-        seen.append(sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories))
+        seen.append(sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories.values()))
     assert seen == sorted(seen)
     assert seen[-1] == 2 * len(POSES)
     assert len(list((cloud.folder.path / "snapshots").iterdir())) <= 2
@@ -296,14 +298,14 @@ def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):
     blocked.unlink()
     cloud.now += 1000.0
     cloud.work()
-    assert sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories) == 2 * len(POSES)
+    assert sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories.values()) == 2 * len(POSES)
 
 
 def test_more_robots_join_a_mission_that_was_finished(cloud, tmp_path):
     packets = two_robots()
     half = [p for p in packets if p.robot == "a"]
     cloud.put(half)
-    assert {t.robot for t in cloud.finalize().trajectories} == {"a"}
+    assert set(cloud.finalize().trajectories) == {"a"}
     cloud.restart()
     cloud.put(packets)
     late = cloud.finalize()
@@ -317,12 +319,12 @@ def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scr
     scripted(closures(("a", POSES), ("a+1", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)]))
     first, again = stream("a", POSES, start_s=0.0), stream("a", POSES, start_s=600_000.0)
     cloud.put(first)
-    assert {t.robot: t.map_index for t in cloud.finalize().trajectories} == {"a": 0}
+    assert {t.robot: t.map_index for t in cloud.finalize().trajectories.values()} == {"a": 0}
     cloud.restart()
     hello = replace(again[0], epoch=1, body=replace(again[0].body, epoch=1))
     cloud.put([hello, *(replace(packet, epoch=1) for packet in again[1:])])
     run = cloud.finalize()
-    assert {t.robot: t.map_index for t in run.trajectories} == {"a": 0, "a+1": 0}
+    assert {t.robot: t.map_index for t in run.trajectories.values()} == {"a": 0, "a+1": 0}
     assert {"map.pgm", "map.yaml", "map.png"} == set(run.map_files)
 
 
@@ -347,7 +349,7 @@ def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same
     cloud.put(stream("c", far, start_s=0.0))
     run = cloud.finalize()
     assert "m from the start" in cloud.store.refusals("c")[0][2]
-    assert {t.robot: len(t.stamps) for t in run.trajectories} == {"c": kept}
+    assert {t.robot: len(t.stamps) for t in run.trajectories.values()} == {"c": kept}
     assert cloud.folder.live.exists()
 
 
@@ -355,7 +357,7 @@ def test_corrections_number_maps_as_the_live_run_does(cloud):
     alone = stream("c", POSES, start_s=-500.0)
     cloud.put(in_order([*alone, *two_robots()]))
     run = cloud.finalize()
-    assert {t.robot: t.map_index for t in run.trajectories} == {"a": 0, "b": 0, "c": 1}
+    assert {t.robot: t.map_index for t in run.trajectories.values()} == {"a": 0, "b": 0, "c": 1}
     cloud.restart()
     cloud.work()
     cloud.put(stream("d", POSES, start_s=2000.0))

@@ -60,7 +60,7 @@ def test_scans_lie_on_one_another_only_by_the_right_conventions(log: str, turned
 @pytest.mark.parametrize("log", LOGS)
 def test_the_map_confirms_the_wheels(log):
     source = open_source(DATA / log)
-    trajectory = run_mission([source], MissionConfig()).trajectories[0]
+    (trajectory,) = run_mission([source], MissionConfig()).trajectories.values()
     odometry = np.array([scan.T_odom_base for scan in scans_of(source)])
     assert trajectory.path_length_m == pytest.approx(source.survey().path_length_m, rel=0.05)
     by_wheels, by_map = (se2.between(poses[:-20], poses[20:]) for poses in (odometry, trajectory.T_map_base))

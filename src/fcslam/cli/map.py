@@ -83,7 +83,6 @@ def map_sources(
     from rich.console import Console
 
     from fcslam.mission import run_mission
-    from fcslam.runs import write_run
 
     console = Console(stderr=True)
     surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
@@ -93,7 +92,7 @@ def map_sources(
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     with _progress(console, sum(survey.scan_count for survey in surveys)) as watch:
         run = run_mission(sources, settings, watch, vetoes)
-    write_run(run, output, force)
+    run.save(output, force)
     show_faults(console, sources)
     _report(Console(), run, time.perf_counter() - began, output, settings.fleet.join_maps)
     return run
@@ -157,9 +156,9 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, join
 
     from fcslam.cloud.sessions import robot_of
 
-    values = {metric.name: metric.value for metric in run.metrics}
+    values = {name: metric.value for name, metric in run.metrics.items()}
     table = Table("robot", "map", "path, m", "scans")
-    for trajectory in run.trajectories:
+    for trajectory in run.trajectories.values():
         table.add_row(
             trajectory.robot, str(trajectory.map_index), f"{trajectory.path_length_m:.1f}", str(len(trajectory.stamps))
         )
@@ -171,7 +170,7 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, join
         highlight=False,
         soft_wrap=True,
     )
-    for session in run.trajectories:
+    for session in run.trajectories.values():
         if robot_of(session.robot) != session.robot:
             console.print(
                 f"{session.robot}: {robot_of(session.robot)} was lost, and began anew at {session.stamps[0]:.3f}",

@@ -13,10 +13,10 @@ from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.drawing import Meeting, map_png
-from fcslam.maps.fusion import FusedMap, fuse
-from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure
+from fcslam.maps.fusion import fuse
+from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure, frozen
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
-from fcslam.runs.map_files import map_yaml, pgm_bytes
+from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 
@@ -53,18 +53,20 @@ def run_of(
 ) -> Run:
     """Collect what the run folder holds; ``tracks`` has every robot of the result, and orders them."""
     mapped = {robot.robot: robot for robot in result.robots}
-    trajectories = tuple(
-        RobotTrajectory(name, mapped[name].map_index, track.stamps, track.laid_on(mapped[name].T_map_base))
+    trajectories = {
+        name: RobotTrajectory(
+            name, mapped[name].map_index, frozen(track.stamps), frozen(track.laid_on(mapped[name].T_map_base))
+        )
         for name, track in tracks.items()
-    )
+    }
     return Run(
         trajectories=trajectories,
         closures=tuple(_closure_row(closure, mapped) for closure in result.closures),
-        metrics=(*_counts(result), *metrics),
+        metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
         pose_graph_g2o=g2o_text(result.graph),
-        map_files=_map_files(result, trajectories, grid),
-        local_maps=tuple(_local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps),
+        map_files=_map_files(result, tuple(trajectories.values()), grid),
+        local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
     )
 
 
@@ -104,7 +106,11 @@ def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> Local
     fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.laser}, grid)
     name = f"{robot.robot}.pgm"
     return LocalMap(
-        robot.robot, track.stamps, track.laid_on(robot.T_local_base), pgm_bytes(fused), map_yaml(fused, name)
+        robot.robot,
+        frozen(track.stamps),
+        frozen(track.laid_on(robot.T_local_base)),
+        pgm_bytes(fused),
+        map_yaml(fused, name),
     )
 
 
@@ -130,7 +136,7 @@ def _map_files(result: FleetResult, trajectories: Sequence[RobotTrajectory], gri
     return files
 
 
-def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> FusedMap:
+def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> OccupancyMap:
     """One map of robots that share it."""
     keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
     poses: FloatArray = np.concatenate([robot.T_map_base[robot.numbers()] for robot in members])

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.maps import palette
-from fcslam.maps.fusion import FusedMap
 from fcslam.records import Channel, FloatArray
-from fcslam.runs.map_files import Cells, Occupancy
+from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
@@ -78,7 +77,7 @@ class _View:
         return np.asarray(np.clip(np.stack((column, row), axis=-1), -FARTHEST_PX, FARTHEST_PX))
 
 
-def map_png(fused: FusedMap, trajectories: Mapping[str, FloatArray], closures: Sequence[Meeting]) -> bytes:
+def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closures: Sequence[Meeting]) -> bytes:
     """PNG of the map, about 1600 pixels on its long side; what is known and where robots were fits in.
 
     ``trajectories`` holds each robot's poses or points in ``map``, shape (N, 2+), drawn from a dot at the first;
@@ -111,27 +110,26 @@ def _spread(meetings: Sequence[Meeting]) -> list[Meeting]:
     return drawn
 
 
-def _view(fused: FusedMap, trajectories: Iterable[FloatArray]) -> _View:
+def _view(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> _View:
     """Crop to what matters, then whole pixels per cell, or whole cells per pixel where the map is large."""
-    grid = fused.grid
     low, high = _shown_box(fused, trajectories)
     cells = fused.cells[low[0] : high[0], low[1] : high[1]]
-    corner = np.array(grid.origin_xy) + grid.resolution_m * low[::-1]
+    corner = np.array(fused.origin_xy) + fused.resolution_m * low[::-1]
     ratio = LONG_SIDE_PX / max(cells.shape)
     cells_per_pixel, cell_px = max(1, round(1.0 / ratio)), max(1, round(ratio))
     cells = _shrunk(cells, cells_per_pixel)
     offset = max(MARGIN_PX, (NARROWEST_PX - cells.shape[1] * cell_px) // 2)
-    return _View(cells, corner, grid.resolution_m * cells_per_pixel, cell_px, offset)
+    return _View(cells, corner, fused.resolution_m * cells_per_pixel, cell_px, offset)
 
 
-def _shown_box(fused: FusedMap, trajectories: Iterable[FloatArray]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _shown_box(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and one past the last (row, column) of known area, single beams apart, and of trajectories."""
     shape = fused.cells.shape
-    side = max(1, round(RAY_M / fused.grid.resolution_m))
+    side = max(1, round(RAY_M / fused.resolution_m))
     shown = (fused.cells != Occupancy.UNKNOWN).astype(np.uint8)
     shown = cv2.morphologyEx(shown, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     for points in trajectories:
-        columns, rows = np.floor((_finite(points) - fused.grid.origin_xy) / fused.grid.resolution_m).T
+        columns, rows = np.floor((_finite(points) - fused.origin_xy) / fused.resolution_m).T
         inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
         shown[rows[inside].astype(np.int64), columns[inside].astype(np.int64)] = 1
     if not shown.any():

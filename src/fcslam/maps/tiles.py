@@ -5,12 +5,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 from fastapi import HTTPException
 from fastapi.responses import Response
 from numpy.typing import NDArray
 
-from fcslam.runs.map_files import PIXELS, Occupancy
+from fcslam.runs.map_files import PIXELS, Occupancy, parse_map, pixels_of
 
 WORLD_M = 256.0
 """Side of a tile at zoom 0; each zoom halves it."""
@@ -52,9 +51,6 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> Respo
 @lru_cache(maxsize=8)
 def _grid(folder: Path, stem: str) -> tuple[NDArray[np.uint8], float, NDArray[np.float64]]:
     """Pixels with row 0 at the lowest y, side of a cell, lower left corner (2,). A snapshot never changes."""
-    data = (folder / f"{stem}.pgm").read_bytes()
-    _, size, _, cells = data.split(b"\n", 3)
-    width, height = map(int, size.split())
-    told = yaml.safe_load((folder / f"{stem}.yaml").read_text(encoding="utf-8"))
-    pixels = np.frombuffer(cells, np.uint8).reshape(height, width)[::-1]
-    return pixels, float(told["resolution"]), np.array(told["origin"][:2], dtype=np.float64)
+    pgm, description = (folder / f"{stem}.pgm").read_bytes(), (folder / f"{stem}.yaml").read_text(encoding="utf-8")
+    occupancy = parse_map(stem, pgm, description)
+    return pixels_of(occupancy.cells), occupancy.resolution_m, np.array(occupancy.origin_xy)

@@ -4,12 +4,12 @@ from fcslam.runs.folder import (
     LOCAL,
     POSE_GRAPH,
     TRAJECTORIES,
+    Run,
     check_names,
     open_run,
     prepare_output,
-    write_run,
 )
-from fcslam.runs.records import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
+from fcslam.runs.records import ClosureRow, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import metrics_json, read_vetoes
 from fcslam.runs.trajectories import read_tum, write_tum
 
@@ -28,6 +28,5 @@ __all__ = [
     "prepare_output",
     "read_tum",
     "read_vetoes",
-    "write_run",
     "write_tum",
 ]

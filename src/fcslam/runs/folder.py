@@ -16,12 +16,15 @@ A run folder is whole or not there: it is written into a hidden folder beside it
 import csv
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from fcslam.errors import EvaluationError, OutputError
-from fcslam.runs.records import LocalMap, RobotTrajectory, Run
+from fcslam.runs.map_files import OccupancyMap, parse_map
+from fcslam.runs.records import ClosureRow, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import (
     metrics_json,
     read_closures,
@@ -37,6 +40,63 @@ TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 
 _SAFE_NAME = re.compile(r"\w[\w.+-]*")
+_MAP_FILE = re.compile(r"map(?:_([1-9]\d{0,8}))?\.pgm")
+"""Map 0 has no number in its name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The result of a mission: what ``fcslam.map_recordings`` returns and ``fcslam.open_run`` reads.
+
+    Poses are (x, y, theta) of the robot's ``base`` in metres and radians; ``T_a_b`` maps coordinates in b to a. Robots
+    whose relative pose is not supported by enough closures are in separate maps, each with its own coordinate frame.
+    Files hold poses and stamps with nine digits after the decimal point and closures with six.
+    """
+
+    trajectories: Mapping[str, RobotTrajectory]
+    """By robot."""
+    closures: tuple[ClosureRow, ...] = ()
+    """Every loop closure considered between robots and every one within a robot, with its status and the reason."""
+    metrics: Mapping[str, Metric] = field(default_factory=dict)
+    """By name."""
+    config_yaml: str = ""
+    """The complete configuration."""
+    pose_graph_g2o: str = ""
+    """All keyscans at their optimised poses with the constraints in use, in the g2o format."""
+    map_files: Mapping[str, bytes] = field(default_factory=dict)
+    """File name to content: map.pgm, map.yaml, map.png, map_1.pgm ..."""
+    local_maps: Mapping[str, LocalMap] = field(default_factory=dict)
+    """By robot: every robot's own map. Live results of the service have none, and their folder has no ``local``."""
+
+    @cached_property
+    def maps(self) -> Mapping[int, OccupancyMap]:
+        """The occupancy maps, by index; most robots are in map 0. Decoded at the first use.
+
+        Raises:
+            EvaluationError: a map file is broken or has no description.
+        """
+        return dict(sorted(self._decoded_maps()))
+
+    def save(self, folder: str | os.PathLike[str], force: bool = False) -> None:
+        """Write the run folder, whole or not at all.
+
+        Args:
+            folder: the folder to make; its parents are made too.
+            force: replace a run that is there.
+
+        Raises:
+            OutputError: something else is there, a run is there and ``force`` is not given, a robot's name cannot be a
+                file name, or writing fails.
+        """
+        check_names([*self.trajectories, *self.local_maps, *self.map_files])
+        with _staged(prepare_output(Path(folder), force)) as place:
+            _write(self, place)
+
+    def _decoded_maps(self) -> Iterator[tuple[int, OccupancyMap]]:
+        for name, pgm in self.map_files.items():
+            if match := _MAP_FILE.fullmatch(name):
+                description = self.map_files.get(f"{name.removesuffix('.pgm')}.yaml", b"").decode(errors="replace")
+                yield int(match[1] or 0), parse_map(name, pgm, description)
 
 
 def prepare_output(path: Path, force: bool = False) -> Path:
@@ -58,7 +118,9 @@ def prepare_output(path: Path, force: bool = False) -> Path:
     if occupied and not (place.is_dir() and is_run_folder(place)):
         raise OutputError(f"{path}: exists and is no run folder; name a new folder")
     if occupied and not force:
-        raise OutputError(f"{path}: already holds a run; name a new folder or give --force to replace it")
+        raise OutputError(
+            f"{path}: already holds a run; name a new folder or give --force (in Python force=True) to replace it"
+        )
     return place
 
 
@@ -78,51 +140,27 @@ def is_run_folder(path: Path) -> bool:
     return (path / ROBOTS).is_file() and (path / TRAJECTORIES).is_dir()
 
 
-def write_run(run: Run, path: Path, force: bool = False) -> None:
-    """Write ``run`` as the folder ``path``, whole or not at all.
+def open_run(folder: str | os.PathLike[str]) -> Run:
+    """Read a run folder back; files are read, never executed.
 
     Raises:
-        OutputError: as in ``prepare_output``, a name cannot be a file's, or writing fails.
+        EvaluationError: ``folder`` is no run folder, or a file of it is missing or broken.
     """
-    robots = [trajectory.robot for trajectory in run.trajectories] + [local.robot for local in run.local_maps]
-    check_names([*robots, *run.map_files])
-    with _staged(prepare_output(path, force)) as folder:
-        (folder / TRAJECTORIES).mkdir()
-        for trajectory in run.trajectories:
-            write_tum(_tum_path(folder, trajectory.robot), trajectory.stamps, trajectory.T_map_base)
-        if run.local_maps:
-            (folder / LOCAL).mkdir()
-        for local in run.local_maps:
-            _write_local_map(folder / LOCAL, local)
-        write_robots(folder / ROBOTS, run.trajectories)
-        write_closures(folder / CLOSURES, run.closures)
-        (folder / METRICS).write_text(metrics_json(run.metrics), encoding="utf-8")
-        (folder / CONFIG).write_text(run.config_yaml, encoding="utf-8")
-        (folder / POSE_GRAPH).write_text(run.pose_graph_g2o, encoding="utf-8")
-        for name, content in run.map_files.items():
-            (folder / name).write_bytes(content)
-
-
-def open_run(path: Path) -> Run:
-    """Read a run folder back.
-
-    Raises:
-        EvaluationError: ``path`` is no run folder, or a file of it is missing or broken.
-    """
+    path = Path(folder)
     if not is_run_folder(path):
         raise EvaluationError(
             f"{path}: no run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one"
         )
     try:
-        trajectories = tuple(_read_trajectory(path, *row) for row in read_robots(path / ROBOTS))
+        maps = read_robots(path / ROBOTS)
         return Run(
-            trajectories=trajectories,
+            trajectories={robot: _read_trajectory(path, robot, index) for robot, index in maps.items()},
             closures=read_closures(path / CLOSURES),
             metrics=read_metrics(path / METRICS),
             config_yaml=(path / CONFIG).read_text(encoding="utf-8"),
             pose_graph_g2o=(path / POSE_GRAPH).read_text(encoding="utf-8"),
             map_files={file.name: file.read_bytes() for file in sorted(path.glob("map*.*"))},
-            local_maps=_read_local_maps(path / LOCAL, [trajectory.robot for trajectory in trajectories]),
+            local_maps=_read_local_maps(path / LOCAL, maps),
         )
     except (OSError, ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: a broken run folder ({error})") from error
@@ -135,6 +173,23 @@ def _staged(place: Path) -> Iterator[Path]:
             yield folder
     except OSError as error:
         raise OutputError(f"{place}: cannot write the run ({error})") from error
+
+
+def _write(run: Run, folder: Path) -> None:
+    (folder / TRAJECTORIES).mkdir()
+    for trajectory in run.trajectories.values():
+        write_tum(_tum_path(folder, trajectory.robot), trajectory.stamps, trajectory.T_map_base)
+    if run.local_maps:
+        (folder / LOCAL).mkdir()
+    for local in run.local_maps.values():
+        _write_local_map(folder / LOCAL, local)
+    write_robots(folder / ROBOTS, run.trajectories.values())
+    write_closures(folder / CLOSURES, run.closures)
+    (folder / METRICS).write_text(metrics_json(run.metrics.values()), encoding="utf-8")
+    (folder / CONFIG).write_text(run.config_yaml, encoding="utf-8")
+    (folder / POSE_GRAPH).write_text(run.pose_graph_g2o, encoding="utf-8")
+    for name, content in run.map_files.items():
+        (folder / name).write_bytes(content)
 
 
 def _tum_path(folder: Path, robot: str) -> Path:
@@ -154,8 +209,8 @@ def _write_local_map(folder: Path, local: LocalMap) -> None:
     (folder / f"{local.robot}.yaml").write_text(local.yaml, encoding="utf-8")
 
 
-def _read_local_maps(folder: Path, robots: Iterable[str]) -> tuple[LocalMap, ...]:
-    return tuple(_read_local_map(folder, robot) for robot in robots) if folder.exists() else ()
+def _read_local_maps(folder: Path, robots: Iterable[str]) -> dict[str, LocalMap]:
+    return {robot: _read_local_map(folder, robot) for robot in robots} if folder.exists() else {}
 
 
 def _read_local_map(folder: Path, robot: str) -> LocalMap:

@@ -1,15 +1,24 @@
-"""An occupancy map as the two files that ROS map_server reads: an image and what the image means."""
+"""An occupancy map as the two files that ROS map_server reads: an image and its description. Writer and reader."""
 
+import math
+import re
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from fcslam.errors import EvaluationError
+from fcslam.records import frozen
+
 OCCUPIED_THRESHOLD: Final = 0.65
 FREE_THRESHOLD: Final = 0.196
 """map_server: occupied above, free below, unknown between; a pixel p stands for the occupancy (255 - p) / 255."""
+
+_PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*([1-9]\d{0,6})\s+([1-9]\d{0,6})\s+255\s")
+"""Width, height; other programs write a comment after the first line."""
 
 
 class Occupancy(IntEnum):
@@ -25,29 +34,30 @@ PIXELS: Final = {Occupancy.UNKNOWN: 205, Occupancy.FREE: 254, Occupancy.OCCUPIED
 Cells = NDArray[np.uint8]
 
 
-class OccupancyMap(Protocol):
-    """A map whose cells have been decided."""
+@dataclass(frozen=True, slots=True, eq=False)
+class OccupancyMap:
+    """An occupancy grid whose cells are classified as occupied, free or unknown."""
 
-    @property
-    def cells(self) -> Cells:
-        """``Occupancy`` of every cell, shape (H, W), row 0 at the lowest y."""
-
-    @property
-    def resolution_m(self) -> float:
-        """Side of a cell."""
-
-    @property
-    def origin_xy(self) -> tuple[float, float]:
-        """Lower left corner of cell (0, 0) in the map's frame."""
+    cells: Cells
+    """``Occupancy`` of every cell, shape (H, W). Rows run along y and columns along x, from the lowest value up."""
+    resolution_m: float
+    """Side of a cell."""
+    origin_xy: tuple[float, float]
+    """Lower left corner of cell (0, 0) in the coordinate frame of the map, metres."""
 
 
 def pgm_bytes(occupancy: OccupancyMap) -> bytes:
     """The map as a binary PGM for map_server: row 0 at the highest y; 254 free, 0 occupied, 205 unknown."""
+    height, width = occupancy.cells.shape
+    return f"P5\n{width} {height}\n255\n".encode("ascii") + pixels_of(occupancy.cells[::-1]).tobytes()
+
+
+def pixels_of(cells: Cells) -> NDArray[np.uint8]:
+    """The grey values of map_server for ``Occupancy`` of cells, in the same shape."""
     pixels = np.zeros(len(Occupancy), np.uint8)
     for known, pixel in PIXELS.items():
         pixels[known] = pixel
-    height, width = occupancy.cells.shape
-    return f"P5\n{width} {height}\n255\n".encode("ascii") + pixels[occupancy.cells[::-1]].tobytes()
+    return np.asarray(pixels[cells])
 
 
 def map_yaml(occupancy: OccupancyMap, image: str) -> str:
@@ -63,3 +73,55 @@ def map_yaml(occupancy: OccupancyMap, image: str) -> str:
     }
     text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
     return text
+
+
+def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
+    """Read back what ``pgm_bytes`` and ``map_yaml`` wrote; also what map_server saves in the mode trinary.
+
+    Args:
+        name: what messages call the map.
+        pgm: content of the image file.
+        description: content of the YAML file; the image that it names is not opened.
+
+    Raises:
+        EvaluationError: the image is no binary PGM of its stated size, or the description is incomplete, contains a
+            number that is out of range, or rotates or negates the image.
+    """
+    try:
+        return _parsed(pgm, description)
+    except ValueError as error:
+        raise EvaluationError(f"{name} is broken: {error}") from error
+
+
+def _parsed(pgm: bytes, description: str) -> OccupancyMap:
+    header = _PGM_HEADER.match(pgm)
+    if header is None:
+        raise ValueError("the image is not a binary PGM of 8 bits")
+    width, height = map(int, header.groups())
+    if len(pgm) - header.end() != width * height:
+        raise ValueError(f"the image has {len(pgm) - header.end()} pixels, not {width} x {height}")
+    pixels = np.frombuffer(pgm, np.uint8, offset=header.end()).reshape(height, width)
+    resolution_m, origin_xy, occupied_threshold, free_threshold = _described(description)
+    occupancy = (255 - np.arange(256)) / 255.0
+    known = np.full(256, Occupancy.UNKNOWN, np.uint8)
+    known[occupancy < free_threshold] = Occupancy.FREE
+    known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
+    return OccupancyMap(frozen(known[pixels[::-1]], np.uint8), resolution_m, origin_xy)
+
+
+def _described(description: str) -> tuple[float, tuple[float, float], float, float]:
+    """Resolution, origin, threshold of occupied cells, threshold of free cells."""
+    try:
+        content: Any = yaml.safe_load(description)
+        resolution_m, occupied, free = (float(content[key]) for key in ("resolution", "occupied_thresh", "free_thresh"))
+        x, y, theta = map(float, content["origin"])
+        plain = not content.get("negate", 0) and content.get("mode", "trinary") == "trinary" and theta == 0.0
+    except yaml.YAMLError as error:
+        raise ValueError(f"the description is not valid YAML ({' '.join(str(error).split())})") from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError("the description lacks resolution, origin, occupied_thresh or free_thresh") from error
+    if not (0.0 < resolution_m < math.inf and math.isfinite(x) and math.isfinite(y) and 0.0 <= free <= occupied <= 1.0):
+        raise ValueError("the description has a resolution, an origin or a threshold that is out of range")
+    if not plain:
+        raise ValueError("the image is negated, rotated or not in the mode trinary")
+    return resolution_m, (x, y), occupied, free

@@ -1,23 +1,25 @@
-"""What a run folder holds, as frozen records."""
+"""What a run holds, as frozen records. Arrays in them are read-only."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from fcslam.records import Channel, ClosureStatus, FloatArray
+from fcslam.runs.map_files import OccupancyMap, parse_map
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RobotTrajectory:
-    """Where one robot was at every laser scan of its recording, in the scans' order."""
+    """Where one robot was at every laser scan of its recording, in the order of the scans."""
 
     robot: str
+    """Name of the robot, or of one of its sessions: ``robot1``, ``robot1+1`` ..."""
     map_index: int
+    """Key of the robot's map in ``Run.maps``."""
     stamps: FloatArray
-    """Shape (N,), the recording's own stamps."""
+    """Shape (N,), seconds of the recording's own clock."""
     T_map_base: FloatArray
-    """Shape (N, 3), in the coordinate frame of map ``map_index``."""
+    """Poses (x, y, theta) of ``base`` in the coordinate frame of the robot's map, metres and radians, shape (N, 3)."""
 
     @property
     def path_length_m(self) -> float:
@@ -26,34 +28,45 @@ class RobotTrajectory:
         return float(np.sum(np.hypot(steps[:, 0], steps[:, 1])))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class LocalMap:
-    """One robot's own map: what it knew before any other robot's measurements; the origin is its first keyscan."""
+    """One robot's own map, made from its own measurements alone; the origin is its first keyscan."""
 
     robot: str
     stamps: FloatArray
     """Shape (N,), as in the robot's trajectory."""
     T_local_base: FloatArray
-    """Shape (N, 3), at every laser scan."""
+    """Poses (x, y, theta) of ``base`` in the robot's own map at every laser scan, shape (N, 3)."""
     pgm: bytes
     yaml: str
     """For ROS map_server; names the PGM file ``<robot>.pgm``."""
 
+    def occupancy(self) -> OccupancyMap:
+        """The robot's own occupancy map.
 
-@dataclass(frozen=True, slots=True)
+        Raises:
+            EvaluationError: ``pgm`` or ``yaml`` is broken.
+        """
+        return parse_map(f"the own map of {self.robot}", self.pgm, self.yaml)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ClosureRow:
-    """One loop closure as closures.csv tells it."""
+    """One loop closure: the claim that two keyscans saw the same place. A line of closures.csv."""
 
     robot_i: str
     stamp_i: float
+    """Of the keyscan of ``robot_i``, seconds."""
     robot_j: str
     stamp_j: float
     channel: Channel
     similarity: float
     """In [0, 1]."""
     T_i_j: FloatArray
+    """Measured pose (x, y, theta) of base j in base i, metres and radians, shape (3,)."""
     status: ClosureStatus
     reason: str
+    """Why the closure has this status, in one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,19 +75,6 @@ class Metric:
 
     name: str
     value: float
+    """NaN: there is nothing to measure."""
     unit: str
-
-
-@dataclass(frozen=True)
-class Run:
-    """Everything in a run folder."""
-
-    trajectories: tuple[RobotTrajectory, ...]
-    closures: tuple[ClosureRow, ...] = ()
-    metrics: tuple[Metric, ...] = ()
-    config_yaml: str = ""
-    pose_graph_g2o: str = ""
-    map_files: Mapping[str, bytes] = field(default_factory=dict)
-    """File name to content: map.pgm, map.yaml, map.png, map_1.pgm ..."""
-    local_maps: tuple[LocalMap, ...] = ()
-    """Of every robot, in the order of the trajectories; or none, and the folder has no ``local``."""
+    """``1`` for counts and ratios."""

@@ -5,11 +5,13 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fcslam.errors import ConfigError
 from fcslam.records import Channel, ClosureStatus, Veto, frozen
 from fcslam.runs.records import ClosureRow, Metric, RobotTrajectory
+
+_Value = TypeVar("_Value")
 
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
 _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
@@ -21,13 +23,13 @@ def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
     _write_csv(path, _ROBOT_COLUMNS, map(_robot_fields, trajectories))
 
 
-def read_robots(path: Path) -> list[tuple[str, int]]:
-    """Robot and map index of every line of robots.csv.
+def read_robots(path: Path) -> dict[str, int]:
+    """Map index by robot, in the order of robots.csv.
 
     Raises:
-        ValueError: a column is missing or a map index is no number.
+        ValueError: a column is missing, a map index is no number, or a robot occurs twice.
     """
-    return [(row["robot"], int(row["map"])) for row in _read_csv(path, _ROBOT_COLUMNS)]
+    return _unique(path.name, ((row["robot"], int(row["map"])) for row in _read_csv(path, _ROBOT_COLUMNS)))
 
 
 def write_closures(path: Path, closures: Iterable[ClosureRow]) -> None:
@@ -80,18 +82,29 @@ def metrics_json(metrics: Iterable[Metric]) -> str:
     return json.dumps(rows, indent=2) + "\n"
 
 
-def read_metrics(path: Path) -> tuple[Metric, ...]:
-    """Every metric of metrics.json; null is NaN.
+def read_metrics(path: Path) -> dict[str, Metric]:
+    """Every metric of metrics.json by its name; null is NaN.
 
     Raises:
-        ValueError: it is not a list of name, value, unit.
+        ValueError: it is not a list of name, value, unit, or a name occurs twice.
     """
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
         values = [math.nan if row["value"] is None else float(row["value"]) for row in rows]
-        return tuple(Metric(row["name"], value, row["unit"]) for row, value in zip(rows, values, strict=True))
+        return _unique(
+            path.name, ((row["name"], Metric(row["name"], v, row["unit"])) for row, v in zip(rows, values, strict=True))
+        )
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path.name} is not a list of name, value, unit") from error
+
+
+def _unique(file: str, items: Iterable[tuple[str, _Value]]) -> dict[str, _Value]:
+    found: dict[str, _Value] = {}
+    for name, value in items:
+        if name in found:
+            raise ValueError(f"{file}: '{name}' occurs twice")
+        found[name] = value
+    return found
 
 
 def _robot_fields(trajectory: RobotTrajectory) -> list[Any]:

@@ -14,7 +14,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from fcslam.runs import Run, write_run
+from fcslam.runs import Run
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class MissionFolder:
         snapshots = self.path / "snapshots"
         before = int(self.live.resolve().name) if self.live.exists() else 0
         name = str(before + 1)
-        write_run(run, snapshots / name, force=True)
+        run.save(snapshots / name, force=True)
         link = self.path / ".live.partial"
         link.unlink(missing_ok=True)
         link.symlink_to(Path("snapshots") / name, target_is_directory=True)

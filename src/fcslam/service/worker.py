@@ -31,7 +31,7 @@ from fcslam.cloud.sessions import session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump
 from fcslam.errors import PacketError
-from fcslam.runs import Metric, Run, write_run
+from fcslam.runs import Metric, Run
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, SessionCorrection, StoredPacket
 from fcslam.service.supervisor import READY
@@ -137,7 +137,7 @@ class Worker:
     def _answer(self, asked: Finalization) -> None:
         name = str(asked.number)
         try:
-            write_run(self._run(self._fleet.finalize()), self._folder.run(name), force=True)
+            self._run(self._fleet.finalize()).save(self._folder.run(name), force=True)
         except (
             Exception
         ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on

@@ -1,7 +1,6 @@
 """What a fleet could have known without any error: relations between its scans, and the map of what its beams met."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -10,7 +9,7 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
 from fcslam.records import FloatArray, LaserModel, frozen
-from fcslam.runs.map_files import Cells, Occupancy, map_yaml, pgm_bytes
+from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster
@@ -37,17 +36,6 @@ class HasTruth(Protocol):
     @property
     def T_building_base(self) -> FloatArray:
         """The truth at these stamps, shape (N, 3)."""
-
-
-@dataclass(frozen=True, slots=True)
-class TrueMap:
-    """An occupancy map in ``building``."""
-
-    cells: Cells
-    """``Occupancy`` of every cell, shape (H, W), row 0 at the lowest y."""
-    resolution_m: float
-    origin_xy: tuple[float, float]
-    """Lower left corner of cell (0, 0)."""
 
 
 def write_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -> None:
@@ -82,10 +70,11 @@ def true_relations(
     )
 
 
-def true_map(fleet: SimulatedFleet) -> TrueMap:
+def true_map(fleet: SimulatedFleet) -> OccupancyMap:
     """What the robots' beams meet without noise, from where they truly scanned: surfaces, and free space before them.
 
-    Beams that return nothing tell nothing. Where furniture moved, a surface that any robot saw stands.
+    The coordinate frame is the building's. A beam that returns nothing leaves its cells unknown. Where furniture moved,
+    every surface that a robot saw is occupied.
 
     Raises:
         SimulationError: MuJoCo is missing.
@@ -97,7 +86,7 @@ def true_map(fleet: SimulatedFleet) -> TrueMap:
     cells = np.full((height, width), Occupancy.UNKNOWN, dtype=np.uint8)
     cells[passed > 0] = Occupancy.FREE
     cells[hit > 0] = Occupancy.OCCUPIED
-    return TrueMap(cells, RESOLUTION_M, (-_MARGIN * RESOLUTION_M,) * 2)
+    return OccupancyMap(cells, RESOLUTION_M, (-_MARGIN * RESOLUTION_M,) * 2)
 
 
 def _draw_beams(robot: SimulatedRobot, passed: Cells, hit: Cells) -> None:

@@ -198,7 +198,7 @@ def test_tiles_show_what_the_map_shows(mapped):
 def test_a_result_is_a_run_folder(mapped):
     answer = mapped.ask("POST", f"{API}/finalize", "boss").json()
     run = open_run(Path(answer["run"]))
-    assert sum(len(t.stamps) for t in run.trajectories) == 2 * len(POSES)
+    assert sum(len(t.stamps) for t in run.trajectories.values()) == 2 * len(POSES)
     assert mapped.ask("POST", f"{API}/finalize", "boss").json()["number"] == answer["number"] + 1
 
 

@@ -90,16 +90,15 @@ def fleet_charts(run: Path, truth: Path | None = None, outlines: Sequence[Outlin
     known = known_poses(opened, folder)
     if not opened.local_maps:
         raise EvaluationError(f"{run}: has no {LOCAL}/ with the robots' own maps; map the recordings again")
-    drawn = [local.robot for local in opened.local_maps]
     return FleetCharts(
         local={
-            local.robot: Chart(read_grid(run / LOCAL / f"{local.robot}.yaml"), {local.robot: local.T_local_base})
-            for local in opened.local_maps
+            robot: Chart(read_grid(run / LOCAL / f"{robot}.yaml"), {robot: local.T_local_base})
+            for robot, local in opened.local_maps.items()
         },
         fused=_fused_chart(run, opened, known),
         building=Chart(
             read_grid(folder / TRUE_MAP),
-            {robot: known.truth.T_map_base[known.truth.robots == k] for k, robot in enumerate(drawn)},
+            {robot: known.truth.T_map_base[known.truth.robots == k] for k, robot in enumerate(opened.local_maps)},
             outlines=outlines,
         ),
         matches=_matches(opened),
@@ -110,14 +109,13 @@ def _fused_chart(run: Path, opened: Run, known: KnownPoses) -> Chart:
     members = known.estimate.maps == 0
     T_building_map = align(known.truth.T_map_base[members], known.estimate.T_map_base[members])
     x, y, theta = T_building_map if np.isfinite(T_building_map).all() else AS_IT_IS
-    ways = {t.robot: t.T_map_base for t in opened.trajectories if t.map_index == 0}
+    ways = {t.robot: t.T_map_base for t in opened.trajectories.values() if t.map_index == 0}
     return Chart(read_grid(run / "map.yaml"), ways, (float(x), float(y), float(theta)))
 
 
 def _matches(run: Run) -> list[Match]:
-    local = {own.robot: own for own in run.local_maps}
     return [
-        _match(closure, local)
+        _match(closure, run.local_maps)
         for closure in run.closures
         if closure.status is ClosureStatus.ACCEPTED and closure.robot_i != closure.robot_j
     ]

@@ -92,7 +92,7 @@ def evaluate_closures(run: Path, relations: Path, criteria: ClosureCriteria) -> 
 
 def closure_rows(run: Run, poses: PoseTable) -> Rows:
     """Rows of both keyscans of each closure in the run's pose table, shape (K, 2); -1 where it cannot be told which."""
-    robots = {trajectory.robot: number for number, trajectory in enumerate(run.trajectories)}
+    robots = {robot: number for number, robot in enumerate(run.trajectories)}
     rows = np.full((len(run.closures), 2), -1, dtype=np.int64)
     for end, names, stamps in (
         (0, [c.robot_i for c in run.closures], [c.stamp_i for c in run.closures]),

@@ -60,7 +60,7 @@ def known_poses(run: Run, folder: Path) -> KnownPoses:
         raise EvaluationError("the run has no robot, so there is nothing to compare with the truth")
     estimate = pose_table(run)
     true = np.empty_like(estimate.T_map_base)
-    for number, trajectory in enumerate(run.trajectories):
+    for number, trajectory in enumerate(run.trajectories.values()):
         rows = estimate.robots == number
         true[rows] = _true_poses(trajectory, estimate.stamps[rows], folder)
     known = np.isfinite(true[:, 0])

@@ -58,12 +58,12 @@ def pose_table(run: Run) -> PoseTable:
     """All poses of ``run`` in one table; robots are numbered in the run's order."""
     if not run.trajectories:
         return PoseTable.of([], np.empty((0, 3)))
-    counts = [len(trajectory.stamps) for trajectory in run.trajectories]
+    counts = [len(trajectory.stamps) for trajectory in run.trajectories.values()]
     return PoseTable.of(
-        np.concatenate([trajectory.stamps for trajectory in run.trajectories]),
-        np.concatenate([trajectory.T_map_base for trajectory in run.trajectories]),
+        np.concatenate([trajectory.stamps for trajectory in run.trajectories.values()]),
+        np.concatenate([trajectory.T_map_base for trajectory in run.trajectories.values()]),
         robots=np.repeat(np.arange(len(counts)), counts),
-        maps=np.repeat([trajectory.map_index for trajectory in run.trajectories], counts),
+        maps=np.repeat([trajectory.map_index for trajectory in run.trajectories.values()], counts),
     )
 
 

@@ -105,7 +105,7 @@ def evaluate_fleet(run: Path, truth: Path | None = None, criteria: ClosureCriter
     known = known_poses(opened, folder)
     alignments = {k: align(*_poses(known, known.estimate.maps == k)) for k in np.unique(known.estimate.maps).tolist()}
     rng = np.random.default_rng(0)
-    figures = {metric.name: metric.value for metric in opened.metrics}
+    figures = {name: metric.value for name, metric in opened.metrics.items()}
     return FleetReport(
         truth=folder,
         criteria=criteria,
@@ -129,7 +129,7 @@ def _robot_scores(
     run: Run, known: KnownPoses, alignments: Mapping[int, FloatArray], figures: Mapping[str, float]
 ) -> tuple[RobotScore, ...]:
     scores = []
-    for number, trajectory in enumerate(run.trajectories):
+    for number, trajectory in enumerate(run.trajectories.values()):
         true, estimated = _poses(known, known.truth.robots == number)
         joint, alone = alignments[trajectory.map_index], align(true, estimated)
         scores.append(
@@ -150,7 +150,7 @@ def _robot_scores(
 
 def _joins(run: Run, known: KnownPoses) -> tuple[Join, ...]:
     tracks = [TrackPair(*_poses(known, known.truth.robots == number)) for number in range(len(run.trajectories))]
-    robots = list(zip(run.trajectories, tracks, strict=True))
+    robots = list(zip(run.trajectories.values(), tracks, strict=True))
     return tuple(
         Join(a.robot, b.robot, *placement_error(track_a, track_b))
         for (a, track_a), (b, track_b) in combinations(robots, 2)

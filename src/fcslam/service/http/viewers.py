@@ -50,10 +50,12 @@ def fleet_router(state: ServiceState) -> APIRouter:
             packets=store.turn_count(),
             applied=store.applied(),
             waiting=store.waiting_count(),
-            robots=[robot.robot for robot in run.trajectories],
-            maps=len({robot.map_index for robot in run.trajectories}),
+            robots=list(run.trajectories),
+            maps=len({robot.map_index for robot in run.trajectories.values()}),
             # JSON has no NaN
-            metrics={metric.name: metric.value if math.isfinite(metric.value) else None for metric in run.metrics},
+            metrics={
+                name: metric.value if math.isfinite(metric.value) else None for name, metric in run.metrics.items()
+            },
         )
 
     @router.get("/robots")
@@ -85,7 +87,8 @@ def fleet_router(state: ServiceState) -> APIRouter:
     def get_vocabulary() -> dict[str, float]:
         """Words by channel and detector version."""
         prefix = "words_"
-        return {m.name.removeprefix(prefix): m.value for m in _live_run(state).metrics if m.name.startswith(prefix)}
+        metrics = _live_run(state).metrics
+        return {name.removeprefix(prefix): m.value for name, m in metrics.items() if name.startswith(prefix)}
 
     @router.get("/detectors")
     def get_detectors() -> list[DetectorSummary]:
@@ -104,7 +107,7 @@ def map_router(state: ServiceState) -> APIRouter:
     @router.get("/maps")
     def get_maps() -> list[MapSummary]:
         """Which robots share which map."""
-        robots = _live_run(state).trajectories
+        robots = _live_run(state).trajectories.values()
         numbers = sorted({robot.map_index for robot in robots})
         return [MapSummary(map=k, robots=[r.robot for r in robots if r.map_index == k]) for k in numbers]
 
@@ -151,7 +154,7 @@ def _live_folder(state: ServiceState) -> Path:
 
 
 def _live_run(state: ServiceState) -> Run:
-    return _run(_live_folder(state)) if state.mission.folder.live.exists() else Run(())
+    return _run(_live_folder(state)) if state.mission.folder.live.exists() else Run({})
 
 
 def _file(state: ServiceState, name: str, media_type: str = TEXT) -> FileResponse:
@@ -170,7 +173,7 @@ def _detectors(state: ServiceState) -> list[DetectorSummary]:
 
 
 def _sessions(state: ServiceState, robot: str) -> list[RobotSession]:
-    store, mapped = state.mission.store, {robot.robot: robot for robot in _live_run(state).trajectories}
+    store, mapped = state.mission.store, _live_run(state).trajectories
     told = []
     for session in store.sessions(robot):
         name = session_name(robot, session.epoch)
