@@ -396,7 +396,7 @@ def test_ctrl_c_while_writing_leaves_no_folder(tmp_path, log, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fcslam.runs.metrics_json", interrupt)
+    monkeypatch.setattr("fcslam.runs.folder.metrics_json", interrupt)
     assert run_map(log, "--output", tmp_path / "run") == 130
     assert names_in(tmp_path) == {"healthy.log"}
 
@@ -405,7 +405,7 @@ def test_a_disk_that_is_full_is_one_line(tmp_path, log, monkeypatch, capsys):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fcslam.runs.metrics_json", full)
+    monkeypatch.setattr("fcslam.runs.folder.metrics_json", full)
     assert "No space left" in refused(capsys, tmp_path, log, "--output", tmp_path / "run")
     assert names_in(tmp_path) == {"healthy.log"}
 
