@@ -14,14 +14,18 @@ APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire:
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 HAS_LEARNING := $(BIN)/python -c "import flwr, onnx, torch" 2>/dev/null
+# One worker per core. Workers share cores, so a library that starts its own threads gains nothing and slows the others.
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
+PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-system check bench proto
+.PHONY: help install gl learning demo test test-fast test-system check bench proto
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo         simulate a fleet, map it, compare with the truth, draw it all"
 	@echo "make test         the tests that need nothing but this folder"
+	@echo "make test-fast    those of them that take less than a second or two each"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings only if FCSLAM_DATA names their folder"
@@ -60,10 +64,13 @@ demo: gl learning
 	@$(BIN)/fcslam demo --output $(DEMO) $$($(HAS_GL) || echo --no-camera)
 
 test: $(INSTALLED)
-	@$(BIN)/python -m pytest -m "not system"
+	@$(PYTEST) -m "not system"
+
+test-fast: $(INSTALLED)
+	@$(PYTEST) -m "not system and not slow"
 
 test-system: $(INSTALLED)
-	@$(BIN)/python -m pytest -m system -rs
+	@$(PYTEST) -m system -rs
 
 check: $(INSTALLED)
 	@$(BIN)/ruff check .

@@ -12,11 +12,14 @@ from fcslam.simulation.truth import write_truth
 from fcslam.sources import write_carmen
 from fcslam.wire.messages import Packet
 from tests import small_fleet
+from tests.numba_cache import lock_numba_cache
 from tests.scripted import ScriptedMatcher
 
 # How long an example takes says something of the machine, and of code that is compiled at its first call.
 settings.register_profile("fcslam", deadline=None)
 settings.load_profile("fcslam")
+
+lock_numba_cache()
 
 
 @pytest.fixture(scope="session")
