@@ -45,14 +45,14 @@ def elsewhere():
 
 
 def judged(mapper, scans):
-    sight = mapper.look(scans[0])
-    return is_lost(scans, sight.tracked.T_local_base, mapper, CONFIG)
+    tracking = mapper.localize(scans[0])
+    return is_lost(scans, tracking.tracked.T_local_base, mapper, CONFIG)
 
 
 def test_looking_leaves_no_trace(around):
     looked, plain = mapped(around[:80]), mapped(around[:80])
     for scan in around[80:90]:
-        looked.look(scan)
+        looked.localize(scan)
     again = [looked.process(scan) for scan in around[80:90]]
     for step, other in zip(again, (plain.process(scan) for scan in around[80:90]), strict=True):
         assert np.array_equal(step.pose.T_keyscan_base, other.pose.T_keyscan_base)
@@ -63,7 +63,7 @@ def test_scans_of_one_drive_are_hardly_doubted_and_never_lost(around):
     mapper = mapped(around[:60])
     doubts = []
     for k in range(60, len(around) - 20):
-        doubts.append(is_doubtful(mapper.look(around[k]), mapper, CONFIG))
+        doubts.append(is_doubtful(mapper.localize(around[k]), mapper, CONFIG))
         if k % 25 == 0:
             assert not judged(mapper, around[k : k + 15])
         mapper.process(around[k])
@@ -73,7 +73,7 @@ def test_scans_of_one_drive_are_hardly_doubted_and_never_lost(around):
 def test_another_place_is_doubted_and_lost(around, elsewhere):
     before = around[:120]
     mapper, there = mapped(before), moved_on(elsewhere, before)
-    assert is_doubtful(mapper.look(there[0]), mapper, CONFIG)
+    assert is_doubtful(mapper.localize(there[0]), mapper, CONFIG)
     assert judged(mapper, there[:20])
 
 
@@ -97,7 +97,7 @@ def test_who_has_hardly_moved_cannot_be_lost(around, elsewhere):
     before = around[:15]
     mapper = mapped(before)
     assert 0.0 < mapper.travel_m < CONFIG.settled_m
-    assert not is_doubtful(mapper.look(moved_on(elsewhere, before)[0]), mapper, CONFIG)
+    assert not is_doubtful(mapper.localize(moved_on(elsewhere, before)[0]), mapper, CONFIG)
 
 
 def test_it_takes_a_way_and_several_scans_or_very_many(around):
@@ -112,4 +112,4 @@ def test_it_takes_a_way_and_several_scans_or_very_many(around):
 def test_what_was_not_matched_is_not_doubted(around):
     mapper = mapped(around[:60])
     nothing = replace(around[60], ranges_m=frozen(np.full(LASER.beam_count, LASER.max_range_m), np.float32))
-    assert not is_doubtful(mapper.look(nothing), mapper, CONFIG)
+    assert not is_doubtful(mapper.localize(nothing), mapper, CONFIG)

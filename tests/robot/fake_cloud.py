@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import DetectorFile
-from fcslam.wire.http_transport import Answer, CloudState, Refusal
+from fcslam.wire.http_transport import CloudState, HttpResponse, Refusal
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate
 from fcslam.wire.packets import decode, encode, readdress
 from tests.wire.examples import CLOSURE, CORRECTION, HELLO, packet
@@ -60,7 +60,7 @@ class FakeCloud:
             key = sent.epoch, sent.sequence
             if content(data) in self.unwanted:
                 self.refused[key] = "unwanted"
-                return Answer(refusal=Refusal(index, "unwanted"))
+                return HttpResponse(refusal=Refusal(index, "unwanted"))
             assert self.stored.setdefault(key, data) == data, "two packets of one number"
         epoch = decode(packets[0]).epoch if packets else max((e for e, _ in self.stored), default=0)
         answer = []
@@ -71,7 +71,7 @@ class FakeCloud:
             answer += [encode(packet(DetectorUpdate("alice", file))) for file in self.detector_updates]
         if self.correction > correction:
             answer.append(encode(replace(packet(replace(CORRECTION, version=self.correction)), epoch=epoch)))
-        return Answer(tuple(answer), refused=len(self.refused))
+        return HttpResponse(tuple(answer), refused=len(self.refused))
 
 
 class Network:
@@ -99,7 +99,7 @@ class Network:
             case "answer lost" | "twice" | "noise":
                 self.cloud.send(packets, correction)
         if fault == "noise":
-            return Answer((b"noise",))
+            return HttpResponse((b"noise",))
         if fault in ("none", "twice"):
             return self.cloud.send(packets, correction)
         raise UnavailableError("no answer")

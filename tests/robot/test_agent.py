@@ -10,7 +10,7 @@ from fcslam.errors import CloudError, StateError
 from fcslam.features.release import file_of
 from fcslam.geometry import se2
 from fcslam.records import Channel, Place
-from fcslam.robot.agent import Agent, Pace, Whereabouts
+from fcslam.robot.agent import Agent, LocalizationState, PlaybackPace
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
 from fcslam.wire.messages import Hello
@@ -21,7 +21,7 @@ from tests.robot.fake_cloud import FakeCloud, Network, content
 from tests.robot.kidnapping import kidnapping
 from tests.wire.examples import CORRECTION
 
-AS_FAST_AS_POSSIBLE = Pace(None, lambda: 0.0, lambda _: None)
+AS_FAST_AS_POSSIBLE = PlaybackPace(None, lambda: 0.0, lambda _: None)
 
 
 @pytest.fixture(scope="module")
@@ -208,20 +208,20 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         drive(tmp_path, Network(cloud), stop_after(scans, len(scans) - 5))
     seen = []
-    agent = drive(tmp_path, Network(cloud), scans, resume=True, watch=lambda now: seen.append(now.whereabouts))
+    agent = drive(tmp_path, Network(cloud), scans, resume=True, watch=lambda now: seen.append(now.localization))
     frontend = RobotFrontend("alice", RobotConfig())
     said = [packet for scan in scans for packet in frontend.process(scan)] + frontend.finish()
     assert {packet.epoch for packet in said} == {0, 1}
     assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(said)]
     assert list(cloud.stored) == [(packet.epoch, packet.sequence) for packet in said]
-    assert list(dict.fromkeys(seen)) == [Whereabouts.MAPPING, Whereabouts.LOST]
+    assert list(dict.fromkeys(seen)) == [LocalizationState.MAPPING, LocalizationState.LOST]
     assert agent.trajectory() is None
     newest = agent.localizer
     agent._localizer(0).correct(replace(CORRECTION, map_index=1))
     agent._localizer(1).correct(replace(CORRECTION, quality=0.5))
     now = agent.progress()
     assert agent.localizer is newest
-    assert (now.whereabouts, now.quality, now.map_index, now.times_lost) == (Whereabouts.RELOCALISED, 0.5, 0, 1)
+    assert (now.localization, now.quality, now.map_index, now.times_lost) == (LocalizationState.RELOCALISED, 0.5, 0, 1)
     stamps, poses = agent.trajectory()
     assert np.array_equal(stamps, [scan.stamp for scan in scans if scan.stamp >= stamps[0]])
     assert stamps[0] > moment, "where it was before is known as of then only"
@@ -250,7 +250,7 @@ def test_a_recording_is_played_by_its_own_clock():
         slept.append(seconds)
         now += seconds
 
-    pace = Pace(2.0, lambda: now, sleep)
+    pace = PlaybackPace(2.0, lambda: now, sleep)
     for stamp in (5.0, 6.0, 8.0):
         pace.wait(stamp)
     now += 10.0  # mapping took long: nothing is left out, the recording just comes late

@@ -17,7 +17,7 @@ class Frontend:
     def __init__(self):
         self.took = []
 
-    def adopt(self, file, path):
+    def set_detector(self, file, path):
         if path.read_bytes() == b"broken":
             raise FeatureError("it is broken")
         self.took.append(file.version)
@@ -47,7 +47,7 @@ def drive(updates, frontend, records, catching_up=0):
     taken = {}
     for number in records:
         before = len(frontend.took)
-        updates.take(number, number < catching_up)
+        updates.apply_due(number, number < catching_up)
         if frontend.took[before:]:
             (taken[number],) = frontend.took[before:]
     return taken
@@ -56,19 +56,19 @@ def drive(updates, frontend, records, catching_up=0):
 def test_what_was_fetched_is_taken_before_the_next_record(start):
     updates, frontend = start()
     assert drive(updates, frontend, range(3)) == {}
-    updates.keep(FIRST, b"network")
-    updates.keep(SECOND, b"network")
+    updates.store(FIRST, b"network")
+    updates.store(SECOND, b"network")
     assert drive(updates, frontend, range(3, 9)) == {3: FIRST.version, 4: "second"}
     assert updates.notice == "detector second from now on"
 
 
 def test_a_resumed_recording_takes_the_same_at_the_same_place(start):
     updates, frontend = start()
-    updates.keep(FIRST, b"network")
+    updates.store(FIRST, b"network")
     drive(updates, frontend, range(5, 9))
     again, frontend = start(resume=True)
-    again.keep(FIRST, b"network")  # it is announced again
-    again.keep(SECOND, b"network")
+    again.store(FIRST, b"network")  # it is announced again
+    again.store(SECOND, b"network")
     assert drive(again, frontend, range(20), catching_up=9) == {5: FIRST.version, 10: "second"}
     anew, frontend = start()
     assert drive(anew, frontend, range(20)) == {}, "another session"
@@ -77,16 +77,16 @@ def test_a_resumed_recording_takes_the_same_at_the_same_place(start):
 def test_news_wait_for_what_was_taken_before(start):
     """Even if nothing was said since then."""
     updates, frontend = start()
-    updates.keep(FIRST, b"network")
+    updates.store(FIRST, b"network")
     drive(updates, frontend, range(5, 9))
     again, frontend = start(resume=True)
-    again.keep(SECOND, b"network")
+    again.store(SECOND, b"network")
     assert drive(again, frontend, range(20)) == {5: FIRST.version, 6: "second"}
 
 
 def test_one_that_cannot_be_used_is_said_and_nothing_stops(start):
     updates, frontend = start()
-    updates.keep(FIRST, b"broken")
+    updates.store(FIRST, b"broken")
     assert drive(updates, frontend, range(3)) == {}
     assert updates.notice == f"detector {FIRST.version} not taken: it is broken"
 
@@ -95,14 +95,14 @@ def test_one_that_cannot_be_kept_is_one_line(start, tmp_path):
     updates, frontend = start()
     (tmp_path / "detectors").touch()
     with pytest.raises(StateError, match=f"detectors: detector {FIRST.version} cannot be kept there"):
-        updates.keep(FIRST, b"network")
+        updates.store(FIRST, b"network")
     assert drive(updates, frontend, range(3)) == {}
 
 
 def test_one_that_is_kept_again_replaces_the_file_in_one_piece(start, tmp_path, monkeypatch):
     """A resumed recording may need it, whatever interrupts the writing."""
     updates, frontend = start()
-    updates.keep(FIRST, b"network")
+    updates.store(FIRST, b"network")
     drive(updates, frontend, range(5, 9))
     again, frontend = start(resume=True)
 
@@ -111,6 +111,6 @@ def test_one_that_is_kept_again_replaces_the_file_in_one_piece(start, tmp_path, 
 
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(StateError, match="no space left"):
-        again.keep(FIRST, b"network")
+        again.store(FIRST, b"network")
     assert [file.read_bytes() for file in (tmp_path / "detectors").glob("*.onnx")] == [b"network"]
     assert drive(again, frontend, range(20), catching_up=9) == {5: FIRST.version}

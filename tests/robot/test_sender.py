@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fcslam.errors import CloudError, OversizeError, StateError, UnavailableError
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import ASK_AFTER_S, EVERY_S, LONGEST_RETRY_S, Sender, retry_delay_s
-from fcslam.wire.http_transport import Answer
+from fcslam.wire.http_transport import HttpResponse
 from fcslam.wire.packets import decode, encode
 from tests.robot.fake_cloud import FakeCloud, Network, content, said
 from tests.wire.examples import DETECTOR_UPDATE, HELLO, LIDAR_PLACE
@@ -247,7 +247,7 @@ def test_a_single_packet_that_is_too_large_is_told(robot):
 def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):
     class Deaf(Network):
         def send(self, *_):
-            return Answer()
+            return HttpResponse()
 
     deaf = Deaf(FakeCloud())
     robot.sender._transport = deaf

@@ -11,8 +11,8 @@ from fcslam.features.detector import SHIPPED_NETWORK
 from fcslam.features.kinds import DetectorKind
 from fcslam.features.release import file_of
 from fcslam.records import CameraImage, Channel, DetectorFile, LaserScan, Place
-from fcslam.robot.album import AlbumConfig
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.image_buffer import ImageBufferConfig
 from fcslam.robot.views import ViewsConfig
 from fcslam.wire.messages import DetectorUpdate, Hello
 from fcslam.wire.packets import decode, encode
@@ -35,7 +35,7 @@ def driven(robot, records, switch_after=None):
     packets = []
     for number, record in enumerate(records):
         if number == switch_after:
-            robot.adopt(SHIPPED, SHIPPED_NETWORK)
+            robot.set_detector(SHIPPED, SHIPPED_NETWORK)
         packets += robot.process(record)
     return packets + robot.finish()
 
@@ -72,7 +72,7 @@ def content(packets):
 
 
 def test_a_robot_that_keeps_no_images_describes_none_again(seen):
-    config = replace_album(WITH_ORB, AlbumConfig(most_images=0))
+    config = with_image_buffer(WITH_ORB, ImageBufferConfig(most_images=0))
     half = len(seen) // 2
     packets = driven(RobotFrontend("r", config), seen, half)
     numbers = [packet.body.id.number for packet in packets if isinstance(packet.body, Place)]
@@ -80,8 +80,8 @@ def test_a_robot_that_keeps_no_images_describes_none_again(seen):
     assert places(packets, SHIPPED.version)
 
 
-def replace_album(config, album):
-    return config.model_copy(update={"views": config.views.model_copy(update={"album": album})})
+def with_image_buffer(config, image_buffer):
+    return config.model_copy(update={"views": config.views.model_copy(update={"image_buffer": image_buffer})})
 
 
 def test_a_detector_that_comes_before_the_first_scan_is_announced_once(seen):
@@ -97,9 +97,9 @@ def test_going_back_and_forth_describes_nothing_twice(seen, tmp_path):
     changes = {len(seen) // 3: tmp_path / "tiny.onnx", len(seen) // 2: SHIPPED_NETWORK, len(seen) - 1: SHIPPED_NETWORK}
     for number, record in enumerate(seen):
         if number in changes:
-            robot.adopt(file_of(changes[number]), changes[number])
+            robot.set_detector(file_of(changes[number]), changes[number])
         packets += robot.process(record)
-    robot.adopt(file_of(tmp_path / "tiny.onnx"), tmp_path / "tiny.onnx")
+    robot.set_detector(file_of(tmp_path / "tiny.onnx"), tmp_path / "tiny.onnx")
     packets += robot.finish()  # the last change is told even though no scan comes after it
     announced = [packet.body.detector_versions[Channel.CAMERA] for packet in packets if isinstance(packet.body, Hello)]
     assert announced == [SHIPPED.version, "tiny-1", SHIPPED.version, "tiny-1"]
@@ -123,9 +123,9 @@ def test_what_is_not_the_file_that_was_announced_changes_nothing(seen, tmp_path)
         (replace(tiny, channel=Channel.LIDAR), tmp_path / "tiny.onnx", "describes lidar places"),
     ):
         with pytest.raises(FeatureError, match=reason):
-            robot.adopt(file, path)
+            robot.set_detector(file, path)
     with pytest.raises(FeatureError, match="takes none"):
-        RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,))).adopt(tiny, tmp_path / "tiny.onnx")
+        RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,))).set_detector(tiny, tmp_path / "tiny.onnx")
     untouched = driven(RobotFrontend("r", WITH_ORB), seen[:40])
     assert [encode(packet) for packet in driven(robot, seen[:40])] == [encode(packet) for packet in untouched]
 

@@ -7,7 +7,7 @@ import pytest
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import Channel
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch
-from fcslam.wire.http_transport import Answer, HttpTransport, Refusal
+from fcslam.wire.http_transport import HttpResponse, HttpTransport, Refusal
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode, encode
 from tests.federated.authority import certificates
@@ -63,13 +63,13 @@ def test_a_batch_that_is_too_large_is_an_error_of_its_own(cloud, transport):
 
 
 def test_asking_for_what_is_new_sends_no_bytes(cloud, transport):
-    assert transport.send((), -1) == Answer()
+    assert transport.send((), -1) == HttpResponse()
     assert cloud.requests[0][3] == b""
 
 
 def test_a_refused_packet_is_told_by_its_place(cloud, transport):
     cloud.canned.append(error(400, "bad", index=1))
-    assert transport.send(PACKETS, -1) == Answer(refusal=Refusal(1, f"{cloud.url}: bad (400)"))
+    assert transport.send(PACKETS, -1) == HttpResponse(refusal=Refusal(1, f"{cloud.url}: bad (400)"))
 
 
 @pytest.mark.parametrize(

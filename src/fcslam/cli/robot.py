@@ -120,9 +120,9 @@ def robot(
     """Be one robot: map a recording, send places and keyscans to the cloud, through outages and restarts."""
     from rich.console import Console
 
-    from fcslam.robot.agent import Pace
+    from fcslam.robot.agent import PlaybackPace
 
-    pace = Pace(_speed(speed), time.monotonic, time.sleep)
+    pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
     settings = _settings(config)
     argument = source if name is None else f"{name}={source}"
     recording = open_recording(argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
@@ -285,13 +285,13 @@ def _progress(console: "Console", total: int) -> "Iterator[AgentWatch]":
         def watch(now: "AgentProgress") -> None:
             nonlocal trouble, notices, whereabouts, times_lost
             lines = [now.trouble or "connected"] * (now.trouble != trouble)
-            if (now.whereabouts, now.times_lost) != (whereabouts, times_lost):
+            if (now.localization, now.times_lost) != (whereabouts, times_lost):
                 lines.append(_found(now, times_lost))
-            whereabouts, times_lost = now.whereabouts, now.times_lost
+            whereabouts, times_lost = now.localization, now.times_lost
             for line in [*lines, *(notice for notice in now.notices if notice not in notices)]:
                 console.print(line, highlight=False, markup=False, soft_wrap=True)
             trouble, notices = now.trouble, now.notices
-            stage = "catching up" if now.catching_up else str(now.whereabouts) if now.scans < total else "sending"
+            stage = "catching up" if now.catching_up else str(now.localization) if now.scans < total else "sending"
             bar.update(task, completed=now.scans, stage=stage, what=_what(now))
 
         yield watch

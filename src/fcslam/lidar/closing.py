@@ -31,7 +31,7 @@ class ClosingConfig(Settings):
     """Loop closing inside one robot."""
 
     gap_m: float = Field(default=12.0, gt=0, description="travel that must lie between two submaps to be compared")
-    sight_m: float = Field(default=8.0, gt=0, description="anchors farther apart than this share too little sight")
+    sight_m: float = Field(default=8.0, gt=0, description="anchors farther apart than this share too little tracking")
     candidates: int = Field(default=4, gt=0, description="earlier visits compared with one submap")
     drift: float = Field(default=0.03, gt=0, description="drift allowed for, per metre of path through the graph")
     drift_rad_m: float = Field(default=0.006, gt=0, description="the same in heading")
@@ -41,7 +41,7 @@ class ClosingConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Anchored:
+class AnchoredSubmap:
     """A submap with where it hangs in the pose graph."""
 
     keyscan: int
@@ -51,7 +51,7 @@ class Anchored:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Closure:
+class LocalClosure:
     """A verified closure between the anchors of two submaps (indices into the closer's list)."""
 
     earlier: int
@@ -80,16 +80,16 @@ class LoopCloser:
         self._config = config
         self._search = search_config
         self._verification = verification
-        self.places: list[Anchored] = []
-        self._accepted: list[Closure] = []
-        self._pending: list[Closure] = []
+        self.places: list[AnchoredSubmap] = []
+        self._accepted: list[LocalClosure] = []
+        self._pending: list[LocalClosure] = []
 
     @property
     def has_closures(self) -> bool:
         """Whether any closure was accepted."""
         return bool(self._accepted)
 
-    def add(self, place: Anchored, poses: Sequence[FloatArray]) -> list[Closure]:
+    def add(self, place: AnchoredSubmap, poses: Sequence[FloatArray]) -> list[LocalClosure]:
         """Take in the next submap; closures that hold now (of it, and of earlier ones it supports).
 
         ``poses``: T_map_base of every keyscan so far.
@@ -137,7 +137,7 @@ class LoopCloser:
         best.sort(key=lambda k: distance[k])
         return best[: self._config.candidates]
 
-    def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> Closure | None:
+    def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> LocalClosure | None:
         a, b = self.places[earlier].submap, self.places[later].submap
         predicted = se2.between(anchors[earlier], anchors[later])
         radius, angle = self._slack(path_m)
@@ -151,14 +151,14 @@ class LoopCloser:
         check = verify(a, b, guess, self._verification)
         innovation = se2.between(predicted, check.T_a_b)
         off = np.hypot(innovation[0], innovation[1])
-        if not (check.loose or check.testimony) or off > radius + 0.3 or abs(innovation[2]) > angle + 0.1:
+        if not (check.loose or check.support) or off > radius + 0.3 or abs(innovation[2]) > angle + 0.1:
             return None
-        return Closure(earlier, later, check, innovation, radius)
+        return LocalClosure(earlier, later, check, innovation, radius)
 
-    def _judge(self, found: list[Closure], anchors: FloatArray) -> list[Closure]:
+    def _judge(self, found: list[LocalClosure], anchors: FloatArray) -> list[LocalClosure]:
         """Closures near their prediction hold at once; others wait until enough of them agree."""
         sure = [c for c in found if self._is_expected(c) or self._is_plain(c)]
-        self._pending += [c for c in found if c not in sure and c.check.testimony]
+        self._pending += [c for c in found if c not in sure and c.check.support]
         self._pending = [
             c for c in self._pending if self.places[-1].travel_m - self.places[c.later].travel_m < PENDING_M
         ]
@@ -169,30 +169,30 @@ class LoopCloser:
         return sure
 
     @staticmethod
-    def _is_expected(closure: Closure) -> bool:
+    def _is_expected(closure: LocalClosure) -> bool:
         """Near the prediction while little drift is to be allowed for."""
         return closure.check.loose and closure.slack_m <= NARROW_M
 
     @staticmethod
-    def _is_plain(closure: Closure) -> bool:
-        """A wide closure that stands alone: informative, rich, and close to where it was expected."""
+    def _is_plain(closure: LocalClosure) -> bool:
+        """A wide closure that stands alone: informative, partial, and close to where it was expected."""
         worse = closure.check.worse
         near = closure.off_m < 0.3 * closure.slack_m + 0.2
         return closure.check.strict and closure.check.informative and worse.overlap > 0.4 and near
 
-    def _cluster(self, anchors: FloatArray) -> list[Closure]:
+    def _cluster(self, anchors: FloatArray) -> list[LocalClosure]:
         """The pending closures that agree with the newest one, if they are enough."""
         if not self._pending:
             return []
         newest = self._pending[-1]
         agreeing = [c for c in self._pending if self._agree(c, newest, anchors)]
         spread = np.ptp([self.places[c.later].travel_m for c in agreeing])
-        testimony = sum(c.check.testimony for c in agreeing)
-        if testimony >= 3.0 and spread >= 3.0 and any(c.check.informative for c in agreeing):
+        support = sum(c.check.support for c in agreeing)
+        if support >= 3.0 and spread >= 3.0 and any(c.check.informative for c in agreeing):
             return agreeing
         return []
 
-    def _agree(self, a: Closure, b: Closure, anchors: FloatArray) -> bool:
+    def _agree(self, a: LocalClosure, b: LocalClosure, anchors: FloatArray) -> bool:
         """Whether going round both closures and the estimates between their ends leads back to the start."""
         earlier = se2.between(anchors[a.earlier], anchors[b.earlier])
         later = se2.between(anchors[a.later], anchors[b.later])

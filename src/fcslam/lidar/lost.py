@@ -13,7 +13,7 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.mapper import Mapper
-from fcslam.lidar.tracker import Sight
+from fcslam.lidar.tracker import TrackingResult
 from fcslam.lidar.verification import verify
 from fcslam.records import FloatArray, LaserScan
 
@@ -38,10 +38,10 @@ class LostConfig(Settings):
     overlap: float = Field(default=0.25, ge=0, le=1, description="least share of points in known area to tell")
 
 
-def is_doubtful(sight: Sight, mapper: Mapper, config: LostConfig) -> bool:
+def is_doubtful(tracking: TrackingResult, mapper: Mapper, config: LostConfig) -> bool:
     """Whether a scan seems to show another place than the scans before it."""
     # False for a scan that was not matched, as both are NaN.
-    return mapper.travel_m >= config.settled_m and sight.explained < config.doubted * sight.known
+    return mapper.travel_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
 
 
 def is_enough(scans: Sequence[LaserScan], config: LostConfig) -> bool:
@@ -63,7 +63,7 @@ def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, mapper: Mappe
     anew = Mapper(mapper.robot, mapper.config)
     if not _agree(scans, anew, config):
         return False
-    (seen, T_local_seen), (now, T_first_now) = mapper.surroundings(), anew.surroundings()
+    (seen, T_local_seen), (now, T_first_now) = mapper.recent_submap(), anew.recent_submap()
     predicted = se2.between(T_local_seen, se2.compose(T_local_first, T_first_now))
     worse = verify(seen, now, predicted, mapper.config.verification).worse
     return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
@@ -73,8 +73,8 @@ def _agree(scans: Sequence[LaserScan], anew: Mapper, config: LostConfig) -> bool
     """Whether scans explain one another, mapped anew: where even they do not, nothing can be told from the rest."""
     shares = []
     for scan in scans:
-        sight = anew.look(scan)
-        anew.process(scan, sight)
-        if sight.known > 0.0:  # not so for a scan that was not matched
-            shares.append(sight.explained / sight.known)
+        tracking = anew.localize(scan)
+        anew.process(scan, tracking)
+        if tracking.known > 0.0:  # not so for a scan that was not matched
+            shares.append(tracking.explained / tracking.known)
     return bool(shares) and bool(np.median(shares) >= config.agreeing)

@@ -11,11 +11,11 @@ from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.lidar.closing import Anchored, ClosingConfig, Closure, LoopCloser
+from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LocalClosure, LoopCloser
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.lidar.tracker import ScanTracker, Sight, Tracked, TrackerConfig, odometry_information
+from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackerConfig, TrackingResult, odometry_information
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, KeyscanId, LaserScan, Ranges, frozen
 
@@ -95,15 +95,15 @@ class Mapper:
         self._next_anchor_m = 0.0
         self._unsolved = 0
 
-    def look(self, scan: LaserScan) -> Sight:
+    def localize(self, scan: LaserScan) -> TrackingResult:
         """The next scan, which leaves no trace before it is processed."""
-        return self._tracker.look(scan)
+        return self._tracker.localize(scan)
 
-    def process(self, scan: LaserScan, sight: Sight | None = None) -> Step:
+    def process(self, scan: LaserScan, tracking: TrackingResult | None = None) -> Step:
         """Take in the next scan, as it was seen if it was looked at before."""
-        sight = self._tracker.look(scan) if sight is None else sight
-        self._tracker.follow(sight)
-        tracked = sight.tracked
+        tracking = self._tracker.localize(scan) if tracking is None else tracking
+        self._tracker.commit(tracking)
+        tracked = tracking.tracked
         if not self._is_keyscan(tracked):
             return Step(self._scan_pose(scan.stamp, tracked))
         keyscan, odometry = self._add_keyscan(scan, tracked)  # pose graph grows
@@ -115,7 +115,7 @@ class Mapper:
         """Path length up to the newest keyscan; turning counts a little."""
         return self._travel[-1] if self._travel else 0.0
 
-    def surroundings(self) -> tuple[Submap, FloatArray]:
+    def recent_submap(self) -> tuple[Submap, FloatArray]:
         """What the robot saw on the last ``submap_reach_m`` of its way, and ``T_local_base`` of the anchor, the newest
         keyscan."""
         anchor = self._local[-1]
@@ -136,7 +136,7 @@ class Mapper:
             self._poses = list(optimize_gnc(self._graph, self._poses, factors=self._factors).poses)
         return np.array(self._poses).reshape(-1, 3)
 
-    def _is_keyscan(self, tracked: Tracked) -> bool:
+    def _is_keyscan(self, tracked: TrackedScan) -> bool:
         if tracked.scan is None:
             return False
         if not self._local:
@@ -148,11 +148,11 @@ class Mapper:
             or abs(motion[2]) >= gate.minimum_travel_heading_rad
         )
 
-    def _scan_pose(self, stamp: float, tracked: Tracked) -> ScanPose:
+    def _scan_pose(self, stamp: float, tracked: TrackedScan) -> ScanPose:
         number = len(self._local) - 1
         return ScanPose(stamp, number, se2.between(self._local[number], tracked.T_local_base))
 
-    def _add_keyscan(self, scan: LaserScan, tracked: Tracked) -> tuple[Keyscan, Constraint | None]:
+    def _add_keyscan(self, scan: LaserScan, tracked: TrackedScan) -> tuple[Keyscan, Constraint | None]:
         """New variable of the pose graph, tied to the keyscan before it."""
         points = tracked.scan or point_scan(scan.ranges_m, scan.laser)
         number = len(self._local)
@@ -192,10 +192,10 @@ class Mapper:
         submap = build_submap([(self._points[first + k], pose) for k, pose in enumerate(T_anchor)])
         for number in [k for k in self._points if k < first]:
             del self._points[number]
-        closures = self._close_loops(Anchored(anchor, travel[anchor], submap))
+        closures = self._close_loops(AnchoredSubmap(anchor, travel[anchor], submap))
         return FinishedSubmap(anchor, first, last, submap.surface.points, closures)
 
-    def _close_loops(self, place: Anchored) -> tuple[Constraint, ...]:
+    def _close_loops(self, place: AnchoredSubmap) -> tuple[Constraint, ...]:
         """Compare the new submap with earlier ones; what holds becomes constraints."""
         closures = self._closer.add(place, self._poses)
         constraints = tuple(self._constraint(closure) for closure in closures)
@@ -204,14 +204,14 @@ class Mapper:
         self._optimize_if_needed(closures)
         return constraints
 
-    def _constraint(self, closure: Closure) -> Constraint:
+    def _constraint(self, closure: LocalClosure) -> Constraint:
         places = self._closer.places
         return Constraint(
             self.robot, places[closure.earlier].keyscan, places[closure.later].keyscan, ConstraintKind.CLOSURE,
             frozen(closure.check.T_a_b), frozen(closure.check.information),
         )  # fmt: skip
 
-    def _optimize_if_needed(self, closures: list[Closure]) -> None:
+    def _optimize_if_needed(self, closures: list[LocalClosure]) -> None:
         """Solve at once when a closure says that the estimate is off, else only now and then."""
         self._unsolved += len(closures)
         enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._local))
@@ -220,7 +220,7 @@ class Mapper:
             self._unsolved = 0
 
 
-def motion_information(motion: FloatArray, tracked: Tracked) -> FloatArray:
+def motion_information(motion: FloatArray, tracked: TrackedScan) -> FloatArray:
     """Information of the motion between two keyscans, in the coordinates of the later one, shape (3, 3).
 
     Neighbouring points err together, so they count a tenth; odometry holds what they leave open (along a corridor).

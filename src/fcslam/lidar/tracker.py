@@ -33,7 +33,7 @@ class TrackerConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Tracked:
+class TrackedScan:
     """One scan's pose in the tracker's own smooth frame."""
 
     T_local_base: FloatArray
@@ -44,10 +44,10 @@ class Tracked:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class TrackingResult:
     """One scan as the tracker sees it; it goes on from there once it is told to follow."""
 
-    tracked: Tracked
+    tracked: TrackedScan
     explained: float
     """Share of the scan's points that lie on a surface of the running buffer, matched or not."""
     known: float
@@ -73,34 +73,34 @@ class ScanTracker:
         self._moved_m = 0.0
         self._turned_rad = 0.0
 
-    def track(self, scan: LaserScan) -> Tracked:
+    def track(self, scan: LaserScan) -> TrackedScan:
         """Pose of the next scan."""
-        sight = self.look(scan)
-        self.follow(sight)
-        return sight.tracked
+        tracking = self.localize(scan)
+        self.commit(tracking)
+        return tracking.tracked
 
-    def look(self, scan: LaserScan) -> Sight:
+    def localize(self, scan: LaserScan) -> TrackingResult:
         """The next scan, which leaves no trace before ``follow``."""
         T_local_guess, moved_m, turned_rad = self._predict(scan)
         if self._fields and moved_m < self._config.still_m and turned_rad < self._config.still_rad:
-            tracked = Tracked(T_local_guess, np.zeros((3, 3)), None)
-            return Sight(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad)
+            tracked = TrackedScan(T_local_guess, np.zeros((3, 3)), None)
+            return TrackingResult(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad)
         points = point_scan(scan.ranges_m, scan.laser)
         if not self._fields:
-            tracked = Tracked(T_local_guess, np.zeros((3, 3)), points)
-            return Sight(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad)
+            tracked = TrackedScan(T_local_guess, np.zeros((3, 3)), points)
+            return TrackingResult(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad)
         match = self._match(points, T_local_guess, odometry_information(moved_m, turned_rad))
         if match.explained < self._config.supported:
-            tracked = Tracked(T_local_guess, np.zeros((3, 3)), points)
-            return Sight(tracked, match.explained, match.known, scan.T_odom_base, moved_m, turned_rad)
-        tracked = Tracked(match.T_field_base, match.information, points)
-        return Sight(tracked, match.explained, match.known, scan.T_odom_base, 0.0, 0.0)
+            tracked = TrackedScan(T_local_guess, np.zeros((3, 3)), points)
+            return TrackingResult(tracked, match.explained, match.known, scan.T_odom_base, moved_m, turned_rad)
+        tracked = TrackedScan(match.T_field_base, match.information, points)
+        return TrackingResult(tracked, match.explained, match.known, scan.T_odom_base, 0.0, 0.0)
 
-    def follow(self, sight: Sight) -> None:
+    def commit(self, tracking: TrackingResult) -> None:
         """The robot is where ``look`` saw it."""
-        self._T_local_base = sight.tracked.T_local_base
-        self._T_odom_base = sight.T_odom_base
-        self._moved_m, self._turned_rad = sight.moved_m, sight.turned_rad
+        self._T_local_base = tracking.tracked.T_local_base
+        self._T_odom_base = tracking.T_odom_base
+        self._moved_m, self._turned_rad = tracking.moved_m, tracking.turned_rad
 
     def insert(self, points: PointScan, T_local_base: FloatArray) -> None:
         """Add a keyscan to the running buffer."""

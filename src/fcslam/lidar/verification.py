@@ -38,7 +38,7 @@ class LooseGate(Gate):
     violation: float = Field(default=0.10, ge=0, le=1, description="as in strict")
 
 
-class RichGate(Gate):
+class PartialGate(Gate):
     """The same for half a witness: much is seen, but the submaps are bent (outdoors, on a slope)."""
 
     explained: float = Field(default=0.65, ge=0, le=1, description="as in strict")
@@ -52,7 +52,7 @@ class VerificationConfig(Settings):
 
     strict: Gate = Field(default=Gate(), description="gate without a prediction")
     loose: LooseGate = Field(default=LooseGate(), description="gate where a closure is predicted")
-    rich: RichGate = Field(default=RichGate(), description="gate for half a witness: much is seen, but bent")
+    partial: PartialGate = Field(default=PartialGate(), description="gate for half a witness: much is seen, but bent")
     informative: float = Field(
         default=30.0, ge=0, description="least small eigenvalue of the normal tensor: below, it may be a corridor"
     )
@@ -74,15 +74,15 @@ class Verification:
     small submap may lie within a large one."""
     strict: bool
     loose: bool
-    rich: bool
+    partial: bool
     informative: bool
     reason: str
     """Why it is not more, in words; empty if strict and informative."""
 
     @property
-    def testimony(self) -> float:
-        """What it counts for in a cluster of closures that agree: 1 if strict, a half if only rich, else nothing."""
-        return 1.0 if self.strict else 0.5 * self.rich
+    def support(self) -> float:
+        """What it counts for in a cluster of closures that agree: 1 if strict, a half if only partial, else nothing."""
+        return 1.0 if self.strict else 0.5 * self.partial
 
 
 def verify(
@@ -125,7 +125,7 @@ def verify(
         worse=worse,
         strict=symmetric and not strict_reason,
         loose=symmetric and not _shortfall(worse, config.loose),
-        rich=symmetric and informative and not _shortfall(worse, config.rich),
+        partial=symmetric and informative and not _shortfall(worse, config.partial),
         informative=informative,
         reason=reason if symmetric else "the two directions of the alignment disagree",
     )

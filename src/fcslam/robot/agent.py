@@ -19,7 +19,7 @@ from fcslam.robot.budget import Budget
 from fcslam.robot.detector_updates import DetectorUpdates
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.localization import Localizer
-from fcslam.robot.outbox import Outbox, Waiting
+from fcslam.robot.outbox import Outbox, WaitingPackets
 from fcslam.robot.sender import Sender
 from fcslam.wire.http_transport import BatchTransport
 from fcslam.wire.messages import Packet
@@ -30,7 +30,7 @@ FAREWELL_S = 2.0
 """How long a request under way may take when the robot stops; what it brought is sent again next time."""
 
 
-class Whereabouts(StrEnum):
+class LocalizationState(StrEnum):
     """Whether a robot knows where it is."""
 
     MAPPING = "mapping"
@@ -47,7 +47,7 @@ class AgentProgress:
 
     scans: int
     keyscans: int
-    waiting: Waiting
+    waiting: WaitingPackets
     """Packets that the cloud has not confirmed."""
     confirmed: int
     """Packets that it has."""
@@ -72,17 +72,17 @@ class AgentProgress:
     announced, if there were any."""
 
     @property
-    def whereabouts(self) -> Whereabouts:
+    def localization(self) -> LocalizationState:
         """Whether the robot knows where it is, as far as it needed to find out."""
         if not self.times_lost:
-            return Whereabouts.MAPPING
-        return Whereabouts.RELOCALISED if self.quality > 0.0 else Whereabouts.LOST
+            return LocalizationState.MAPPING
+        return LocalizationState.RELOCALISED if self.quality > 0.0 else LocalizationState.LOST
 
 
 AgentWatch = Callable[[AgentProgress], None]
 
 
-class Pace:
+class PlaybackPace:
     """Plays a recording by its own clock."""
 
     def __init__(self, speed: float | None, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
@@ -122,13 +122,13 @@ class Agent:
         self._localizers: dict[int, Localizer] = {}
         """Of every part of this start: each has a frame of its own."""
         self._sender = Sender(
-            outbox, transport, rng, clock, self._correct, self._detector_updates.keep, self._keep_refused
+            outbox, transport, rng, clock, self._correct, self._detector_updates.store, self._keep_refused
         )
         self._kept: int | None = None
         """Files of refused packets, once they were counted: there may be many."""
         self._known = self._said = self._keyscans = self._crowded_out = 0
 
-    def run(self, records: Iterable[SensorRecord], known: int, pace: Pace, watch: AgentWatch) -> None:
+    def run(self, records: Iterable[SensorRecord], known: int, pace: PlaybackPace, watch: AgentWatch) -> None:
         """Map a whole recording and send all of it; ``known`` packets of it were said before, and hurry by.
 
         Raises:
@@ -140,7 +140,7 @@ class Agent:
         self._detector_updates.resume()
         with self._sending():
             for number, record in enumerate(records):
-                self._detector_updates.take(number, self._said < known)
+                self._detector_updates.apply_due(number, self._said < known)
                 if isinstance(record, LaserScan) and self._said >= known:
                     pace.wait(record.stamp)
                 self._say(self._frontend.process(record))

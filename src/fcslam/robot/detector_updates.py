@@ -30,7 +30,7 @@ class DetectorUpdates:
         """Look up what the session, once begun, took before it was stopped."""
         self._taken = self._outbox.detector_updates()
 
-    def keep(self, file: DetectorFile, content: bytes) -> None:
+    def store(self, file: DetectorFile, content: bytes) -> None:
         """Called by the sender: here is what was announced.
 
         Raises:
@@ -45,7 +45,7 @@ class DetectorUpdates:
             ) from error
         self._fetched.put(file)
 
-    def take(self, record: int, catching_up: bool) -> None:
+    def apply_due(self, record: int, catching_up: bool) -> None:
         """Called before each record, which are counted from 0: let the front end have what is due."""
         file = self._taken.get(record)
         is_news = not catching_up and record > max(self._taken, default=-1)
@@ -58,7 +58,7 @@ class DetectorUpdates:
         if file is None:
             return
         try:
-            self._frontend.adopt(file, self._path(file))
+            self._frontend.set_detector(file, self._path(file))
             self.notice = f"detector {file.version} from now on"
         except FeatureError as error:
             self.notice = f"detector {file.version} not taken: {error}"

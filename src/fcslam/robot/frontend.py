@@ -14,8 +14,8 @@ from fcslam.errors import FeatureError
 from fcslam.lidar.lost import LostConfig, is_doubtful, is_enough, is_lost
 from fcslam.lidar.mapper import ScanPose
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord
-from fcslam.robot.session import Session, SessionConfig
-from fcslam.robot.views import ViewFinder
+from fcslam.robot.session import RobotSession, SessionConfig
+from fcslam.robot.views import ViewExtractor
 from fcslam.wire.messages import Packet
 from fcslam.wire.quantisation import dequantise, quantise
 
@@ -37,7 +37,7 @@ class RobotFrontend:
         self.tracks: list[list[ScanPose]] = []
         """Poses of the scans of every session."""
         self._config = config
-        self._view_finder = ViewFinder(config.views)
+        self._view_extractor = ViewExtractor(config.views)
         self._put_by: list[LaserScan | CameraImage] = []
         """From the first scan on that is doubtful."""
         self._T_local_doubted: FloatArray | None = None
@@ -61,7 +61,7 @@ class RobotFrontend:
                 self._session.process_image(record)
         return []  # a scan brings its own odometry; images never leave the robot
 
-    def adopt(self, file: DetectorFile, path: Path) -> None:
+    def set_detector(self, file: DetectorFile, path: Path) -> None:
         """Describe camera images by another network from now on, and, with the next scan, those that are still here.
 
         Args:
@@ -73,8 +73,8 @@ class RobotFrontend:
         """
         if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
             raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
-        if file.version != self._view_finder.detector_version:
-            self._view_finder.take(file, path)
+        if file.version != self._view_extractor.detector_version:
+            self._view_extractor.set_detector(file, path)
 
     def finish(self) -> list[Packet]:
         """The packets of what was still open when the recording ended."""
@@ -82,13 +82,13 @@ class RobotFrontend:
 
     def _process_scan(self, scan: LaserScan) -> list[Packet]:
         mapper, config = self._session.mapper, self._config.lost
-        sight = mapper.look(scan)
-        if not is_doubtful(sight, mapper, config):
+        tracking = mapper.localize(scan)
+        if not is_doubtful(tracking, mapper, config):
             if self._put_by:
                 return [*self._go_on(), *self._session.process_scan(scan)]
-            return self._session.process_scan(scan, sight)
+            return self._session.process_scan(scan, tracking)
         if self._T_local_doubted is None:
-            self._T_local_doubted = sight.tracked.T_local_base
+            self._T_local_doubted = tracking.tracked.T_local_base
         self._put_by.append(scan)
         scans = [record for record in self._put_by if isinstance(record, LaserScan)]
         if not is_enough(scans, config):
@@ -96,12 +96,12 @@ class RobotFrontend:
         if not is_lost(scans, self._T_local_doubted, mapper, config):
             return self._go_on()
         rest = self._session.finish()
-        self._view_finder.forget()
+        self._view_extractor.reset()
         self._session = self._begin(self._session.time)
         return [*rest, *self._go_on()]
 
-    def _begin(self, time: float) -> Session:
-        session = Session(self.robot, len(self.tracks), time, self._view_finder, self._config)
+    def _begin(self, time: float) -> RobotSession:
+        session = RobotSession(self.robot, len(self.tracks), time, self._view_extractor, self._config)
         self.tracks.append(session.scan_poses)
         return session
 

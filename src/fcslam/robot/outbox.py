@@ -49,7 +49,7 @@ CREATE INDEX IF NOT EXISTS waiting ON packets (epoch, sequence) WHERE data IS NO
 # the epoch belongs to this start; stored: packets of the epoch, from its first, that the cloud has confirmed.
 
 
-class Batch(NamedTuple):
+class PacketBatch(NamedTuple):
     """Packets of one epoch that travel next, oldest first."""
 
     epoch: int
@@ -58,7 +58,7 @@ class Batch(NamedTuple):
     packets: tuple[bytes, ...]
 
 
-class Waiting(NamedTuple):
+class WaitingPackets(NamedTuple):
     """What is not confirmed yet."""
 
     packets: int
@@ -89,7 +89,7 @@ class Outbox:
         except StateError:
             self.close()
             raise
-        self.waiting = Waiting(*self._count("data IS NOT NULL"))
+        self.waiting = WaitingPackets(*self._count("data IS NOT NULL"))
         """What is not confirmed yet, of all sessions."""
 
     def close(self) -> None:
@@ -160,7 +160,7 @@ class Outbox:
                 (number,) = self._one("SELECT coalesce(max(sequence) + 1, 0) FROM packets WHERE epoch = ?", epoch)
                 sent = readdress(data, epoch, number)
                 self._insert(epoch, packet.sequence, digest, number, sent)
-                self.waiting = Waiting(self.waiting.packets + 1, self.waiting.bytes + len(sent))
+                self.waiting = WaitingPackets(self.waiting.packets + 1, self.waiting.bytes + len(sent))
         return left_out
 
     def record_detector_update(self, record: int, file: DetectorFile) -> None:
@@ -176,7 +176,7 @@ class Outbox:
             rows = self._database.execute(f"SELECT {columns} FROM releases WHERE epoch >= ?", (self._first,)).fetchall()
         return {record: DetectorFile(Channel(channel), *rest) for record, channel, *rest in rows}
 
-    def batch(self, maximum_bytes: int, maximum_packets: int) -> Batch | None:
+    def batch(self, maximum_bytes: int, maximum_packets: int) -> PacketBatch | None:
         """The oldest waiting packets of sessions that were met that fit one batch, at least one; None if none waits."""
         question = (
             "SELECT epoch, sequence, data FROM packets JOIN sessions USING (epoch) WHERE data IS NOT NULL AND met = 1 "
@@ -190,7 +190,7 @@ class Outbox:
                 if chosen and (size > maximum_bytes or row[0] != chosen[0][0]):
                     break
                 chosen.append(row)
-        return Batch(chosen[0][0], chosen[0][1], tuple(data for _, _, data in chosen)) if chosen else None
+        return PacketBatch(chosen[0][0], chosen[0][1], tuple(data for _, _, data in chosen)) if chosen else None
 
     def synchronize(self, expected: Mapping[int, int]) -> list[tuple[int, int]]:
         """Learn what the cloud has of this robot: the next sequence that it expects, by epoch.
@@ -248,7 +248,7 @@ class Outbox:
         """These need not be sent any more. Returns how many they were."""
         count, size = self._count(which)
         self._database.execute(f"UPDATE packets SET data = NULL WHERE {which}")
-        self.waiting = Waiting(self.waiting.packets - count, self.waiting.bytes - size)
+        self.waiting = WaitingPackets(self.waiting.packets - count, self.waiting.bytes - size)
         return count
 
     def _move(self, epoch: int, to: int) -> None:
@@ -264,7 +264,7 @@ class Outbox:
                 )
         for table in ("packets", "sessions", "releases"):
             self._database.execute(f"UPDATE {table} SET epoch = ? WHERE epoch = ?", (to, epoch))
-        self.waiting = Waiting(*self._count("data IS NOT NULL"))
+        self.waiting = WaitingPackets(*self._count("data IS NOT NULL"))
         self.epoch = to if self.epoch == epoch else self.epoch
         self._first = to if self._first == epoch else self._first
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
 from fcslam.records import Correction, DetectorFile
-from fcslam.robot.outbox import Batch, Outbox
-from fcslam.wire.http_transport import Answer, BatchTransport, CloudState
+from fcslam.robot.outbox import Outbox, PacketBatch
+from fcslam.wire.http_transport import BatchTransport, CloudState, HttpResponse
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate
 from fcslam.wire.packets import decode
@@ -135,7 +135,7 @@ class Sender:
             )
         self._refused_there = len(state.refused)
 
-    def _exchange(self, packets: Sequence[bytes], batch: Batch | None) -> None:
+    def _exchange(self, packets: Sequence[bytes], batch: PacketBatch | None) -> None:
         before = self.confirmed + self.refusals
         self.sent_bytes += sum(map(len, packets))
         answer = self._transport.send(packets, self._correction)
@@ -161,7 +161,7 @@ class Sender:
         self._outbox.drop(epoch, sequence)
         self.refusals += 1
 
-    def _read(self, answer: Answer) -> None:
+    def _read(self, answer: HttpResponse) -> None:
         try:
             packets = [decode(data) for data in answer.packets]
         except PacketError as error:

@@ -7,9 +7,9 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig, describe
 from fcslam.lidar.mapper import FinishedSubmap, LidarConfig, Mapper, ScanPose, Step
-from fcslam.lidar.tracker import Sight
+from fcslam.lidar.tracker import TrackingResult
 from fcslam.records import CameraImage, Channel, KeyscanId, LaserModel, LaserScan, Place
-from fcslam.robot.views import View, ViewFinder, ViewsConfig
+from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
 from fcslam.wire.messages import Body, Hello, Packet
 
 
@@ -24,10 +24,12 @@ class SessionConfig(Settings):
     views: ViewsConfig = Field(default=ViewsConfig(), description="binary features of camera images")
 
 
-class Session:
+class RobotSession:
     """Turns sensor records into numbered packets; keeps every raw scan's pose for itself."""
 
-    def __init__(self, robot: str, epoch: int, time: float, view_finder: ViewFinder, config: SessionConfig) -> None:
+    def __init__(
+        self, robot: str, epoch: int, time: float, view_extractor: ViewExtractor, config: SessionConfig
+    ) -> None:
         """``epoch`` counts the robot's sessions; packets bear no ``time`` before this."""
         self.robot = robot
         self.epoch = epoch
@@ -36,8 +38,8 @@ class Session:
         self.scan_poses: list[ScanPose] = []
         self.mapper = Mapper(robot, config.lidar)
         self._config = config
-        self._view_finder = view_finder
-        self._views: list[View] = []
+        self._view_extractor = view_extractor
+        self._views: list[CameraView] = []
         """Those that wait for the submap around them."""
         self._submaps: dict[int, tuple[int, int]] = {}
         """First and last keyscan of the submap that each camera place was sent with."""
@@ -48,19 +50,19 @@ class Session:
         """Version of the camera's detector in the last hello."""
         self._sequence = 0
 
-    def process_scan(self, scan: LaserScan, sight: Sight | None = None) -> list[Packet]:
-        """The packets that the next scan causes; ``sight``: as the mapper saw it, if it has looked already."""
+    def process_scan(self, scan: LaserScan, tracking: TrackingResult | None = None) -> list[Packet]:
+        """The packets that the next scan causes; ``tracking``: as the mapper saw it, if it has looked already."""
         self.time = max(self.time, scan.stamp)
         self._laser = scan.laser
         news = self._news()
-        step = self.mapper.process(scan, sight)
+        step = self.mapper.process(scan, tracking)
         self.scan_poses.append(step.pose)
-        self._view_finder.at(scan, step.pose)
+        self._view_extractor.set_scan(scan, step.pose)
         return self._packets([*news, *self._bodies(step)])
 
     def process_image(self, image: CameraImage) -> None:
         """Keep what an image shows until the submap around it is complete."""
-        view = self._view_finder.look(image)
+        view = self._view_extractor.describe(image)
         if view is not None:
             self._views.append(view)
 
@@ -95,10 +97,10 @@ class Session:
 
     def _news(self) -> list[Body]:
         """A hello, first of all and with another detector; then the camera places that this had not described yet."""
-        if self._laser is None or self._told == self._view_finder.detector_version:
+        if self._laser is None or self._told == self._view_extractor.detector_version:
             return []
-        self._told = self._view_finder.detector_version
-        views = {view.keyscan: view for view in self._view_finder.look_again()} if self._submaps else {}
+        self._told = self._view_extractor.detector_version
+        views = {view.keyscan: view for view in self._view_extractor.describe_again()} if self._submaps else {}
         self._views = [views.get(view.keyscan, view) for view in self._views]
         sent = [view for view in views.values() if view.keyscan in self._submaps]
         fresh = [view for view in sent if (view.keyscan, view.detector_version) not in self._described]
@@ -111,7 +113,7 @@ class Session:
             features.keypoints_m, features.descriptors,
         )  # fmt: skip
 
-    def _camera_place(self, view: View) -> Place:
+    def _camera_place(self, view: CameraView) -> Place:
         first, last = self._submaps[view.keyscan]
         self._described.add((view.keyscan, view.detector_version))
         return Place(
@@ -120,7 +122,7 @@ class Session:
         )  # fmt: skip
 
     def _hello(self, laser: LaserModel) -> Hello:
-        versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_finder.detector_version}
+        versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
         return Hello(self.robot, self.epoch, laser, {channel: versions[channel] for channel in self._config.channels})
 
     def _packets(self, bodies: Iterable[Body]) -> list[Packet]:

@@ -18,7 +18,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.mapper import ScanPose
 from fcslam.lidar.scan import point_scan
 from fcslam.records import CameraImage, Codes, DetectorFile, FloatArray, LaserScan, frozen
-from fcslam.robot.album import Album, AlbumConfig, Shot
+from fcslam.robot.image_buffer import ImageBuffer, ImageBufferConfig, KeyframeImage
 
 
 class ViewsConfig(Settings):
@@ -31,11 +31,11 @@ class ViewsConfig(Settings):
     detector: DetectorKind = Field(default=DetectorKind.ONNX, description="what describes images: a network or orb")
     orb: OrbConfig = Field(default=OrbConfig(), description="settings of detector orb")
     onnx: OnnxConfig = Field(default=OnnxConfig(), description="settings of detector onnx")
-    album: AlbumConfig = Field(default=AlbumConfig(), description="images kept for another detector")
+    image_buffer: ImageBufferConfig = Field(default=ImageBufferConfig(), description="images kept for another detector")
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraView:
     """One keyframe image, as far as it leaves the robot."""
 
     keyscan: int
@@ -46,7 +46,7 @@ class View:
     detector_version: str
 
 
-class ViewFinder:
+class ViewExtractor:
     """Picks images that show something new and turns them into views."""
 
     def __init__(self, config: ViewsConfig) -> None:
@@ -57,7 +57,7 @@ class ViewFinder:
         """
         self._config = config
         self._detector = make_detector(config.detector, config.orb, config.onnx)
-        self._album = Album(config.album)
+        self._image_buffer = ImageBuffer(config.image_buffer)
         self._scan: LaserScan | None = None
         self._pose: ScanPose | None = None
         self._last: tuple[int, FloatArray] | None = None
@@ -68,11 +68,11 @@ class ViewFinder:
         """Of the descriptors."""
         return self._detector.version
 
-    def at(self, scan: LaserScan, pose: ScanPose) -> None:
+    def set_scan(self, scan: LaserScan, pose: ScanPose) -> None:
         """The robot has seen this scan from this pose."""
         self._scan, self._pose = scan, pose
 
-    def look(self, image: CameraImage) -> View | None:
+    def describe(self, image: CameraImage) -> CameraView | None:
         """The view in the next image; None if it shows little, or little that is new.
 
         Between the last scan and the image the robot moved as its odometry says, or not at all if that is not known.
@@ -92,13 +92,13 @@ class ViewFinder:
         ends = se2.transform(se2.inverse(T_scan_image), np.vstack((returns.origin, returns.points)))
         T_keyscan_image = se2.compose(self._pose.T_keyscan_base, T_scan_image)
         surroundings = LidarView(ends[1:], ends[0], spacing_rad)
-        shot = Shot(self._pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
+        shot = KeyframeImage(self._pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
         view = self._describe(shot, picture)
         if view is not None:
-            self._album.add(shot)
+            self._image_buffer.add(shot)
         return view
 
-    def take(self, file: DetectorFile, path: Path) -> None:
+    def set_detector(self, file: DetectorFile, path: Path) -> None:
         """Look with a network that was announced and fetched from now on.
 
         Raises:
@@ -106,18 +106,18 @@ class ViewFinder:
         """
         self._detector = open_release(file, path, self._config.onnx)
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """What was seen is of a session that has ended."""
-        self._album = Album(self._config.album)
+        self._image_buffer = ImageBuffer(self._config.image_buffer)
         self._scan = self._pose = self._last = None
 
-    def look_again(self) -> list[View]:
+    def describe_again(self) -> list[CameraView]:
         """The views in the images that are still here, oldest first, as the detector sees them now."""
-        pictures = ((shot, decode_grey(shot.encoded)) for shot in self._album)
+        pictures = ((shot, decode_grey(shot.encoded)) for shot in self._image_buffer)
         views = (self._describe(shot, picture) for shot, picture in pictures if picture is not None)
         return [view for view in views if view is not None]
 
-    def _describe(self, shot: Shot, picture: GreyImage) -> View | None:
+    def _describe(self, shot: KeyframeImage, picture: GreyImage) -> CameraView | None:
         features = self._detector.detect(picture)
         positions, placed = place_keypoints(
             features.keypoints_px, shot.camera, shot.surroundings, self._config.ceiling_m
@@ -126,7 +126,7 @@ class ViewFinder:
             return None
         positions[:, :2] = se2.transform(shot.T_keyscan_image, positions[:, :2])
         keypoints, codes = frozen(positions[placed], np.float32), frozen(features.descriptors[placed], np.uint8)
-        return View(shot.keyscan, keypoints, codes, self._detector.version)
+        return CameraView(shot.keyscan, keypoints, codes, self._detector.version)
 
     def _is_new(self, keyscan: int, T_odom_base: FloatArray) -> bool:
         """A keyscan has one view at most, which names its place."""

@@ -34,7 +34,7 @@ class Refusal:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class HttpResponse:
     """What came of a batch."""
 
     packets: tuple[bytes, ...] = ()
@@ -65,7 +65,7 @@ class BatchTransport(Protocol):
             CloudError: it turns this robot away.
         """
 
-    def send(self, packets: Sequence[bytes], correction: int) -> Answer:
+    def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
         """Hand over a batch of encoded packets, tell the newest correction (-1: none), wait for the answer.
 
         Without packets it asks for what is new. Nothing is known of a batch whose answer is lost, so it comes again.
@@ -130,7 +130,7 @@ class HttpTransport:
             raise CloudError(f"{self._url}: answers, but not as a cloud of fcslam; give its address") from error
         return CloudState(expected, refused)
 
-    def send(self, packets: Sequence[bytes], correction: int) -> Answer:
+    def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
         """As in BatchTransport."""
         response = self._ask(
             "POST",
@@ -141,11 +141,13 @@ class HttpTransport:
         if response.status_code == 400:
             index = _detail(response).get("index")
             if isinstance(index, int) and 0 <= index < len(packets):
-                return Answer(refusal=Refusal(index, self._reason(response)))
+                return HttpResponse(refusal=Refusal(index, self._reason(response)))
             raise UnavailableError(self._reason(response))  # the batch went astray on its way
         self._require(response, 200)
         try:
-            return Answer(tuple(read_batch(response.content)), refused=int(response.headers.get(REFUSED_HEADER, 0)))
+            return HttpResponse(
+                tuple(read_batch(response.content)), refused=int(response.headers.get(REFUSED_HEADER, 0))
+            )
         except (PacketError, ValueError) as error:
             raise UnavailableError(f"{self._url}: the answer is broken ({error})") from error
 

@@ -10,7 +10,7 @@ from fcslam.features.placing import LidarView
 from fcslam.records import CameraModel, FloatArray
 
 
-class AlbumConfig(Settings):
+class ImageBufferConfig(Settings):
     """How much is kept, in memory; the oldest go first."""
 
     most_images: int = Field(default=500, ge=0, description="images that a new detector describes again; 0 for none")
@@ -18,7 +18,7 @@ class AlbumConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class KeyframeImage:
     """A keyframe's image with all that places its keypoints."""
 
     keyscan: int
@@ -30,21 +30,21 @@ class Shot:
     """Pose of the base at that moment, in the keyscan's."""
 
 
-class Album:
+class ImageBuffer:
     """The newest shots, one a keyscan."""
 
-    def __init__(self, config: AlbumConfig) -> None:
+    def __init__(self, config: ImageBufferConfig) -> None:
         self._config = config
-        self._shots: dict[int, Shot] = {}
+        self._images: dict[int, KeyframeImage] = {}
         self._bytes = 0
 
-    def __iter__(self) -> Iterator[Shot]:
-        return iter(self._shots.values())
+    def __iter__(self) -> Iterator[KeyframeImage]:
+        return iter(self._images.values())
 
-    def add(self, shot: Shot) -> None:
+    def add(self, shot: KeyframeImage) -> None:
         """Keep a shot of a keyscan that has none, and let go of the oldest where there is no room."""
-        self._shots[shot.keyscan] = shot
+        self._images[shot.keyscan] = shot
         self._bytes += len(shot.encoded)
-        while len(self._shots) > self._config.most_images or self._bytes > 1e6 * self._config.most_megabytes:
-            oldest = self._shots.pop(next(iter(self._shots)))
+        while len(self._images) > self._config.most_images or self._bytes > 1e6 * self._config.most_megabytes:
+            oldest = self._images.pop(next(iter(self._images)))
             self._bytes -= len(oldest.encoded)
