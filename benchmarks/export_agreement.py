@@ -77,13 +77,13 @@ def _trained(checkpoint: Path, version: str) -> Network:
     """The checkpoint's network, which must be the one of that version."""
     import torch
 
-    from fcslam.learning.export import version_of
+    from fcslam.learning.export import detector_version
     from fcslam.learning.trainer import trained_network
 
     torch.set_num_threads(1)
     network = trained_network(checkpoint)
-    if version_of(network) != version:
-        sys.exit(f"{checkpoint}: holds {version_of(network)}, but detector.onnx is {version}; export it anew")
+    if detector_version(network) != version:
+        sys.exit(f"{checkpoint}: holds {detector_version(network)}, but detector.onnx is {version}; export it anew")
 
     def infer(image: GreyImage) -> tuple[Probabilities, Logits]:
         with torch.inference_mode():

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from training_fleet import Rows
 
-    from fcslam.evaluation.federated.study import Findings
+    from fcslam.evaluation.federated.study import StudyResults
 
 PUBLIC = "sun_hays80"
 """Photographs that the start is trained on."""
@@ -134,7 +134,7 @@ def main() -> None:
     report.write()
 
 
-def study(vision: Path, folder: Path, until: str | None) -> "Findings":
+def study(vision: Path, folder: Path, until: str | None) -> "StudyResults":
     """Train and measure whatever is missing, up to an arm."""
     fleet = robots(vision, folder)
     if not (folder / "start" / "detector.onnx").exists():
@@ -155,7 +155,7 @@ def study(vision: Path, folder: Path, until: str | None) -> "Findings":
     return run(fleet, folder / "study", content)
 
 
-def setting(findings: "Findings", folder: Path) -> str:
+def setting(findings: "StudyResults", folder: Path) -> str:
     """What was done, in words."""
     measured = [file.stat().st_mtime for file in (folder / "study").glob("seed*/measured/*.npz")]
     labelled = {name: list((folder / "study" / "labels" / place).rglob("*.npz")) for name, place in places()}
@@ -174,7 +174,7 @@ def places() -> list[tuple[str, str]]:
     return [(name, Path(place).name) for name, place in VISION.items()] + list(SIMULATED.items())
 
 
-def home_rows(findings: "Findings") -> Iterator[tuple[object, ...]]:
+def home_rows(findings: "StudyResults") -> Iterator[tuple[object, ...]]:
     """What a robot's own network makes of its own images, and of others', beside the networks that all have."""
     from fcslam.evaluation.federated.pairs import MEASURES
 

@@ -174,12 +174,12 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     import torch
 
     from fcslam.federated import robot as robots
-    from fcslam.federated.client import client_app
+    from fcslam.federated.client_app import build_client_app
+    from fcslam.federated.codec import network_to_weights, version_maker
+    from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
     from fcslam.federated.grid import InProcessGrid
-    from fcslam.federated.network import version_maker, weights_of
-    from fcslam.federated.rounds import Outside, Server
+    from fcslam.federated.initial_weights import public_evaluator, read_public_images
     from fcslam.federated.settings import FederatedSettings
-    from fcslam.federated.start import judge_by, public_images
     from fcslam.learning.network import KeypointNetwork
     from fcslam.learning.settings import TrainingSettings
 
@@ -191,17 +191,17 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
         robots.RobotLearner(name, drawn(folder / name, 5, seed), folder / "labels" / name, robots.secret_noise)
         for seed, name in enumerate(ROBOTS)
     ]
-    start = weights_of(KeypointNetwork("light"))
+    start = network_to_weights(KeypointNetwork("light"))
     for each in fleet:
         # Labels, and what torch does first.
         each.learn(start, 0, "first", settings.model_copy(update={"local_steps": 1}))
     legs, judging = Stopwatch(), Stopwatch()
-    judge = judge_by(public_images([drawn(folder / "public", 4, 99)]), "light", "cpu")
-    outside = Outside(version_maker("light"), judging.around(judge))
-    grid = InProcessGrid(client_app(lambda context: fleet[int(context.node_config["partition-id"])]), len(fleet))
+    judge = public_evaluator(read_public_images([drawn(folder / "public", 4, 99)]), "light", "cpu")
+    outside = CoordinatorHooks(version_maker("light"), judging.around(judge))
+    grid = InProcessGrid(build_client_app(lambda context: fleet[int(context.node_config["partition-id"])]), len(fleet))
     train_leg, robots.train_leg = robots.train_leg, legs.around(robots.train_leg)
     began = time.process_time()
-    Server(settings, start, folder / "run", outside).run(grid)
+    Coordinator(settings, start, folder / "run", outside).run(grid)
     total_s = time.process_time() - began
     robots.train_leg = train_leg
     rest_s = (total_s - legs.spent_s - judging.spent_s) / count

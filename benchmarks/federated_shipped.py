@@ -76,12 +76,12 @@ def main() -> None:
 
 def exported(folder: Path, arm: str) -> Path:
     """What an arm came to, as robots run it."""
-    from fcslam.federated.network import network_of
-    from fcslam.federated.start import read_weights
-    from fcslam.learning.export import export
+    from fcslam.federated.codec import weights_to_network
+    from fcslam.federated.initial_weights import read_detector_weights
+    from fcslam.learning.export import export_onnx
 
     target = folder / f"{arm}.onnx"
-    export(network_of(read_weights(folder / arm / "checkpoint.npz", "light"), "light"), target)
+    export_onnx(weights_to_network(read_detector_weights(folder / arm / "checkpoint.npz", "light"), "light"), target)
     return target
 
 

@@ -11,7 +11,7 @@ from fcslam.metrics.bootstrap import Interval
 
 if TYPE_CHECKING:
     from fcslam.evaluation.federated.report import ArmReport
-    from fcslam.evaluation.federated.study import Findings
+    from fcslam.evaluation.federated.study import StudyResults
 
     Rows = dict[tuple[str, str], ArmReport]
     """By measure and arm."""
@@ -32,12 +32,12 @@ def robots(vision: Path, folder: Path) -> dict[str, Path]:
     return real | {name: folder / "fleet" / robot for name, robot in SIMULATED.items()}
 
 
-def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> "Findings":
+def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> "StudyResults":
     """Train and measure whatever is missing of a study in a folder; ``content`` is of ``StudySettings``."""
     import torch
 
     from fcslam.evaluation.federated.study import Study, StudySettings, run_study
-    from fcslam.learning.trainer import Pace
+    from fcslam.learning.trainer import ExecutionOptions
 
     torch.set_num_threads(1)
 
@@ -45,10 +45,10 @@ def run(fleet: Mapping[str, Path], folder: Path, content: Mapping[str, Any]) -> 
         if done == of:
             print(f"{datetime.now(UTC):%H:%M:%S} {name}: {of}", flush=True)
 
-    return run_study(Study(fleet, folder, StudySettings.model_validate(content), Pace(), watch))
+    return run_study(Study(fleet, folder, StudySettings.model_validate(content), ExecutionOptions(), watch))
 
 
-def compare(findings: "Findings", against: str) -> "Rows":
+def compare(findings: "StudyResults", against: str) -> "Rows":
     """Every arm by every measure, compared to one."""
     from fcslam.evaluation.federated.report import report
 

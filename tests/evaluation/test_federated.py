@@ -13,16 +13,16 @@ torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import EvaluationError  # noqa: E402
-from fcslam.evaluation.federated.pairs import MEASURES, Described, described, held_out_pairs, measure_pair  # noqa: E402
-from fcslam.evaluation.federated.poison import Poisoned  # noqa: E402
+from fcslam.evaluation.federated.pairs import MEASURES, DetectedFeatures, detect_features, held_out_pairs, measure_pair  # noqa: E402
+from fcslam.evaluation.federated.poison import PoisonedClient  # noqa: E402
 from fcslam.evaluation.federated.report import report  # noqa: E402
-from fcslam.evaluation.federated.study import Findings, Study, StudySettings, run_study  # noqa: E402
+from fcslam.evaluation.federated.study import Study, StudyResults, StudySettings, run_study  # noqa: E402
 from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
-from fcslam.learning.export import export  # noqa: E402
+from fcslam.learning.export import export_onnx  # noqa: E402
 from fcslam.learning.images import find_images  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.trainer import Pace  # noqa: E402
+from fcslam.learning.trainer import ExecutionOptions  # noqa: E402
 from tests.federated.fakes import Fake  # noqa: E402
 
 TINY = {
@@ -53,7 +53,7 @@ def robots(tmp_path_factory):
 
 
 def study(robots, folder, watch=lambda *_: None, **changes):
-    return Study(robots, folder, StudySettings.model_validate(TINY | changes), Pace(), watch)
+    return Study(robots, folder, StudySettings.model_validate(TINY | changes), ExecutionOptions(), watch)
 
 
 def test_an_interrupted_study_ends_as_if_it_had_not_been(robots, tmp_path):
@@ -143,9 +143,9 @@ def test_two_at_one_study_share_the_work_out(robots, tmp_path, monkeypatch):
 
     def export_one_at_a_time(network, path):  # processes need not; the exporter of threads has globals
         with exporting:
-            export(network, path)
+            export_onnx(network, path)
 
-    monkeypatch.setattr("fcslam.evaluation.federated.study.export", export_one_at_a_time)
+    monkeypatch.setattr("fcslam.evaluation.federated.study.export_onnx", export_one_at_a_time)
 
     def work(watch):
         found.append(run_study(study(robots, tmp_path, watch, arms={"averaged": {}})))
@@ -208,17 +208,17 @@ def test_a_network_matches_a_view_with_itself(robots, tmp_path):
     torch.manual_seed(1)
     network = KeypointNetwork("light").eval()
     network.body.code_head[-1].bias.data.zero_()  # or all its codes are alike
-    export(network, tmp_path / "detector.onnx")
+    export_onnx(network, tmp_path / "detector.onnx")
     detector = OnnxDetector(OnnxConfig(weights=tmp_path / "detector.onnx"))
     (pair,) = held_out_pairs("north", find_images([robots["north"]])[:1], 1)
     same = type(pair)((pair.views[0], pair.views[0]), pair.valid, pair.taught_valid, pair.taught, np.eye(3))
-    own = described(detector, pair.views[0])
+    own = detect_features(detector, pair.views[0])
     correct, accuracy, again, former = measure_pair(detector, same, own)
     assert (correct, again) == (1.0, 1.0)
     assert accuracy > 0.95
     assert former == accuracy
-    assert measure_pair(detector, same, Described(own.points, np.bitwise_not(own.codes)))[3] < 0.2
-    nothing = Described(np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
+    assert measure_pair(detector, same, DetectedFeatures(own.points, np.bitwise_not(own.codes)))[3] < 0.2
+    nothing = DetectedFeatures(np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
     assert measure_pair(detector, same, nothing)[3] == 0.0
 
 
@@ -232,7 +232,7 @@ def findings(central, federated, local):
 
     measured = {"central": stacked(central), "local": stacked(*local), "federated": stacked(federated)}
     measured["alone"] = measured["local"] - 0.2
-    return Findings(("north", "south"), owners, measured)
+    return StudyResults(("north", "south"), owners, measured)
 
 
 def test_an_arm_of_fewer_seeds_is_compared_with_those():
@@ -242,7 +242,7 @@ def test_an_arm_of_fewer_seeds_is_compared_with_those():
     later = findings(central + 0.5, central, [central - 0.2, central - 0.2]).measured
     measured = {name: np.concatenate((whole.measured[name], later[name])) for name in ("central", "local", "alone")}
     measured |= {"federated": whole.measured["federated"], "poor": whole.measured["federated"] - 0.03}
-    found = Findings(whole.robots, whole.owners, measured)
+    found = StudyResults(whole.robots, whole.owners, measured)
     rows = {row.arm: row for row in report(found) if row.measure == MEASURES[0]}
     assert rows["federated"].gap.mean == pytest.approx(0.1)
     assert rows["federated"].closed == pytest.approx(0.5)
@@ -277,7 +277,7 @@ def test_nothing_is_closed_where_central_is_no_better():
 @pytest.mark.parametrize("poison", ["flipped", "scaled", "reversed", "random", "nan"])
 def test_poison_is_what_it_says(poison):
     before = {"weight": np.zeros(6, np.float32)}
-    bad = Poisoned(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
+    bad = PoisonedClient(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
     sent = bad.learn(before, 0, "run", FederatedSettings()).weights["weight"]
     expected = {
         "flipped": -np.arange(6.0),

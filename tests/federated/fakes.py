@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fcslam.federated.client import client_app
+from fcslam.federated.client import ClientUpdate
+from fcslam.federated.client_app import build_client_app
+from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.grid import InProcessGrid
-from fcslam.federated.robot import Learned
-from fcslam.federated.rounds import Outside, Server
 from fcslam.federated.settings import FederatedSettings
 
 START = {
@@ -42,14 +42,16 @@ class Fake:
     def learn(self, weights, round_number, _run, _settings):
         self.asked.append(round_number)
         new = self.answer(weights, round_number) if self.answer else shifted(weights, self.by)
-        return Learned(new, {"detector": self.by})
+        return ClientUpdate(new, {"detector": self.by})
 
     def judge(self, _weights, _settings):
         return self.figures
 
 
 def grid_of(robots, **extra):
-    return InProcessGrid(client_app(lambda context: robots[context.node_config["partition-id"]]), len(robots), **extra)
+    return InProcessGrid(
+        build_client_app(lambda context: robots[context.node_config["partition-id"]]), len(robots), **extra
+    )
 
 
 def settings(**given):
@@ -72,7 +74,10 @@ LENIENT = {"largest_change": None, "longest": None, "least_agreement": None}
 def run(robots, folder, chosen=None, grid=None, start=START, **outside):
     reports = []
     outside = {"version": version, "judge": lambda _weights: {"repeatability": 0.5, "mma_3px": 0.5}} | outside
-    server = Server(
-        chosen or settings(), start, folder, Outside(watch=lambda report, _best: reports.append(report), **outside)
+    server = Coordinator(
+        chosen or settings(),
+        start,
+        folder,
+        CoordinatorHooks(watch=lambda report, _best: reports.append(report), **outside),
     )
     return server.run(grid or grid_of(robots)), reports

@@ -11,8 +11,8 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 from fcslam.cli.federate_apart import _address
 from fcslam.errors import OutputError, TrainingError
 from fcslam.federated import launch
+from fcslam.federated.job import FederatedJob
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.task import Task
 from fcslam.federated.tls import Address
 
 REFUSED, INTERRUPTED = 1, 0
@@ -74,7 +74,7 @@ def test_a_server_that_goes_and_comes_back_is_joined_again(joined):
 
 
 def serve(tmp_path, where):
-    task = Task(tmp_path / "run", FederatedSettings())
+    task = FederatedJob(tmp_path / "run", FederatedSettings())
     launch.serve(task, "cpu", where, None, [], lambda: None)
 
 

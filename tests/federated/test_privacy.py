@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from fcslam.federated.privacy import clipped, epsilon, privatised
+from fcslam.federated.privacy import clip_update, epsilon, privatise_update
 from fcslam.federated.settings import PrivacySettings
 from fcslam.federated.weights import update_vector
 
@@ -50,7 +50,7 @@ def test_no_noise_promises_nothing_and_no_rounds_give_nothing_away():
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=20), st.floats(0.01, 100.0))
 def test_what_is_clipped_is_no_longer_than_allowed_and_points_where_it_did(values, limit):
     update = np.array(values)
-    short = clipped(update, limit)
+    short = clip_update(update, limit)
     assert np.linalg.norm(short) <= limit * (1 + 1e-9)
     assert np.linalg.norm(short) == pytest.approx(min(np.linalg.norm(update), limit))
     assert short * np.linalg.norm(update) == pytest.approx(update * np.linalg.norm(short), abs=1e-6)
@@ -63,8 +63,8 @@ def test_what_leaves_is_the_clipped_update_and_noise_of_the_right_size(length):
         "running_mean": np.full(5, 9, np.float32),
     }
     chosen = PrivacySettings(clip_norm=2.0, noise_multiplier=3.0)
-    sent = privatised(after, BEFORE, ["weight"], chosen, np.random.default_rng(1))
-    noise = update_vector(sent, BEFORE, ["weight"]) - clipped(update_vector(after, BEFORE, ["weight"]), 2.0)
+    sent = privatise_update(after, BEFORE, ["weight"], chosen, np.random.default_rng(1))
+    noise = update_vector(sent, BEFORE, ["weight"]) - clip_update(update_vector(after, BEFORE, ["weight"]), 2.0)
     assert noise.std() == pytest.approx(6.0, rel=0.03)
     assert abs(noise.mean()) < 0.2
     assert np.array_equal(sent["running_mean"], BEFORE["running_mean"])
@@ -72,5 +72,5 @@ def test_what_leaves_is_the_clipped_update_and_noise_of_the_right_size(length):
 
 def test_without_noise_the_weights_leave_as_they_are():
     after = {"weight": np.full((100, 200), 7, np.float32), "running_mean": np.zeros(5, np.float32)}
-    sent = privatised(after, BEFORE, ["weight"], PrivacySettings(clip_norm=0.1), np.random.default_rng(1))
+    sent = privatise_update(after, BEFORE, ["weight"], PrivacySettings(clip_norm=0.1), np.random.default_rng(1))
     assert all(np.array_equal(sent[name], after[name]) for name in after)

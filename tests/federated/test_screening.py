@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from fcslam.federated.screening import agreement, screen
 from fcslam.federated.settings import ScreeningSettings
-from fcslam.federated.weights import malformed, moved, trained_names, update_vector
+from fcslam.federated.weights import apply_update, trained_names, update_vector, weights_error
 
 RNG = np.random.default_rng(4)
 BEFORE = {
@@ -104,10 +104,10 @@ def test_an_update_taken_apart_and_added_again_is_the_same(seed, frozen):
     before = {name: array[:7] for name, array in BEFORE.items()}
     after = {name: (array + rng.random(array.shape)).astype(np.float32) for name, array in before.items()}
     names = trained_names(before, frozen)
-    back = moved(before, update_vector(after, before, names), names)
+    back = apply_update(before, update_vector(after, before, names), names)
     for name, array in before.items():
         assert back[name] == pytest.approx(after[name] if name in names else array, abs=1e-6)
-    assert malformed(after, before) is None
+    assert weights_error(after, before) is None
     assert ("norm.running_var" in names) is not frozen
 
 

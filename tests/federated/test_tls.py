@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from fcslam.errors import TrainingError
-from fcslam.federated.tls import Address, Certificates, check_own, check_server
+from fcslam.federated.tls import Address, Certificates, check_own_certificate, check_server_certificate
 from tests.federated.authority import certificates
 
 
@@ -28,7 +28,7 @@ def of(ca, certificate, key):
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])
 def test_a_certificate_fits_its_authority_its_key_and_its_names(fleet, host):
-    check_own(of(fleet, fleet, fleet), host)
+    check_own_certificate(of(fleet, fleet, fleet), host)
 
 
 def refused(call, *arguments):
@@ -39,15 +39,19 @@ def refused(call, *arguments):
 
 
 def test_another_name_key_or_authority_does_not(fleet, others):
-    assert "hostname mismatch" in refused(check_own, of(fleet, fleet, fleet), "server.lab")
-    assert "is no key of" in refused(check_own, of(fleet, fleet, others), "localhost")
-    assert str(others / "ca.crt") in refused(check_own, of(others, fleet, fleet), "localhost")
+    assert "hostname mismatch" in refused(check_own_certificate, of(fleet, fleet, fleet), "server.lab")
+    assert "is no key of" in refused(check_own_certificate, of(fleet, fleet, others), "localhost")
+    assert str(others / "ca.crt") in refused(check_own_certificate, of(others, fleet, fleet), "localhost")
 
 
 def test_what_is_no_certificate_is_said_by_name(fleet, tmp_path):
     (tmp_path / "text").write_text("hello")
-    assert "text" in refused(check_own, Certificates(tmp_path / "text", fleet / "own.crt", fleet / "own.key"), "a")
-    assert "text" in refused(check_own, Certificates(fleet / "ca.crt", tmp_path / "text", fleet / "own.key"), "a")
+    assert "text" in refused(
+        check_own_certificate, Certificates(tmp_path / "text", fleet / "own.crt", fleet / "own.key"), "a"
+    )
+    assert "text" in refused(
+        check_own_certificate, Certificates(fleet / "ca.crt", tmp_path / "text", fleet / "own.key"), "a"
+    )
 
 
 @contextmanager
@@ -84,20 +88,20 @@ def tls_of(folder):
 
 def test_a_server_is_known_by_the_fleets_authority(fleet, others):
     with listening(tls_of(fleet)) as address:
-        check_server(address, fleet / "ca.crt")
+        check_server_certificate(address, fleet / "ca.crt")
     with listening(tls_of(others)) as address:
-        line = refused(check_server, address, fleet / "ca.crt")
+        line = refused(check_server_certificate, address, fleet / "ca.crt")
     assert str(address) in line
     assert "does not fit" in line
 
 
 def test_a_server_without_tls_is_refused_and_one_that_is_not_there_awaited(fleet):
     with listening() as address:
-        assert "does not fit" in refused(check_server, address, fleet / "ca.crt")
-    check_server(address, fleet / "ca.crt")
+        assert "does not fit" in refused(check_server_certificate, address, fleet / "ca.crt")
+    check_server_certificate(address, fleet / "ca.crt")
 
 
 @pytest.mark.parametrize("words", [b"", bytes.fromhex("15030300020100")], ids=["nothing", "farewell"])
 def test_a_server_that_hangs_up_in_the_middle_is_awaited(fleet, words):
     with listening(words=words) as address:
-        check_server(address, fleet / "ca.crt")
+        check_server_certificate(address, fleet / "ca.crt")

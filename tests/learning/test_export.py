@@ -10,7 +10,7 @@ pytest.importorskip("onnx", reason="needs fcslam[train]")
 runtime = pytest.importorskip("onnxruntime", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError  # noqa: E402
-from fcslam.learning.export import export, quantise, version_of  # noqa: E402
+from fcslam.learning.export import detector_version, export_onnx, quantise_onnx  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 
 
@@ -27,7 +27,7 @@ def answers(path, image):
 @pytest.mark.parametrize("encoder", ["light", "vgg"])
 def test_the_file_says_what_torch_says_at_any_size(encoder, tmp_path):
     net = network(encoder)
-    export(net, tmp_path / "detector.onnx")
+    export_onnx(net, tmp_path / "detector.onnx")
     for height, width in ((64, 96), (72, 88), (120, 136)):
         image = textured(1, width, height).astype(np.float32) / 255
         (scores, logits), metadata = answers(tmp_path / "detector.onnx", image)
@@ -38,30 +38,30 @@ def test_the_file_says_what_torch_says_at_any_size(encoder, tmp_path):
         assert logits.shape == (1, 256, height // 8, width // 8)
         assert scores == pytest.approx(expected, abs=1e-4)
         assert ((logits >= 0) != (maps.code_logits.numpy() >= 0)).mean() < 0.005
-    assert metadata == {"fcslam_format": "1", "fcslam_version": version_of(net)}
+    assert metadata == {"fcslam_format": "1", "fcslam_version": detector_version(net)}
     assert sorted(file.name for file in tmp_path.iterdir()) == ["detector.onnx"]
 
 
 def test_int8_is_smaller_and_nearly_the_same(tmp_path):
     net = network("light")
-    export(net, tmp_path / "detector.onnx")
-    quantise(tmp_path / "detector.onnx", tmp_path / "small.onnx", [textured(seed) for seed in range(4)])
+    export_onnx(net, tmp_path / "detector.onnx")
+    quantise_onnx(tmp_path / "detector.onnx", tmp_path / "small.onnx", [textured(seed) for seed in range(4)])
     image = textured(9).astype(np.float32) / 255
     (_, logits), _ = answers(tmp_path / "detector.onnx", image)
     (_, rounded), metadata = answers(tmp_path / "small.onnx", image)
     assert ((logits >= 0) != (rounded >= 0)).mean() < 0.06
     assert (tmp_path / "small.onnx").stat().st_size < 0.5 * (tmp_path / "detector.onnx").stat().st_size
-    assert metadata["fcslam_version"] == f"{version_of(net)}-int8"
+    assert metadata["fcslam_version"] == f"{detector_version(net)}-int8"
 
 
 def test_other_weights_have_another_version():
     first, second = network("light", 0), network("light", 1)
-    assert version_of(first) == version_of(network("light", 0))
-    assert version_of(first) != version_of(second)
-    assert version_of(first).startswith("light-")
+    assert detector_version(first) == detector_version(network("light", 0))
+    assert detector_version(first) != detector_version(second)
+    assert detector_version(first).startswith("light-")
 
 
 def test_a_place_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
-        export(network("light"), tmp_path / "file" / "detector.onnx")
+        export_onnx(network("light"), tmp_path / "file" / "detector.onnx")

@@ -6,7 +6,7 @@ import pytest
 
 from fcslam.errors import TrainingError
 from fcslam.learning.homographic_adaptation import adapt, harris, peaks
-from fcslam.learning.labels import Labels, fuse, read_labels, read_teacher, write_labels
+from fcslam.learning.labels import Labels, fuse_keypoints, read_labels, read_teacher, write_labels
 from fcslam.learning.synthetic_shapes import FAMILIES, background, ellipses, noise
 from tests.learning.textures import textured
 
@@ -46,7 +46,7 @@ def test_what_one_copy_alone_saw_fades():
 
 
 def test_points_of_both_come_first_and_lie_midway():
-    labels = fuse(points((10, 10), (50, 50)), points((80, 80), (52, 50)))
+    labels = fuse_keypoints(points((10, 10), (50, 50)), points((80, 80), (52, 50)))
     assert labels.keypoints[0] == pytest.approx([51, 50])
     assert len(labels.keypoints) == 3
     assert (np.diff(labels.quality) < 0).all()
@@ -54,19 +54,19 @@ def test_points_of_both_come_first_and_lie_midway():
 
 
 def test_one_detector_may_find_nothing():
-    assert len(fuse(points(), points((5, 5))).keypoints) == 1
-    assert len(fuse(points(), points()).keypoints) == 0
+    assert len(fuse_keypoints(points(), points((5, 5))).keypoints) == 1
+    assert len(fuse_keypoints(points(), points()).keypoints) == 0
 
 
 def test_no_two_labels_are_one_point():
     rng = np.random.default_rng(0)
-    kept = fuse(*(rng.uniform(0, 60, (200, 2)).astype(np.float32) for _ in range(2))).keypoints
+    kept = fuse_keypoints(*(rng.uniform(0, 60, (200, 2)).astype(np.float32) for _ in range(2))).keypoints
     distances = np.linalg.norm(kept[:, None] - kept[None], axis=2) + 1e3 * np.eye(len(kept))
     assert distances.min() > 3.0
 
 
 def test_labels_are_kept_for_the_image_they_belong_to(tmp_path):
-    labels = fuse(points((10, 10)), points((30, 30)))
+    labels = fuse_keypoints(points((10, 10)), points((30, 30)))
     write_labels(tmp_path / "a" / "b.npz", labels, 7)
     assert np.array_equal(read_labels(tmp_path / "a" / "b.npz", 7).keypoints, labels.keypoints)
     assert read_labels(tmp_path / "a" / "b.npz", 8) is None

@@ -8,7 +8,7 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 from fcslam.learning.batches import collate  # noqa: E402
 from fcslam.learning.labels import Labels  # noqa: E402
 from fcslam.learning.objective import views_aligned  # noqa: E402
-from fcslam.learning.pairs import Example, draw_pair  # noqa: E402
+from fcslam.learning.pairs import TrainingExample, draw_pair  # noqa: E402
 from fcslam.metrics.homography import warp  # noqa: E402
 from tests.learning.textures import textured  # noqa: E402
 
@@ -17,7 +17,7 @@ SIZE = (120, 96)
 
 def batch(seed):
     keypoints = np.random.default_rng(seed).uniform(5, 150, (60, 2)).astype(np.float32)
-    example = Example(textured(seed), Labels(keypoints, np.linspace(1, 0.1, 60, dtype=np.float32)))
+    example = TrainingExample(textured(seed), Labels(keypoints, np.linspace(1, 0.1, 60, dtype=np.float32)))
     return collate([draw_pair(example, SIZE, 32, 8, np.random.default_rng([seed, index])) for index in range(4)])
 
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from fcslam.learning.labels import Labels, Teacher
-from fcslam.learning.pairs import Example, draw_pair, splat
-from fcslam.learning.warps import random_change, random_view, relight, seen, warp_image, well_inside
+from fcslam.learning.pairs import TrainingExample, draw_pair, splat_points
+from fcslam.learning.warps import random_change, random_view, relight, visible_mask, warp_image, well_inside
 from fcslam.metrics.homography import inverse, warp
 from tests.learning.textures import textured
 
@@ -18,7 +18,9 @@ def example(seed=0, taught=True):
     rng = np.random.default_rng(seed)
     keypoints = rng.uniform(5, 150, (120, 2)).astype(np.float32)
     labels = Labels(keypoints, np.linspace(1, 0.1, 120, dtype=np.float32))
-    return Example(image, labels, Teacher(keypoints, rng.normal(size=(120, 16)).astype(np.float16)) if taught else None)
+    return TrainingExample(
+        image, labels, Teacher(keypoints, rng.normal(size=(120, 16)).astype(np.float16)) if taught else None
+    )
 
 
 def blob(x, y, width, height):
@@ -50,7 +52,7 @@ def test_points_nowhere_are_not_inside():
 def test_what_is_seen_is_the_image():
     rng = np.random.default_rng(3)
     homography = random_change(SIZE, rng) @ random_view(textured(0), SIZE, rng)
-    mask = seen((160, 200), homography, SIZE)
+    mask = visible_mask((160, 200), homography, SIZE)
     columns, rows = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     places = warp(inverse(homography), np.stack((columns, rows), -1).reshape(-1, 2).astype(float))
     expected = well_inside(places, (200, 160), 2.0).reshape(mask.shape)
@@ -67,7 +69,7 @@ def test_light_keeps_images_images(seed):
 
 def test_weights_are_shared_among_four_pixels_about_their_point():
     points, weight = np.array([[10.25, 5.5], [30.0, 7.0]]), np.array([0.8, 0.5], np.float32)
-    spread = splat(points, weight, SIZE)
+    spread = splat_points(points, weight, SIZE)
     assert spread.sum() == pytest.approx(1.3, rel=1e-6)
     assert spread[7, 30] == pytest.approx(0.5)
     assert spread[5, 10] == pytest.approx(0.8 * 0.75 * 0.5)

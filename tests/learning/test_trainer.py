@@ -12,18 +12,18 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError, TrainingError  # noqa: E402
 from fcslam.learning.checkpoint import Checkpoint, write_checkpoint  # noqa: E402
-from fcslam.learning.descent import learning_rate  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
-from fcslam.learning.labels import Teacher, fuse  # noqa: E402
-from fcslam.learning.monitor import alarms, validate  # noqa: E402
+from fcslam.learning.labels import Teacher, fuse_keypoints  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.objective import negatives, shift_grid, teacher_bits  # noqa: E402
-from fcslam.learning.pairs import Example  # noqa: E402
+from fcslam.learning.pairs import TrainingExample  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.trainer import CHECKPOINT_FILE, Pace, Run, trained_network, validation_pairs  # noqa: E402
+from fcslam.learning.trainer import CHECKPOINT_FILE, ExecutionOptions, TrainingRun, trained_network, validation_pairs  # noqa: E402
+from fcslam.learning.training_step import learning_rate  # noqa: E402
+from fcslam.learning.validation import collapse_warnings, validate  # noqa: E402
 
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64, points=32)
-PACE = Pace(validate_every=100, checkpoint_every_s=0.0, log_every=1)
+PACE = ExecutionOptions(validate_every=100, checkpoint_every_s=0.0, log_every=1)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def examples():
         image = textured(seed)
         points = peaks(harris(image), 4, 200)
         descriptors = np.random.default_rng(seed).normal(size=(len(points), 16)).astype(np.float16)
-        made.append(Example(image, fuse(points, points), Teacher(points, descriptors)))
+        made.append(TrainingExample(image, fuse_keypoints(points, points), Teacher(points, descriptors)))
     return made
 
 
@@ -44,7 +44,7 @@ def weights(network):
 def test_a_run_learns(examples, tmp_path):
     longer = SMALL.model_copy(update={"steps": 40, "pairs": 2})
     figures = []
-    Run(longer, "joint", tmp_path, PACE).train(
+    TrainingRun(longer, "joint", tmp_path, PACE).train(
         examples, examples[:1], watch=lambda status: figures.append(status.figures)
     )
     first, last = ([np.mean([row[name] for row in part]) for name in ("detector", "contrastive")]
@@ -53,7 +53,7 @@ def test_a_run_learns(examples, tmp_path):
 
 
 def test_a_checkpoint_gives_the_network_that_the_run_handed_over(examples, tmp_path):
-    run = Run(SMALL, "joint", tmp_path, PACE)
+    run = TrainingRun(SMALL, "joint", tmp_path, PACE)
     delivered = run.train(examples, examples[:1])
     read = trained_network(tmp_path / CHECKPOINT_FILE)
     assert not read.training
@@ -71,7 +71,7 @@ def test_a_checkpoint_of_another_network_is_refused(tmp_path):
 
 def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):
     bits = teacher_bits(torch.from_numpy(examples[0].teacher.descriptors.astype(np.float32)), 1)
-    whole = Run(SMALL, "joint", tmp_path / "whole", PACE)
+    whole = TrainingRun(SMALL, "joint", tmp_path / "whole", PACE)
     (tmp_path / "whole").mkdir()
     (tmp_path / "torn").mkdir()
 
@@ -80,8 +80,8 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Run(SMALL, "joint", tmp_path / "torn", PACE).train(examples, examples[:1], bits, stop)
-    resumed = Run(SMALL, "joint", tmp_path / "torn", PACE)
+        TrainingRun(SMALL, "joint", tmp_path / "torn", PACE).train(examples, examples[:1], bits, stop)
+    resumed = TrainingRun(SMALL, "joint", tmp_path / "torn", PACE)
     steps = []
     torn = resumed.train(examples, examples[:1], bits, lambda status: steps.append(status.step))
     assert steps == [4, 5, 6]
@@ -94,12 +94,12 @@ def test_another_seed_trains_another_network(examples, tmp_path):
         folder = tmp_path / str(seed)
         folder.mkdir()
         settings = SMALL.model_copy(update={"seed": seed, "steps": 1})
-        networks.append(weights(Run(settings, "joint", folder, PACE).train(examples, examples[:1])))
+        networks.append(weights(TrainingRun(settings, "joint", folder, PACE).train(examples, examples[:1])))
     assert not torch.equal(*networks)
 
 
 def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeypatch):
-    Run(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
+    TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
     before = (tmp_path / CHECKPOINT_FILE).read_bytes()
     write = Path.write_bytes
 
@@ -109,7 +109,7 @@ def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeyp
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OutputError, match="No space left on device"):
-        Run(SMALL.model_copy(update={"steps": 8}), "joint", tmp_path, PACE).train(examples, examples[:1])
+        TrainingRun(SMALL.model_copy(update={"steps": 8}), "joint", tmp_path, PACE).train(examples, examples[:1])
     assert (tmp_path / CHECKPOINT_FILE).read_bytes() == before
     assert [file.name for file in tmp_path.iterdir() if file.suffix == ".part"] == []
 
@@ -118,14 +118,14 @@ def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeyp
 def test_a_foreign_checkpoint_is_said(examples, tmp_path, content):
     (tmp_path / CHECKPOINT_FILE).write_bytes(content)
     with pytest.raises(TrainingError, match=r"checkpoint\.npz: is no checkpoint"):
-        Run(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
+        TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
 
 
 def test_a_checkpoint_of_other_settings_is_refused_but_more_steps_are_not(examples, tmp_path):
-    Run(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
+    TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
     with pytest.raises(TrainingError, match="other settings"):
-        Run(SMALL.model_copy(update={"seed": 5}), "joint", tmp_path, PACE).train(examples, examples[:1])
-    more = Run(SMALL.model_copy(update={"steps": 7}), "joint", tmp_path, PACE)
+        TrainingRun(SMALL.model_copy(update={"seed": 5}), "joint", tmp_path, PACE).train(examples, examples[:1])
+    more = TrainingRun(SMALL.model_copy(update={"steps": 7}), "joint", tmp_path, PACE)
     more.train(examples, examples[:1])
     assert more.step == 7
 
@@ -138,15 +138,15 @@ def test_collapsed_codes_sound_the_alarm(examples):
     figures = validate(network, validation_pairs(examples), torch.device("cpu"))
     assert figures["code_spread_bits"] == 0.0
     assert figures["bit_bias"] == 0.5
-    assert len(alarms(figures)) == 2
-    assert alarms({"code_spread_bits": 120.0, "bit_bias": 0.05}) == []
+    assert len(collapse_warnings(figures)) == 2
+    assert collapse_warnings({"code_spread_bits": 120.0, "bit_bias": 0.05}) == []
 
 
 def test_a_perfect_detector_of_unmoved_pictures_scores_one():
     """The same view twice: everything is found again, everything matches."""
     image = textured(4)
     points = peaks(harris(image), 4, 100)
-    (pair,) = validation_pairs([Example(image, fuse(points, points))])
+    (pair,) = validation_pairs([TrainingExample(image, fuse_keypoints(points, points))])
     same = type(pair)((pair.views[0], pair.views[0]), pair.valid, pair.taught_valid, pair.taught, np.eye(3))
     figures = validate(KeypointNetwork("light").eval(), [same], torch.device("cpu"))
     assert figures["repeatability"] == 1.0
@@ -161,7 +161,7 @@ def test_a_network_that_finds_nothing_has_no_figures_and_no_alarm(examples):
     figures = validate(network, validation_pairs(examples), torch.device("cpu"))
     assert np.isnan(figures["repeatability"])
     assert figures["mma_3px"] == 0.0
-    assert alarms(figures) == []
+    assert collapse_warnings(figures) == []
 
 
 def test_the_rate_rises_stays_and_falls():

@@ -48,10 +48,10 @@ def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console
     from fcslam.config import parse
     from fcslam.features.detector import SHIPPED_NETWORK
     from fcslam.federated.history import RoundReport
+    from fcslam.federated.job import FederatedJob, ProgressCallbacks
     from fcslam.federated.local import federate_locally
     from fcslam.federated.settings import FederatedSettings
-    from fcslam.federated.task import Task, Watches
-    from fcslam.learning.trainer import Pace
+    from fcslam.learning.trainer import ExecutionOptions
 
     given = {"rounds": ROUNDS, "local_steps": STEPS, "judge_every": 1, "normalisation": "frozen"}
     settings = parse(FederatedSettings, given | {"training": TRAINING | {"seed": seed}}, "the demo")
@@ -63,7 +63,9 @@ def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console
         released |= report.released
         console.print(line_of(report.row(), settings.rounds), highlight=False, soft_wrap=True)
 
-    files = federate_locally(homes, Task(folder, settings, SHIPPED_NETWORK), Pace(), Watches(rounds=tell))
+    files = federate_locally(
+        homes, FederatedJob(folder, settings, SHIPPED_NETWORK), ExecutionOptions(), ProgressCallbacks(rounds=tell)
+    )
     return files[0] if released else None
 
 

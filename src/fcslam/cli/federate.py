@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from fcslam.federated.history import RoundReport
+    from fcslam.federated.job import FederatedJob, ProgressCallbacks
     from fcslam.federated.settings import FederatedSettings
-    from fcslam.federated.task import Task, Watches
-    from fcslam.learning.trainer import Status
+    from fcslam.learning.trainer import TrainingProgress
 
 QUICK = {"rounds": 3, "local_steps": 6, "judge_every": 1}
 QUICK_TRAINING = {"shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2}
@@ -68,9 +68,9 @@ def federate(
     given = {"strategy": strategy, "rounds": rounds, "local_steps": local_steps}
     settings = _settings(config, quick, {name: value for name, value in given.items() if value is not None}, seed)
     need_torch("flwr", extra="federated")
-    from fcslam.federated.task import Task
+    from fcslam.federated.job import FederatedJob
 
-    task = Task(output, settings, start, tuple(public or ()))
+    task = FederatedJob(output, settings, start, tuple(public or ()))
     if local:
         _run_locally(folders or [], task, device, quick)
         return
@@ -83,7 +83,7 @@ def federate(
         run_robot(join, folders or [], output, device, security, name)
 
 
-def _run_locally(folders: list[Path], task: "Task", device: str, quick: bool) -> None:
+def _run_locally(folders: list[Path], task: "FederatedJob", device: str, quick: bool) -> None:
     import time
 
     from rich.console import Console
@@ -116,11 +116,11 @@ def _settings(config: Path | None, quick: bool, given: dict[str, Any], seed: int
 
 
 @contextmanager
-def _progress(console: Any, settings: "FederatedSettings") -> "Iterator[Watches]":
+def _progress(console: Any, settings: "FederatedSettings") -> "Iterator[ProgressCallbacks]":
     """A live line for the rounds, one for the robot at work, and one a stage before; a printed line for each round."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from fcslam.federated.task import Watches
+    from fcslam.federated.job import ProgressCallbacks
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
@@ -131,7 +131,7 @@ def _progress(console: Any, settings: "FederatedSettings") -> "Iterator[Watches]
                 tasks[name] = bar.add_task(name, total=of)
             bar.update(tasks[name], completed=done, total=of)
 
-        def stage(name: str, status: "Status") -> None:
+        def stage(name: str, status: "TrainingProgress") -> None:
             show(name, status.step, status.steps)
 
         def steps(robot: str, done: int) -> None:
@@ -142,7 +142,7 @@ def _progress(console: Any, settings: "FederatedSettings") -> "Iterator[Watches]
             show("rounds", report.round_number, settings.rounds)
             console.print(line_of(report.row(), settings.rounds), highlight=False, soft_wrap=True)
 
-        yield Watches(stage, steps, rounds)
+        yield ProgressCallbacks(stage, steps, rounds)
 
 
 def line_of(row: "Mapping[str, str]", rounds: int) -> str:

@@ -9,7 +9,7 @@ import typer
 from fcslam.errors import TrainingError
 
 if TYPE_CHECKING:
-    from fcslam.federated.task import Task
+    from fcslam.federated.job import FederatedJob
     from fcslam.federated.tls import Address, Certificates
 
 NEEDED = "give --ca, --certificate, --key and --robot-key, or --insecure where nobody else is on the network"
@@ -46,13 +46,13 @@ class Security:
         return Certificates(self.ca, self.certificate, self.key)
 
 
-def run_server(where: str, task: "Task", device: str, security: Security, folders: list[Path]) -> None:
+def run_server(where: str, task: "FederatedJob", device: str, security: Security, folders: list[Path]) -> None:
     """Be the server; a line for each round, and whenever it waits."""
     from rich.console import Console
 
     from fcslam.cli.federate import line_of
     from fcslam.cli.train import pace_on
-    from fcslam.federated.deployed import read_status
+    from fcslam.federated.deployed_apps import read_status
     from fcslam.federated.history import ROUNDS_FILE, read_rows
     from fcslam.federated.launch import serve
 
@@ -87,7 +87,7 @@ def run_robot(
 
     from fcslam.cli.train import pace_on
     from fcslam.federated.launch import LOG_FILE, join
-    from fcslam.federated.letters import LONGEST_NAME
+    from fcslam.federated.messages import MAX_NAME_LENGTH
 
     if len(folders) != 1 or not folders[0].is_dir():
         raise TrainingError("--join needs one folder, that of the robot's images")
@@ -96,8 +96,8 @@ def run_robot(
         raise TrainingError("a robot has one --robot-key, its private one")
     folder = folders[0].resolve()
     called = folder.name if name is None else name
-    if not (0 < len(called) <= LONGEST_NAME and called.isprintable()):
-        raise TrainingError(f"{called!r}: a robot's name has 1 to {LONGEST_NAME} printable characters; give --name")
+    if not (0 < len(called) <= MAX_NAME_LENGTH and called.isprintable()):
+        raise TrainingError(f"{called!r}: a robot's name has 1 to {MAX_NAME_LENGTH} printable characters; give --name")
     robot = {
         "robot": called,
         "images": str(folder),

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from fcslam.learning.settings import TrainingSettings
-    from fcslam.learning.stages import Watch
-    from fcslam.learning.trainer import Status
+    from fcslam.learning.stages import StageCallback
+    from fcslam.learning.trainer import TrainingProgress
 
 QUICK = {"steps": 40, "shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Enough to see that everything works, and no more."""
@@ -41,14 +41,14 @@ def train(
 
     settings = _settings(config, quick, {"encoder": encoder, "steps": steps, "seed": seed})
     need_torch()
-    from fcslam.learning.deliver import deliver
+    from fcslam.learning.artifacts import write_training_artifacts
     from fcslam.learning.stages import train_detector
 
     console = Console(stderr=True)
     began = time.perf_counter()
     with _progress(console) as watch:
         network, found = train_detector(images, output, settings, pace_on(device, quick), teacher, watch)
-    files = deliver(network, output, settings, found, teacher)
+    files = write_training_artifacts(network, output, settings, found, teacher)
     for file in files:
         typer.echo(str(file))
     console.print(
@@ -85,7 +85,7 @@ def pace_on(device: str, quick: bool) -> Any:
     import torch
 
     from fcslam.errors import TrainingError
-    from fcslam.learning.trainer import Pace
+    from fcslam.learning.trainer import ExecutionOptions
 
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -95,11 +95,11 @@ def pace_on(device: str, quick: bool) -> Any:
         raise TrainingError(f"--device {device}: cannot be used ({error}); give cpu") from error
     threads = 1 if device == "cpu" else max((os.cpu_count() or 2) - 1, 1)
     every = 20 if quick else 500
-    return Pace(device=device, threads=threads, validate_every=every, log_every=every if quick else 50)
+    return ExecutionOptions(device=device, threads=threads, validate_every=every, log_every=every if quick else 50)
 
 
 @contextmanager
-def _progress(console: Any) -> "Iterator[Watch]":
+def _progress(console: Any) -> "Iterator[StageCallback]":
     """A live line a stage; without a terminal, a line of figures now and then."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -120,14 +120,14 @@ def _progress(console: Any) -> "Iterator[Watch]":
                 said.add(text)
                 console.print(text, highlight=False)
 
-        def watch(stage: str, status: "Status") -> None:
+        def watch(stage: str, status: "TrainingProgress") -> None:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=status.steps, figures="")
             text = "  ".join(f"{name} {status.figures[name]:.3f}" for name in FIGURES if name in status.figures)
             bar.update(tasks[stage], completed=status.step, figures=text)
             if not live and text and status.step % LINE_EVERY == 0:
                 say(f"{stage} {status.step}/{status.steps}  {text}")
-            for alarm in status.alarms:
+            for alarm in status.collapse_warnings:
                 say(f"warning: {alarm}")
 
         yield watch

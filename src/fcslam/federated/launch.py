@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import IO, Final
 
 from fcslam.errors import OutputError, TrainingError
-from fcslam.federated.deployed import read_status, task_text, write_status
+from fcslam.federated.deployed_apps import encode_job, read_status, write_status
 from fcslam.federated.flower import QUIET
-from fcslam.federated.task import Task
-from fcslam.federated.tls import Address, Certificates, check_own, check_server
+from fcslam.federated.job import FederatedJob
+from fcslam.federated.tls import Address, Certificates, check_own_certificate, check_server_certificate
 
 LINK: Final = "fleet"
 START_S: Final = 180.0
@@ -60,7 +60,7 @@ task = %s
 
 
 def serve(
-    task: Task,
+    task: FederatedJob,
     device: str,
     address: Address,
     certificates: Certificates | None,
@@ -83,13 +83,13 @@ def serve(
         OutputError: the run folder cannot be written.
     """
     if certificates is not None:
-        check_own(certificates, address.host)
+        check_own_certificate(certificates, address.host)
     _check_place(address)
     with tempfile.TemporaryDirectory() as place, _log(task.output / LOG_FILE) as log:
         write_status(task.output, "running", "")
         home = Path(place)
         environment = _environment(home / "home")
-        _write_app(home, task_text(task, device), address, certificates)
+        _write_app(home, encode_job(task, device), address, certificates)
         security = ["--insecure"] if certificates is None else [*certificates.options(), "--enable-supernode-auth"]
         where = ["--host", address.host, "--port", str(address.port)]
         with _daemon(["flower-superlink", *security, *where], environment, log) as link:
@@ -134,7 +134,7 @@ def join(
     """
     security = ["--insecure"]
     if certificates is not None:
-        check_own(certificates, LOOPBACK)
+        check_own_certificate(certificates, LOOPBACK)
         security = ["--root-certificates", str(certificates.ca.resolve()), *certificates.options()]
     if private_key is not None:
         security += ["--auth-supernode-private-key", str(private_key.resolve())]
@@ -144,7 +144,7 @@ def join(
     while True:
         _await(address, say)
         if certificates is not None:
-            check_server(address, certificates.ca)
+            check_server_certificate(address, certificates.ca)
         began = time.monotonic()
         code = _be_node([*command, "--port", str(free_port())], log_file)
         if code == 0:

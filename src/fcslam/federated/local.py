@@ -4,15 +4,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fcslam.errors import TrainingError
-from fcslam.federated.client import client_app
+from fcslam.federated.client import RobotClient, seeded_noise
+from fcslam.federated.client_app import build_client_app
 from fcslam.federated.flower import Context
 from fcslam.federated.grid import InProcessGrid
-from fcslam.federated.robot import RobotLearner, seeded_noise
-from fcslam.federated.task import Task, Watches, run_task
-from fcslam.learning.trainer import Pace
+from fcslam.federated.job import FederatedJob, ProgressCallbacks, run_job
+from fcslam.learning.trainer import ExecutionOptions
 
 
-def federate_locally(folders: Sequence[Path], task: Task, pace: Pace, watches: Watches) -> list[Path]:
+def federate_locally(
+    folders: Sequence[Path], task: FederatedJob, pace: ExecutionOptions, watches: ProgressCallbacks
+) -> list[Path]:
     """Run or resume federated training of robots with their images in ``folders``; returns the files that were made.
 
     Raises:
@@ -27,7 +29,7 @@ def federate_locally(folders: Sequence[Path], task: Task, pace: Pace, watches: W
         if not folder.is_dir():
             raise TrainingError(f"{folder}: is no folder; give one folder of images for each robot")
     robots = [
-        RobotLearner(
+        RobotClient(
             name,
             folder,
             task.output / "robots" / name,
@@ -38,7 +40,7 @@ def federate_locally(folders: Sequence[Path], task: Task, pace: Pace, watches: W
         for name, folder in zip(names, folders, strict=True)
     ]
 
-    def robot_of(context: Context) -> RobotLearner:
+    def robot_of(context: Context) -> RobotClient:
         return robots[int(context.node_config["partition-id"])]
 
-    return run_task(task, pace, watches, InProcessGrid(client_app(robot_of), len(robots)))
+    return run_job(task, pace, watches, InProcessGrid(build_client_app(robot_of), len(robots)))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.federated.settings import PrivacySettings
-from fcslam.federated.weights import FloatVector, Weights, moved, update_vector
+from fcslam.federated.weights import FloatVector, Weights, apply_update, update_vector
 
 ORDERS: Final = tuple(1.0 + 10.0**exponent for exponent in np.linspace(-3.0, 4.0, 701))
 """Of the Renyi divergence; the best one is taken."""
@@ -21,13 +21,13 @@ _SENSITIVITY: Final = 2.0
 """Largest distance of two clipped updates, in clip norms."""
 
 
-def clipped(update: FloatVector, clip_norm: float) -> FloatVector:
+def clip_update(update: FloatVector, clip_norm: float) -> FloatVector:
     """The update (N,), shortened to the clip norm if it is longer."""
     length = float(np.linalg.norm(update))
     return update * (clip_norm / length) if length > clip_norm else update
 
 
-def privatised(
+def privatise_update(
     new: Weights, old: Weights, names: Collection[str], settings: PrivacySettings, rng: np.random.Generator
 ) -> dict[str, NDArray[np.float32]]:
     """Weights that may leave the robot: the arrays of these names are clipped and blurred, the others those of ``old``.
@@ -36,9 +36,9 @@ def privatised(
     """
     if settings.noise_multiplier == 0.0:
         return dict(new)
-    update = clipped(update_vector(new, old, names), settings.clip_norm)
+    update = clip_update(update_vector(new, old, names), settings.clip_norm)
     update = update + rng.normal(0.0, settings.noise_multiplier * settings.clip_norm, len(update))
-    return moved(old, update, names)
+    return apply_update(old, update, names)
 
 
 def epsilon(noise_multiplier: float, rounds: int, delta: float) -> float:

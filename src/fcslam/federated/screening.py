@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fcslam.federated.settings import ScreeningSettings
-from fcslam.federated.weights import FloatVector, Weights, malformed, trained_names, update_vector
+from fcslam.federated.weights import FloatVector, Weights, trained_names, update_vector, weights_error
 
 
 def screen(
@@ -18,7 +18,7 @@ def screen(
     Batch statistics move many times as far as what is trained, and each robot's lie where its own light puts them:
     their length is looked at by itself, and their direction not at all.
     """
-    refused = {robot: reason for robot, weights in answers.items() if (reason := malformed(weights, asked))}
+    refused = {robot: reason for robot, weights in answers.items() if (reason := weights_error(weights, asked))}
     parameters = trained_names(asked, frozen_statistics=True)
     statistics = [name for name in asked if name not in set(parameters)]
     for robot in [robot for robot in answers if frozen and robot not in refused]:

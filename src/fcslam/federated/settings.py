@@ -83,6 +83,6 @@ class FederatedSettings(Settings):
             raise ValueError("FedAdam and noise may turn variances negative: they need normalisation: frozen")
         return self
 
-    def of_robots(self) -> TrainingSettings:
+    def client_training(self) -> TrainingSettings:
         """The training settings with the steps of the whole run."""
         return self.training.model_copy(update={"steps": self.rounds * self.local_steps})

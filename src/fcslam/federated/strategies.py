@@ -18,20 +18,27 @@ from fcslam.federated.flower import (
     MetricRecord,
     RecordDict,
 )
-from fcslam.federated.letters import ARRAYS, CONFIG, METRICS, WEIGHT, read_arrays, write_arrays
+from fcslam.federated.messages import (
+    ARRAYS_KEY,
+    CONFIG_KEY,
+    EXAMPLES_KEY,
+    METRICS_KEY,
+    record_to_weights,
+    weights_to_record,
+)
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.weights import Weights, malformed, trained_names
+from fcslam.federated.weights import Weights, trained_names, weights_error
 
 _MOMENTS: Final = ("m_t", "v_t")
 """FedAdam's memory, by its attributes' names."""
 _MOMENTUM: Final = "momentum"
 
 
-class Merger:
+class Aggregator:
     """One of Flower's strategies, and what it is to remember of earlier rounds."""
 
     def __init__(self, settings: FederatedSettings, memory: Mapping[str, NDArray[Any]]) -> None:
-        self.strategy = new_strategy(settings)
+        self.strategy = create_strategy(settings)
         self._most = settings.server_momentum
         for moment in _MOMENTS:
             if part := _part(memory, moment):
@@ -56,23 +63,23 @@ class Merger:
         messages = []
         for message, weights in answers:
             # All did the same number of steps, so all weigh the same, whatever a robot would like to weigh.
-            metrics = MetricRecord({WEIGHT: 1.0})
-            message.content = RecordDict({ARRAYS: write_arrays(weights), METRICS: metrics})
+            metrics = MetricRecord({EXAMPLES_KEY: 1.0})
+            message.content = RecordDict({ARRAYS_KEY: weights_to_record(weights), METRICS_KEY: metrics})
             messages.append(message)
         record, _ = self.strategy.aggregate_train(round_number, messages)
-        merged = {name: np.asarray(array, np.float32) for name, array in read_arrays(record).items()}
-        reason, onward = malformed(merged, old), merged
+        merged = {name: np.asarray(array, np.float32) for name, array in record_to_weights(record).items()}
+        reason, onward = weights_error(merged, old), merged
         if reason is None and self._momentum is not None:
             # As far as all robots would have come one after another, at most.
             share = min(self._most, 1.0 - 1.0 / len(answers))
-            onward, self._momentum = with_momentum(merged, old, self._momentum, share)
-            reason = malformed(onward, old)
+            onward, self._momentum = apply_server_momentum(merged, old, self._momentum, share)
+            reason = weights_error(onward, old)
         if reason is not None:
             raise TrainingError(f"round {round_number}: the strategy gave unusable weights: {reason}")
         return {name: onward[name] for name in old}
 
 
-def with_momentum(
+def apply_server_momentum(
     merged: Weights, old: Weights, momentum: Mapping[str, NDArray[np.float32]], share: float
 ) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]]:
     """Weights beyond the ``merged`` ones by Nesterov's momentum, and the momentum for the next round.
@@ -89,16 +96,16 @@ def with_momentum(
     return onward, following
 
 
-def new_strategy(settings: FederatedSettings) -> FedAvg:
+def create_strategy(settings: FederatedSettings) -> FedAvg:
     """The strategy of these settings; it asks every robot it sees, so whoever runs it shows it those to ask."""
     everyone: dict[str, Any] = {
         "fraction_train": 1.0,
         "min_train_nodes": 1,
         "min_evaluate_nodes": 1,
         "min_available_nodes": 1,
-        "weighted_by_key": WEIGHT,
-        "arrayrecord_key": ARRAYS,
-        "configrecord_key": CONFIG,
+        "weighted_by_key": EXAMPLES_KEY,
+        "arrayrecord_key": ARRAYS_KEY,
+        "configrecord_key": CONFIG_KEY,
     }
     match settings.strategy:
         case "fedavg":

@@ -40,7 +40,7 @@ class Address:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-def check_own(certificates: Certificates, host: str) -> None:
+def check_own_certificate(certificates: Certificates, host: str) -> None:
     """Let this machine shake hands with itself, in memory.
 
     Raises:
@@ -68,7 +68,7 @@ def check_own(certificates: Certificates, host: str) -> None:
         ) from error
 
 
-def check_server(address: Address, ca: Path) -> None:
+def check_server_certificate(address: Address, ca: Path) -> None:
     """Shake hands with the server, if it is there already.
 
     Raises:

@@ -23,7 +23,7 @@ def update_vector(new: Weights, old: Weights, names: Collection[str]) -> FloatVe
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def moved(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str, NDArray[np.float32]]:
+def apply_update(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str, NDArray[np.float32]]:
     """``old`` with ``update`` (N,) added to the arrays of these names."""
     arrays = {name: array.copy() for name, array in old.items()}
     begin = 0
@@ -35,13 +35,13 @@ def moved(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str
     return arrays
 
 
-def blended(old: Weights, new: Weights, share: float) -> dict[str, NDArray[np.float32]]:
+def interpolate_weights(old: Weights, new: Weights, share: float) -> dict[str, NDArray[np.float32]]:
     """A ``share`` of old weights and the rest of new ones."""
     # Not a sum of products: what is equal in both is to stay as it is, to the last bit.
     return {name: np.asarray(new[name] + share * (old[name] - new[name]), np.float32) for name in old}
 
 
-def malformed(new: Weights, old: Weights) -> str | None:
+def weights_error(new: Weights, old: Weights) -> str | None:
     """Why ``new`` cannot be weights of the network that ``old`` are of, in words; None if it can."""
     if new.keys() != old.keys():
         odd = sorted(new.keys() ^ old.keys())

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fcslam.learning.pairs import Example, Pair, draw_pair
+from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.settings import TrainingSettings
 
-TAUGHT_POINTS = 192
+TEACHER_POINTS = 192
 """Points of the teacher in a pair."""
 
 
 @dataclass(frozen=True, slots=True)
-class Batch:
+class TrainingBatch:
     """B pairs; the first B images are first views, the others second views."""
 
     images: Tensor
@@ -39,29 +39,31 @@ class Batch:
     homographies: Tensor
     """Shape (B, 3, 3): take pixels of the first view to pixels of the second."""
 
-    def to(self, device: torch.device) -> "Batch":
+    def to(self, device: torch.device) -> "TrainingBatch":
         """The batch on another device."""
-        return Batch(**{field.name: getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)})
+        return TrainingBatch(
+            **{field.name: getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)}
+        )
 
 
-def draw_batch(examples: Sequence[Example], settings: TrainingSettings, step: int) -> Batch:
+def draw_batch(examples: Sequence[TrainingExample], settings: TrainingSettings, step: int) -> TrainingBatch:
     """The batch of a step."""
     pairs = []
     for index in range(settings.pairs):
         rng = np.random.default_rng([settings.seed, step, index])
         example = examples[int(rng.integers(len(examples)))]
-        pairs.append(draw_pair(example, (settings.side_px, settings.side_px), settings.points, TAUGHT_POINTS, rng))
+        pairs.append(draw_pair(example, (settings.side_px, settings.side_px), settings.points, TEACHER_POINTS, rng))
     return collate(pairs)
 
 
-def collate(pairs: Sequence[Pair]) -> Batch:
+def collate(pairs: Sequence[ViewPair]) -> TrainingBatch:
     """Pairs as one batch."""
     views = [pair.views[side] for side in (0, 1) for pair in pairs]
 
     def stack(arrays: Sequence[np.ndarray]) -> Tensor:
         return torch.from_numpy(np.nan_to_num(np.stack(arrays)))
 
-    return Batch(
+    return TrainingBatch(
         images=stack([view.image for view in views]).unsqueeze(1),
         targets=stack([view.targets for view in views]),
         seen=stack([view.valid for view in views]),
@@ -74,12 +76,12 @@ def collate(pairs: Sequence[Pair]) -> Batch:
     )
 
 
-def stream(
-    examples: Sequence[Example], settings: TrainingSettings, first: int, ahead: int, threads: int
-) -> Iterator[tuple[int, Batch]]:
+def batch_stream(
+    examples: Sequence[TrainingExample], settings: TrainingSettings, first: int, ahead: int, threads: int
+) -> Iterator[tuple[int, TrainingBatch]]:
     """Batches from step ``first`` on, in order, up to ``ahead`` of them prepared by ``threads`` threads."""
     with ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[Batch]] = deque()
+        waiting: deque[Future[TrainingBatch]] = deque()
         asked = first
         try:
             for step in range(first, settings.steps):

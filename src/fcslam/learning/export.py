@@ -32,7 +32,7 @@ FEWEST_INPUTS: Final = 8
 TRACED_SIZE: Final = (240, 320)
 
 
-class Exported(nn.Module):
+class ExportedNetwork(nn.Module):
     """A network with the outputs of the file."""
 
     def __init__(self, network: KeypointNetwork) -> None:
@@ -45,7 +45,7 @@ class Exported(nn.Module):
         return self.network.scores(maps), maps.code_logits
 
 
-def version_of(network: KeypointNetwork) -> str:
+def detector_version(network: KeypointNetwork) -> str:
     """A name of exactly these weights, such as `light-0a1b2c3d4e5f`."""
     digest = hashlib.sha256()
     for name, tensor in sorted(network.state_dict().items()):
@@ -54,7 +54,7 @@ def version_of(network: KeypointNetwork) -> str:
     return f"{network.encoder}-{digest.hexdigest()[:12]}"
 
 
-def export(network: KeypointNetwork, path: Path) -> None:
+def export_onnx(network: KeypointNetwork, path: Path) -> None:
     """Write the float32 file.
 
     Raises:
@@ -62,7 +62,7 @@ def export(network: KeypointNetwork, path: Path) -> None:
     """
     import onnx
 
-    ready = Exported(network).cpu().eval()
+    ready = ExportedNetwork(network).cpu().eval()
     content = io.BytesIO()
     sides = {2: "height", 3: "width"}
     with _quietly():
@@ -76,10 +76,10 @@ def export(network: KeypointNetwork, path: Path) -> None:
             opset_version=OPSET,
             dynamo=False,
         )
-    _write(onnx.load_from_string(content.getvalue()), version_of(network), path)
+    _write(onnx.load_from_string(content.getvalue()), detector_version(network), path)
 
 
-def quantise(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
+def quantise_onnx(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
     """Write the int8 file of a float32 one, with the ranges that ``images`` give its activations.
 
     The two last convolutions stay in float, as what they give is compared with each other, and so do those with so few

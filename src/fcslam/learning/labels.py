@@ -39,7 +39,7 @@ class Labels:
     """Shape (N,): in (0, 1], 1 for the best of the image."""
 
 
-def fuse(first: Points, second: Points) -> Labels:
+def fuse_keypoints(first: Points, second: Points) -> Labels:
     """Two detectors' keypoints, each strongest first, as one set ranked by the mean of both ranks.
 
     A point that only one of them found ranks last with the other. Points both found lie midway.

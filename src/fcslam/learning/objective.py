@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX
 from fcslam.learning import losses
-from fcslam.learning.batches import Batch
+from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.network import Maps, sample_codes
 from fcslam.learning.settings import Encoder, LossSettings
 
@@ -40,7 +40,7 @@ class TeacherBits:
 
 def objective(
     maps: Maps,
-    batch: Batch,
+    batch: TrainingBatch,
     weights: LossSettings,
     progress: float,
     grid_shift: tuple[int, int],
@@ -82,7 +82,7 @@ def objective(
     return total, parts
 
 
-def views_aligned(maps: Tensor, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+def views_aligned(maps: Tensor, batch: TrainingBatch) -> tuple[Tensor, Tensor, Tensor]:
     """Maps (2B, H, W) of the first views, of the second ones as the first ones' pixels see them, and where both see."""
     first, second = maps.chunk(2)
     seen_first, seen_second = batch.seen.chunk(2)

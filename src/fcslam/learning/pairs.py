@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
 from fcslam.learning.labels import Labels, Teacher
-from fcslam.learning.warps import random_change, random_shift, random_view, relight, seen, warp_image, well_inside
+from fcslam.learning.warps import (
+    random_change,
+    random_shift,
+    random_view,
+    relight,
+    visible_mask,
+    warp_image,
+    well_inside,
+)
 from fcslam.metrics.framing import Size
 from fcslam.metrics.homography import Mask, inverse, warp
 from fcslam.records import FloatArray
@@ -23,7 +31,7 @@ SHIFT_SHARE: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Example:
+class TrainingExample:
     """An image with what is known of it."""
 
     image: GreyImage
@@ -32,7 +40,7 @@ class Example:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class AugmentedView:
     """One side of a pair."""
 
     image: NDArray[np.float32]
@@ -48,10 +56,10 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class ViewPair:
     """Two views of an image."""
 
-    views: tuple[View, View]
+    views: tuple[AugmentedView, AugmentedView]
     valid: Mask
     """Shape (N,): whether both views see a point."""
     taught_valid: Mask
@@ -62,7 +70,7 @@ class Pair:
     """Shape (3, 3): takes pixels of the first view to pixels of the second."""
 
 
-def draw_pair(example: Example, size: Size, points: int, taught: int, rng: np.random.Generator) -> Pair:
+def draw_pair(example: TrainingExample, size: Size, points: int, taught: int, rng: np.random.Generator) -> ViewPair:
     """A pair of views of this size with ``points`` points, ``taught`` of the teacher's among its own."""
     image = example.image
     window = random_view(image, size, rng)
@@ -72,7 +80,7 @@ def draw_pair(example: Example, size: Size, points: int, taught: int, rng: np.ra
     chosen = _choose(example, homographies, size, points, rng)
     told, descriptors = _choose_taught(example.teacher, homographies, size, taught, rng)
     views = [_view(example, homography, size, chosen, told, rng) for homography in homographies]
-    return Pair(
+    return ViewPair(
         (views[0], views[1]),
         _in_both(views[0].points, views[1].points, size) & well_inside(chosen, (image.shape[1], image.shape[0]), 0.0),
         _in_both(views[0].taught, views[1].taught, size),
@@ -81,7 +89,7 @@ def draw_pair(example: Example, size: Size, points: int, taught: int, rng: np.ra
     )
 
 
-def splat(points: FloatArray, weight: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
+def splat_points(points: FloatArray, weight: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
     """Weights of points (N, 2) shared out among the four pixels around each, shape (height, width)."""
     padded = np.zeros((size[1] + 1, size[0] + 1), np.float32)
     here = well_inside(points, size, 0.0)
@@ -95,25 +103,25 @@ def splat(points: FloatArray, weight: NDArray[np.float32], size: Size) -> NDArra
 
 
 def _view(
-    example: Example,
+    example: TrainingExample,
     homography: FloatArray,
     size: Size,
     chosen: FloatArray,
     told: FloatArray,
     rng: np.random.Generator,
-) -> View:
+) -> AugmentedView:
     keypoints = warp(homography, example.labels.keypoints.astype(np.float64))
-    return View(
+    return AugmentedView(
         relight(warp_image(example.image, homography, size), rng),
-        splat(keypoints, example.labels.quality, size),
-        seen((example.image.shape[0], example.image.shape[1]), homography, size),
+        splat_points(keypoints, example.labels.quality, size),
+        visible_mask((example.image.shape[0], example.image.shape[1]), homography, size),
         warp(homography, chosen).astype(np.float32),
         warp(homography, told).astype(np.float32),
     )
 
 
 def _choose(
-    example: Example, homographies: list[FloatArray], size: Size, count: int, rng: np.random.Generator
+    example: TrainingExample, homographies: list[FloatArray], size: Size, count: int, rng: np.random.Generator
 ) -> FloatArray:
     """Points (count, 2) of the image: keypoints that both views see, the better the likelier, and others anywhere."""
     keypoints = example.labels.keypoints.astype(np.float64)

@@ -21,13 +21,13 @@ from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
 from fcslam.learning.homographic_adaptation import Response, adapt, harris, peaks
 from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_image
-from fcslam.learning.labels import MOST_POINTS, Labels, Teacher, fuse, read_labels, read_teacher, write_labels
+from fcslam.learning.labels import MOST_POINTS, Labels, Teacher, fuse_keypoints, read_labels, read_teacher, write_labels
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits, teacher_bits
-from fcslam.learning.pairs import Example
+from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import LossSettings, TrainingSettings
 from fcslam.learning.synthetic_shapes import draw_shapes
-from fcslam.learning.trainer import Pace, Run, Status
+from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
 
 LABEL_NMS_PX: Final = 4.0
 DESCRIPTORS_OF_AN_IMAGE: Final = 32
@@ -37,22 +37,22 @@ HELD_OUT_SHAPES: Final = 32
 SHAPE_SIDE_PX: Final = 240
 SHAPE_LOSSES: Final = LossSettings(triplet=0.0, contrastive=0.0, distillation=0.0, balance=0.0)
 
-Watch = Callable[[str, Status], None]
+StageCallback = Callable[[str, TrainingProgress], None]
 """Is told the stage and where it stands."""
 
 
 @dataclass(frozen=True, slots=True)
-class Images:
+class TrainingImages:
     """What there is to learn from."""
 
-    train: list[Example]
-    held_out: list[Example]
+    train: list[TrainingExample]
+    held_out: list[TrainingExample]
     """Not trained on, unless there are too few images to hold any out."""
     skipped: int
     """Files that are no images, too small or too bare."""
 
 
-class Shapes(Sequence[Example]):
+class SyntheticShapes(Sequence[TrainingExample]):
     """Endless synthetic shapes; the same number gives the same picture."""
 
     def __init__(self, first: int, count: int) -> None:
@@ -62,19 +62,24 @@ class Shapes(Sequence[Example]):
         return self._count
 
     @overload
-    def __getitem__(self, index: int) -> Example: ...
+    def __getitem__(self, index: int) -> TrainingExample: ...
     @overload
-    def __getitem__(self, index: slice) -> Sequence[Example]: ...
-    def __getitem__(self, index: int | slice) -> Example | Sequence[Example]:
+    def __getitem__(self, index: slice) -> Sequence[TrainingExample]: ...
+    def __getitem__(self, index: int | slice) -> TrainingExample | Sequence[TrainingExample]:
         if isinstance(index, slice):
             return [self[position] for position in range(*index.indices(self._count))]
         rng = np.random.default_rng([self._first, index])
-        return Example(*draw_shapes(SHAPE_SIDE_PX, SHAPE_SIDE_PX, rng))
+        return TrainingExample(*draw_shapes(SHAPE_SIDE_PX, SHAPE_SIDE_PX, rng))
 
 
 def train_detector(
-    roots: Sequence[Path], folder: Path, settings: TrainingSettings, pace: Pace, teacher: Path | None, watch: Watch
-) -> tuple[KeypointNetwork, Images]:
+    roots: Sequence[Path],
+    folder: Path,
+    settings: TrainingSettings,
+    pace: ExecutionOptions,
+    teacher: Path | None,
+    watch: StageCallback,
+) -> tuple[KeypointNetwork, TrainingImages]:
     """Train on every image below ``roots``; all that is made goes into ``folder``.
 
     Raises:
@@ -86,43 +91,43 @@ def train_detector(
     detector: Callable[[GreyImage], Response] | None = None
     if teacher is None:
         first = train_on_shapes(folder / "shapes", settings, pace, watch)
-        start, detector = first.state_dict(), as_detector(first, torch.device(pace.device))
-    images = gather(files, folder / "labels", settings, detector, teacher, watch)
-    run = Run(settings, "joint", _made(folder / "joint"), pace, start)
+        start, detector = first.state_dict(), keypoint_response(first, torch.device(pace.device))
+    images = read_labelled_images(files, folder / "labels", settings, detector, teacher, watch)
+    run = TrainingRun(settings, "joint", _made(folder / "joint"), pace, start)
     return run.train(images.train, images.held_out, _bits(images.train, settings.seed), partial(watch, "joint")), images
 
 
-def gather(
+def read_labelled_images(
     files: Sequence[ImageFile],
     cache: Path,
     settings: TrainingSettings,
     detector: Callable[[GreyImage], Response] | None,
     teacher: Path | None,
-    watch: Watch,
-) -> Images:
+    watch: StageCallback,
+) -> TrainingImages:
     """Read the images and label those that have no labels in ``cache`` yet.
 
     Raises:
         TrainingError: too few can be used, or a teacher's file is missing or broken.
         OutputError: labels cannot be written.
     """
-    train: list[Example] = []
-    held_out: list[Example] = []
+    train: list[TrainingExample] = []
+    held_out: list[TrainingExample] = []
     for index, file in enumerate(files):
         image = read_image(file.path)
         if image is not None and is_usable(image):
             taught = None if teacher is None else read_teacher(teacher / f"{file.name}.npz")
             place = cache / f"{file.name}.npz"
             (held_out if is_held_out(file.name) else train).append(
-                Example(image, _labels(image, place, settings, detector, taught), taught)
+                TrainingExample(image, _labels(image, place, settings, detector, taught), taught)
             )
-        watch("labels", Status(index + 1, len(files), {}))
+        watch("labels", TrainingProgress(index + 1, len(files), {}))
     if len(train) < FEWEST_IMAGES:
         raise TrainingError(
             f"only {len(train)} of {len(files)} image files can be trained on: the others are no images, "
             "smaller than 96 px or bare; give more"
         )
-    return Images(train, held_out or train[:1], len(files) - len(train) - len(held_out))
+    return TrainingImages(train, held_out or train[:1], len(files) - len(train) - len(held_out))
 
 
 def _labels(
@@ -145,7 +150,7 @@ def _labels(
         others = peaks(adapt(detector, image, settings.label_copies, rng), LABEL_NMS_PX, MOST_POINTS)
     else:
         others = corners
-    labels = fuse(corners, others)
+    labels = fuse_keypoints(corners, others)
     try:
         write_labels(place, labels, key)
     except OSError as error:
@@ -153,7 +158,9 @@ def _labels(
     return labels
 
 
-def train_on_shapes(folder: Path, settings: TrainingSettings, pace: Pace, watch: Watch) -> KeypointNetwork:
+def train_on_shapes(
+    folder: Path, settings: TrainingSettings, pace: ExecutionOptions, watch: StageCallback
+) -> KeypointNetwork:
     """A detector of corners of synthetic shapes, whose codes mean nothing yet; resumes in ``folder``.
 
     Raises:
@@ -161,11 +168,13 @@ def train_on_shapes(folder: Path, settings: TrainingSettings, pace: Pace, watch:
         OutputError: something cannot be written.
     """
     shapes = settings.model_copy(update={"steps": settings.shape_steps, "loss": SHAPE_LOSSES})
-    run = Run(shapes, "shapes", _made(folder), pace)
-    return run.train(Shapes(0, SHAPE_COUNT), Shapes(1, HELD_OUT_SHAPES), watch=partial(watch, "shapes"))
+    run = TrainingRun(shapes, "shapes", _made(folder), pace)
+    return run.train(
+        SyntheticShapes(0, SHAPE_COUNT), SyntheticShapes(1, HELD_OUT_SHAPES), watch=partial(watch, "shapes")
+    )
 
 
-def _bits(examples: Sequence[Example], seed: int) -> TeacherBits | None:
+def _bits(examples: Sequence[TrainingExample], seed: int) -> TeacherBits | None:
     """A teacher's bits, fitted to some of its descriptors of each image."""
     taught = [example.teacher.descriptors for example in examples if example.teacher is not None]
     if not taught:
@@ -174,7 +183,7 @@ def _bits(examples: Sequence[Example], seed: int) -> TeacherBits | None:
     return teacher_bits(torch.from_numpy(np.concatenate(some).astype(np.float32)), seed)
 
 
-def as_detector(network: KeypointNetwork, device: torch.device) -> Callable[[GreyImage], Response]:
+def keypoint_response(network: KeypointNetwork, device: torch.device) -> Callable[[GreyImage], Response]:
     """A network as what labels images, on its device."""
 
     @torch.inference_mode()

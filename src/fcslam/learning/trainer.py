@@ -15,14 +15,20 @@ import torch
 from torch import Tensor
 
 from fcslam.errors import OutputError, TrainingError
-from fcslam.learning.batches import Batch, stream
+from fcslam.learning.batches import TrainingBatch, batch_stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from fcslam.learning.descent import descend, give_moments, learning_rate, moments_of, new_optimiser
-from fcslam.learning.monitor import alarms, validate
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits
-from fcslam.learning.pairs import Example, Pair, draw_pair
+from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.training_step import (
+    create_optimiser,
+    learning_rate,
+    optimiser_state,
+    restore_optimiser_state,
+    training_step,
+)
+from fcslam.learning.validation import collapse_warnings, validate
 
 AVERAGE_DECAY: Final = 0.999
 VALIDATION_PAIRS: Final = 24
@@ -35,7 +41,7 @@ NETWORK, AVERAGE, OPTIMISER = "network/", "average/", "optimiser/"
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
+class ExecutionOptions:
     """How often what happens, and on what; none of it changes the result."""
 
     validate_every: int = 500
@@ -46,7 +52,7 @@ class Pace:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class TrainingProgress:
     """Where a stage stands."""
 
     step: int
@@ -54,15 +60,20 @@ class Status:
     steps: int
     figures: Mapping[str, float]
     """The latest losses and validation figures."""
-    alarms: tuple[str, ...] = ()
+    collapse_warnings: tuple[str, ...] = ()
     """What the latest validation found wrong with the codes."""
 
 
-class Run:
+class TrainingRun:
     """One stage of training in a folder: resumes where its checkpoint stands."""
 
     def __init__(
-        self, settings: TrainingSettings, stage: str, folder: Path, pace: Pace, start: dict[str, Tensor] | None = None
+        self,
+        settings: TrainingSettings,
+        stage: str,
+        folder: Path,
+        pace: ExecutionOptions,
+        start: dict[str, Tensor] | None = None,
     ) -> None:
         self.settings, self.stage, self.folder, self.pace = settings, stage, folder, pace
         self.device = torch.device(pace.device)
@@ -75,16 +86,16 @@ class Run:
         self.average = KeypointNetwork(settings.encoder).to(self.device)
         self.average.load_state_dict(self.network.state_dict())
         self.average.eval()
-        self.optimiser = new_optimiser(self.network)
+        self.optimiser = create_optimiser(self.network)
         self.step = 0
         self._saved = time.monotonic()
 
     def train(
         self,
-        examples: Sequence[Example],
-        held_out: Sequence[Example],
+        examples: Sequence[TrainingExample],
+        held_out: Sequence[TrainingExample],
         bits: TeacherBits | None = None,
-        watch: Callable[[Status], None] = lambda _status: None,
+        watch: Callable[[TrainingProgress], None] = lambda _status: None,
     ) -> KeypointNetwork:
         """Train to the last step; returns the averaged network.
 
@@ -103,7 +114,7 @@ class Run:
         views = validation_pairs(held_out)
         figures: dict[str, float] = {}
         warnings: tuple[str, ...] = ()
-        for step, batch in stream(examples, self.settings, self.step, 4 * self.pace.threads, self.pace.threads):
+        for step, batch in batch_stream(examples, self.settings, self.step, 4 * self.pace.threads, self.pace.threads):
             parts = self._step(step, batch.to(self.device), bits)
             self.step = step + 1
             last = self.step == self.settings.steps
@@ -114,18 +125,18 @@ class Run:
             if self.step % self.pace.validate_every == 0 or last:
                 found = validate(self.average, views, self.device)
                 figures |= found
-                warnings = tuple(alarms(found))
+                warnings = tuple(collapse_warnings(found))
                 self._log(found | {"alarms": float(len(warnings))})
             if last or time.monotonic() - self._saved > self.pace.checkpoint_every_s:
                 self._save()
-            watch(Status(self.step, self.settings.steps, dict(figures), warnings))
+            watch(TrainingProgress(self.step, self.settings.steps, dict(figures), warnings))
         trained: KeypointNetwork = self.average
         return trained
 
-    def _step(self, step: int, batch: Batch, bits: TeacherBits | None) -> dict[str, Tensor]:
+    def _step(self, step: int, batch: TrainingBatch, bits: TeacherBits | None) -> dict[str, Tensor]:
         self.network.train()
         rate = learning_rate(self.settings, step)
-        parts = descend(self.network, self.optimiser, batch, self.settings, step, rate, bits)
+        parts = training_step(self.network, self.optimiser, batch, self.settings, step, rate, bits)
         self._average(step)
         return parts
 
@@ -154,13 +165,13 @@ class Run:
     def _load(self, checkpoint: Checkpoint) -> None:
         self.network.load_state_dict(checkpoint.part(NETWORK))
         self.average.load_state_dict(checkpoint.part(AVERAGE))
-        give_moments(self.optimiser, checkpoint.part(OPTIMISER))
+        restore_optimiser_state(self.optimiser, checkpoint.part(OPTIMISER))
         self.step = checkpoint.step
 
     def _save(self) -> None:
         tensors = {f"{NETWORK}{name}": value for name, value in self.network.state_dict().items()}
         tensors |= {f"{AVERAGE}{name}": value for name, value in self.average.state_dict().items()}
-        tensors |= {f"{OPTIMISER}{name}": value for name, value in moments_of(self.optimiser).items()}
+        tensors |= {f"{OPTIMISER}{name}": value for name, value in optimiser_state(self.optimiser).items()}
         settings = self.settings.model_dump(mode="json")
         write_checkpoint(self.folder / CHECKPOINT_FILE, Checkpoint(self.stage, self.step, settings, tensors))
         self._saved = time.monotonic()
@@ -194,7 +205,7 @@ def trained_network(path: Path) -> KeypointNetwork:
     return network
 
 
-def validation_pairs(held_out: Sequence[Example]) -> list[Pair]:
+def validation_pairs(held_out: Sequence[TrainingExample]) -> list[ViewPair]:
     """The same pairs each time, from images spread over those held out."""
     pairs = []
     for index in range(min(VALIDATION_PAIRS, len(held_out))):

@@ -58,7 +58,7 @@ def warp_image(image: GreyImage, homography: FloatArray, size: Size) -> GreyImag
     return np.asarray(warped, np.uint8)
 
 
-def seen(shape: tuple[int, int], homography: FloatArray, size: Size, border: int = 2) -> NDArray[np.bool_]:
+def visible_mask(shape: tuple[int, int], homography: FloatArray, size: Size, border: int = 2) -> NDArray[np.bool_]:
     """Which pixels (height, width) of a view show the image of this shape, ``border`` pixels of it left out."""
     own = np.zeros(shape, np.uint8)
     own[border:-border, border:-border] = 1

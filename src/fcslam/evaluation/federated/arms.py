@@ -8,20 +8,20 @@ from typing import Any, Final
 from pydantic import Field
 
 from fcslam.config import Settings, parse
-from fcslam.evaluation.federated.poison import Poison, Poisoned
-from fcslam.federated.client import client_app
+from fcslam.evaluation.federated.poison import Poison, PoisonedClient
+from fcslam.federated.client import FederatedClient, RobotClient, seeded_noise
+from fcslam.federated.client_app import build_client_app
+from fcslam.federated.codec import version_maker, weights_to_network
+from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import Context
 from fcslam.federated.grid import InProcessGrid
-from fcslam.federated.network import network_of, version_maker
-from fcslam.federated.robot import Learner, RobotLearner, seeded_noise
-from fcslam.federated.rounds import Outside, Server
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.pairs import Example
+from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.stages import Images
-from fcslam.learning.trainer import Pace, Run, Status
+from fcslam.learning.stages import TrainingImages
+from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
 
 START: Final = "start"
 """What all begin from, as it is."""
@@ -51,77 +51,79 @@ class Arm(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class SeedContext:
     """What all arms of one seed share."""
 
     settings: FederatedSettings
     seed: int
     start: Weights
-    images: Mapping[str, Images]
+    images: Mapping[str, TrainingImages]
     """By robot."""
     folder: Path
-    pace: Pace
+    pace: ExecutionOptions
     watch: Callable[[str, int, int], None]
     """Is told who trains, the steps or rounds done, and all of them."""
 
 
-def train_central(ground: Ground) -> list[KeypointNetwork]:
+def train_central(ground: SeedContext) -> list[KeypointNetwork]:
     """One network, on all images in one place."""
     return [_train_alone(ground, CENTRAL, _everything(ground), _of_robots(ground, len(ground.images)))]
 
 
-def train_locally(ground: Ground, name: str) -> list[KeypointNetwork]:
+def train_locally(ground: SeedContext, name: str) -> list[KeypointNetwork]:
     """A network for each robot, on its images alone: with as many samples as all of them saw together, or its share."""
     training = _of_robots(ground, len(ground.images) if name == LOCAL else 1)
     return [_train_alone(ground, f"{name}-{robot}", images.train, training) for robot, images in ground.images.items()]
 
 
-def train_arm(ground: Ground, name: str, arm: Arm) -> list[KeypointNetwork]:
+def train_arm(ground: SeedContext, name: str, arm: Arm) -> list[KeypointNetwork]:
     """One network, in one place, or by federated training in one process: what that would release at its end."""
     settings, place = arm.federated(ground.settings, ground.seed), ground.folder / name
     if not arm.together:
-        return [_train_alone(ground, name, _everything(ground), settings.of_robots())]
-    learners: list[Learner] = [
-        RobotLearner(
+        return [_train_alone(ground, name, _everything(ground), settings.client_training())]
+    learners: list[FederatedClient] = [
+        RobotClient(
             robot, Path(robot), place / robot, seeded_noise(robot, ground.seed), ground.pace.device, gathered=own
         )
         for robot, own in ground.images.items()
     ]
     if arm.poison is not None:
-        learners[-1] = Poisoned(learners[-1], arm.poison)
+        learners[-1] = PoisonedClient(learners[-1], arm.poison)
 
-    def learner_of(context: Context) -> Learner:
+    def learner_of(context: Context) -> FederatedClient:
         return learners[int(context.node_config["partition-id"])]
 
-    outside = Outside(
+    outside = CoordinatorHooks(
         version_maker(settings.training.encoder),
         # No version is compared with another one: the last one counts, as in the other arms.
         judge=lambda _weights: {},
         watch=lambda report, _best: ground.watch(name, report.round_number, settings.rounds),
     )
-    server = Server(settings, ground.start, place, outside)
-    state = server.run(InProcessGrid(client_app(learner_of), len(learners)))
-    return [network_of(state.average, settings.training.encoder)]
+    server = Coordinator(settings, ground.start, place, outside)
+    state = server.run(InProcessGrid(build_client_app(learner_of), len(learners)))
+    return [weights_to_network(state.average, settings.training.encoder)]
 
 
-def _everything(ground: Ground) -> list[Example]:
+def _everything(ground: SeedContext) -> list[TrainingExample]:
     return [example for images in ground.images.values() for example in images.train]
 
 
-def _of_robots(ground: Ground, shares: int) -> TrainingSettings:
+def _of_robots(ground: SeedContext, shares: int) -> TrainingSettings:
     """With ``shares`` times the steps of a robot."""
-    training = ground.settings.of_robots()
+    training = ground.settings.client_training()
     return training.model_copy(update={"steps": training.steps * shares, "seed": ground.seed})
 
 
-def _train_alone(ground: Ground, name: str, examples: list[Example], training: TrainingSettings) -> KeypointNetwork:
+def _train_alone(
+    ground: SeedContext, name: str, examples: list[TrainingExample], training: TrainingSettings
+) -> KeypointNetwork:
     """By the central trainer."""
-    state = network_of(ground.start, training.encoder).state_dict()
+    state = weights_to_network(ground.start, training.encoder).state_dict()
     folder = ground.folder / name
     folder.mkdir(parents=True, exist_ok=True)
     quiet = replace(ground.pace, validate_every=training.steps, log_every=max(training.steps // 20, 1))
 
-    def watch(status: Status) -> None:
+    def watch(status: TrainingProgress) -> None:
         ground.watch(name, status.step, status.steps)
 
-    return Run(training, "joint", folder, quiet, state).train(examples, examples[:1], watch=watch)
+    return TrainingRun(training, "joint", folder, quiet, state).train(examples, examples[:1], watch=watch)

@@ -11,7 +11,7 @@ from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import Detector
 from fcslam.learning.images import ImageFile, is_usable, read_image
 from fcslam.learning.labels import Labels
-from fcslam.learning.pairs import Example, Pair, View, draw_pair
+from fcslam.learning.pairs import AugmentedView, TrainingExample, ViewPair, draw_pair
 from fcslam.metrics.homography import corner_error, estimate_homography, inverse, match_errors
 from fcslam.metrics.repeatability import in_common_view, repeatability
 from fcslam.records import Codes, FloatArray
@@ -24,7 +24,7 @@ MOST_POINTS: Final = 300
 """The best of so many that each view sees are looked for again."""
 
 
-class Described(NamedTuple):
+class DetectedFeatures(NamedTuple):
     """What a detector finds in a view."""
 
     points: FloatArray
@@ -33,7 +33,7 @@ class Described(NamedTuple):
     """Shape (N, 32)."""
 
 
-def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[Pair]:
+def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[ViewPair]:
     """Pairs of views of a robot's images; always the same.
 
     Raises:
@@ -46,30 +46,30 @@ def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[P
     pairs = []
     for index in range(count):
         rng = np.random.default_rng([PAIR_SEED, zlib.crc32(robot.encode()), index])
-        pairs.append(draw_pair(Example(images[index % len(images)], unlabelled), VIEW, 16, 0, rng))
+        pairs.append(draw_pair(TrainingExample(images[index % len(images)], unlabelled), VIEW, 16, 0, rng))
     return pairs
 
 
-def described(detector: Detector, view: View) -> Described:
+def detect_features(detector: Detector, view: AugmentedView) -> DetectedFeatures:
     """What a detector finds, of 8 bits a pixel as a camera gives them."""
     found = detector.detect(np.rint(255.0 * view.image).astype(np.uint8))
-    return Described(found.keypoints_px.astype(np.float64), found.descriptors)
+    return DetectedFeatures(found.keypoints_px.astype(np.float64), found.descriptors)
 
 
-def measure_pair(detector: Detector, pair: Pair, former: Described) -> tuple[float, float, float, float]:
+def measure_pair(detector: Detector, pair: ViewPair, former: DetectedFeatures) -> tuple[float, float, float, float]:
     """``MEASURES`` of one pair: homography right to 3 px at the corners or not, MMA at 3 px, repeatability, former MMA.
 
     The last is that of the codes which a ``former`` detector gave the first view and this one gives the second.
     Where nothing is matched MMA is 0, or a detector that finds nothing would look good.
     """
-    first, second = (described(detector, view) for view in pair.views)
+    first, second = (detect_features(detector, view) for view in pair.views)
     matched = _matched(first, second, pair)
     error = corner_error(estimate_homography(*matched), pair.homography, VIEW)
     again = repeatability(first.points, second.points, pair.homography, VIEW, MOST_POINTS).repeatability
     return float(error <= WITHIN_PX), _accuracy(matched, pair), again, _accuracy(_matched(former, second, pair), pair)
 
 
-def _matched(first: Described, second: Described, pair: Pair) -> tuple[FloatArray, FloatArray]:
+def _matched(first: DetectedFeatures, second: DetectedFeatures, pair: ViewPair) -> tuple[FloatArray, FloatArray]:
     """Points (N, 2) of both views whose codes are each other's nearest, among those that both see."""
     here = in_common_view(first.points, pair.homography, VIEW)
     there = in_common_view(second.points, inverse(pair.homography), VIEW)
@@ -77,6 +77,6 @@ def _matched(first: Described, second: Described, pair: Pair) -> tuple[FloatArra
     return first.points[here][matches[:, 0]], second.points[there][matches[:, 1]]
 
 
-def _accuracy(matched: tuple[FloatArray, FloatArray], pair: Pair) -> float:
+def _accuracy(matched: tuple[FloatArray, FloatArray], pair: ViewPair) -> float:
     right = match_errors(*matched, pair.homography) <= WITHIN_PX
     return float(right.mean()) if len(right) else 0.0

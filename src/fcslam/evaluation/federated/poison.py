@@ -5,19 +5,19 @@ from typing import Literal
 
 import numpy as np
 
-from fcslam.federated.robot import Learned, Learner
+from fcslam.federated.client import ClientUpdate, FederatedClient
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.weights import Weights, moved, trained_names, update_vector
+from fcslam.federated.weights import Weights, apply_update, trained_names, update_vector
 
 Poison = Literal["flipped", "scaled", "reversed", "random", "nan"]
 SCALE = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Poisoned:
+class PoisonedClient:
     """Trains like another robot, and spoils its update before it leaves."""
 
-    learner: Learner
+    learner: FederatedClient
     poison: Poison
 
     @property
@@ -25,8 +25,8 @@ class Poisoned:
         """As the other robot."""
         return self.learner.name
 
-    def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> Learned:
-        """As in ``Learner``."""
+    def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> ClientUpdate:
+        """As in ``FederatedClient``."""
         learned = self.learner.learn(weights, round_number, run, settings)
         names = trained_names(weights, frozen_statistics=True)
         update = update_vector(learned.weights, weights, names)
@@ -41,8 +41,8 @@ class Poisoned:
                 update = np.random.default_rng([settings.training.seed, round_number]).permutation(update)
             case "nan":
                 update = np.full_like(update, np.nan)
-        return Learned(moved(weights, update, names), learned.losses)
+        return ClientUpdate(apply_update(weights, update, names), learned.losses)
 
     def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
-        """As in ``Learner``."""
+        """As in ``FederatedClient``."""
         return self.learner.judge(weights, settings)

@@ -10,7 +10,7 @@ import numpy as np
 from fcslam.errors import OutputError
 from fcslam.evaluation.federated.arms import ALONE, CENTRAL, LOCAL
 from fcslam.evaluation.federated.pairs import MEASURES
-from fcslam.evaluation.federated.study import Findings
+from fcslam.evaluation.federated.study import StudyResults
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
 
@@ -40,7 +40,7 @@ class ArmReport:
     """The mean of each seed."""
 
 
-def report(findings: Findings, seed: int = 1, against: str = CENTRAL) -> list[ArmReport]:
+def report(findings: StudyResults, seed: int = 1, against: str = CENTRAL) -> list[ArmReport]:
     """Every arm by every measure, compared to the arm ``against``, which has no fewer seeds than any."""
     return [
         _report(findings, arm, index, against, np.random.default_rng(seed))
@@ -68,7 +68,7 @@ def write_report(reports: list[ArmReport], path: Path) -> None:
         raise OutputError(f"{path}: cannot be written ({error})") from error
 
 
-def _report(findings: Findings, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
+def _report(findings: StudyResults, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
     seeds = len(findings.measured[arm])
     values, reference, central = (_by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL))
     gap = mean_interval(reference - values, rng)

@@ -27,24 +27,31 @@ from fcslam.evaluation.federated.arms import (
     LOCAL,
     START,
     Arm,
-    Ground,
+    SeedContext,
     train_arm,
     train_central,
     train_locally,
 )
-from fcslam.evaluation.federated.pairs import MEASURES, MOST_POINTS, Described, described, held_out_pairs, measure_pair
+from fcslam.evaluation.federated.pairs import (
+    MEASURES,
+    MOST_POINTS,
+    DetectedFeatures,
+    detect_features,
+    held_out_pairs,
+    measure_pair,
+)
 from fcslam.features.detector import OnnxConfig, OnnxDetector
-from fcslam.federated.network import network_of
+from fcslam.federated.codec import weights_to_network
+from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.start import first_weights
 from fcslam.federated.weights import Weights
 from fcslam.learning.arrays import read_arrays, write_arrays
-from fcslam.learning.export import export
+from fcslam.learning.export import export_onnx
 from fcslam.learning.images import ImageFile, find_images
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.pairs import Pair
-from fcslam.learning.stages import Images, as_detector, gather
-from fcslam.learning.trainer import Pace, Status
+from fcslam.learning.pairs import ViewPair
+from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
+from fcslam.learning.trainer import ExecutionOptions, TrainingProgress
 from fcslam.records import FloatArray
 
 TEST_SHARE: Final = 0.25
@@ -77,13 +84,13 @@ class Study:
     """Folders of images by name."""
     folder: Path
     settings: StudySettings
-    pace: Pace
+    pace: ExecutionOptions
     watch: Callable[[str, int, int], None]
     """Is told what is done, how much of it, and of how much."""
 
 
 @dataclass(frozen=True, slots=True)
-class Findings:
+class StudyResults:
     """Everything that was measured."""
 
     robots: tuple[str, ...]
@@ -96,7 +103,7 @@ class Findings:
     """
 
 
-def run_study(study: Study) -> Findings:
+def run_study(study: Study) -> StudyResults:
     """Train and measure whatever is not yet measured.
 
     Raises:
@@ -107,24 +114,24 @@ def run_study(study: Study) -> Findings:
     for name in study.settings.arms:
         if name.split("-")[0] in (START, CENTRAL, LOCAL, ALONE) or not name.replace("-", "").isalnum():
             raise EvaluationError(f"{name}: an arm of a study needs another name")
-    with _alone(study.folder / "study.lock", patient=True):  # who begins at the same time reads all of it
+    with _locked(study.folder / "study.lock", patient=True):  # who begins at the same time reads all of it
         _claim(study)
     share = -(-study.settings.pairs // len(study.robots))
     pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
     files = _files_of_arms(study)
     missing = [(name, seed, file) for name, places in files.items() for seed, file in enumerate(places, start=1)]
-    common: Common | None = None
+    common: SharedInputs | None = None
     # What another process is at is left to it; when there is nothing else to do it is waited for, or taken over.
     for patient in (False, True):
         for name, seed, file in missing:
-            with _alone(file.with_suffix(".lock"), patient) as mine:
+            with _locked(file.with_suffix(".lock"), patient) as mine:
                 if mine and not file.exists():
-                    common = common or _common(study, pairs)
-                    networks = _trained(_ground(study, common, seed), name, study.settings.arms)
+                    common = common or _shared_inputs(study, pairs)
+                    networks = _trained(_seed_context(study, common, seed), name, study.settings.arms)
                     write_arrays(file, {"measures": _measured(networks, pairs, common, seed, study)})
     owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
     measured = {name: np.stack([read_arrays(file)["measures"] for file in places]) for name, places in files.items()}
-    return Findings(tuple(study.robots), owners, measured)
+    return StudyResults(tuple(study.robots), owners, measured)
 
 
 def _files_of_arms(study: Study) -> dict[str, list[Path]]:
@@ -141,7 +148,7 @@ def _files_of_arms(study: Study) -> dict[str, list[Path]]:
 
 
 @contextmanager
-def _alone(path: Path, patient: bool) -> Iterator[bool]:
+def _locked(path: Path, patient: bool) -> Iterator[bool]:
     """Whether no other process is in here with the same file; if ``patient``, it is waited for."""
     mine = True
     with ExitStack() as stack:
@@ -156,9 +163,9 @@ def _alone(path: Path, patient: bool) -> Iterator[bool]:
         yield mine
 
 
-def _trained(ground: Ground, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:
+def _trained(ground: SeedContext, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:
     if name == START:
-        return [network_of(ground.start, ground.settings.training.encoder)]
+        return [weights_to_network(ground.start, ground.settings.training.encoder)]
     if name == CENTRAL:
         return train_central(ground)
     return train_arm(ground, name, arms[name]) if name in arms else train_locally(ground, name)
@@ -185,41 +192,41 @@ def _claim(study: Study) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Common:
+class SharedInputs:
     """What all seeds share."""
 
     start: Weights
-    images: Mapping[str, Images]
+    images: Mapping[str, TrainingImages]
     """By robot, labelled by the start."""
-    former: Sequence[Described]
+    former: Sequence[DetectedFeatures]
     """What the start finds in the first view of each pair."""
 
 
-def _common(study: Study, pairs: Sequence[Pair]) -> Common:
-    training = study.settings.federated.of_robots()
+def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:
+    training = study.settings.federated.client_training()
 
-    def watch(stage: str, status: Status) -> None:
+    def watch(stage: str, status: TrainingProgress) -> None:
         study.watch(stage, status.step, status.steps)
 
     device = torch.device(study.pace.device)
-    images: dict[str, Images] = {}
-    with _alone(study.folder / "common.lock", patient=True):
-        start = first_weights(study.settings.start, study.folder, study.settings.federated, study.pace, watch)
-        network = network_of(start, training.encoder)
-        labeller = as_detector(network.to(device), device)
+    images: dict[str, TrainingImages] = {}
+    with _locked(study.folder / "common.lock", patient=True):
+        start = prepare_initial_weights(study.settings.start, study.folder, study.settings.federated, study.pace, watch)
+        network = weights_to_network(start, training.encoder)
+        labeller = keypoint_response(network.to(device), device)
         for robot in study.robots:
             files = _files(study, robot)[0]
-            images[robot] = gather(files, study.folder / "labels", training, labeller, None, watch)
+            images[robot] = read_labelled_images(files, study.folder / "labels", training, labeller, None, watch)
     detector = _detector(network)
-    return Common(start, images, [described(detector, pair.views[0]) for pair in pairs])
+    return SharedInputs(start, images, [detect_features(detector, pair.views[0]) for pair in pairs])
 
 
-def _ground(study: Study, common: Common, seed: int) -> Ground:
+def _seed_context(study: Study, common: SharedInputs, seed: int) -> SeedContext:
     def told(name: str, done: int, of: int) -> None:
         study.watch(f"{name}, seed {seed}", done, of)
 
     folder = study.folder / f"seed{seed}"
-    return Ground(study.settings.federated, seed, common.start, common.images, folder, study.pace, told)
+    return SeedContext(study.settings.federated, seed, common.start, common.images, folder, study.pace, told)
 
 
 def _files(study: Study, robot: str) -> tuple[list[ImageFile], list[ImageFile]]:
@@ -235,7 +242,7 @@ def _spread(files: Sequence[ImageFile], most: int) -> list[ImageFile]:
 
 
 def _measured(
-    networks: Sequence[KeypointNetwork], pairs: Sequence[Pair], common: Common, seed: int, study: Study
+    networks: Sequence[KeypointNetwork], pairs: Sequence[ViewPair], common: SharedInputs, seed: int, study: Study
 ) -> FloatArray:
     """Shape (networks, pairs, measures): several networks take turns, so that all together cost what one does."""
     detectors = [_detector(network) for network in networks]
@@ -251,5 +258,5 @@ def _detector(network: KeypointNetwork) -> OnnxDetector:
     """A network as robots run it, exported."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "detector.onnx"
-        export(network, path)
+        export_onnx(network, path)
         return OnnxDetector(OnnxConfig(weights=path, most_features=MOST_POINTS))

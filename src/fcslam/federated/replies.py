@@ -8,16 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.federated.flower import Message
-from fcslam.federated.letters import ARRAYS, figures_of, read_arrays, signature, size_of, write_arrays
+from fcslam.federated.messages import (
+    ARRAYS_KEY,
+    record_bytes,
+    record_to_weights,
+    reply_metrics,
+    reply_sender,
+    weights_to_record,
+)
 from fcslam.federated.weights import Weights
 
-LONGEST_REASON: Final = 300
-LARGEST: Final = 2.0
+MAX_REASON_LENGTH: Final = 300
+MAX_REPLY_RATIO: Final = 2.0
 """An answer's size, in sizes of what was asked about; one that is larger is not unpacked."""
 
 
 @dataclass(slots=True)
-class Answers:
+class RoundReplies:
     """Updates by robot, and why others gave none."""
 
     weights: dict[str, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
@@ -28,25 +35,25 @@ class Answers:
 
     def leave_out(self, robot: str, reason: str) -> None:
         """Whatever the robot sent, it does not count."""
-        self.left_out[robot] = line_of(reason)
+        self.left_out[robot] = printable_line(reason)
         for kept in (self.weights, self.losses, self.messages):
             kept.pop(robot, None)
 
     def mention(self, reasons: Mapping[str, str]) -> None:
         """What else was amiss, shown and kept in the same place."""
         for what, reason in reasons.items():
-            self.left_out.setdefault(what, line_of(reason))
+            self.left_out.setdefault(what, printable_line(reason))
 
 
-def line_of(text: str) -> str:
+def printable_line(text: str) -> str:
     """A short line of printable text."""
     words = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
-    return words if len(words) <= LONGEST_REASON else f"{words[: LONGEST_REASON - 3]}..."
+    return words if len(words) <= MAX_REASON_LENGTH else f"{words[: MAX_REASON_LENGTH - 3]}..."
 
 
-def read_answers(replies: Any, robots: Mapping[int, str], version: str, asked: Weights) -> Answers:
+def read_replies(replies: Any, robots: Mapping[int, str], version: str, asked: Weights) -> RoundReplies:
     """Answers of these robots, by node, to ``asked`` weights of this version; arrays are checked by ``screen``."""
-    answers, most = Answers(), LARGEST * size_of(write_arrays(asked))
+    answers, most = RoundReplies(), MAX_REPLY_RATIO * record_bytes(weights_to_record(asked))
     for reply in replies:
         robot = robots.get(reply.metadata.src_node_id)
         if robot is None:
@@ -55,13 +62,13 @@ def read_answers(replies: Any, robots: Mapping[int, str], version: str, asked: W
             answers.leave_out(robot, reply.error.reason or f"error {reply.error.code}")
             continue
         try:
-            name, base = signature(reply.content)
+            name, base = reply_sender(reply.content)
             if (name, base) != (robot, version):
                 raise ValueError(f"an answer by {name} about version {base}, not by {robot} about {version}")
-            size = size_of(reply.content[ARRAYS])
+            size = record_bytes(reply.content[ARRAYS_KEY])
             if size > most:
                 raise ValueError(f"{size} bytes, where {most:.0f} were enough")
-            weights, losses = read_arrays(reply.content[ARRAYS]), figures_of(reply.content)
+            weights, losses = record_to_weights(reply.content[ARRAYS_KEY]), reply_metrics(reply.content)
         except (ValueError, KeyError, TypeError, EOFError) as error:
             answers.leave_out(robot, f"an answer that cannot be read ({error})")
             continue

@@ -5,10 +5,10 @@ from pathlib import Path
 from fcslam.config import dump
 from fcslam.errors import OutputError
 from fcslam.learning.curve import draw_curves, read_curves
-from fcslam.learning.export import export, quantise, version_of
+from fcslam.learning.export import detector_version, export_onnx, quantise_onnx
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.stages import Images
+from fcslam.learning.stages import TrainingImages
 from fcslam.learning.trainer import PROGRESS_FILE
 
 FIGURES = {
@@ -20,8 +20,8 @@ FIGURES = {
 }
 
 
-def deliver(
-    network: KeypointNetwork, folder: Path, settings: TrainingSettings, images: Images, teacher: Path | None
+def write_training_artifacts(
+    network: KeypointNetwork, folder: Path, settings: TrainingSettings, images: TrainingImages, teacher: Path | None
 ) -> list[Path]:
     """Write `detector.onnx`, `detector-int8.onnx`, `training.png` and `card.md`; returns their paths.
 
@@ -29,21 +29,21 @@ def deliver(
         OutputError: one cannot be written.
     """
     floating, small = folder / "detector.onnx", folder / "detector-int8.onnx"
-    export(network, floating)
-    quantise(floating, small, [example.image for example in images.train])
+    export_onnx(network, floating)
+    quantise_onnx(floating, small, [example.image for example in images.train])
     picture, card = folder / "training.png", folder / "card.md"
     curves = read_curves(folder / "joint" / PROGRESS_FILE, "joint")
     try:
         draw_curves(curves, picture)
         latest = {name: curves[name][1][-1] for name in FIGURES if name in curves}
-        card.write_text(_card(version_of(network), settings, images, teacher, latest), encoding="utf-8")
+        card.write_text(_card(detector_version(network), settings, images, teacher, latest), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error}); make room and run the command again") from error
     return [floating, small, picture, card]
 
 
 def _card(
-    version: str, settings: TrainingSettings, images: Images, teacher: Path | None, figures: dict[str, float]
+    version: str, settings: TrainingSettings, images: TrainingImages, teacher: Path | None, figures: dict[str, float]
 ) -> str:
     taught = "none" if teacher is None else f"keypoints and descriptors in {teacher.name}"
     lines = [

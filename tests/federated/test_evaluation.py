@@ -10,9 +10,9 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli.federate import line_of
 from fcslam.errors import TrainingError
-from fcslam.federated.client import client_app
+from fcslam.federated.client_app import build_client_app
+from fcslam.federated.evaluation import VersionComparison, valid_metrics
 from fcslam.federated.grid import InProcessGrid
-from fcslam.federated.judging import Verdict, credible
 from tests.federated.fakes import START, Fake, run, settings, shifted
 
 
@@ -35,7 +35,7 @@ class Coming(InProcessGrid):
     """Robots that are there from some round on."""
 
     def __init__(self, robots, since):
-        super().__init__(client_app(lambda context: robots[context.node_config["partition-id"]]), len(robots))
+        super().__init__(build_client_app(lambda context: robots[context.node_config["partition-id"]]), len(robots))
         self._first, self._since = robots[0], since
 
     def get_node_ids(self):
@@ -129,9 +129,9 @@ def test_a_robot_that_only_fails_to_judge_the_best_is_named(tmp_path):
 
 
 def test_one_that_has_judged_neither_decides_nothing():
-    assert Verdict({"a": figures(0.5)}, {"b": 0.4}).gain is None
-    assert Verdict({"a": figures(0.5), "b": figures(0.1)}, {"b": 0.4}).gain == pytest.approx(-0.3)
-    assert credible(figures(0.3) | {"round": 3.0}) == figures(0.3)
+    assert VersionComparison({"a": figures(0.5)}, {"b": 0.4}).gain is None
+    assert VersionComparison({"a": figures(0.5), "b": figures(0.1)}, {"b": 0.4}).gain == pytest.approx(-0.3)
+    assert valid_metrics(figures(0.3) | {"round": 3.0}) == figures(0.3)
 
 
 def test_all_weights_move_as_told(tmp_path):

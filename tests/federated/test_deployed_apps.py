@@ -19,10 +19,10 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.cli import main
-from fcslam.federated.deployed import read_status, read_task, task_text, write_status
+from fcslam.federated.deployed_apps import decode_job, encode_job, read_status, write_status
+from fcslam.federated.job import FederatedJob
 from fcslam.federated.launch import free_port
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.task import Task
 
 PATH = os.pathsep.join(path for path in sys.path if path)
 LIMIT_S = 900.0
@@ -37,8 +37,8 @@ TINY = {
 
 
 def test_a_task_arrives_as_it_was_sent(tmp_path):
-    task = Task(tmp_path / 'a "name"', FederatedSettings.model_validate(TINY), None, (tmp_path / "p",))
-    assert read_task(json.loads(json.dumps(task_text(task, "cpu")))) == (task, "cpu")
+    task = FederatedJob(tmp_path / 'a "name"', FederatedSettings.model_validate(TINY), None, (tmp_path / "p",))
+    assert decode_job(json.loads(json.dumps(encode_job(task, "cpu")))) == (task, "cpu")
 
 
 def test_the_status_is_what_was_written_last(tmp_path):

@@ -11,7 +11,7 @@ from torch import Tensor
 from fcslam.features.codes import CODE_BITS, hamming_matrix, mutual_matches
 from fcslam.features.dense import find_peaks, sample_codes
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.pairs import Pair
+from fcslam.learning.pairs import ViewPair
 from fcslam.learning.warps import well_inside
 from fcslam.metrics.homography import inverse, match_errors, matching_accuracy
 from fcslam.metrics.repeatability import CORRECT_PX, in_common_view, repeatability
@@ -38,7 +38,7 @@ def detect(network: KeypointNetwork, image: Tensor, most: int = MOST_POINTS) -> 
 
 
 def validate(
-    network: KeypointNetwork, pairs: Sequence[Pair], device: torch.device, shifts: bool = True
+    network: KeypointNetwork, pairs: Sequence[ViewPair], device: torch.device, shifts: bool = True
 ) -> dict[str, float]:
     """Means over pairs: repeatability, MMA at 3 px by bits, shift, bits' bias and spread.
 
@@ -51,7 +51,7 @@ def validate(
     return {name: _mean([row[name] for row in rows]) for name in rows[0]}
 
 
-def alarms(figures: dict[str, float]) -> list[str]:
+def collapse_warnings(figures: dict[str, float]) -> list[str]:
     """What is wrong with the codes, in words; empty while they are sound."""
     found = []
     if figures["code_spread_bits"] < LEAST_SPREAD_BITS:
@@ -76,7 +76,7 @@ def shift_repeatability(network: KeypointNetwork, image: Tensor, most: int = MOS
     return _mean(shares)
 
 
-def _validate_pair(network: KeypointNetwork, pair: Pair, device: torch.device, shifts: bool) -> dict[str, float]:
+def _validate_pair(network: KeypointNetwork, pair: ViewPair, device: torch.device, shifts: bool) -> dict[str, float]:
     images = [torch.from_numpy(view.image)[None, None].to(device) for view in pair.views]
     (first, first_codes), (second, second_codes) = (detect(network, image) for image in images)
     size = (images[0].shape[-1], images[0].shape[-2])

@@ -7,24 +7,29 @@ from typing import Final
 
 from fcslam.config import dump
 from fcslam.errors import OutputError, TrainingError
-from fcslam.federated.delivery import DETECTOR, deliver
+from fcslam.federated.artifacts import DETECTOR, write_federated_artifacts
+from fcslam.federated.client import NOISE_NEEDS_PUBLIC_IMAGES
+from fcslam.federated.codec import version_maker, weights_to_network
+from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import Grid
 from fcslam.federated.history import RoundReport
-from fcslam.federated.network import network_of, version_maker
-from fcslam.federated.robot import FIGURES_TELL
-from fcslam.federated.rounds import Outside, Server
+from fcslam.federated.initial_weights import (
+    calibration_images,
+    prepare_initial_weights,
+    public_evaluator,
+    read_public_images,
+)
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.start import calibration_images, first_weights, judge_by, public_images
 from fcslam.federated.weights import Weights
-from fcslam.learning.export import export
-from fcslam.learning.stages import Watch
-from fcslam.learning.trainer import Pace
+from fcslam.learning.export import export_onnx
+from fcslam.learning.stages import StageCallback
+from fcslam.learning.trainer import ExecutionOptions
 
 CONFIG_FILE: Final = "config.yaml"
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class FederatedJob:
     """What is asked of the server."""
 
     output: Path
@@ -36,43 +41,47 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Watches:
+class ProgressCallbacks:
     """Who is told what."""
 
-    stage: Watch = lambda _stage, _status: None
+    stage: StageCallback = lambda _stage, _status: None
     steps: Callable[[str, int], None] = lambda _robot, _steps: None
     rounds: Callable[[RoundReport], None] = lambda _report: None
 
 
-def run_task(
-    task: Task, pace: Pace, watches: Watches, grid: Grid, wait: Callable[[str], None] | None = None
+def run_job(
+    task: FederatedJob,
+    pace: ExecutionOptions,
+    watches: ProgressCallbacks,
+    grid: Grid,
+    wait: Callable[[str], None] | None = None,
 ) -> list[Path]:
-    """Run or resume; returns the files that were made. ``wait`` is as in ``Outside``.
+    """Run or resume; returns the files that were made. ``wait`` is as in ``CoordinatorHooks``.
 
     Raises:
         TrainingError: something given is unusable, no robot can train, or the output is another run's.
         OutputError: something cannot be written.
     """
     if task.settings.privacy.noise_multiplier and not task.public:
-        raise TrainingError(FIGURES_TELL)
-    images = public_images(task.public)
+        raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
+    images = read_public_images(task.public)
     _write_config(task, task.output / CONFIG_FILE)
-    start = first_weights(task.start, task.output, task.settings, pace, watches.stage, images)
+    start = prepare_initial_weights(task.start, task.output, task.settings, pace, watches.stage, images)
     encoder = task.settings.training.encoder
 
     def watch(report: RoundReport, best: Weights) -> None:
         if report.released:
-            export(network_of(best, encoder), task.output / DETECTOR)
+            export_onnx(weights_to_network(best, encoder), task.output / DETECTOR)
         watches.rounds(report)
 
-    outside = Outside(version_maker(encoder), judge_by(images, encoder, pace.device), watch, wait)
-    state = Server(task.settings, start, task.output, outside).run(grid)
+    outside = CoordinatorHooks(version_maker(encoder), public_evaluator(images, encoder, pace.device), watch, wait)
+    state = Coordinator(task.settings, start, task.output, outside).run(grid)
     _write_config(task, task.output / CONFIG_FILE, again=True)
     judged_on = "on pairs of public images" if images else "on pairs of images held out by the robots, their median"
-    return deliver(state, task.output, task.settings, calibration_images(images), judged_on)
+    return write_federated_artifacts(state, task.output, task.settings, calibration_images(images), judged_on)
 
 
-def _write_config(task: Task, path: Path, again: bool = False) -> None:
+def _write_config(task: FederatedJob, path: Path, again: bool = False) -> None:
     """At the start, unless an earlier run's is there, and at the end."""
     try:
         task.output.mkdir(parents=True, exist_ok=True)

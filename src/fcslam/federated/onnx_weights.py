@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from fcslam.errors import TrainingError
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
-from fcslam.federated.network import network_of, weights_of
+from fcslam.federated.codec import network_to_weights, weights_to_network
 from fcslam.federated.weights import Weights
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import Encoder
@@ -24,11 +24,11 @@ LEAST_DEVIATION: Final = 2.0**-8
 """Of a channel that says the same everywhere; its square has to be more than the 1e-5."""
 
 
-def read_released(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
+def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
     """Weights of a network that gives what the float32 file gives.
 
-    Exporting folded each batch normalisation into the convolution before it. Read back, it holds the shift alone:
-    another network of the same function. Before it is trained on by batches' own statistics, see ``normalised``.
+    The export folded each batch normalisation into the convolution before it. Read back, the normalisation only holds
+    the shift, so the network computes the same function. Before training, call ``with_batch_statistics``.
 
     Raises:
         TrainingError: the file is no detector in float32, or of another encoder.
@@ -39,7 +39,7 @@ def read_released(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]
         graph = onnx.load(str(path)).graph
     except Exception as error:  # of protobuf, of the system, of onnx
         raise TrainingError(f"{path}: is no ONNX file ({error})") from error
-    weights = weights_of(KeypointNetwork(encoder))
+    weights = network_to_weights(KeypointNetwork(encoder))
     arrays = {array.name: np.array(onnx.numpy_helper.to_array(array)) for array in graph.initializer}
     given: dict[str, NDArray[Any]] = {}
     for node in graph.node:
@@ -51,7 +51,7 @@ def read_released(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]
     if missing:
         raise TrainingError(f"{path}: holds no {missing[0]} of a {encoder} detector in float32")
     # A network of the right names and shapes, and finite, or refused.
-    return weights_of(network_of({name: given[name] for name in weights}, encoder))
+    return network_to_weights(weights_to_network({name: given[name] for name in weights}, encoder))
 
 
 def _module(node: str) -> str:
@@ -79,13 +79,15 @@ def _unfolded(
     }
 
 
-def normalised(weights: Weights, encoder: Encoder, images: Sequence[GreyImage]) -> dict[str, NDArray[np.float32]]:
+def with_batch_statistics(
+    weights: Weights, encoder: Encoder, images: Sequence[GreyImage]
+) -> dict[str, NDArray[np.float32]]:
     """The same function, its batch normalisations by what these images are within the network.
 
     Training normalises by each batch: a network whose normalisations changed nothing would be another one from the
     first step on. The more these images resemble a robot's, the closer it stays; any are far better than none.
     """
-    network = network_of(weights, encoder)
+    network = weights_to_network(weights, encoder)
     norms = {name: module for name, module in network.named_modules() if isinstance(module, nn.BatchNorm2d)}
     sums = _sums_before(norms, network, images)
     given = dict(weights)

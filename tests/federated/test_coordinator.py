@@ -9,9 +9,9 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import OutputError, TrainingError
-from fcslam.evaluation.federated.poison import Poisoned
+from fcslam.evaluation.federated.poison import PoisonedClient
+from fcslam.federated.checkpoint import CHECKPOINT_FILE, read_state, write_state
 from fcslam.federated.history import ROUNDS_FILE
-from fcslam.federated.memory import CHECKPOINT_FILE, read_state, write_state
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.settings import FederatedSettings
 from tests.federated.fakes import START, Fake, grid_of, run, settings, shifted, version
@@ -158,7 +158,7 @@ def test_a_kill_between_table_and_checkpoint_repeats_the_round(tmp_path, monkeyp
 
     robots = [Fake("a")]
     run(robots, tmp_path, settings(rounds=1))
-    monkeypatch.setattr("fcslam.federated.rounds.write_state", fail)
+    monkeypatch.setattr("fcslam.federated.coordinator.write_state", fail)
     with pytest.raises(OutputError):
         run(robots, tmp_path, settings(rounds=3))
     with (tmp_path / ROUNDS_FILE).open() as file:
@@ -327,7 +327,7 @@ def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
 
     chosen = settings(rounds=3, screening={"least_agreement": 0.01})
     alone, _ = run(fleet(), tmp_path / "alone", chosen, start=start)
-    bad = Poisoned(Fake("bad", answer=towards(9)), poison)
+    bad = PoisonedClient(Fake("bad", answer=towards(9)), poison)
     together, reports = run([*fleet(), bad], tmp_path / "together", chosen, start=start)
     assert all(set(report.left_out) == {"bad"} for report in reports)
     assert same(alone.weights, together.weights)

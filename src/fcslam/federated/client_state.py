@@ -17,20 +17,20 @@ from fcslam.federated.weights import Weights
 from fcslam.learning.arrays import read_arrays, write_arrays
 
 
-def former_weights(cache: Path, run: str, round_number: int, weights: Weights) -> Weights:
+def legacy_weights(cache: Path, run: str, round_number: int, weights: Weights) -> Weights:
     """The weights that the run began from, or the first that came here of a run that had begun before.
 
     Raises:
         TrainingError: they cannot be kept.
     """
     path = cache / f"former-{_number(run)}.npz"
-    with _told(path, "the first weights cannot be kept there"):
+    with translate_errors(path, "the first weights cannot be kept there"):
         if round_number == 0 or not path.exists():
             write_arrays(path, weights)
         return read_arrays(path)
 
 
-def last_moments(cache: Path, run: str, round_number: int) -> dict[str, Tensor] | None:
+def load_optimiser_state(cache: Path, run: str, round_number: int) -> dict[str, Tensor] | None:
     """Those at the end of the last round before this one that the robot trained in; None if it trained in none.
 
     Raises:
@@ -40,18 +40,18 @@ def last_moments(cache: Path, run: str, round_number: int) -> dict[str, Tensor] 
     if not earlier:
         return None
     path = _moments_path(cache, run, max(earlier))
-    with _told(path, "the optimiser's memory cannot be read"):
+    with translate_errors(path, "the optimiser's memory cannot be read"):
         return {name: torch.from_numpy(array) for name, array in read_arrays(path).items()}
 
 
-def keep_moments(cache: Path, run: str, round_number: int, moments: Mapping[str, Tensor]) -> None:
+def save_optimiser_state(cache: Path, run: str, round_number: int, moments: Mapping[str, Tensor]) -> None:
     """Keep them, and those before: a server that was killed may ask for the same round again.
 
     Raises:
         TrainingError: they cannot be kept.
     """
     path = _moments_path(cache, run, round_number)
-    with _told(path, "the optimiser's memory cannot be kept there"):
+    with translate_errors(path, "the optimiser's memory cannot be kept there"):
         write_arrays(path, {name: value.cpu().numpy() for name, value in moments.items()})
         before = [each for each in _rounds(cache, run) if each < round_number]
         for each in _rounds(cache, run):
@@ -74,8 +74,9 @@ def _number(run: str) -> str:
 
 
 @contextlib.contextmanager
-def _told(path: Path, what: str) -> Iterator[None]:
+def translate_errors(path: Path, failure: str) -> Iterator[None]:
+    """Raise errors of reading or writing ``path`` as TrainingError; ``failure`` says what could not be done."""
     try:
         yield
-    except (OSError, TypeError, ValueError) as error:  # torch knows not every type of numbers
-        raise TrainingError(f"{path}: {what} ({error}); make room, or take it away") from error
+    except (OSError, TypeError, ValueError) as error:  # torch does not support every dtype of NumPy
+        raise TrainingError(f"{path}: {failure} ({error}); free disk space or remove the file") from error

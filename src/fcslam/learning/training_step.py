@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from fcslam.errors import TrainingError
-from fcslam.learning.batches import Batch
+from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.losses import distillation_loss
 from fcslam.learning.network import KeypointNetwork, Maps, sample_codes
 from fcslam.learning.objective import TeacherBits, grid_shift, objective
@@ -22,7 +22,7 @@ DECAY_SHARE: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Pull:
+class ProximalTerm:
     """A spring back to given weights: strength / 2 times the squared distance is added to what is minimised."""
 
     strength: float
@@ -36,14 +36,14 @@ class Pull:
 
 
 @dataclass(frozen=True, slots=True)
-class Former:
+class LegacyDetector:
     """A former network whose codes are still in use: points should get codes that match those it gives them."""
 
     strength: float
     network: KeypointNetwork
     """In evaluation mode, on the device of the one that is trained."""
 
-    def loss(self, maps: Maps, batch: Batch) -> Tensor:
+    def loss(self, maps: Maps, batch: TrainingBatch) -> Tensor:
         """Cross entropy of the bits at the batch's points against the former network's bits there."""
         with torch.no_grad(), torch.autocast(batch.images.device.type, torch.bfloat16):
             before = self.network(batch.images.contiguous(memory_format=torch.channels_last))
@@ -52,18 +52,18 @@ class Former:
         return distillation_loss(now, wanted, batch.valid.repeat(2, 1))
 
 
-def new_optimiser(network: KeypointNetwork) -> torch.optim.Optimizer:
-    """An optimiser without a memory yet; ``descend`` sets its rate."""
+def create_optimiser(network: KeypointNetwork) -> torch.optim.Optimizer:
+    """An optimiser without a memory yet; ``training_step`` sets its rate."""
     return torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
 
 
-def moments_of(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
     """What an optimiser has learnt of gradients, by the parameters' numbers."""
     states = optimiser.state_dict()["state"]
     return {f"{index}/{name}": value for index, entries in states.items() for name, value in entries.items()}
 
 
-def give_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
+def restore_optimiser_state(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
     """Let a new optimiser go on with what another one had learnt.
 
     Raises:
@@ -82,16 +82,16 @@ def give_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
-def descend(
+def training_step(
     network: KeypointNetwork,
     optimiser: torch.optim.Optimizer,
-    batch: Batch,
+    batch: TrainingBatch,
     settings: TrainingSettings,
     step: int,
     rate: float,
     bits: TeacherBits | None = None,
-    pull: Pull | None = None,
-    former: Former | None = None,
+    pull: ProximalTerm | None = None,
+    former: LegacyDetector | None = None,
 ) -> dict[str, Tensor]:
     """One step in place, with batch, network and optimiser on one device; returns the losses by name.
 

@@ -6,33 +6,33 @@ from pathlib import Path
 from typing import Any, Final
 
 from fcslam.errors import FcslamError, OutputError
-from fcslam.federated.client import client_app
+from fcslam.federated.client import RobotClient, secret_noise, seeded_noise
+from fcslam.federated.client_app import build_client_app
 from fcslam.federated.flower import Context, Grid, ServerApp
-from fcslam.federated.robot import RobotLearner, secret_noise, seeded_noise
+from fcslam.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.task import Task, Watches, run_task
-from fcslam.learning.trainer import Pace
+from fcslam.learning.trainer import ExecutionOptions
 from fcslam.storage.files import write_file
 
 STATUS_FILE: Final = "status.json"
 WAIT_S: Final = 5.0
 
 
-def task_text(task: Task, device: str) -> str:
-    """A task as a line that ``read_task`` understands."""
+def encode_job(task: FederatedJob, device: str) -> str:
+    """A task as a line that ``decode_job`` understands."""
     paths = {"output": str(task.output.resolve()), "public": [str(path.resolve()) for path in task.public]}
     start = None if task.start is None else str(task.start.resolve())
     settings = task.settings.model_dump(mode="json")
     return json.dumps({**paths, "start": start, "settings": settings, "device": device})
 
 
-def read_task(text: str) -> tuple[Task, str]:
+def decode_job(text: str) -> tuple[FederatedJob, str]:
     """A task and the device to work on."""
     content = json.loads(text)
     start = None if content["start"] is None else Path(content["start"])
     settings = FederatedSettings.model_validate(content["settings"])
     public = tuple(Path(path) for path in content["public"])
-    return Task(Path(content["output"]), settings, start, public), content["device"]
+    return FederatedJob(Path(content["output"]), settings, start, public), content["device"]
 
 
 def write_status(folder: Path, state: str, text: str) -> None:
@@ -64,7 +64,7 @@ server = ServerApp()
 @server.main()
 def serve(grid: Grid, context: Context) -> None:
     """Run the task in the run's configuration; all that goes wrong is said in its folder."""
-    task, device = read_task(str(context.run_config["task"]))
+    task, device = decode_job(str(context.run_config["task"]))
 
     def wait(reason: str) -> None:
         write_status(task.output, "waiting", reason)
@@ -72,20 +72,20 @@ def serve(grid: Grid, context: Context) -> None:
         write_status(task.output, "running", "")
 
     try:
-        run_task(task, Pace(device=device), Watches(), grid, wait)
+        run_job(task, ExecutionOptions(device=device), ProgressCallbacks(), grid, wait)
         write_status(task.output, "done", "")
     except FcslamError as error:
         write_status(task.output, "failed", str(error))
         raise
 
 
-def _robot_of(context: Context) -> RobotLearner:
+def _robot_of(context: Context) -> RobotClient:
     config: dict[str, Any] = context.node_config
     name = str(config["robot"])
     seed = config.get("noise-seed")
     noise = secret_noise if seed is None else seeded_noise(name, int(seed))
-    return RobotLearner(name, Path(str(config["images"])), Path(str(config["labels"])), noise, str(config["device"]))
+    return RobotClient(name, Path(str(config["images"])), Path(str(config["labels"])), noise, str(config["device"]))
 
 
-robot = client_app(_robot_of)
+robot = build_client_app(_robot_of)
 """Named in the app that every SuperNode runs."""

@@ -11,12 +11,12 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
-from fcslam.federated.network import network_of, version_maker, weights_of  # noqa: E402
-from fcslam.federated.robot import RobotLearner, own_seed, secret_noise, seeded_noise  # noqa: E402
+from fcslam.federated.client import RobotClient, robot_seed, secret_noise, seeded_noise  # noqa: E402
+from fcslam.federated.codec import network_to_weights, version_maker, weights_to_network  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.federated.weights import trained_names, update_vector  # noqa: E402
 from fcslam.learning.arrays import read_arrays, write_arrays  # noqa: E402
-from fcslam.learning.leg import network_with  # noqa: E402
+from fcslam.learning.local_training import network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 
 TINY = {"rounds": 2, "local_steps": 2, "training": {"pairs": 1, "side_px": 64, "points": 32, "label_copies": 1}}
@@ -29,7 +29,7 @@ def settings(**given):
 @pytest.fixture(scope="module")
 def start():
     torch.manual_seed(3)
-    return weights_of(KeypointNetwork("light"))
+    return network_to_weights(KeypointNetwork("light"))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def folder(tmp_path_factory):
 
 
 def robot(folder, cache, name="rover"):
-    return RobotLearner(name, folder, cache, seeded_noise(name, 1))
+    return RobotClient(name, folder, cache, seeded_noise(name, 1))
 
 
 def labels_in(cache):
@@ -131,7 +131,7 @@ def test_the_pull_holds_updates_back(folder, start, tmp_path):
 def test_codes_are_kept_to_those_of_the_run_s_first_weights(folder, start, tmp_path):
     chosen = settings(compatible=100.0)
     torch.manual_seed(4)
-    moved = weights_of(KeypointNetwork("light"))
+    moved = network_to_weights(KeypointNetwork("light"))
     first = robot(folder, tmp_path / "a")
     assert "former" in first.learn(start, 0, "run", chosen).losses
     assert "former" not in robot(folder, tmp_path / "b").learn(start, 0, "run", settings()).losses
@@ -174,7 +174,7 @@ def test_noise_is_added_before_anything_leaves(folder, start, tmp_path):
 def test_secret_noise_never_repeats_and_seeded_noise_does():
     assert secret_noise(0).random() != secret_noise(0).random()
     assert seeded_noise("a", 1)(0).random() == seeded_noise("a", 1)(0).random()
-    assert len({own_seed(name, seed) for name in "abc" for seed in (1, 2)}) == 6
+    assert len({robot_seed(name, seed) for name in "abc" for seed in (1, 2)}) == 6
 
 
 @pytest.mark.parametrize("content", ["none", "one", "broken"])
@@ -195,17 +195,17 @@ def test_weights_of_another_network_are_refused(folder, start, tmp_path):
     with pytest.raises(TrainingError, match="no weights of a vgg network"):
         robot(folder, tmp_path).learn(start, 0, "run", chosen)
     with pytest.raises(TrainingError, match="not those of a light network"):
-        network_with("light", {})
+        network_from_state("light", {})
 
 
 def test_weights_become_the_same_network_again(start):
     torch.manual_seed(5)
     image = torch.rand(1, 1, 64, 64)
     network = KeypointNetwork("light").eval()
-    again = network_of(weights_of(network), "light")
+    again = weights_to_network(network_to_weights(network), "light")
     assert torch.equal(network(image).code_logits, again(image).code_logits)
     version = version_maker("light")
-    assert version(weights_of(network)) == version(weights_of(again)) != version(start)
+    assert version(network_to_weights(network)) == version(network_to_weights(again)) != version(start)
 
 
 def test_with_noise_no_exact_number_leaves_a_robot(folder, start, tmp_path):

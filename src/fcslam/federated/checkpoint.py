@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.weights import Weights, malformed
+from fcslam.federated.weights import Weights, weights_error
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 
 CHECKPOINT_FILE: Final = "checkpoint.npz"
 STAGE: Final = "federated"
-MAY_CHANGE: Final = frozenset({"rounds", "deadline_s", "minimum_robots"})
+CHANGEABLE: Final = frozenset({"rounds", "deadline_s", "minimum_robots"})
 """Settings that a run may go on with other values of."""
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class CoordinatorState:
     """After a round."""
 
     rounds_done: int
@@ -45,12 +45,12 @@ class State:
     """Version of the weights that everything began from."""
 
 
-def run_name(settings: FederatedSettings, origin: str) -> str:
+def run_id(settings: FederatedSettings, origin: str) -> str:
     """One for all that may go on from one checkpoint: 16 hexadecimal digits of settings and first weights."""
     return hashlib.sha256(json.dumps([_fixed(settings.model_dump(mode="json")), origin]).encode()).hexdigest()[:16]
 
 
-def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
+def write_state(path: Path, state: CoordinatorState, settings: FederatedSettings) -> None:
     """Write beside the last state, then take its place.
 
     Raises:
@@ -76,7 +76,7 @@ def write_state(path: Path, state: State, settings: FederatedSettings) -> None:
     write_checkpoint(path, Checkpoint(STAGE, state.rounds_done, header, tensors))
 
 
-def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: str) -> State | None:
+def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: str) -> CoordinatorState | None:
     """The state in a file; None if there is no file. ``start`` are this run's first weights, ``origin`` names them.
 
     Raises:
@@ -94,7 +94,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
             groups[group][name] = tensor.numpy()
         header = checkpoint.settings
         fixed = _fixed(header["settings"])
-        state = State(
+        state = CoordinatorState(
             checkpoint.step,
             groups["weights"],
             groups["average"],
@@ -115,7 +115,7 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
             f"{path}: is of a run with other settings ({', '.join(others)}); give them again, or another --output"
         )
     for group in ("weights", "average", "best"):
-        reason = malformed(groups[group], start)
+        reason = weights_error(groups[group], start)
         if reason is not None:
             raise TrainingError(f"{path}: its {group} do not fit this network ({reason})")
     if state.origin != origin:
@@ -126,4 +126,4 @@ def read_state(path: Path, settings: FederatedSettings, start: Weights, origin: 
 
 
 def _fixed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if name not in MAY_CHANGE}
+    return {name: value for name, value in settings.items() if name not in CHANGEABLE}

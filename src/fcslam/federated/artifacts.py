@@ -8,11 +8,11 @@ from typing import Final
 from fcslam.config import dump
 from fcslam.errors import OutputError, TrainingError
 from fcslam.features.detector import GreyImage
+from fcslam.federated.checkpoint import CoordinatorState
+from fcslam.federated.codec import weights_to_network
 from fcslam.federated.history import LOSS, ROUNDS_FILE, Row
-from fcslam.federated.memory import State
-from fcslam.federated.network import network_of
 from fcslam.federated.settings import FederatedSettings
-from fcslam.learning.export import export, quantise, version_of
+from fcslam.learning.export import detector_version, export_onnx, quantise_onnx
 
 DETECTOR, INT8, CARD, PICTURE = "detector.onnx", "detector-int8.onnx", "card.md", "rounds.png"
 FIGURES: Final = {
@@ -23,8 +23,8 @@ SHOWN_LOSSES: Final = ("detector", "contrastive", "triplet")
 MEGABYTE: Final = 1e6
 
 
-def deliver(
-    state: State, folder: Path, settings: FederatedSettings, calibration: Sequence[GreyImage], judged_on: str
+def write_federated_artifacts(
+    state: CoordinatorState, folder: Path, settings: FederatedSettings, calibration: Sequence[GreyImage], judged_on: str
 ) -> list[Path]:
     """Write all four files; returns their paths.
 
@@ -39,13 +39,13 @@ def deliver(
         OutputError: one cannot be written.
         TrainingError: the table of rounds is broken.
     """
-    network = network_of(state.best, settings.training.encoder)
-    export(network, folder / DETECTOR)
-    quantise(folder / DETECTOR, folder / INT8, calibration)
+    network = weights_to_network(state.best, settings.training.encoder)
+    export_onnx(network, folder / DETECTOR)
+    quantise_onnx(folder / DETECTOR, folder / INT8, calibration)
     rows = _rows(folder / ROUNDS_FILE)
     try:
         draw_rounds(rows, folder / PICTURE)
-        (folder / CARD).write_text(_card(version_of(network), state, settings, rows, judged_on), encoding="utf-8")
+        (folder / CARD).write_text(_card(detector_version(network), state, settings, rows, judged_on), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error}); make room and run the command again") from error
     return [folder / name for name in (DETECTOR, INT8, PICTURE, CARD)]
@@ -90,7 +90,9 @@ def _column(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:
     return [float(row.get(name) or "nan") for row in rows]
 
 
-def _card(version: str, state: State, settings: FederatedSettings, rows: Sequence[Row], judged_on: str) -> str:
+def _card(
+    version: str, state: CoordinatorState, settings: FederatedSettings, rows: Sequence[Row], judged_on: str
+) -> str:
     asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.asked.items()))
     best = next((row for row in rows if int(row["round"]) == state.best_round), {})
     sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))

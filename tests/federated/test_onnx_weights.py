@@ -8,15 +8,15 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.features.detector import SHIPPED_NETWORK, OnnxConfig, OnnxDetector  # noqa: E402
-from fcslam.federated.network import network_of, weights_of  # noqa: E402
-from fcslam.federated.released import normalised  # noqa: E402
+from fcslam.federated.codec import network_to_weights, weights_to_network  # noqa: E402
+from fcslam.federated.initial_weights import prepare_initial_weights, read_detector_weights  # noqa: E402
+from fcslam.federated.onnx_weights import with_batch_statistics  # noqa: E402
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
-from fcslam.federated.start import first_weights, read_weights  # noqa: E402
 from fcslam.federated.weights import trained_names  # noqa: E402
-from fcslam.learning.export import export, quantise  # noqa: E402
+from fcslam.learning.export import export_onnx, quantise_onnx  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.stages import Shapes  # noqa: E402
-from fcslam.learning.trainer import Pace  # noqa: E402
+from fcslam.learning.stages import SyntheticShapes  # noqa: E402
+from fcslam.learning.trainer import ExecutionOptions  # noqa: E402
 from tests.features.networks import tiny_network  # noqa: E402
 
 
@@ -39,18 +39,18 @@ def lived_in(encoder):
 @pytest.mark.parametrize("encoder", ["light", "vgg"])
 def test_it_is_the_same_function(encoder, tmp_path):
     network = lived_in(encoder)
-    export(network, tmp_path / "detector.onnx")
-    weights = read_weights(tmp_path / "detector.onnx", encoder)
+    export_onnx(network, tmp_path / "detector.onnx")
+    weights = read_detector_weights(tmp_path / "detector.onnx", encoder)
     pictures = np.random.default_rng(1).integers(0, 256, (2, 64, 96), np.uint8)
     images = torch.from_numpy(pictures)[:, None].float() / 255.0
-    for read in (weights, normalised(weights, encoder, list(pictures))):
+    for read in (weights, with_batch_statistics(weights, encoder, list(pictures))):
         with torch.inference_mode():
-            for ours, theirs in zip(network_of(read, encoder)(images), network(images), strict=True):
+            for ours, theirs in zip(weights_to_network(read, encoder)(images), network(images), strict=True):
                 assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4 * float(theirs.abs().max()))
 
 
 def test_the_network_that_comes_with_fcslam_can_be_trained_on():
-    read = network_of(read_weights(SHIPPED_NETWORK, "light"), "light")
+    read = weights_to_network(read_detector_weights(SHIPPED_NETWORK, "light"), "light")
     picture = np.random.default_rng(0).integers(0, 256, (64, 96), np.uint8)
     scores, logits = OnnxDetector(OnnxConfig()).infer(picture)
     with torch.inference_mode():
@@ -61,8 +61,8 @@ def test_the_network_that_comes_with_fcslam_can_be_trained_on():
 
 def test_its_normalisations_begin_as_none(tmp_path):
     """So everything that training moves is there, and statistics can be frozen."""
-    export(lived_in("light"), tmp_path / "detector.onnx")
-    weights = read_weights(tmp_path / "detector.onnx", "light")
+    export_onnx(lived_in("light"), tmp_path / "detector.onnx")
+    weights = read_detector_weights(tmp_path / "detector.onnx", "light")
     statistics = set(weights) - set(trained_names(weights, frozen_statistics=True))
     assert statistics
     for name in statistics:
@@ -71,13 +71,13 @@ def test_its_normalisations_begin_as_none(tmp_path):
 
 def test_what_no_normalisation_had_become_is_another_function_as_soon_as_it_is_trained():
     """Normalised anew it stays what it was, the more so the more alike the images are."""
-    released = read_weights(SHIPPED_NETWORK, "light")
-    shapes, others = ([example.image for example in Shapes(first, 8)[:]] for first in (5, 6))
+    released = read_detector_weights(SHIPPED_NETWORK, "light")
+    shapes, others = ([example.image for example in SyntheticShapes(first, 8)[:]] for first in (5, 6))
     batch = torch.from_numpy(np.stack(shapes))[:, None].float() / 255.0
-    given, alike = (normalised(released, "light", images) for images in (shapes, others))
+    given, alike = (with_batch_statistics(released, "light", images) for images in (shapes, others))
     with torch.inference_mode():
-        expected = network_of(released, "light")(batch)
-        networks = [network_of(weights, "light") for weights in (given, alike, released)]
+        expected = weights_to_network(released, "light")(batch)
+        networks = [weights_to_network(weights, "light") for weights in (given, alike, released)]
         assert torch.allclose(networks[0](batch).code_logits, expected.code_logits, rtol=1e-3, atol=1e-3)
         assert torch.allclose(networks[0](batch).point_logits, expected.point_logits, rtol=1e-3, atol=1e-3)
         bits = [network.train()(batch).code_logits > 0.0 for network in networks]
@@ -90,23 +90,27 @@ def test_what_no_normalisation_had_become_is_another_function_as_soon_as_it_is_t
 def test_a_channel_that_says_the_same_everywhere_is_normalised_as_well():
     network = lived_in("light")
     network.body.joint[0][0].weight.data[3] = 0.0
-    weights = weights_of(network)
-    given = normalised(weights, "light", [np.random.default_rng(1).integers(0, 256, (64, 96), np.uint8)])
+    weights = network_to_weights(network)
+    given = with_batch_statistics(weights, "light", [np.random.default_rng(1).integers(0, 256, (64, 96), np.uint8)])
     images = torch.rand(2, 1, 64, 96, generator=torch.Generator().manual_seed(1))
     with torch.inference_mode():
-        ours, theirs = (network_of(each, "light")(images).code_logits for each in (given, weights))
+        ours, theirs = (weights_to_network(each, "light")(images).code_logits for each in (given, weights))
     assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4 * float(theirs.abs().max()))
 
 
 def test_a_fleet_goes_on_from_the_start_it_had_whatever_public_images_there_are_now(tmp_path):
-    export(lived_in("light"), tmp_path / "detector.onnx")
+    export_onnx(lived_in("light"), tmp_path / "detector.onnx")
     pictures = np.random.default_rng(1).integers(0, 256, (2, 96, 96), np.uint8)
 
     def first(public):
-        return first_weights(tmp_path / "detector.onnx", tmp_path, FederatedSettings(), Pace(), lambda *_: None, public)
+        return prepare_initial_weights(
+            tmp_path / "detector.onnx", tmp_path, FederatedSettings(), ExecutionOptions(), lambda *_: None, public
+        )
 
     begun = first([pictures[0]])
-    assert any((begun[name] != read_weights(tmp_path / "detector.onnx", "light")[name]).any() for name in begun)
+    assert any(
+        (begun[name] != read_detector_weights(tmp_path / "detector.onnx", "light")[name]).any() for name in begun
+    )
     again = first([pictures[1]])
     assert all(np.array_equal(begun[name], again[name]) for name in begun)
     (kept,) = tmp_path.glob("start-*.npz")
@@ -118,10 +122,10 @@ def test_a_fleet_goes_on_from_the_start_it_had_whatever_public_images_there_are_
 
 
 def test_another_network_is_refused_by_name(tmp_path):
-    export(lived_in("light"), tmp_path / "light.onnx")
-    quantise(tmp_path / "light.onnx", tmp_path / "int8.onnx", [np.full((64, 64), 128, np.uint8)])
+    export_onnx(lived_in("light"), tmp_path / "light.onnx")
+    quantise_onnx(tmp_path / "light.onnx", tmp_path / "int8.onnx", [np.full((64, 64), 128, np.uint8)])
     (tmp_path / "text.onnx").write_text("hello")
     tiny_network(tmp_path / "tiny.onnx")
     for name, encoder in (("light", "vgg"), ("int8", "light"), ("text", "light"), ("tiny", "light")):
         with pytest.raises(TrainingError, match=name):
-            read_weights(tmp_path / f"{name}.onnx", encoder)
+            read_detector_weights(tmp_path / f"{name}.onnx", encoder)

@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.federated.answers import LONGEST_REASON, Answers
 from fcslam.federated.flower import Array, ArrayRecord, Error, Message, MessageType, MetricRecord
 from fcslam.federated.history import ROUNDS_FILE, read_rows
+from fcslam.federated.replies import MAX_REASON_LENGTH, RoundReplies
 from tests.federated.fakes import START, Fake, grid_of, run, settings, shifted
 
 
@@ -136,13 +136,13 @@ def test_reasons_are_short_lines(tmp_path):
 
     grid._ask = shouting
     _, reports = run(robots, tmp_path, grid=grid)
-    assert {len(report.left_out["bad"]) for report in reports} == {LONGEST_REASON}
+    assert {len(report.left_out["bad"]) for report in reports} == {MAX_REASON_LENGTH}
     assert all(report.left_out["bad"].isprintable() for report in reports)
     assert len(read_rows(tmp_path / ROUNDS_FILE, 9)) == 2
 
 
 def test_who_is_left_out_counts_for_nothing():
-    answers = Answers({"a": {}}, {"a": {}}, {"a": None})
+    answers = RoundReplies({"a": {}}, {"a": {}}, {"a": None})
     answers.leave_out("a", "late\nagain")
     assert (answers.weights, answers.losses, answers.messages) == ({}, {}, {})
     assert answers.left_out == {"a": "late again"}

@@ -7,28 +7,28 @@ from typing import Final
 
 import numpy as np
 
-SCORE_FIGURES: Final = ("repeatability", "mma_3px")
+SCORE_METRICS: Final = ("repeatability", "mma_3px")
 
-Figures = Mapping[str, float]
+Metrics = Mapping[str, float]
 
 
-def score_of(figures: Figures) -> float:
+def combined_score(figures: Metrics) -> float:
     """What versions of the detector are compared by: the mean of repeatability and MMA; -1 where one is not known."""
-    values = [figures.get(name, np.nan) for name in SCORE_FIGURES]
+    values = [figures.get(name, np.nan) for name in SCORE_METRICS]
     return float(np.mean(values)) if np.isfinite(values).all() else -1.0
 
 
-def credible(figures: Figures) -> dict[str, float]:
+def valid_metrics(figures: Metrics) -> dict[str, float]:
     """What a robot may say of a version: both shares, or nothing."""
-    found = {name: figures[name] for name in SCORE_FIGURES if 0.0 <= figures.get(name, np.nan) <= 1.0}
-    return found if len(found) == len(SCORE_FIGURES) else {}
+    found = {name: figures[name] for name in SCORE_METRICS if 0.0 <= figures.get(name, np.nan) <= 1.0}
+    return found if len(found) == len(SCORE_METRICS) else {}
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class VersionComparison:
     """On a version, beside the best one so far."""
 
-    by_judge: Mapping[str, Figures]
+    by_evaluator: Mapping[str, Metrics]
     """Figures of the version; none where it is not judged."""
     best: Mapping[str, float]
     """Scores of the best, by all who ever judged it."""
@@ -36,18 +36,18 @@ class Verdict:
     @property
     def scores(self) -> dict[str, float]:
         """The version's, by who judged it."""
-        return {judge: score_of(figures) for judge, figures in self.by_judge.items()}
+        return {judge: combined_score(figures) for judge, figures in self.by_evaluator.items()}
 
     @property
     def score(self) -> float:
         """The median; NaN if nobody judged."""
-        return float(np.median(list(self.scores.values()))) if self.by_judge else math.nan
+        return float(np.median(list(self.scores.values()))) if self.by_evaluator else math.nan
 
     @property
     def figures(self) -> dict[str, float]:
         """Medians of each."""
-        names = dict.fromkeys(name for figures in self.by_judge.values() for name in figures)
-        rows = self.by_judge.values()
+        names = dict.fromkeys(name for figures in self.by_evaluator.values() for name in figures)
+        rows = self.by_evaluator.values()
         return {name: float(np.median([row[name] for row in rows if name in row])) for name in names}
 
     @property

@@ -5,16 +5,16 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from fcslam.federated.flower import Grid, Message, MessageType, RecordDict
-from fcslam.federated.letters import signature
+from fcslam.federated.messages import reply_sender
 
 
-class Roster:
+class RobotRegistry:
     """Asks every node once for its name."""
 
     def __init__(self, grid: Grid, deadline_s: float) -> None:
         self._grid, self._deadline_s = grid, deadline_s
         self._names: dict[int, str] = {}
-        self.doubles: tuple[str, ...] = ()
+        self.duplicates: tuple[str, ...] = ()
         """Names that more than one of those present had when last looked."""
 
     def present(self) -> dict[str, int]:
@@ -22,10 +22,10 @@ class Roster:
         nodes = sorted(self._grid.get_node_ids())
         self._meet([node for node in nodes if node not in self._names])
         found: dict[str, int] = {}
-        doubles: dict[str, int] = {}
+        duplicates: dict[str, int] = {}
         for name, node in sorted((self._names[node], node) for node in nodes if node in self._names):
-            (doubles if name in found else found)[name] = node
-        self.doubles = tuple(doubles)
+            (duplicates if name in found else found)[name] = node
+        self.duplicates = tuple(duplicates)
         return found
 
     def _meet(self, nodes: Sequence[int]) -> None:
@@ -36,12 +36,12 @@ class Roster:
             if reply.has_error():
                 continue
             try:
-                self._names[reply.metadata.src_node_id], _ = signature(reply.content)
+                self._names[reply.metadata.src_node_id], _ = reply_sender(reply.content)
             except ValueError:
                 continue
 
 
-def choose(names: Iterable[str], share: float, fewest: int, rng: np.random.Generator) -> list[str]:
+def sample_robots(names: Iterable[str], share: float, fewest: int, rng: np.random.Generator) -> list[str]:
     """Some of the robots, in the order of their names: a share of them, and no fewer than ``fewest`` if there are."""
     everyone = sorted(names)
     count = min(max(int(np.ceil(share * len(everyone))), fewest), len(everyone))

@@ -10,13 +10,13 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import TrainingError  # noqa: E402
 from fcslam.learning.batches import draw_batch  # noqa: E402
-from fcslam.learning.descent import Former, Pull  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
-from fcslam.learning.labels import fuse  # noqa: E402
-from fcslam.learning.leg import RAMP_STEPS, Leg, network_with, train_leg  # noqa: E402
+from fcslam.learning.labels import fuse_keypoints  # noqa: E402
+from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, local_training, network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.pairs import Example  # noqa: E402
+from fcslam.learning.pairs import TrainingExample  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
+from fcslam.learning.training_step import LegacyDetector, ProximalTerm  # noqa: E402
 
 SMALL = TrainingSettings(steps=40, pairs=1, side_px=64, points=32)
 CPU = torch.device("cpu")
@@ -26,7 +26,7 @@ CPU = torch.device("cpu")
 def examples():
     images = [textured(seed) for seed in range(2)]
     points = [peaks(harris(image), 4, 200) for image in images]
-    return [Example(image, fuse(each, each)) for image, each in zip(images, points, strict=True)]
+    return [TrainingExample(image, fuse_keypoints(each, each)) for image, each in zip(images, points, strict=True)]
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def start():
 def test_a_leg_does_its_steps_and_says_so(examples, start):
     done = []
     before = {name: tensor.clone() for name, tensor in start.items()}
-    network, losses, _ = train_leg(start, examples, SMALL, Leg(first=5, steps=3), CPU, done.append)
+    network, losses, _ = local_training(start, examples, SMALL, LocalTrainingPlan(first=5, steps=3), CPU, done.append)
     assert done == [1, 2, 3]
     assert not network.training
     assert {"detector", "contrastive", "triplet"} <= losses.keys()
@@ -48,18 +48,18 @@ def test_a_leg_does_its_steps_and_says_so(examples, start):
 
 def test_a_leg_learns(examples, start):
     longer = SMALL.model_copy(update={"pairs": 2})
-    first = train_leg(start, examples, longer, Leg(first=0, steps=5), CPU).losses
-    network = train_leg(start, examples, longer, Leg(first=0, steps=30), CPU).network
-    last = train_leg(network.state_dict(), examples, longer, Leg(first=30, steps=5), CPU).losses
+    first = local_training(start, examples, longer, LocalTrainingPlan(first=0, steps=5), CPU).losses
+    network = local_training(start, examples, longer, LocalTrainingPlan(first=0, steps=30), CPU).network
+    last = local_training(network.state_dict(), examples, longer, LocalTrainingPlan(first=30, steps=5), CPU).losses
     assert last["detector"] < 0.9 * first["detector"]
 
 
 def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, start):
-    whole = train_leg(start, examples, SMALL, Leg(0, RAMP_STEPS + 3), CPU)
-    first = train_leg(start, examples, SMALL, Leg(0, RAMP_STEPS), CPU)
+    whole = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS + 3), CPU)
+    first = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS), CPU)
     halfway = first.network.state_dict()
-    second = train_leg(halfway, examples, SMALL, Leg(RAMP_STEPS, 3), CPU, moments=first.moments)
-    forgetful = train_leg(halfway, examples, SMALL, Leg(RAMP_STEPS, 3), CPU)
+    second = local_training(halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU, moments=first.moments)
+    forgetful = local_training(halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU)
     expected = whole.network.state_dict()
     assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
     assert all(torch.equal(tensor, whole.moments[name]) for name, tensor in second.moments.items())
@@ -74,13 +74,13 @@ def test_moments_that_are_no_numbers_are_given_to_no_other_leg(examples, start, 
         optimiser.step()
         return {}
 
-    monkeypatch.setattr("fcslam.learning.leg.descend", overflow)
+    monkeypatch.setattr("fcslam.learning.local_training.training_step", overflow)
     with pytest.raises(TrainingError, match="diverged in the last step"):
-        train_leg(start, examples, SMALL, Leg(0, 1), CPU)
+        local_training(start, examples, SMALL, LocalTrainingPlan(0, 1), CPU)
 
 
 def test_frozen_statistics_are_not_touched_while_their_scales_are_trained(examples, start):
-    network = train_leg(start, examples, SMALL, Leg(0, 2, frozen_statistics=True), CPU).network
+    network = local_training(start, examples, SMALL, LocalTrainingPlan(0, 2, frozen_statistics=True), CPU).network
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(tensor, start[name])}
     assert not [name for name in changed if "running" in name]
     norms = {name.removesuffix("running_var") for name in start if name.endswith("running_var")}
@@ -88,9 +88,9 @@ def test_frozen_statistics_are_not_touched_while_their_scales_are_trained(exampl
 
 
 def test_the_pull_is_half_its_strength_times_the_squared_distance(start):
-    network = network_with("light", start)
+    network = network_from_state("light", start)
     weights = {name: value.detach().clone() for name, value in network.named_parameters()}
-    pull = Pull(3.0, weights)
+    pull = ProximalTerm(3.0, weights)
     assert pull.energy(network).item() == 0.0
     count = 0
     with torch.no_grad():
@@ -109,41 +109,41 @@ def bits(network):
 
 
 def test_a_network_is_not_pulled_away_from_its_own_codes(examples, start):
-    network = network_with("light", start)
+    network = network_from_state("light", start)
     batch = draw_batch(examples, SMALL, 0)
     with torch.autocast("cpu", torch.bfloat16):
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))
     logits = maps.code_logits.float().detach().requires_grad_()
-    loss = Former(1.0, network).loss(maps._replace(code_logits=logits), batch)
+    loss = LegacyDetector(1.0, network).loss(maps._replace(code_logits=logits), batch)
     loss.backward()
     assert logits.grad.abs().max() < 1e-6
-    flipped = Former(1.0, network).loss(maps._replace(code_logits=-logits), batch)
+    flipped = LegacyDetector(1.0, network).loss(maps._replace(code_logits=-logits), batch)
     assert flipped > loss
     nothing = replace(batch, valid=torch.zeros_like(batch.valid))
-    assert Former(1.0, network).loss(maps._replace(code_logits=-logits), nothing) == 0.0
+    assert LegacyDetector(1.0, network).loss(maps._replace(code_logits=-logits), nothing) == 0.0
 
 
 def test_codes_are_kept_to_those_of_a_former_network(examples, start):
     torch.manual_seed(2)
     former = KeypointNetwork("light").state_dict()
-    wanted = bits(network_with("light", former))
+    wanted = bits(network_from_state("light", former))
 
     def agreement(leg, state):
-        network, losses, _ = train_leg(start, examples, SMALL, leg, CPU, former=state)
+        network, losses, _ = local_training(start, examples, SMALL, leg, CPU, former=state)
         assert ("former" in losses) is (state is not None and leg.compatible > 0.0)
         return float((bits(network) == wanted).float().mean())
 
-    free = agreement(Leg(0, 30), None)
-    assert agreement(Leg(0, 30), former) == free
-    assert agreement(Leg(0, 30, compatible=100.0), former) > free + 0.1
+    free = agreement(LocalTrainingPlan(0, 30), None)
+    assert agreement(LocalTrainingPlan(0, 30), former) == free
+    assert agreement(LocalTrainingPlan(0, 30, compatible=100.0), former) > free + 0.1
 
 
 def test_a_former_network_of_another_kind_is_refused(examples, start):
     with pytest.raises(TrainingError, match="not those of a light network"):
-        train_leg(start, examples, SMALL, Leg(0, 1, compatible=1.0), CPU, former={})
+        local_training(start, examples, SMALL, LocalTrainingPlan(0, 1, compatible=1.0), CPU, former={})
 
 
 def test_weights_that_make_training_diverge_are_said(examples, start):
     broken = start | {"body.code_head.1.bias": torch.full_like(start["body.code_head.1.bias"], torch.nan)}
     with pytest.raises(TrainingError, match="diverged at step 7"):
-        train_leg(broken, examples, SMALL, Leg(7, 1), CPU)
+        local_training(broken, examples, SMALL, LocalTrainingPlan(7, 1), CPU)

@@ -11,15 +11,15 @@ from fcslam.federated.flower import Array, ArrayRecord, ConfigRecord, MetricReco
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 
-ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"
-WEIGHT = "num-examples"
+ARRAYS_KEY, CONFIG_KEY, METRICS_KEY = "arrays", "config", "metrics"
+EXAMPLES_KEY = "num-examples"
 """Flower's name for how much an update weighs."""
-LONGEST_NAME = 64
-MOST_FIGURES = 32
+MAX_NAME_LENGTH = 64
+MAX_METRICS = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class ClientRequest:
     """What a robot is asked."""
 
     weights: Weights
@@ -31,13 +31,13 @@ class Order:
     settings: FederatedSettings
 
 
-def order_config(version: str, round_number: int, run: str, settings: FederatedSettings) -> ConfigRecord:
+def request_config(version: str, round_number: int, run: str, settings: FederatedSettings) -> ConfigRecord:
     """What goes with the weights to every robot."""
     order = {"version": version, "round": round_number, "run": run, "settings": settings.model_dump_json()}
     return ConfigRecord(order)
 
 
-def read_order(content: RecordDict) -> Order:
+def read_request(content: RecordDict) -> ClientRequest:
     """An order as a robot gets it.
 
     Raises:
@@ -45,20 +45,20 @@ def read_order(content: RecordDict) -> Order:
         ConfigError: its settings are of another version of fcslam.
     """
     try:
-        config = content[CONFIG]
+        config = content[CONFIG_KEY]
         settings = FederatedSettings.model_validate_json(config["settings"])
         version, number, run = str(config["version"]), int(config["round"]), str(config["run"])
-        return Order(read_arrays(content[ARRAYS]), version, number, run, settings)
+        return ClientRequest(record_to_weights(content[ARRAYS_KEY]), version, number, run, settings)
     except (KeyError, TypeError, ValueError) as error:
         raise TrainingError(f"the server's order cannot be read ({error}); are both of one version?") from error
 
 
-def write_arrays(weights: Weights) -> ArrayRecord:
+def weights_to_record(weights: Weights) -> ArrayRecord:
     """Weights as a record."""
     return ArrayRecord({name: Array(np.asarray(array, order="C")) for name, array in weights.items()})
 
 
-def read_arrays(record: ArrayRecord) -> dict[str, NDArray[np.float32]]:
+def record_to_weights(record: ArrayRecord) -> dict[str, NDArray[np.float32]]:
     """Weights of a record, as they are: neither names nor shapes nor numbers are checked.
 
     Raises:
@@ -74,7 +74,7 @@ def read_arrays(record: ArrayRecord) -> dict[str, NDArray[np.float32]]:
     return arrays
 
 
-def size_of(record: ArrayRecord) -> int:
+def record_bytes(record: ArrayRecord) -> int:
     """Bytes of its arrays.
 
     Raises:
@@ -84,38 +84,40 @@ def size_of(record: ArrayRecord) -> int:
     return sum(len(array.data) for array in record.values())
 
 
-def answer(robot: str, version: str, figures: Mapping[str, float], arrays: ArrayRecord | None = None) -> RecordDict:
+def client_reply(
+    robot: str, version: str, figures: Mapping[str, float], arrays: ArrayRecord | None = None
+) -> RecordDict:
     """A robot's answer to an order that came with weights of this version."""
-    records = {CONFIG: ConfigRecord({"robot": robot, "version": version}), METRICS: MetricRecord(dict(figures))}
-    return RecordDict(records if arrays is None else records | {ARRAYS: arrays})
+    records = {CONFIG_KEY: ConfigRecord({"robot": robot, "version": version}), METRICS_KEY: MetricRecord(dict(figures))}
+    return RecordDict(records if arrays is None else records | {ARRAYS_KEY: arrays})
 
 
-def signature(content: RecordDict) -> tuple[str, str]:
+def reply_sender(content: RecordDict) -> tuple[str, str]:
     """Who answers, and which version it was asked about.
 
     Raises:
         ValueError: the answer does not say.
     """
     try:
-        config = content[CONFIG]
+        config = content[CONFIG_KEY]
         robot, version = config["robot"], config["version"]
     except (KeyError, TypeError) as error:
         raise ValueError("an answer without a name") from error
-    if not (isinstance(robot, str) and 0 < len(robot) <= LONGEST_NAME and robot.isprintable()):
+    if not (isinstance(robot, str) and 0 < len(robot) <= MAX_NAME_LENGTH and robot.isprintable()):
         raise ValueError("an answer without a usable name")
     return robot, str(version)
 
 
-def figures_of(content: RecordDict) -> dict[str, float]:
+def reply_metrics(content: RecordDict) -> dict[str, float]:
     """The numbers of an answer.
 
     Raises:
         ValueError: there are none, too many, or some with odd names.
     """
-    record = content[METRICS]
+    record = content[METRICS_KEY]
     _check_kind(record, MetricRecord)
     figures = {str(name): float(value) for name, value in record.items() if isinstance(value, int | float)}
-    if len(figures) > MOST_FIGURES or not all(name.isidentifier() and len(name) <= LONGEST_NAME for name in figures):
+    if len(figures) > MAX_METRICS or not all(name.isidentifier() and len(name) <= MAX_NAME_LENGTH for name in figures):
         raise ValueError("figures that nobody asked for")
     return figures
 
