@@ -1,7 +1,6 @@
 """The training loop: it learns, resumes as if nothing had happened, keeps what it has, and sounds its alarms."""
 
 import errno
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from fcslam.learning.settings import TrainingSettings  # noqa: E402
 from fcslam.learning.trainer import CHECKPOINT_FILE, ExecutionOptions, TrainingRun, trained_network, validation_pairs  # noqa: E402
 from fcslam.learning.training_step import learning_rate  # noqa: E402
 from fcslam.learning.validation import collapse_warnings, validate  # noqa: E402
+from fcslam.storage.files import replacing  # noqa: E402
 
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64, points=32)
 PACE = ExecutionOptions(validate_every=100, checkpoint_every_s=0.0, log_every=1)
@@ -101,17 +101,17 @@ def test_another_seed_trains_another_network(examples, tmp_path):
 def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeypatch):
     TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
     before = (tmp_path / CHECKPOINT_FILE).read_bytes()
-    write = Path.write_bytes
 
     def full(path, content):
-        write(path, bytes(content)[:100])
-        raise OSError(errno.ENOSPC, "No space left on device")
+        with replacing(path) as unfinished:
+            unfinished.write_bytes(bytes(content)[:100])
+            raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr("fcslam.learning.arrays.write_file", full)
     with pytest.raises(OutputError, match="No space left on device"):
         TrainingRun(SMALL.model_copy(update={"steps": 8}), "joint", tmp_path, PACE).train(examples, examples[:1])
     assert (tmp_path / CHECKPOINT_FILE).read_bytes() == before
-    assert [file.name for file in tmp_path.iterdir() if file.suffix == ".part"] == []
+    assert [file.name for file in tmp_path.iterdir() if file.suffix == ".partial"] == []
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\x03\x04"])
