@@ -21,6 +21,7 @@ from fcslam.runs import (
     prepare_output,
     read_vetoes,
 )
+from fcslam.runs.map_files import OccupancyMap, map_yaml, parse_map, pgm_bytes
 from fcslam.storage import files
 
 
@@ -266,3 +267,60 @@ def test_what_is_no_list_of_vetoes_is_refused(tmp_path, content, reason):
         path.write_text(content)
     with pytest.raises(ConfigError, match=reason):
         read_vetoes(path)
+
+
+MAP = OccupancyMap(np.random.default_rng(0).integers(0, 3, (7, 4)).astype(np.uint8), 0.05, (-1.25, 3.5))
+PGM, DESCRIPTION = pgm_bytes(MAP), map_yaml(MAP, "map.pgm")
+
+
+def test_a_map_that_is_written_is_read_back():
+    read = parse_map("map.pgm", PGM, DESCRIPTION)
+    assert np.array_equal(read.cells, MAP.cells)
+    assert (read.resolution_m, read.origin_xy) == (MAP.resolution_m, MAP.origin_xy)
+    assert not read.cells.flags.writeable
+
+
+def test_a_comment_as_other_programs_write_it_is_skipped():
+    commented = PGM.replace(b"P5\n", b"P5\n# CREATOR: map_saver 0.050 m/pix\n", 1)
+    assert np.array_equal(parse_map("map.pgm", commented, DESCRIPTION).cells, MAP.cells)
+
+
+@pytest.mark.parametrize(
+    "pgm",
+    [b"", b"P5", b"P2" + PGM[2:], PGM[:-1], PGM + b"\0", PGM.replace(b"4 7", b"0 7"), PGM.replace(b"4 7", b"-4 -7"),
+     PGM.replace(b"4 7", b"4000000 7000000"), PGM.replace(b"4 7", b"9" * 5000 + b" 7"), PGM.replace(b"255", b"65535")],
+)  # fmt: skip
+def test_a_broken_image_of_a_map_is_refused(pgm):
+    with pytest.raises(EvaluationError, match=r"map\.pgm is broken") as raised:
+        parse_map("map.pgm", pgm, DESCRIPTION)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "description",
+    ["", "[]", "resolution: 0.05", ": :", "a: &a [*a, *a]",
+     DESCRIPTION.replace("0.05", "0"), DESCRIPTION.replace("0.05", ".nan"), DESCRIPTION.replace("0.05", ".inf"),
+     DESCRIPTION.replace("-1.25", ".nan"), DESCRIPTION.replace("3.5, 0.0", "3.5, 0.5"),
+     DESCRIPTION.replace("3.5, 0.0", "3.5"), DESCRIPTION.replace("negate: 0", "negate: 1"),
+     DESCRIPTION.replace("trinary", "raw"), DESCRIPTION.replace("0.65", "2.0"), DESCRIPTION.replace("0.65", "0.1"),
+     DESCRIPTION.replace("0.05", "!!python/object/apply:os.getpid []")],
+)  # fmt: skip
+def test_a_broken_description_of_a_map_is_refused(description):
+    with pytest.raises(EvaluationError, match=r"map\.pgm is broken") as raised:
+        parse_map("map.pgm", PGM, description)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_run_says_which_map_is_broken(run):
+    with pytest.raises(EvaluationError, match=r"map\.pgm"):
+        _ = run.maps
+
+
+@pytest.mark.parametrize(("name", "line"), [("robots.csv", "robot_1,0,1.0,1\n"), ("metrics.json", "")])
+def test_what_occurs_twice_is_refused(tmp_path, run, name, line):
+    run.save(tmp_path / "run")
+    path = tmp_path / "run" / name
+    text = path.read_text()
+    path.write_text(text + line if line else text.replace('"error"', '"uplink"'))
+    with pytest.raises(EvaluationError, match="occurs twice"):
+        open_run(tmp_path / "run")

@@ -1,3 +1,108 @@
-"""fcslam: several robots map one building together."""
+"""fcslam: several robots map one building together.
+
+    import fcslam
+
+    run = fcslam.map_recordings(["robot1.clf", "robot2.clf"], output="runs/building")
+    run.trajectories["robot1"].T_map_base  # poses (x, y, theta) at every scan, shape (N, 3)
+    run.maps[0].cells  # the occupancy grid, shape (H, W)
+
+Everything in ``__all__`` is public; modules load when a name is used for the first time.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+from fcslam.errors import (
+    CloudError,
+    ConfigError,
+    EvaluationError,
+    FcslamError,
+    FeatureError,
+    InputError,
+    OutputError,
+    OversizeError,
+    PacketConflictError,
+    PacketError,
+    ServiceError,
+    SimulationError,
+    SourceError,
+    StateError,
+    StoreError,
+    TrainingError,
+    UnavailableError,
+)
+
+if TYPE_CHECKING:
+    from fcslam.api import map_recordings
+    from fcslam.mission import MissionConfig, Progress
+    from fcslam.records import Channel, ClosureStatus, Veto
+    from fcslam.runs import ClosureRow, LocalMap, Metric, Occupancy, OccupancyMap, RobotTrajectory, Run, open_run
+    from fcslam.sources import BagOptions
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "BagOptions",
+    "Channel",
+    "ClosureRow",
+    "ClosureStatus",
+    "CloudError",
+    "ConfigError",
+    "EvaluationError",
+    "FcslamError",
+    "FeatureError",
+    "InputError",
+    "LocalMap",
+    "Metric",
+    "MissionConfig",
+    "Occupancy",
+    "OccupancyMap",
+    "OutputError",
+    "OversizeError",
+    "PacketConflictError",
+    "PacketError",
+    "Progress",
+    "RobotTrajectory",
+    "Run",
+    "ServiceError",
+    "SimulationError",
+    "SourceError",
+    "StateError",
+    "StoreError",
+    "TrainingError",
+    "UnavailableError",
+    "Veto",
+    "__version__",
+    "map_recordings",
+    "open_run",
+]
+
+_LAZY: Final = {
+    "BagOptions": "fcslam.sources",
+    "Channel": "fcslam.records",
+    "ClosureRow": "fcslam.runs",
+    "ClosureStatus": "fcslam.records",
+    "LocalMap": "fcslam.runs",
+    "Metric": "fcslam.runs",
+    "MissionConfig": "fcslam.mission",
+    "Occupancy": "fcslam.runs",
+    "OccupancyMap": "fcslam.runs",
+    "Progress": "fcslam.mission",
+    "RobotTrajectory": "fcslam.runs",
+    "Run": "fcslam.runs",
+    "Veto": "fcslam.records",
+    "map_recordings": "fcslam.api",
+    "open_run": "fcslam.runs",
+}
+"""Where each name is that is imported at its first use."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module 'fcslam' has no attribute '{name}'")
+    value = globals()[name] = getattr(import_module(_LAZY[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

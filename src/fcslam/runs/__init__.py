@@ -1,4 +1,4 @@
-"""The run folder: what a mission leaves behind."""
+"""The result of a mission, in memory and as a run folder."""
 
 from fcslam.runs.folder import (
     LOCAL,
@@ -9,6 +9,7 @@ from fcslam.runs.folder import (
     open_run,
     prepare_output,
 )
+from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.runs.records import ClosureRow, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import metrics_json, read_vetoes
 from fcslam.runs.trajectories import read_tum, write_tum
@@ -20,6 +21,8 @@ __all__ = [
     "ClosureRow",
     "LocalMap",
     "Metric",
+    "Occupancy",
+    "OccupancyMap",
     "RobotTrajectory",
     "Run",
     "check_names",

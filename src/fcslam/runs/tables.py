@@ -90,12 +90,19 @@ def read_metrics(path: Path) -> dict[str, Metric]:
     """
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
-        values = [math.nan if row["value"] is None else float(row["value"]) for row in rows]
+        values = [math.nan if row["value"] is None else _number(row["value"]) for row in rows]
         return _unique(
             path.name, ((row["name"], Metric(row["name"], v, row["unit"])) for row, v in zip(rows, values, strict=True))
         )
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path.name} is not a list of name, value, unit") from error
+
+
+def _number(value: object) -> float:
+    """As it stands: a count stays an integer."""
+    if not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return value
 
 
 def _unique(file: str, items: Iterable[tuple[str, _Value]]) -> dict[str, _Value]:

@@ -1,0 +1,117 @@
+"""Map recordings with one function call; `fcslam map` calls the same function."""
+
+import logging
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fcslam import sources
+from fcslam.config import load, parse
+from fcslam.errors import SourceError
+from fcslam.mission import MissionConfig, Watch, run_mission
+from fcslam.records import Veto
+from fcslam.runs import Run, prepare_output
+from fcslam.sources import BagOptions, Source
+
+StrPath = str | os.PathLike[str]
+Recordings = StrPath | Iterable[StrPath | Source] | Mapping[str, StrPath]
+
+_log = logging.getLogger(__name__)
+
+
+def map_recordings(
+    recordings: Recordings,
+    *,
+    config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
+    output: StrPath | None = None,
+    split: int = 1,
+    seed: int | None = None,
+    join_maps: bool | None = None,
+    vetoes: Iterable[Veto] = (),
+    bag_options: BagOptions | None = None,
+    progress: Watch | None = None,
+    force: bool = False,
+) -> Run:
+    """Map the recordings of several robots together, one robot per recording.
+
+    The same recordings, configuration and seed give the same run. Faults of a recording that do not keep it from being
+    mapped are logged as warnings.
+
+    Args:
+        recordings: one path, several, or a mapping of robot names to paths, in any known format. Without a mapping,
+            each robot is named after its file. Objects of your own that implement ``Source`` can stand for paths.
+        config: a ``MissionConfig``, a mapping with some of its keys, or the path of a YAML file; missing keys have
+            their default values.
+        output: run folder to write; by default nothing is written.
+        split: number of robots into which a single recording is cut, with equal scan counts; the odometry of each
+            starts at zero.
+        seed: replaces the seed of the configuration.
+        join_maps: replaces ``fleet.join_maps`` of the configuration; False maps each robot alone.
+        vetoes: closures that you know to be false.
+        bag_options: topics and the pose of the laser, where a ROS bag leaves a choice.
+        progress: called every 50 scans, and before the maps are fused, with the state of the mission.
+        force: replace a run that is at ``output``.
+
+    Raises:
+        InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
+            that says what is wrong and what to do. Most errors are found before the mapping begins.
+    """
+    if output is not None:
+        prepare_output(Path(output), force)
+    settings = _settings(config, seed, join_maps)
+    robots = split_recordings(_opened(recordings, bag_options), split)
+    run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes))
+    if output is not None:
+        run.save(output, force)
+    return run
+
+
+def split_recordings(recordings: list[Source], parts: int) -> list[Source]:
+    """Cut the only one of ``recordings`` into ``parts`` robots; with 1 part, all recordings stay as they are.
+
+    Raises:
+        SourceError: there are several recordings, or not enough scans.
+    """
+    if parts == 1:
+        return recordings
+    if len(recordings) != 1:
+        raise SourceError(f"only one recording can be split, {len(recordings)} are given; map them one by one")
+    return sources.split(recordings[0], parts)
+
+
+def _opened(recordings: Recordings, options: BagOptions | None) -> list[Source]:
+    """The recordings as sources, each checked as far as can be without reading the ranges."""
+    if isinstance(recordings, Mapping):
+        return [_open(path, options, name) for name, path in recordings.items()]
+    if isinstance(recordings, str | os.PathLike):
+        recordings = [recordings]
+    found = [_open(item, options) if isinstance(item, str | os.PathLike) else item for item in recordings]
+    if not found:
+        raise SourceError("no recording is given; give one for each robot")
+    return found
+
+
+def _open(path: StrPath, options: BagOptions | None, name: str | None = None) -> Source:
+    source = sources.open_source(Path(path), options, name)
+    survey = source.survey()
+    for note in survey.notes:
+        _log.info("%s: %s", source.name, note)
+    if survey.faults:
+        _log.warning("%s: %s", source.name, survey.faults)
+    return source
+
+
+def _settings(
+    config: MissionConfig | Mapping[str, Any] | StrPath | None, seed: int | None, join_maps: bool | None
+) -> MissionConfig:
+    if isinstance(config, str | os.PathLike):
+        config = load(MissionConfig, Path(config))
+    elif not isinstance(config, MissionConfig):
+        config = parse(MissionConfig, dict(config or {}), "config")
+    content = config.model_dump()
+    if seed is not None:
+        content["seed"] = seed
+    if join_maps is not None:
+        content["fleet"]["join_maps"] = join_maps
+    return parse(MissionConfig, content, "map_recordings")

@@ -1,0 +1,247 @@
+"""The public Python API: what it offers, how it fails, and that a run that was opened offers what was mapped."""
+
+import ast
+import contextlib
+import inspect
+import io
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fcslam
+from fcslam import api, errors
+from fcslam.geometry import se2
+from fcslam.sources import open_source
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs") / "building"
+
+
+@pytest.fixture(scope="module")
+def mapped(logs, folder):
+    return fcslam.map_recordings(logs, output=folder, seed=3)
+
+
+@pytest.fixture(scope="module")
+def opened(mapped, folder):
+    return fcslam.open_run(folder)
+
+
+def type_checking_imports():
+    """Module by name, as type checkers see them."""
+    tree = ast.parse(inspect.getsource(fcslam))
+    blocks = [node for node in tree.body if isinstance(node, ast.If)]
+    return {alias.name: node.module for block in blocks for node in block.body for alias in node.names}
+
+
+def test_all_is_sorted_and_every_name_in_it_exists():
+    assert fcslam.__all__ == sorted(fcslam.__all__)
+    assert all(hasattr(fcslam, name) for name in fcslam.__all__)
+    assert dir(fcslam) == fcslam.__all__
+    with pytest.raises(AttributeError, match="no attribute 'map_recording'"):
+        _ = fcslam.map_recording
+
+
+def test_type_checkers_see_what_the_interpreter_imports():
+    assert type_checking_imports() == fcslam._LAZY
+
+
+def test_all_holds_every_exception():
+    tree = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)}
+    assert tree <= set(fcslam.__all__)
+    assert tree | set(fcslam._LAZY) | {"__version__"} == set(fcslam.__all__)
+
+
+def test_names_load_their_modules_at_the_first_use():
+    program = (
+        "import sys, fcslam; before = set(sys.modules); fcslam.Veto; after = set(sys.modules)\n"
+        "assert not {'numpy', 'fcslam.records', 'fcslam.mission'} & before\n"
+        "assert 'fcslam.records' in after and 'fcslam.mission' not in after\n"
+    )
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT / "src", check=True)
+
+
+def test_a_run_that_was_opened_offers_what_was_mapped(mapped, opened, logs):
+    assert list(mapped.trajectories) == list(opened.trajectories) == [log.stem for log in logs]
+    for robot, own in mapped.trajectories.items():
+        read = opened.trajectories[robot]
+        assert (own.robot, own.map_index) == (read.robot, read.map_index) == (robot, read.map_index)
+        np.testing.assert_allclose(read.stamps, own.stamps, atol=1e-6, rtol=0)
+        np.testing.assert_allclose(se2.between(own.T_map_base, read.T_map_base), 0.0, atol=1e-7)
+        assert read.path_length_m == pytest.approx(own.path_length_m, abs=1e-4)
+    assert list(mapped.maps) == list(opened.maps) == sorted({t.map_index for t in mapped.trajectories.values()})
+    for k, drawn in mapped.maps.items():
+        assert np.array_equal(drawn.cells, opened.maps[k].cells)
+        assert (drawn.resolution_m, drawn.origin_xy) == (opened.maps[k].resolution_m, opened.maps[k].origin_xy)
+    assert mapped.closures
+    for own, read in zip(mapped.closures, opened.closures, strict=True):
+        for name in ("robot_i", "robot_j", "channel", "status", "reason"):
+            assert getattr(own, name) == getattr(read, name)
+        for name in ("stamp_i", "stamp_j", "similarity"):
+            assert getattr(own, name) == pytest.approx(getattr(read, name), abs=1e-6)
+        np.testing.assert_allclose(own.T_i_j, read.T_i_j, atol=1e-6)
+    assert {name: (m.name, m.unit) for name, m in mapped.metrics.items()} == {
+        name: (m.name, m.unit) for name, m in opened.metrics.items()
+    }
+    values = [[metric.value for metric in run.metrics.values()] for run in (mapped, opened)]
+    np.testing.assert_array_equal(*values)
+    for name in ("config_yaml", "pose_graph_g2o", "map_files"):
+        assert getattr(mapped, name) == getattr(opened, name)
+    for robot, own in mapped.local_maps.items():
+        read = opened.local_maps[robot]
+        assert np.array_equal(own.occupancy().cells, read.occupancy().cells)
+        np.testing.assert_allclose(se2.between(own.T_local_base, read.T_local_base), 0.0, atol=1e-7)
+
+
+def test_a_run_that_was_opened_can_be_saved_again(opened, tmp_path):
+    opened.save(str(tmp_path / "copy"))
+    copy = fcslam.open_run(str(tmp_path / "copy"))
+    assert copy.map_files == opened.map_files
+    assert list(copy.trajectories) == list(opened.trajectories)
+    with pytest.raises(fcslam.OutputError, match="force=True"):
+        opened.save(tmp_path / "copy")
+    opened.save(tmp_path / "copy", force=True)
+
+
+def test_robots_stand_in_free_cells_of_their_map(opened):
+    """Ties the array to its origin, resolution and order of rows."""
+    for trajectory in opened.trajectories.values():
+        drawn = opened.maps[trajectory.map_index]
+        column, row = np.floor((trajectory.T_map_base[:, :2] - drawn.origin_xy) / drawn.resolution_m).astype(int).T
+        assert np.mean(drawn.cells[row, column] == fcslam.Occupancy.FREE) > 0.99
+
+
+def test_arrays_are_read_only(mapped, opened):
+    for run in (mapped, opened):
+        arrays = [
+            *(array for t in run.trajectories.values() for array in (t.stamps, t.T_map_base)),
+            *(array for own in run.local_maps.values() for array in (own.stamps, own.T_local_base)),
+            *(closure.T_i_j for closure in run.closures),
+            *(drawn.cells for drawn in run.maps.values()),
+        ]
+        assert not any(array.flags.writeable for array in arrays)
+
+
+def test_recordings_may_be_one_path_named_paths_or_sources(logs):
+    quick = {"config": {"fleet": {"join_maps": False}}}
+    (log, *_) = logs
+    runs = [
+        fcslam.map_recordings(str(log), **quick),
+        fcslam.map_recordings([open_source(log)], join_maps=False),
+        fcslam.map_recordings({"anna": log}, **quick),
+    ]
+    assert [list(run.trajectories) for run in runs] == [["robot_1"], ["robot_1"], ["anna"]]
+    assert len({run.maps[0].cells.tobytes() for run in runs}) == 1
+    assert runs[0].config_yaml == runs[1].config_yaml
+
+
+def test_split_cuts_one_recording_and_progress_is_called(logs):
+    seen = []
+    run = fcslam.map_recordings(logs[0], split=2, join_maps=False, progress=seen.append)
+    assert list(run.trajectories) == ["robot_1_1", "robot_1_2"]
+    assert isinstance(seen[-1], fcslam.Progress)
+    assert seen[-1].fusing
+
+
+def test_settings_come_from_a_model_a_mapping_or_a_file_and_arguments_replace_them(tmp_path):
+    path = tmp_path / "mission.yaml"
+    path.write_text("seed: 7\n")
+    for config in (fcslam.MissionConfig(seed=7), {"seed": 7}, path, str(path)):
+        assert api._settings(config, None, None) == fcslam.MissionConfig(seed=7)
+        changed = api._settings(config, 8, False)
+        assert (changed.seed, changed.fleet.join_maps) == (8, False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "said"),
+    [
+        ({"recordings": "none.clf"}, fcslam.SourceError, "none.clf: no such file"),
+        ({"recordings": []}, fcslam.SourceError, "no recording"),
+        ({"recordings": ["LOG", "LOG"]}, fcslam.SourceError, "robot_1"),
+        ({"recordings": ["LOG", "LOG"], "split": 2}, fcslam.SourceError, "only one recording"),
+        ({"split": 0}, fcslam.SourceError, "0 parts"),
+        ({"seed": -1}, fcslam.ConfigError, "seed"),
+        ({"config": {"sed": 1}}, fcslam.ConfigError, "did you mean 'seed'"),
+        ({"config": "none.yaml"}, fcslam.ConfigError, "none.yaml"),
+        ({"vetoes": [fcslam.Veto("nobody", "robot_1")]}, fcslam.ConfigError, "nobody"),
+        ({"output": "LOG"}, fcslam.OutputError, "no run folder"),
+        ({"bag_options": fcslam.BagOptions(scan_topic="/scan")}, fcslam.SourceError, "ROS bags only"),
+    ],
+)
+def test_what_is_wrong_is_an_input_error_of_one_line_before_the_work(arguments, kind, said, logs):
+    def filled(value):
+        return [filled(item) for item in value] if isinstance(value, list) else logs[0] if value == "LOG" else value
+
+    given = {"recordings": "LOG", **arguments}
+    with pytest.raises(fcslam.InputError, match=re.escape(said)) as raised:
+        fcslam.map_recordings(
+            **{name: filled(value) for name, value in given.items()}, progress=lambda _: pytest.fail("worked")
+        )
+    assert raised.type is kind
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("place", ["nowhere", "."])
+def test_a_folder_that_holds_no_run_is_refused(place, tmp_path):
+    with pytest.raises(fcslam.InputError, match="no run folder") as raised:
+        fcslam.open_run(tmp_path / place)
+    assert "\n" not in str(raised.value)
+
+
+USER_SCRIPT = """
+from pathlib import Path
+
+import fcslam
+
+def count(progress: fcslam.Progress) -> None:
+    print(progress.scans)
+
+try:
+    run: fcslam.Run = fcslam.map_recordings(["a.clf", Path("b.clf")], split=1, progress=count)
+except fcslam.InputError as error:
+    raise SystemExit(str(error))
+reveal_type(run.trajectories["a"].T_map_base)
+reveal_type(run.maps[0].origin_xy)
+reveal_type(run.metrics["maps"].value)
+reveal_type([closure.status for closure in run.closures])
+reveal_type(fcslam.open_run("runs/building"))
+fcslam.map_recordings("a.clf", seeds=1)
+"""
+
+
+def test_type_checkers_know_the_api(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(USER_SCRIPT)
+    command = [sys.executable, "-m", "mypy", "--strict", "--no-incremental", "--follow-imports=silent", script.name]
+    # in an own folder: the project's settings do not apply to its users
+    answer = subprocess.run(
+        command, cwd=tmp_path, env={"MYPYPATH": str(ROOT / "src")}, capture_output=True, text=True, check=False
+    )
+    revealed = [re.sub(r"\b\w+\.", "", kind) for kind in re.findall(r'Revealed type is "(.*)"', answer.stdout)]
+    assert revealed[1:] == ["tuple[float, float]", "float", "list[ClosureStatus]", "Run"]
+    assert revealed[0].startswith("ndarray[")
+    assert re.findall(r"^script.py:.* error: (.*)", answer.stdout, re.MULTILINE) == [
+        'Unexpected keyword argument "seeds" for "map_recordings"; did you mean "seed"?  [call-arg]'
+    ]
+
+
+def test_the_example_of_the_readme_prints_what_it_says(logs, tmp_path, monkeypatch):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    ((example, said),) = re.findall(r"```python\n(.*?)```\n+```text\n(.*?)```", text, re.DOTALL)
+    for log in logs:
+        (tmp_path / log.name).write_bytes(log.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(example, "README.md", "exec"), {})
+    number = re.compile(r"-?\d+(?:\.\d+)?")
+    assert number.sub("#", printed.getvalue()) == number.sub("#", said)
+    numbers = [[float(text) for text in number.findall(words)] for words in (printed.getvalue(), said)]
+    assert numbers[0] == pytest.approx(numbers[1], rel=0.1, abs=0.1)
