@@ -23,7 +23,7 @@ import common
 import numpy as np
 
 from fcslam.cloud.fleet import Fleet
-from fcslam.evaluation.fleet.closures import Within, evaluate_closures
+from fcslam.evaluation.fleet.closures import ClosureScope, evaluate_closures
 from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.metrics.closures import ClosureCriteria
 from fcslam.mission import MissionConfig
@@ -151,7 +151,9 @@ def thinned_rows(folder: Path) -> list[tuple]:
 def thinned_row(run: Path, reference: Path) -> tuple:
     found = common.metrics(run)
     up = sum(found.get(f"{kind}_bytes", 0.0) for kind in UPLINK)
-    judged = evaluate_closures(run, reference, ClosureCriteria()).scores[Within.FLEET, ClosureStatus.ACCEPTED].graph
+    judged = (
+        evaluate_closures(run, reference, ClosureCriteria()).scores[ClosureScope.FLEET, ClosureStatus.ACCEPTED].graph
+    )
     errors = evaluate_relations(run, reference, RelationsQuestion(across_robots=True))
     accuracy = (errors.translation.mean, errors.translation.maximum, errors.rotation.mean)
     traffic = (found["place_packets"], up / found["recorded_time"], found["place_bytes"] / up)

@@ -23,7 +23,7 @@ import common
 import numpy as np
 from simulated_fleet import CASES, ROBOTS, SEEDS, read
 
-from fcslam.features.detector import SHIPPED_NETWORK, OnnxConfig, OnnxDetector
+from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector
 from fcslam.metrics.bootstrap import mean_interval
 
 COMPARED = ("default", "default, other light")
@@ -65,7 +65,7 @@ def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of the fleets")
     parser.add_argument("--cases", nargs="+", choices=COMPARED, default=COMPARED, help="kinds of fleet")
-    parser.add_argument("--weights", nargs="+", type=Path, default=[SHIPPED_NETWORK], help="networks")
+    parser.add_argument("--weights", nargs="+", type=Path, default=[BUNDLED_NETWORK], help="networks")
     parser.add_argument("--fleets", type=Path, help="folder of recordings; those that are missing are made there")
     parser.add_argument("--simulate-only", action="store_true", help="make the recordings, map nothing")
     parser.add_argument("--jobs", type=int, default=1, help="maps at the same time")

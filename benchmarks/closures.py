@@ -16,7 +16,7 @@ from pathlib import Path
 import common
 import numpy as np
 
-from fcslam.evaluation.fleet.closures import STAGES, ClosureReport, Within, closure_metrics, evaluate_closures
+from fcslam.evaluation.fleet.closures import STAGES, ClosureReport, ClosureScope, closure_metrics, evaluate_closures
 from fcslam.metrics.closures import ClosureCriteria
 
 SETS = {"log": "", "closures": "", "stage": ""}
@@ -27,7 +27,7 @@ ERRORS = {**SETS, "covered": "", **SPREAD, "median chain": ".0f", "longest chain
 SINGLE = {**SETS, "all": "", "covered": "", "coverage": ".1%", "wrong": "", **SPREAD}
 REFERENCE = {"log": "", "relations": "", "contradicted": "", "components": "", "stamps": "", "in the largest": "",
              **{f"residual: {name}": spec for name, spec in SPREAD.items()}}  # fmt: skip
-NAMES = {Within.ROBOT: "within robots", Within.FLEET: "between robots"}
+NAMES = {ClosureScope.ROBOT: "within robots", ClosureScope.FLEET: "between robots"}
 
 
 def main() -> None:
@@ -57,7 +57,7 @@ def table_rows(log: str, report: ClosureReport) -> list[tuple[tuple, tuple, tupl
     """Each set's row in the three tables; within robots the stages before acceptance are not known."""
     rows = []
     for (within, status), score in report.scores.items():
-        if within is Within.ROBOT and status in STAGES and STAGES[status] != {status}:
+        if within is ClosureScope.ROBOT and status in STAGES and STAGES[status] != {status}:
             continue
         graph, single, recall = score.graph, score.single, score.recall
         head = (log, NAMES[within], status.value)

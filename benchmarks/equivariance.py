@@ -18,14 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from fcslam.evaluation.detectors.contenders import Contender, Picture, choose_contenders, frame, one_thread
+from fcslam.evaluation.detectors.evaluated_detectors import (
+    EvaluatedDetector,
+    FramedImage,
+    choose_detectors,
+    frame,
+    one_thread,
+)
 from fcslam.evaluation.detectors.homography import LARGE, described, match_pair
 from fcslam.evaluation.detectors.scenes import find_scenes
 from fcslam.features.detector import GreyImage
-from fcslam.features.kinds import ContenderKind
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
 
 SCENES = ("oxford_affine", "hpatches_subset")
-DETECTORS = [name for name in ContenderKind if name is not ContenderKind.LOGITS]
+DETECTORS = [name for name in EvaluatedDetectorKind if name is not EvaluatedDetectorKind.LOGITS]
 SHIFTS_PX = tuple(range(1, 9))
 ANGLES_DEG = tuple(range(0, 181, 15))
 STRONGEST, NEAR_PX = 500, 1.0
@@ -40,11 +46,11 @@ def main() -> None:
     report = common.Report(__file__, __doc__ or "", chosen)
     folder = common.recordings(*SCENES, kind="vision")
     pictures = [frame(scene.reference, LARGE) for scene in find_scenes([folder / name for name in SCENES])]
-    contenders = choose_contenders(DETECTORS, chosen.weights, [])
+    detectors = choose_detectors(DETECTORS, chosen.weights, [])
     with one_thread():
         columns = {"": "s"} | {f"{shift} px": ".3f" for shift in SHIFTS_PX}
-        report.table("Shift: keypoints found again", columns, [_shift_row(each, pictures) for each in contenders])
-        matched = [each for each in contenders if hasattr(each.find(pictures[0]), "descriptors")]
+        report.table("Shift: keypoints found again", columns, [_shift_row(each, pictures) for each in detectors])
+        matched = [each for each in detectors if hasattr(each.find(pictures[0]), "descriptors")]
         turned = [(each, [_turned(each, pictures, angle) for angle in ANGLES_DEG]) for each in matched]
     columns = {"": "s"} | {f"{angle} deg": ".2f" for angle in ANGLES_DEG}
     report.table("Turn: MMA@3", columns, [(each.name, *(row[0] for row in rows)) for each, rows in turned])
@@ -52,16 +58,16 @@ def main() -> None:
     report.write()
 
 
-def _shift_row(contender: Contender, pictures: Sequence[Picture]) -> tuple[str | float, ...]:
-    return contender.name, *(
-        float(np.mean([_found_again(contender, picture, shift) for picture in pictures])) for shift in SHIFTS_PX
+def _shift_row(detector: EvaluatedDetector, pictures: Sequence[FramedImage]) -> tuple[str | float, ...]:
+    return detector.name, *(
+        float(np.mean([_found_again(detector, picture, shift) for picture in pictures])) for shift in SHIFTS_PX
     )
 
 
-def _found_again(contender: Contender, picture: Picture, shift: int) -> float:
+def _found_again(detector: EvaluatedDetector, picture: FramedImage, shift: int) -> float:
     rolled = _changed(picture, np.roll(picture.grey, (shift, shift), (0, 1)))
-    expected = _central(contender.find(picture).keypoints_px + np.float32(shift))
-    found = _central(contender.find(rolled).keypoints_px)
+    expected = _central(detector.find(picture).keypoints_px + np.float32(shift))
+    found = _central(detector.find(rolled).keypoints_px)
     return float(np.mean(KDTree(found).query(expected)[0] <= NEAR_PX))
 
 
@@ -70,13 +76,13 @@ def _central(positions_px: NDArray[np.float32]) -> NDArray[np.float32]:
     return positions_px[inside][:STRONGEST]
 
 
-def _turned(contender: Contender, pictures: Sequence[Picture], angle_deg: float) -> tuple[float, float]:
+def _turned(detector: EvaluatedDetector, pictures: Sequence[FramedImage], angle_deg: float) -> tuple[float, float]:
     """MMA@3 and the share of right homographies."""
     H = _rotation(angle_deg)
     results = []
     for picture in pictures:
         turned = np.asarray(cv2.warpPerspective(picture.grey, H, LARGE), np.uint8)
-        found = (described(contender.find(each)) for each in (picture, _changed(picture, turned)))
+        found = (described(detector.find(each)) for each in (picture, _changed(picture, turned)))
         results.append(match_pair(*found, H))
     shares = [(result.accuracy[2], result.corner_error_px <= 3.0) for result in results]
     accuracy, correct = np.mean(shares, axis=0)
@@ -89,8 +95,8 @@ def _rotation(angle_deg: float) -> NDArray[np.float64]:
     return np.vstack((cv2.getRotationMatrix2D(middle, angle_deg, 1.0), (0.0, 0.0, 1.0)))
 
 
-def _changed(picture: Picture, grey: GreyImage) -> Picture:
-    return Picture(picture.path, picture.file_size, picture.framing, np.ascontiguousarray(grey))
+def _changed(picture: FramedImage, grey: GreyImage) -> FramedImage:
+    return FramedImage(picture.path, picture.file_size, picture.framing, np.ascontiguousarray(grey))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import common
 import numpy as np
 from homography import SCENES, SEED
 
-from fcslam.evaluation.detectors.contenders import choose_contenders, frame, one_thread
+from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors, frame, one_thread
 from fcslam.evaluation.detectors.homography import (
     LARGE,
     MATCHED,
@@ -29,7 +29,7 @@ from fcslam.evaluation.detectors.measures import difference, mean
 from fcslam.evaluation.detectors.scenes import Scene, find_scenes
 from fcslam.features.dense import Logits, Probabilities, sample_codes
 from fcslam.features.detector import GreyImage, OnnxConfig, OnnxDetector
-from fcslam.features.kinds import ContenderKind
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
 
 Network = Callable[[GreyImage], tuple[Probabilities, Logits]]
 BITS = {"compared": "s", "images": "d", "codes": "d", "bits that differ, %": ".4f", "in the worst image, %": ".4f",
@@ -63,7 +63,7 @@ def main() -> None:
             report.say("Torch is not installed, so the checkpoint was not compared; install fcslam[train].")
         rows = (_bits_row(name, floating, other, images) for name, other in compared.items())
         report.table("Bits", BITS, rows)
-    measured = evaluate_homography(scenes, choose_contenders([ContenderKind.ONNX], paths, []))
+    measured = evaluate_homography(scenes, choose_detectors([EvaluatedDetectorKind.ONNX], paths, []))
     report.table("On the scenes", {"": "s"} | dict.fromkeys(MEASURES, "s"), _scene_rows(measured))
     report.write()
 
@@ -106,8 +106,8 @@ def _bits_row(name: str, reference: OnnxDetector, other: Network, images: Sequen
 
 
 def _scene_rows(measured: HomographyReport) -> Iterator[tuple[str, ...]]:
-    floating, small = (measured.of(name) for name in measured.contenders)
-    for name in measured.contenders:
+    floating, small = (measured.of(name) for name in measured.detectors)
+    for name in measured.detectors:
         yield name, *(f"{mean(measured.of(name), measure):.3f}" for measure in MEASURES.values())
     gaps = (difference(small, floating, measure, SEED) for measure in MEASURES.values())
     yield "int8 less float32", *(f"{gap.mean:+.3f} [{gap.low:+.3f}, {gap.high:+.3f}]" for gap in gaps)

@@ -130,8 +130,8 @@ class Worlds:
         return self._known[key]
 
     def _record(self, scenario: Scenario, folder: Path) -> tuple[list[Path], float]:
-        from fcslam.simulation.fleet import SimulationSettings, simulate_fleet
         from fcslam.simulation.noise import LidarSettings
+        from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
         from fcslam.sources import write_carmen
 
         lidar = LidarSettings(beams=180, rate_hz=3.0)

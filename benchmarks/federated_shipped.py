@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, Any
 import common
 from training_fleet import GAPS, TITLES, VISION, compare, gap_row, points, robots, run
 
-from fcslam.evaluation.detectors.contenders import choose_contenders
+from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.evaluation.detectors.homography import evaluate_homography
 from fcslam.evaluation.detectors.measures import difference, mean
 from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
-from fcslam.features.detector import SHIPPED_NETWORK
-from fcslam.features.kinds import ContenderKind
-from fcslam.metrics.framing import GroundTruth
+from fcslam.features.detector import BUNDLED_NETWORK
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
+from fcslam.metrics.framing import HomographyGroundTruth
 
 if TYPE_CHECKING:
     from fcslam.evaluation.detectors.homography import HomographyReport
@@ -59,17 +59,17 @@ def main() -> None:
         "local_seeds": 0,
         "pairs": PAIRS,
         "images": IMAGES,
-        "start": SHIPPED_NETWORK,
+        "start": BUNDLED_NETWORK,
     }
     findings = run(robots(vision, folder), folder / "shipped", content)
     report = common.Report(__file__, __doc__ or "", chosen)
     below = compare(findings, "central")
     for measure, title in (TITLES | OTHERS).items():
         report.table(title, GAPS, [gap_row(below[measure, arm]) for arm in COMPARED])
-    networks = [SHIPPED_NETWORK, *(exported(folder / "shipped" / "seed1", arm) for arm in COMPARED[1:])]
-    contenders = choose_contenders([ContenderKind.ONNX], networks, [])
+    networks = [BUNDLED_NETWORK, *(exported(folder / "shipped" / "seed1", arm) for arm in COMPARED[1:])]
+    detectors = choose_detectors([EvaluatedDetectorKind.ONNX], networks, [])
     scenes = find_scenes([vision / name for name in SCENES])
-    measured = evaluate_homography(scenes, contenders, GroundTruth.CORRECTED)
+    measured = evaluate_homography(scenes, detectors, HomographyGroundTruth.CORRECTED)
     report.table("Photographs of elsewhere", ELSEWHERE, elsewhere_rows(measured))
     report.write()
 
@@ -86,8 +86,8 @@ def exported(folder: Path, arm: str) -> Path:
 
 
 def elsewhere_rows(measured: "HomographyReport") -> Iterator[tuple[object, ...]]:
-    shipped = measured.of(measured.contenders[0])
-    for arm, name in zip(COMPARED, measured.contenders, strict=True):
+    shipped = measured.of(measured.detectors[0])
+    for arm, name in zip(COMPARED, measured.detectors, strict=True):
         pairs = measured.of(name)
         kinds = (mean(pairs, "repeatability", kind) for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT))
         corners = (mean(pairs, f"homography_{px}px_nms{NMS_PX}") for px in (1, 3, 5))

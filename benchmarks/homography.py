@@ -17,12 +17,12 @@ from pathlib import Path
 
 import common
 
-from fcslam.evaluation.detectors.contenders import choose_contenders
+from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.evaluation.detectors.homography import LARGE, MATCHING_NMS_PX, SMALL, HomographyReport, evaluate_homography
 from fcslam.evaluation.detectors.measures import difference, interval, mean
 from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.metrics.bootstrap import Interval
-from fcslam.metrics.framing import GroundTruth
+from fcslam.metrics.framing import HomographyGroundTruth
 
 SCENES = ("oxford_affine", "hpatches_subset")
 SEED = 1
@@ -47,19 +47,19 @@ def main() -> None:
     report = common.Report(__file__, __doc__ or "", chosen)
     folder = common.recordings(*SCENES, kind="vision")
     scenes = find_scenes([folder / name for name in SCENES])
-    contenders = choose_contenders([], chosen.weights, [])
-    for truth in GroundTruth:
-        measured = evaluate_homography(scenes, contenders, truth)
+    detectors = choose_detectors([], chosen.weights, [])
+    for truth in HomographyGroundTruth:
+        measured = evaluate_homography(scenes, detectors, truth)
         report.table(f"Repeatability, {truth}", REPEATABILITY, _repeatability(measured))
         report.table(f"Homography and matching, {truth}", MATCHING, _matching(measured))
-        if truth is GroundTruth.CORRECTED:
+        if truth is HomographyGroundTruth.CORRECTED:
             report.table(f"Bits less logits, {truth}", BITS, _bits_less_logits(measured))
             report.table(f"Scene by scene, {truth}", BY_SCENE, _by_scene(measured))
     report.write()
 
 
 def _repeatability(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
-    for name in measured.contenders:
+    for name in measured.detectors:
         if name.endswith(LOGITS):
             continue
         pairs = measured.of(name)
@@ -74,7 +74,7 @@ def _repeatability(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
 
 def _matching(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
     for nms_px in MATCHING_NMS_PX:
-        for name in measured.contenders:
+        for name in measured.detectors:
             pairs = measured.of(name)
             if not pairs[0].matching:
                 continue
@@ -97,8 +97,8 @@ def _matching(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
 def _bits_less_logits(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
     measures = (*(f"homography_{px}px" for px in (1, 3, 5)), "accuracy_1px", "accuracy_3px", "score")
     for nms_px in MATCHING_NMS_PX:
-        for name in measured.contenders:
-            if name + LOGITS in measured.contenders:
+        for name in measured.detectors:
+            if name + LOGITS in measured.detectors:
                 bits, logits = measured.of(name), measured.of(name + LOGITS)
                 gaps = (difference(bits, logits, f"{measure}_nms{nms_px}", SEED) for measure in measures)
                 yield name, nms_px, *(_shown(gap, "+") for gap in gaps)
@@ -107,7 +107,7 @@ def _bits_less_logits(measured: HomographyReport) -> Iterator[tuple[object, ...]
 def _by_scene(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
     measures = ["repeatability", *(f"{name}_nms{nms_px}" for nms_px in MATCHING_NMS_PX for name in SCENE_MEASURES)]
     for scene in dict.fromkeys(pair.scene for pair in measured.pairs):
-        for name in measured.contenders:
+        for name in measured.detectors:
             pairs = [pair for pair in measured.of(name) if pair.scene == scene]
             yield scene, name, *(mean(pairs, measure) for measure in measures)
 

@@ -25,8 +25,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.features.choice import make_detector
-from fcslam.features.detector import Detector
+from fcslam.features.detector import FeatureDetector
+from fcslam.features.factory import make_detector
 from fcslam.learning.images import find_images, read_image
 from fcslam.mission import MissionConfig
 
@@ -90,7 +90,7 @@ def main() -> None:
     report.write()
 
 
-def look(folders: Sequence[Path], most: int, detector: Detector) -> Iterator[Seen]:
+def look(folders: Sequence[Path], most: int, detector: FeatureDetector) -> Iterator[Seen]:
     """Evenly spread images of all folders together, as a robot's camera gives them, with what is detected in them."""
     files = [file for folder in folders for file in find_images([folder])]
     for file in files[:: max(1, len(files) // most)][:most]:

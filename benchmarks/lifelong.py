@@ -65,8 +65,8 @@ def main() -> None:
 
 def robots(sessions: int, path_m: float, seed: int) -> list[Any]:
     """The robot of each session: one building, whose furniture moves."""
-    from fcslam.simulation.fleet import STAMP_SHIFT_S, SimulationSettings, simulate_fleet
     from fcslam.simulation.noise import LidarSettings
+    from fcslam.simulation.simulated_fleet import STAMP_SHIFT_S, SimulationSettings, simulate_fleet
 
     settings = SimulationSettings(
         robots=sessions, path_length_m=path_m, camera=None, lidar=LidarSettings(rate_hz=5.0),
@@ -163,8 +163,8 @@ def against_truth(result: Any, drivers: list[Any], grid: Any) -> tuple[int, floa
     from fcslam.cloud.report import fuse_members, keyscan_track
     from fcslam.metrics.grid import grid_agreement
     from fcslam.metrics.trajectory import PositionErrors, align, position_errors
-    from fcslam.simulation.fleet import SimulatedFleet
-    from fcslam.simulation.truth import true_map
+    from fcslam.simulation.ground_truth import true_map
+    from fcslam.simulation.simulated_fleet import SimulatedFleet
 
     first = [robot for robot in result.robots if robot.map_index == 0]
     estimated = np.concatenate([robot.T_map_base for robot in first])

@@ -33,7 +33,7 @@ from faults import cloud, finalize
 from fcslam.mission import MissionConfig
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.service.missions import FIRST
-from fcslam.simulation.fleet import SimulatedRobot, SimulationSettings, simulate_fleet
+from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.wire.batches import MEDIA_TYPE, write_batch
 from fcslam.wire.packets import encode
 

@@ -17,12 +17,12 @@ import common
 import cv2
 import numpy as np
 
-from fcslam.evaluation.detectors.contenders import choose_contenders
+from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
 from fcslam.evaluation.detectors.homography import MATCHING_NMS_PX, HomographyReport, evaluate_homography
 from fcslam.evaluation.detectors.measures import difference, interval, mean
 from fcslam.evaluation.detectors.scenes import find_scenes
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.files import read_grey
-from fcslam.features.kinds import ContenderKind
 from fcslam.learning.warps import random_change, relight, warp_image
 from fcslam.metrics.bootstrap import Interval
 
@@ -33,7 +33,12 @@ SOURCES = {
 }
 IMAGES, COPIES = 250, 2
 SEED = 1
-CONTENDERS = (ContenderKind.ONNX, ContenderKind.LOGITS, ContenderKind.ORB, ContenderKind.SIFT)
+DETECTORS = (
+    EvaluatedDetectorKind.ONNX,
+    EvaluatedDetectorKind.LOGITS,
+    EvaluatedDetectorKind.ORB,
+    EvaluatedDetectorKind.SIFT,
+)
 LOGITS = "-logits"
 MEASURES = {"e=1": "homography_1px", "e=3": "homography_3px", "e=5": "homography_5px", "MMA@3": "accuracy_3px",
             "matching score": "score"}  # fmt: skip
@@ -47,7 +52,7 @@ def main() -> None:
     folder = common.recordings(*SOURCES, kind="vision")
     with tempfile.TemporaryDirectory() as made:
         scenes = _make_scenes(folder, Path(made))
-        measured = evaluate_homography(find_scenes(scenes), choose_contenders(CONTENDERS, chosen.weights, []))
+        measured = evaluate_homography(find_scenes(scenes), choose_detectors(DETECTORS, chosen.weights, []))
     columns = {"": "s", "NMS": "d", "repeatability": "s"} | dict.fromkeys(MEASURES, "s")
     report.table("Homography and matching", columns, _rows(measured))
     columns = {"": "s", "NMS": "d"} | dict.fromkeys(MEASURES, "s")
@@ -86,7 +91,7 @@ def _images(folder: Path) -> list[Path]:
 
 def _rows(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
     for nms_px in MATCHING_NMS_PX:
-        for name in measured.contenders:
+        for name in measured.detectors:
             pairs = measured.of(name)
             values = (_shown(interval(pairs, f"{each}_nms{nms_px}", SEED)) for each in MEASURES.values())
             yield name, nms_px, f"{mean(pairs, 'repeatability'):.3f}", *values
@@ -94,8 +99,8 @@ def _rows(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
 
 def _bits_less_logits(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
     for nms_px in MATCHING_NMS_PX:
-        for name in measured.contenders:
-            if f"{name}{LOGITS}" in measured.contenders:
+        for name in measured.detectors:
+            if f"{name}{LOGITS}" in measured.detectors:
                 pairs = measured.of(name), measured.of(f"{name}{LOGITS}")
                 gaps = (difference(*pairs, f"{each}_nms{nms_px}", SEED) for each in MEASURES.values())
                 yield name, nms_px, *(_shown(gap, sign="+") for gap in gaps)

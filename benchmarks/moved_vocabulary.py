@@ -70,14 +70,14 @@ def _simulation(folder: Path, features: FeatureChoice) -> School:
 
 
 def _move(origin: School, goal: DescribedSet, scoring: Scoring) -> Iterator[tuple[object, ...]]:
-    contenders = {
+    methods = {
         "static, trained there": (_gallery(goal), Strategy.STATIC),
         "static, moved": (origin, Strategy.STATIC),
         "incremental, moved": (origin, Strategy.INCREMENTAL),
     }
     truth = next(iter(goal.place_set.questions.values()))
     at_home: FloatArray | None = None
-    for name, (school, strategy) in contenders.items():
+    for name, (school, strategy) in methods.items():
         config = VocabularyConfig(strategy=strategy, scoring=scoring)
         index: PlaceIndex[int] = PlaceIndex(config, np.random.default_rng(SEED))
         index.train(school.places)

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import common
 
-from fcslam.evaluation.places.checks import PairChecker
 from fcslam.evaluation.places.features import FeatureChoice, choose_features, describe_sets, describe_training
 from fcslam.evaluation.places.figures import curves_figure
 from fcslam.evaluation.places.report import SetResult, evaluate_set
 from fcslam.evaluation.places.scoring import DescribedSet, choose_scorers
+from fcslam.evaluation.places.verification import PairVerifier
 from fcslam.metrics.bootstrap import Interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes
@@ -65,7 +65,7 @@ def main() -> None:
 
 def _evaluate(sets: Sequence[DescribedSet], training: Sequence[Codes]) -> list[SetResult]:
     scorers = choose_scorers(STRATEGIES, VocabularyConfig(), training, SEED)
-    return [evaluate_set(each, scorers, PairChecker(each), SEED) for each in sets]
+    return [evaluate_set(each, scorers, PairVerifier(each), SEED) for each in sets]
 
 
 def _tell(report: common.Report, features: str, results: Sequence[SetResult], floors: str) -> None:

@@ -32,8 +32,8 @@ from fcslam.metrics.trajectory import align, position_errors
 from fcslam.mission import MissionConfig
 from fcslam.records import Channel, Constraint, ConstraintKind, Correction, FloatArray, Keyscan, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.simulation.fleet import SimulatedRobot, SimulationSettings, simulate_fleet
-from fcslam.simulation.kinds import Building
+from fcslam.simulation.options import Building
+from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode, encode
 

@@ -240,8 +240,8 @@ def drive_fleet(robots: int, buildings: int) -> tuple:
 
 def simulated(building: int, robots: int, path_length_m: float = 60.0) -> Iterator[Any]:
     """Recordings of robots in a building of their own."""
-    from fcslam.simulation.fleet import SimulationSettings, simulate_fleet
     from fcslam.simulation.noise import LidarSettings
+    from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
     settings = SimulationSettings(
         robots=robots, path_length_m=path_length_m, camera=None, lidar=LidarSettings(rate_hz=5.0)

@@ -4,7 +4,7 @@
 
 Places have 300 descriptors. The first ones are ORB's on the images of ie_tower, bsds500, coco_subset, urban100,
 sun_hays80, kodak24 and camvid, in random order; after them come mixtures: of three quarters of one image's
-descriptors and a quarter of another's, every bit flipped with a chance of 1 in 16. Each contender is a process of its
+descriptors and a quarter of another's, every bit flipped with a chance of 1 in 16. Each method is a process of its
 own on one core; times are CPU time of it alone. "insert" is the mean of all places since the row before, with every
 split, renewal and growing of arrays, "slowest" the longest of these. "query" is the mean of 50 for the 20 most similar
 to a further mixture. "memory" is the growth of the resident set, "peak" its maximum, which arrays that move reach for
@@ -27,7 +27,7 @@ IMAGES = ("ie_tower", "bsds500", "coco_subset", "urban100", "sun_hays80", "kodak
 DESCRIPTORS = 300
 MARKS = (100, 300, 1_000, 3_000, 10_000, 30_000, 100_000)
 MOST = {"incremental": 100_000, "static": 30_000, "brute force": 3_000}
-"""Places of each contender at most."""
+"""Places of each method at most."""
 ASKED = 50
 FLIP_HALVINGS = 4
 """A bit flips with a chance of a half to this power."""
@@ -53,7 +53,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         real = Path(place) / "real.npy"
         alone(describe_images, folder, real)
-        measured = [alone(grow, contender, real, chosen.most) for contender in MOST]
+        measured = [alone(grow, method, real, chosen.most) for method in MOST]
     rows = [row for costs, _ in measured for row in costs]
     report.table("Cost of a place", COSTS, rows)
     grown = [row for row in measured[0][0] if row[1] in (10_000, 100_000)]
@@ -103,29 +103,29 @@ def places(real: Any, rng: Any) -> Iterator[Any]:
         yield mixed ^ np.bitwise_and.reduce(flips)
 
 
-def grow(contender: str, real: Path, most: int) -> tuple[list[tuple], tuple | None]:
-    """Rows of ``COSTS`` for one contender, and of ``FILES`` if it has files."""
+def grow(method: str, real: Path, most: int) -> tuple[list[tuple], tuple | None]:
+    """Rows of ``COSTS`` for one method, and of ``FILES`` if it has files."""
     import numpy as np
 
     arrived = np.load(real)
-    make_index(contender, warm_up=arrived)
-    index, rows, inserted_ms, before = make_index(contender), [], [], memory_mb("VmRSS")
+    make_index(method, warm_up=arrived)
+    index, rows, inserted_ms, before = make_index(method), [], [], memory_mb("VmRSS")
     questions = itertools.islice(places(arrived, np.random.default_rng(SEED + 1)), len(arrived), None)
     for number, place in zip(
-        range(min(most, MOST[contender])), places(arrived, np.random.default_rng(SEED)), strict=False
+        range(min(most, MOST[method])), places(arrived, np.random.default_rng(SEED)), strict=False
     ):
         inserted_ms.append(timed_ms(lambda: index.add(number, place)))  # noqa: B023
         if number + 1 in MARKS:
             query_ms = np.mean([timed_ms(lambda: index.query(next(questions), 20)) for _ in range(ASKED)])
             insert_ms, growth = np.mean(inserted_ms), memory_mb("VmRSS") - before
-            rows.append((contender, number + 1, insert_ms, max(inserted_ms), query_ms, insert_ms + query_ms,
+            rows.append((method, number + 1, insert_ms, max(inserted_ms), query_ms, insert_ms + query_ms,
                          1e3 * growth / (number + 1), memory_mb("VmHWM"), index.word_count))  # fmt: skip
             inserted_ms.clear()
             print(*rows[-1], flush=True)
-    return rows, None if contender == "brute force" else files_row(contender, index, next(questions))
+    return rows, None if method == "brute force" else files_row(method, index, next(questions))
 
 
-def make_index(contender: str, warm_up: Any = None) -> Any:
+def make_index(method: str, warm_up: Any = None) -> Any:
     """An empty index; ``warm_up``: places that it takes in to load every kernel."""
     import numpy as np
 
@@ -139,7 +139,7 @@ def make_index(contender: str, warm_up: Any = None) -> Any:
         ),
     }
     index: Any = (
-        BruteForce() if contender == "brute force" else PlaceIndex[int](configs[contender], np.random.default_rng(SEED))
+        BruteForce() if method == "brute force" else PlaceIndex[int](configs[method], np.random.default_rng(SEED))
     )
     for number, place in enumerate([] if warm_up is None else warm_up[:320]):
         index.query(place, 1)
@@ -165,21 +165,21 @@ class BruteForce:
         return sorted(range(len(near)), key=near.__getitem__, reverse=True)[:top_k]
 
 
-def files_row(contender: str, index: Any, descriptors: Any) -> tuple:
+def files_row(method: str, index: Any, descriptors: Any) -> tuple:
     import numpy as np
 
     from fcslam.features.codes import code_words
-    from fcslam.places.kmeans_tree import descend
+    from fcslam.places.kmeans_tree import find_leaves
     from fcslam.places.persistence import load_index, save_index
 
     codes = code_words(np.resize(descriptors, (1_000, 32)))
     tree = index._vocabulary.tree
-    descent_ms = np.median([timed_ms(lambda: descend(tree, codes)) for _ in range(20)])
+    descent_ms = np.median([timed_ms(lambda: find_leaves(tree, codes)) for _ in range(20)])
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "index"
         save_s = timed_s(lambda: save_index(index, path))
         load_s = timed_s(lambda: load_index(path, int))
-        return contender, len(index), save_s, load_s, path.stat().st_size / 1e6, descent_ms
+        return method, len(index), save_s, load_s, path.stat().st_size / 1e6, descent_ms
 
 
 def timed_ms(work: Callable[[], Any]) -> float:
@@ -207,9 +207,9 @@ def draw(rows: list[tuple]) -> Any:
     figure = Figure(figsize=(10.0, 3.6), layout="constrained")
     columns = list(COSTS)
     for axes, name in zip(figure.subplots(1, 3), ("insert, ms", "query, ms", "memory a place, kB"), strict=True):
-        for contender in MOST:
-            own = [row for row in rows if row[0] == contender]
-            axes.plot([row[1] for row in own], [row[columns.index(name)] for row in own], "o-", label=contender)
+        for method in MOST:
+            own = [row for row in rows if row[0] == method]
+            axes.plot([row[1] for row in own], [row[columns.index(name)] for row in own], "o-", label=method)
         axes.set(xscale="log", xlabel="places", title=name)
         if name != "memory a place, kB":
             axes.set_yscale("log")

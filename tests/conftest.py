@@ -7,8 +7,8 @@ from hypothesis import settings
 from fcslam.cloud import fleet
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
-from fcslam.simulation.fleet import SimulatedFleet
-from fcslam.simulation.truth import write_truth
+from fcslam.simulation.ground_truth import write_ground_truth
+from fcslam.simulation.simulated_fleet import SimulatedFleet
 from fcslam.sources import write_carmen
 from fcslam.wire.messages import Packet
 from tests import small_fleet
@@ -40,7 +40,7 @@ def logs(drawn, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
     for robot in drawn.robots:
         write_carmen(folder / f"{robot.name}.clf", robot.scans())
-    write_truth(drawn, folder, np.random.default_rng(0))
+    write_ground_truth(drawn, folder, np.random.default_rng(0))
     return [folder / f"{robot.name}.clf" for robot in drawn.robots]
 
 

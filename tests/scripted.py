@@ -56,10 +56,10 @@ class ScriptedMatcher:
     def __len__(self):
         return 0
 
-    def match(self, place, predicted, strangers) -> list[PlaceMatch]:
+    def match(self, place, predicted, is_unaligned) -> list[PlaceMatch]:
         self.predictions[place.id] = dict(predicted)
         found = [line for line in self.script if line.j == place.id]
-        return [PlaceMatch(s.i, s.j, Channel.LIDAR, 0.5, verified(s), predicted=not strangers(s.i)) for s in found]
+        return [PlaceMatch(s.i, s.j, Channel.LIDAR, 0.5, verified(s), predicted=not is_unaligned(s.i)) for s in found]
 
 
 def verified(line: Script) -> Verification:

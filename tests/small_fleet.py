@@ -7,8 +7,8 @@ import numpy as np
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.result import FleetResult
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.simulation.noise import LidarSettings
+from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 

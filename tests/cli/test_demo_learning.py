@@ -51,14 +51,14 @@ def test_without_a_camera_there_is_nothing_to_learn_from(tmp_path):
 def test_a_detector_is_taken_if_a_round_was_no_worse(released, tmp_path, monkeypatch):
     pytest.importorskip("torch", reason="needs fcslam[federated]")
     pytest.importorskip("flwr", reason="needs fcslam[federated]")
-    from fcslam.features.detector import SHIPPED_NETWORK
+    from fcslam.features.detector import BUNDLED_NETWORK
     from fcslam.federated import local
     from fcslam.federated.history import RoundReport
 
     homes = []
 
     def federate_locally(folders, task, _pace, watches):
-        assert task.start == SHIPPED_NETWORK
+        assert task.start == BUNDLED_NETWORK
         homes.extend(folders)
         for number, accepted in enumerate(released, start=1):
             watches.rounds(RoundReport(number, f"light-{number}", ("a", "b"), released=accepted, bytes_down=5))

@@ -16,7 +16,7 @@ from fcslam.places.matcher import MatcherConfig
 from fcslam.records import Channel, Place, Veto
 from fcslam.runs import open_run
 from fcslam.runs.map_files import Occupancy
-from fcslam.simulation.truth import true_map
+from fcslam.simulation.ground_truth import true_map
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
 from tests import small_fleet

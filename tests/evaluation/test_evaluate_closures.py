@@ -9,7 +9,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.fleet.closures import Within, closure_metrics, closure_rows, evaluate_closures
+from fcslam.evaluation.fleet.closures import ClosureScope, closure_metrics, closure_rows, evaluate_closures
 from fcslam.evaluation.fleet.relation_graph import build_relation_graph
 from fcslam.evaluation.fleet.relations import pose_table, write_metrics
 from fcslam.geometry import se2
@@ -105,7 +105,7 @@ def test_stages_are_counted_by_hand(tmp_path, relations):
 def test_recall_needs_a_correct_closure_of_the_stage(tmp_path, relations):
     def recall(*closures):
         report = evaluate_closures(write(tmp_path / "run", closures), relations, CRITERIA)
-        stages = ((Within.FLEET, CANDIDATE), (Within.FLEET, VERIFIED), (Within.FLEET, ACCEPTED))
+        stages = ((ClosureScope.FLEET, CANDIDATE), (ClosureScope.FLEET, VERIFIED), (ClosureScope.FLEET, ACCEPTED))
         return [report.scores[stage].recall for stage in stages], report
 
     found, _ = recall()
@@ -117,12 +117,12 @@ def test_recall_needs_a_correct_closure_of_the_stage(tmp_path, relations):
     found, report = recall(closure((1, 12), (0, 11), ACCEPTED))  # two steps are 2.5 m of path
     assert [r.found for r in found] == [0, 0, 0]
     # within a robot 60 s are asked for, and 50 steps last 20 s
-    assert report.scores[Within.ROBOT, ACCEPTED].recall.revisits == 0
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].recall.revisits == 0
     shorter = ClosureCriteria(within_gap_s=15.0)
     longer = evaluate_closures(write(tmp_path / "run", [closure((1, 6), (1, 56), ACCEPTED)]), relations, shorter)
-    assert longer.scores[Within.ROBOT, ACCEPTED].recall.revisits == 2
-    assert longer.scores[Within.ROBOT, ACCEPTED].recall.found == 1
-    assert longer.scores[Within.ROBOT, REVOKED].recall is None
+    assert longer.scores[ClosureScope.ROBOT, ACCEPTED].recall.revisits == 2
+    assert longer.scores[ClosureScope.ROBOT, ACCEPTED].recall.found == 1
+    assert longer.scores[ClosureScope.ROBOT, REVOKED].recall is None
 
 
 def test_what_no_relations_join_is_not_covered(tmp_path):
@@ -131,11 +131,11 @@ def test_what_no_relations_join_is_not_covered(tmp_path):
     closures = [closure((0, 70), (1, 20), ACCEPTED), closure((0, 20), (1, 70), ACCEPTED, (5.0, 0.0, 0.0))]
     closures += [closure((0, 45), (1, 45), ACCEPTED), closure((1, 57), (1, 68), ACCEPTED)]
     report = evaluate_closures(write(tmp_path / "run", closures), tmp_path / "relations", CRITERIA)
-    score = report.scores[Within.FLEET, ACCEPTED]
+    score = report.scores[ClosureScope.FLEET, ACCEPTED]
     assert (score.graph.closures, score.graph.covered, score.graph.wrong) == (3, 1, 0)
     assert score.graph.coverage == pytest.approx(1.0 / 3.0)
     assert score.chain == (12 + 1 + 2, 12 + 1 + 2)
-    assert report.scores[Within.ROBOT, ACCEPTED].chain == (3, 3)
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].chain == (3, 3)
     assert report.relations.component_sizes.tolist() == [20 + 8, 10]
 
 
@@ -150,7 +150,7 @@ def test_a_false_relation_is_left_out_and_said(tmp_path, relations):
     assert np.flatnonzero(~graph.holds).tolist() == [len(true) - 1]
     assert graph.residual_m[-1] == pytest.approx(3.0, abs=1e-3)
     assert graph.residual_m[:-1].max() < 1e-5
-    score = report.scores[Within.FLEET, ACCEPTED]
+    score = report.scores[ClosureScope.FLEET, ACCEPTED]
     assert (score.graph.covered, score.graph.wrong, score.single.covered, score.recall.revisits) == (2, 0, 1, 3)
     assert score.graph.translation_m[1] < 1e-5
     assert score.chain == (5, 9)  # of 1 and 9: not over the false one
@@ -170,7 +170,7 @@ def test_where_nothing_tells_which_relation_is_false_none_counts(tmp_path):
     assert np.flatnonzero(~report.relations.holds).tolist() == [len(true) - 2, len(true) - 1]
     assert report.relations.component_sizes.tolist() == [20, 20]
     assert np.isnan(report.relations.residual_m[-2:]).all()
-    score = report.scores[Within.FLEET, ACCEPTED]
+    score = report.scores[ClosureScope.FLEET, ACCEPTED]
     assert (score.graph.covered, score.single.covered, score.recall.revisits) == (0, 0, 0)
 
 
@@ -183,7 +183,7 @@ def test_stamps_with_five_digits_are_found(tmp_path):
     run = write(tmp_path / "run", [closure((0, 70), (1, 20), ACCEPTED)])
     report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
     assert report.stamps_in_run == len(report.relations.stamps)
-    assert report.scores[Within.FLEET, ACCEPTED].graph.covered == 1
+    assert report.scores[ClosureScope.FLEET, ACCEPTED].graph.covered == 1
 
 
 def test_a_stamp_that_the_run_lacks_still_joins_the_others(tmp_path):
@@ -193,9 +193,9 @@ def test_a_stamp_that_the_run_lacks_still_joins_the_others(tmp_path):
     run = write(tmp_path / "run", [closure((0, 11), (0, 61), ACCEPTED)])
     report = evaluate_closures(run, tmp_path / "relations", CRITERIA)
     assert report.stamps_in_run == 2
-    assert report.scores[Within.ROBOT, ACCEPTED].graph.covered == 1
-    assert report.scores[Within.ROBOT, ACCEPTED].chain == (2, 2)
-    assert report.scores[Within.ROBOT, ACCEPTED].single.covered == 0
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].graph.covered == 1
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].chain == (2, 2)
+    assert report.scores[ClosureScope.ROBOT, ACCEPTED].single.covered == 0
 
 
 def test_robots_of_one_clock_are_told_apart_by_name():
@@ -254,9 +254,9 @@ def test_no_accepted_closure_of_a_real_fleet_is_wrong(tmp_path):
     assert main(["map", str(logs / "fr079.clf.xz"), "--split", "3", "--output", str(tmp_path / "run")]) == 0
     report = evaluate_closures(tmp_path / "run", logs / "fr079.relations.gz", CRITERIA)
     assert report.relations.holds.all()
-    for within in Within:
+    for within in ClosureScope:
         score = report.scores[within, ACCEPTED]
         assert score.graph.wrong == score.single.wrong == 0
         assert score.graph.covered >= 0.8 * score.graph.closures
         assert score.single.covered >= 20
-    assert report.scores[Within.FLEET, CANDIDATE].graph.wrong > 0  # so the reference can tell
+    assert report.scores[ClosureScope.FLEET, CANDIDATE].graph.wrong > 0  # so the reference can tell

@@ -8,7 +8,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.fleet.closures import Within
+from fcslam.evaluation.fleet.closures import ClosureScope
 from fcslam.evaluation.fleet.ground_truth import read_grid
 from fcslam.evaluation.fleet.metrics import fleet_metrics
 from fcslam.evaluation.fleet.report import evaluate_fleet
@@ -155,20 +155,20 @@ def test_closures_are_counted_by_hand(folder):
     counts = {
         (str(status), channel): (score.precision.closures, score.precision.covered, score.precision.wrong)
         for (within, status, channel), score in scores.items()
-        if within is Within.FLEET
+        if within is ClosureScope.FLEET
     }
     assert counts == {
         ("candidate", "lidar"): (4, 4, 2), ("candidate", "camera"): (1, 1, 0), ("candidate", "both"): (5, 5, 2),
         ("verified", "lidar"): (3, 3, 1), ("verified", "camera"): (1, 1, 0), ("verified", "both"): (4, 4, 1),
         ("accepted", "lidar"): (1, 1, 0), ("accepted", "camera"): (1, 1, 0), ("accepted", "both"): (2, 2, 0),
     }  # fmt: skip
-    assert scores[Within.ROBOT, ACCEPTED, "lidar"].precision.closures == 1
-    assert scores[Within.ROBOT, ACCEPTED, "camera"].precision.closures == 0
+    assert scores[ClosureScope.ROBOT, ACCEPTED, "lidar"].precision.closures == 1
+    assert scores[ClosureScope.ROBOT, ACCEPTED, "camera"].precision.closures == 0
 
 
 def test_recall_counts_what_correct_closures_find(folder):
     scores = report_of(RUN, folder, *CLOSURES).closures
-    lidar, camera, both = (scores[Within.FLEET, VERIFIED, channel] for channel in ("lidar", "camera", "both"))
+    lidar, camera, both = (scores[ClosureScope.FLEET, VERIFIED, channel] for channel in ("lidar", "camera", "both"))
     # Robot 1 is half a metre ahead. A closure at s metres of both finds those of robot 0 in [s - 1.5, s + 2] and of
     # robot 1 in [s - 2, s + 1.5]: four and three.
     assert (lidar.recall.found, camera.recall.found, both.recall.found) == (14, 7, 21)
@@ -178,8 +178,8 @@ def test_recall_counts_what_correct_closures_find(folder):
     # robot 2 drives the other way round
     assert lidar.recall_like_heading.revisits < lidar.recall.revisits == both.recall.revisits
     assert lidar.recall_like_heading.found == lidar.recall.found
-    assert scores[Within.FLEET, ACCEPTED, "lidar"].recall.found == 7
-    assert scores[Within.ROBOT, ACCEPTED, "both"].recall.revisits == 0, "nobody comes back after a minute"
+    assert scores[ClosureScope.FLEET, ACCEPTED, "lidar"].recall.found == 7
+    assert scores[ClosureScope.ROBOT, ACCEPTED, "both"].recall.revisits == 0, "nobody comes back after a minute"
 
 
 def test_a_closure_is_judged_by_the_truth_and_not_by_the_run(folder):
@@ -192,7 +192,7 @@ def test_where_the_truth_ends_nothing_is_judged(folder):
     write_tum(place, stamps(0)[:100], truth(0)[:100])
     report = report_of(RUN, folder, *CLOSURES)
     assert report.robots[0].covered == 100
-    found = report.closures[Within.FLEET, VERIFIED, "both"].precision
+    found = report.closures[ClosureScope.FLEET, VERIFIED, "both"].precision
     assert (found.closures, found.covered, found.wrong) == (4, 2, 0)
 
 

@@ -8,14 +8,14 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.detectors.contenders import choose_contenders, frame
+from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors, frame
 from fcslam.evaluation.detectors.homography import LARGE, SMALL, evaluate_homography, match_pair, matched_points
 from fcslam.evaluation.detectors.measures import column, difference, mean
 from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.features.detector import ImageFeatures
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.files import read_features, write_features
-from fcslam.features.kinds import ContenderKind
-from fcslam.metrics.framing import GroundTruth, framed_homography
+from fcslam.metrics.framing import HomographyGroundTruth, framed_homography
 from fcslam.metrics.homography import warp
 from tests.features.networks import tiny_network
 
@@ -50,8 +50,8 @@ def scenes(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def report(scenes):
-    kinds = [ContenderKind.ORB, ContenderKind.SIFT, ContenderKind.HARRIS]
-    return evaluate_homography(find_scenes([scenes]), choose_contenders(kinds, [], []))
+    kinds = [EvaluatedDetectorKind.ORB, EvaluatedDetectorKind.SIFT, EvaluatedDetectorKind.HARRIS]
+    return evaluate_homography(find_scenes([scenes]), choose_detectors(kinds, [], []))
 
 
 def test_what_can_be_matched_is(report):
@@ -66,7 +66,7 @@ def test_what_can_be_matched_is(report):
         assert mean(pairs, "accuracy_3px_nms0") > 0.9
         assert mean(pairs, "repeatability") > 0.5
         assert np.all(np.diff([mean(pairs, f"accuracy_{px}px_nms8") for px in range(1, 11)]) >= 0)
-        assert {size for contender, size in report.milliseconds if contender == name} == {SMALL, LARGE}
+        assert {size for detector, size in report.milliseconds if detector == name} == {SMALL, LARGE}
 
 
 def test_corners_have_repeatability_alone(report):
@@ -87,10 +87,10 @@ def test_each_network_is_compared_by_its_bits_and_by_its_logits(scenes, tmp_path
     paths = [tmp_path / f"{name}.onnx" for name in ("first", "second")]
     for seed, path in enumerate(paths):
         tiny_network(path, version=path.stem, seed=seed)
-    kinds = [ContenderKind.ONNX, ContenderKind.LOGITS]
-    report = evaluate_homography(find_scenes([scenes / "v_turn"]), choose_contenders(kinds, paths, []))
-    assert report.contenders == ("first", "second", "first-logits", "second-logits")
-    measured = {name: report.of(name)[0] for name in report.contenders}
+    kinds = [EvaluatedDetectorKind.ONNX, EvaluatedDetectorKind.LOGITS]
+    report = evaluate_homography(find_scenes([scenes / "v_turn"]), choose_detectors(kinds, paths, []))
+    assert report.detectors == ("first", "second", "first-logits", "second-logits")
+    measured = {name: report.of(name)[0] for name in report.detectors}
     for name in ("first", "second"):
         bits, logits = measured[name], measured[f"{name}-logits"]
         assert bits.repeatability == logits.repeatability == measured["first"].repeatability
@@ -102,16 +102,16 @@ def test_each_network_is_compared_by_its_bits_and_by_its_logits(scenes, tmp_path
 def test_without_names_there_is_all_but_two_of_one_network(tmp_path):
     path = tmp_path / "tiny.onnx"
     tiny_network(path)
-    names = [each.name for each in choose_contenders([], [path], [])]
+    names = [each.name for each in choose_detectors([], [path], [])]
     assert names == ["tiny-1", "tiny-1-logits", "orb", "sift", "fast", "harris", "shi"]
     with pytest.raises(EvaluationError, match="tiny-1: named twice"):
-        choose_contenders([ContenderKind.ONNX], [path, path], [])
+        choose_detectors([EvaluatedDetectorKind.ONNX], [path, path], [])
 
 
 def test_the_legacy_truth_spares_the_light_and_ruins_the_turn(scenes):
-    contenders = choose_contenders([ContenderKind.ORB], [], [])
+    detectors = choose_detectors([EvaluatedDetectorKind.ORB], [], [])
     found = find_scenes([scenes])
-    legacy = evaluate_homography(found, contenders, GroundTruth.LEGACY).of("orb")
+    legacy = evaluate_homography(found, detectors, HomographyGroundTruth.LEGACY).of("orb")
     assert mean(legacy, "homography_3px_nms0", SceneKind.ILLUMINATION) == 1.0
     assert mean(legacy, "homography_3px_nms0", SceneKind.VIEWPOINT) == 0.0
 
@@ -123,7 +123,7 @@ def test_extracted_features_score_as_the_detector_that_runs_here(scenes, tmp_pat
     pictures = [frame(scenes / "v_turn" / f"{number}.png", LARGE) for number in (1, 2)]
     for number, picture in enumerate(pictures, start=1):
         cv2.imwrite(str(scene / f"{number}.png"), picture.grey)
-    H = framed_homography(TURN, pictures[0].framing, pictures[1].framing, GroundTruth.CORRECTED)
+    H = framed_homography(TURN, pictures[0].framing, pictures[1].framing, HomographyGroundTruth.CORRECTED)
     np.savetxt(scene / "H_1_2", H / H[2, 2])
     assert (
         main(["extract", str(scene.parent), "-o", str(tmp_path / "mine"), "--detector", "orb", "--keypoints", "1500"])
@@ -135,7 +135,7 @@ def test_extracted_features_score_as_the_detector_that_runs_here(scenes, tmp_pat
         rows = np.random.default_rng(number).permutation(len(features.scores))  # any order will do
         write_features(path, features.take(rows), size)
     found = find_scenes([scene])
-    theirs, ours = choose_contenders([ContenderKind.ORB], [], [tmp_path / "mine"])
+    theirs, ours = choose_detectors([EvaluatedDetectorKind.ORB], [], [tmp_path / "mine"])
     (extracted,) = evaluate_homography(found, [theirs]).of("mine")
     (run,) = evaluate_homography(found, [ours]).of("orb")
     for nms_px in (8, 0):
@@ -153,7 +153,7 @@ def test_features_of_the_file_are_brought_into_the_framed_picture(scenes, tmp_pa
     for number, positions in ((1, first), (2, warp(TURN, first))):
         features = ImageFeatures(positions.astype(np.float32), np.arange(800, dtype=np.float32), codes)
         write_features(tmp_path / "perfect" / "v_turn" / f"{number}.npz", features, (700, 400))
-    perfect = choose_contenders([], [], [tmp_path / "perfect"])
+    perfect = choose_detectors([], [], [tmp_path / "perfect"])
     (pair,) = evaluate_homography(find_scenes([scenes / "v_turn"]), perfect).pairs
     assert pair.repeatability.repeatability > 0.95  # NMS may take another of two neighbours
     assert pair.repeatability.localisation_error_px < 1e-3
@@ -182,7 +182,7 @@ def test_nothing_found_scores_nothing(scenes, tmp_path):
     (tmp_path / "blind" / "v_turn").mkdir(parents=True)
     for number in (1, 2):
         write_features(tmp_path / "blind" / "v_turn" / f"{number}.npz", none, (700, 400))
-    blind = choose_contenders([], [], [tmp_path / "blind"])
+    blind = choose_detectors([], [], [tmp_path / "blind"])
     (pair,) = evaluate_homography(find_scenes([scenes / "v_turn"]), blind).pairs
     assert np.isnan(pair.repeatability.repeatability)
     assert pair.matching[8].corner_error_px == np.inf

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.evaluation.places.checks import ACCEPTED_INLIERS, PairChecker
 from fcslam.evaluation.places.features import choose_features, describe_images, describe_sets
 from fcslam.evaluation.places.scoring import (
-    ForeignTree,
+    PretrainedVocabulary,
     brute_force,
     index_scores,
     matching_descriptors,
@@ -17,6 +16,7 @@ from fcslam.evaluation.places.scoring import (
 )
 from fcslam.evaluation.places.sequences import in_sequence
 from fcslam.evaluation.places.sets import read_place_set
+from fcslam.evaluation.places.verification import ACCEPTED_INLIERS, PairVerifier
 from fcslam.features.codes import hamming_matrix
 from fcslam.metrics.retrieval import recall_at
 from fcslam.places.index import PlaceIndex
@@ -54,7 +54,7 @@ def test_brute_force_counts_mutual_neighbours(described):
 
 def test_the_foreign_tree_scores_as_the_bags_of_two_places(described):
     split, tour = described
-    tree = ForeignTree([place.descriptors for place in tour.gallery], 1)
+    tree = PretrainedVocabulary([place.descriptors for place in tour.gallery], 1)
     assert tree.word_count > 100
     scores = tree(split)
     for (q, g), score in np.ndenumerate(scores):
@@ -83,7 +83,7 @@ def test_an_index_that_was_trained_elsewhere_finds_places(described):
 
 def test_geometry_accepts_what_it_should(described):
     split, _ = described
-    checker = PairChecker(split)
+    checker = PairVerifier(split)
     verified = checker.verified(brute_force(split))
     same = np.eye(5, 6, dtype=bool)
     assert (verified[same] >= 0.5).all()

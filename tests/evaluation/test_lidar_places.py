@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import EvaluationError
-from fcslam.evaluation.places.lidar_places import agreeing_in_plane, describe_recording
+from fcslam.evaluation.places.lidar_places import describe_recording, planar_inliers
 from fcslam.evaluation.places.scoring import PlaceFeatures
 from fcslam.geometry import se2
 
@@ -29,8 +29,8 @@ def test_what_agrees_is_what_a_rigid_motion_moves():
     here = PlaceFeatures(positions.astype(np.float32), codes)
     moved = PlaceFeatures(se2.transform((3.0, -2.0, 2.5), positions[:40]).astype(np.float32), codes[:40])
     scattered = PlaceFeatures(rng.uniform(-10, 10, (60, 2)).astype(np.float32), codes)
-    assert agreeing_in_plane(here, moved) == 40
-    assert agreeing_in_plane(here, scattered) < 8
+    assert planar_inliers(here, moved) == 40
+    assert planar_inliers(here, scattered) < 8
 
 
 def test_a_recording_of_a_single_place_is_told(tmp_path, logs):

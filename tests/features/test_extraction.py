@@ -6,7 +6,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import FeatureError
-from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, Shi, Sift
+from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, ShiTomasi, Sift
 from fcslam.features.detector import NO_FEATURES, FloatFeatures
 from fcslam.features.extraction import extract
 from fcslam.features.files import read_features, read_grey, write_features
@@ -165,7 +165,7 @@ def test_what_is_written_is_read_again_the_strongest_first(tmp_path, image):
     assert sorted(map(bytes, again.descriptors)) == sorted(map(bytes, features.descriptors))
 
 
-@pytest.mark.parametrize("detector", [Fast(), Harris(), Shi(), Sift(500)], ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize("detector", [Fast(), Harris(), ShiTomasi(), Sift(500)], ids=lambda one: type(one).__name__)
 def test_detectors_to_compare_with_find_what_a_shifted_image_has_shifted(detector, image):
     found, shifted = detector.detect(image), detector.detect(np.roll(image, (6, 9), (0, 1)))
     assert len(found.scores) > 50

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from fcslam.errors import FeatureError
-from fcslam.features.choice import make_detector
 from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.detector import OnnxConfig, OnnxDetector
-from fcslam.features.kinds import DetectorKind
+from fcslam.features.detector_kinds import DetectorKind
+from fcslam.features.factory import make_detector
 from tests.features.networks import tiny_network
 
 pytest.importorskip("onnxruntime")
@@ -120,13 +120,13 @@ def test_foreign_and_missing_files_are_refused(tmp_path):
 
 
 def test_without_weights_one_is_told_so(tmp_path, monkeypatch):
-    monkeypatch.setattr("fcslam.features.detector.SHIPPED_NETWORK", tmp_path / "none.onnx")
+    monkeypatch.setattr("fcslam.features.detector.BUNDLED_NETWORK", tmp_path / "none.onnx")
     with pytest.raises(FeatureError, match="no network weights come with this version"):
         OnnxDetector(OnnxConfig())
 
 
 def test_weights_that_come_with_the_package_are_the_default(weights, monkeypatch):
-    monkeypatch.setattr("fcslam.features.detector.SHIPPED_NETWORK", weights)
+    monkeypatch.setattr("fcslam.features.detector.BUNDLED_NETWORK", weights)
     assert OnnxDetector(OnnxConfig()).version == "tiny-1"
 
 

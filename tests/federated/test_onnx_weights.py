@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError  # noqa: E402
-from fcslam.features.detector import SHIPPED_NETWORK, OnnxConfig, OnnxDetector  # noqa: E402
+from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.federated.codec import network_to_weights, weights_to_network  # noqa: E402
 from fcslam.federated.initial_weights import prepare_initial_weights, read_detector_weights  # noqa: E402
 from fcslam.federated.onnx_weights import with_batch_statistics  # noqa: E402
@@ -50,7 +50,7 @@ def test_it_is_the_same_function(encoder, tmp_path):
 
 
 def test_the_network_that_comes_with_fcslam_can_be_trained_on():
-    read = weights_to_network(read_detector_weights(SHIPPED_NETWORK, "light"), "light")
+    read = weights_to_network(read_detector_weights(BUNDLED_NETWORK, "light"), "light")
     picture = np.random.default_rng(0).integers(0, 256, (64, 96), np.uint8)
     scores, logits = OnnxDetector(OnnxConfig()).infer(picture)
     with torch.inference_mode():
@@ -71,7 +71,7 @@ def test_its_normalisations_begin_as_none(tmp_path):
 
 def test_what_no_normalisation_had_become_is_another_function_as_soon_as_it_is_trained():
     """Normalised anew it stays what it was, the more so the more alike the images are."""
-    released = read_detector_weights(SHIPPED_NETWORK, "light")
+    released = read_detector_weights(BUNDLED_NETWORK, "light")
     shapes, others = ([example.image for example in SyntheticShapes(first, 8)[:]] for first in (5, 6))
     batch = torch.from_numpy(np.stack(shapes))[:, None].float() / 255.0
     given, alike = (with_batch_statistics(released, "light", images) for images in (shapes, others))

@@ -4,7 +4,18 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.maps.drawing import CLOSURE, FLOOR, INK, LONG_SIDE_PX, PAPER, ROBOTS, WALL, Meeting, map_png, round_length
+from fcslam.maps.drawing import (
+    CLOSURE,
+    FLOOR,
+    INK,
+    LONG_SIDE_PX,
+    PAPER,
+    ROBOTS,
+    WALL,
+    DrawnClosure,
+    map_png,
+    round_length,
+)
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 SIDE_M = 0.05
@@ -74,8 +85,8 @@ def test_trajectories_lie_on_the_map_with_y_up():
 def test_closures_between_robots_are_drawn_and_counted_others_not():
     fused, ways = walled(120, 180), {"a": way((0, 4), (1, 4)), "b": way((0, 6), (1, 6))}
     bare = map_png(fused, ways, [])
-    own = Meeting(np.array((0.0, 4.0)), np.array((1.0, 6.0)), "a", "a")
-    shared = Meeting(np.array((0.5, 4.0)), np.array((0.5, 6.0)), "a", "b")
+    own = DrawnClosure(np.array((0.0, 4.0)), np.array((1.0, 6.0)), "a", "a")
+    shared = DrawnClosure(np.array((0.5, 4.0)), np.array((0.5, 6.0)), "a", "b")
     assert map_png(fused, ways, [own]) == bare
     assert len(where(seen(bare), CLOSURE)) == 0
     assert len(where(seen(map_png(fused, ways, [shared])), CLOSURE)) > 100
@@ -119,7 +130,7 @@ def test_a_robot_outside_the_known_area_is_shown():
     ],
 )
 def test_odd_trajectories_do_no_harm(points):
-    closure = Meeting(np.array((np.nan, 0.0)), np.array((1e200, 5.0)), "a", "b")
+    closure = DrawnClosure(np.array((np.nan, 0.0)), np.array((1e200, 5.0)), "a", "b")
     assert seen(map_png(walled(120, 180), {"a": points}, [closure])).size > 0
 
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from fcslam.geometry import se2
 from fcslam.metrics.closures import (
     ClosureCriteria,
-    PlacedReference,
-    SingleRelations,
+    PoseReference,
+    RelationReference,
     closure_errors,
     path_lengths,
     precision,
@@ -44,7 +44,7 @@ def fleet(seed, frames=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
 def placed(run, truth, rows, components=None, frame=(0.0, 0.0, 0.0)):
     rows = np.asarray(rows)
     components = np.zeros(len(rows), dtype=np.int64) if components is None else np.asarray(components)
-    return PlacedReference(run, CRITERIA.bridge_s, rows, se2.compose(frame, truth[rows]), components)
+    return PoseReference(run, CRITERIA.bridge_s, rows, se2.compose(frame, truth[rows]), components)
 
 
 def matrix(pose):
@@ -62,7 +62,7 @@ def test_true_closures_have_no_error_in_whatever_frames(seed, frame_1, frame_2, 
     rows = np.arange(0, 2 * STEPS, 3)
     pairs = np.random.default_rng(seed).integers(0, 2 * STEPS, (20, 2))
     T_i_j = se2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])
-    single = SingleRelations(
+    single = RelationReference(
         run, CRITERIA.bridge_s, np.column_stack((rows[:-1], rows[1:])), se2.between(truth[rows[:-1]], truth[rows[1:]])
     )
     for reference in (placed(run, truth, rows, frame=frame_reference), single):
@@ -83,7 +83,7 @@ def test_told_from_the_other_end_a_closure_gets_the_same_verdict(seed):
     ends = rng.choice(rows, (40, 2))
     for reference in (
         placed(run, truth, rows),
-        SingleRelations(run, CRITERIA.bridge_s, ends, se2.between(truth[ends[:, 0]], truth[ends[:, 1]])),
+        RelationReference(run, CRITERIA.bridge_s, ends, se2.between(truth[ends[:, 0]], truth[ends[:, 1]])),
     ):
         there = closure_errors(pairs, T_i_j, run, reference)
         back = closure_errors(pairs[:, ::-1], se2.inverse(T_i_j), run, reference)
@@ -118,8 +118,8 @@ def test_a_gap_is_bridged_up_to_one_second(gap, covered):
     for reference in (
         placed(run, truth, [i - gap, j]),
         placed(run, truth, [i, j + gap]),
-        SingleRelations(run, 1.0, np.array([[i - gap, j]]), se2.between(truth[[i - gap]], truth[[j]])),
-        SingleRelations(run, 1.0, np.array([[j + gap, i]]), se2.between(truth[[j + gap]], truth[[i]])),
+        RelationReference(run, 1.0, np.array([[i - gap, j]]), se2.between(truth[[i - gap]], truth[[j]])),
+        RelationReference(run, 1.0, np.array([[j + gap, i]]), se2.between(truth[[j + gap]], truth[[i]])),
     ):
         errors = closure_errors(np.array([[i, j]]), T_i_j, run, reference)
         assert errors.covered.tolist() == [covered]
@@ -129,7 +129,7 @@ def test_a_gap_is_bridged_up_to_one_second(gap, covered):
 def test_of_several_relations_the_nearest_counts():
     truth, run = fleet(5)
     ends = np.array([[18, 82], [81, 20], [22, 80]])
-    single = SingleRelations(run, 1.0, ends, se2.between(truth[ends[:, 0]], truth[ends[:, 1]]))
+    single = RelationReference(run, 1.0, ends, se2.between(truth[ends[:, 0]], truth[ends[:, 1]]))
     errors = closure_errors(np.array([[20, 80]]), se2.between(truth[[20]], truth[[80]]), run, single)
     assert errors.ends.tolist() == [[20, 81]]
 
@@ -141,7 +141,7 @@ def test_another_robots_stamp_or_another_component_covers_nothing():
     assert closure_errors(closure, T_i_j, run, placed(run, truth, [19, 20, 80], [1, 0, 1])).ends.tolist() == [[19, 80]]
     other = PoseTable(run.stamps, run.T_map_base, np.where(np.arange(len(truth)) == 20, 7, run.robots), run.maps)
     assert not closure_errors(closure, T_i_j, other, placed(other, truth, [19, 80])).covered.any()
-    single = SingleRelations(other, 1.0, np.array([[19, 80]]), se2.between(truth[[19]], truth[[80]]))
+    single = RelationReference(other, 1.0, np.array([[19, 80]]), se2.between(truth[[19]], truth[[80]]))
     assert not closure_errors(closure, T_i_j, other, single).covered.any()
     unknown = closure_errors(np.array([[-1, 80]]), T_i_j, run, placed(run, truth, np.arange(len(truth))))
     assert not unknown.covered.any()

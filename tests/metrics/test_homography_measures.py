@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.metrics.framing import Framing, GroundTruth, framed_homography
+from fcslam.metrics.framing import Framing, HomographyGroundTruth, framed_homography
 from fcslam.metrics.homography import (
     corner_error,
     estimate_homography,
@@ -51,7 +51,7 @@ def test_framing_covers_the_target_and_cuts_evenly():
 
 def test_the_framed_homography_is_the_homography_of_framed_points():
     first, second = Framing.of((640, 448), SIZE), Framing.of((500, 700), SIZE)
-    framed = framed_homography(H, first, second, GroundTruth.CORRECTED)
+    framed = framed_homography(H, first, second, HomographyGroundTruth.CORRECTED)
     here = points(20)
     there = warp(H, here)
     assert np.allclose(
@@ -62,14 +62,14 @@ def test_the_framed_homography_is_the_homography_of_framed_points():
 def test_the_legacy_homography_forgets_the_crop_and_the_second_scale():
     """As published: the identity stays right, whatever the crop, and all else goes wrong."""
     first, second = Framing.of((640, 448), SIZE), Framing.of((500, 700), SIZE)
-    assert np.allclose(framed_homography(np.eye(3), first, first, GroundTruth.LEGACY), np.eye(3))
+    assert np.allclose(framed_homography(np.eye(3), first, first, HomographyGroundTruth.LEGACY), np.eye(3))
     s = first.scale
     by_hand = np.diag([s, s, 1]) @ H @ np.diag([1 / s, 1 / s, 1])
-    assert np.allclose(framed_homography(H, first, second, GroundTruth.LEGACY), by_hand)
-    corrected = framed_homography(H, first, second, GroundTruth.CORRECTED)
+    assert np.allclose(framed_homography(H, first, second, HomographyGroundTruth.LEGACY), by_hand)
+    corrected = framed_homography(H, first, second, HomographyGroundTruth.CORRECTED)
     assert corner_error(by_hand, corrected, SIZE) > 20.0
     uncut = Framing.of((640, 480), SIZE)
-    pair = [framed_homography(H, uncut, uncut, truth) for truth in GroundTruth]
+    pair = [framed_homography(H, uncut, uncut, truth) for truth in HomographyGroundTruth]
     assert np.allclose(pair[0], pair[1])
 
 

@@ -116,8 +116,8 @@ def test_queries_find_what_comparing_with_every_place_finds(strategy, scoring, s
         assert [score for _, score in found] == sorted((score for _, score in found), reverse=True)
         for top_k in (1, 3, 20):
             assert index.query(query, top_k) == found[:top_k]
-        assert not index._tally.scores.any()  # blank for the next query
-        assert not index._tally.marks.any()
+        assert not index._buffers.scores.any()  # blank for the next query
+        assert not index._buffers.marks.any()
 
 
 @EVERY
@@ -171,8 +171,8 @@ def test_excluded_places_make_room_for_the_next(strategy, scoring):
     excluded = {found.id for found in everything[:30:2]}
     expected = [found for found in everything if found.id not in excluded]
     assert index.query(places[3], top_k=5, exclude=excluded) == expected[:5]
-    likeness = index.compare(places[3])
-    assert [likeness.of(place) for place in places] == [dict(everything).get(place, 0.0) for place in places]
+    result = index.compare(places[3])
+    assert [result.of(place) for place in places] == [dict(everything).get(place, 0.0) for place in places]
 
 
 @EVERY

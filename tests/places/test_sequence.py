@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from fcslam.places.index import PlaceIndex
-from fcslam.places.sequence import along_the_way, in_a_row, long_before, normalised_by_previous
+from fcslam.places.sequence import excluding_recent, normalised_by_previous, sequence_similarity, temporally_consistent
 from fcslam.places.vocabulary import VocabularyConfig
 
 similarities = arrays(
@@ -20,7 +20,7 @@ similarities = arrays(
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=20), st.integers(0, 12))
 def test_only_places_from_long_before_may_answer(steps, gap):
     stamps = np.cumsum(steps)
-    admitted = long_before(stamps, gap)
+    admitted = excluding_recent(stamps, gap)
     for t, j in np.ndindex(admitted.shape):
         assert admitted[t, j] == (j < t and stamps[t] - stamps[j] >= gap)
 
@@ -30,7 +30,7 @@ def test_a_robot_that_goes_on_finds_its_first_visit_and_not_its_last_steps():
     rng = np.random.default_rng(0)
     hall = rng.integers(0, 256, (400, 32), dtype=np.uint8)
     way = [hall[10 * k : 10 * k + 60] for k in (*range(30), *range(20))]
-    admitted = long_before(np.arange(len(way)), 8)
+    admitted = excluding_recent(np.arange(len(way)), 8)
     index = PlaceIndex[int](VocabularyConfig(train_batch=3), rng)
     answers = []
     for t, place in enumerate(way):
@@ -80,15 +80,15 @@ def runs_oracle(similarity, hits, reach):
 @settings(max_examples=60)
 @given(similarities, st.integers(1, 4), st.integers(0, 2))
 def test_what_is_kept_ends_a_chain_of_matches(similarity, hits, reach):
-    np.testing.assert_array_equal(in_a_row(similarity, hits, reach), runs_oracle(similarity, hits, reach))
+    np.testing.assert_array_equal(temporally_consistent(similarity, hits, reach), runs_oracle(similarity, hits, reach))
 
 
 @given(similarities, st.integers(1, 4), st.integers(0, 3))
 def test_more_hits_keep_less_and_more_reach_keeps_more(similarity, hits, reach):
-    kept = in_a_row(similarity, hits, reach)
-    np.testing.assert_array_equal(in_a_row(similarity, 1, reach), similarity)
-    assert (in_a_row(similarity, hits + 1, reach) <= kept).all()
-    assert (in_a_row(similarity, hits, reach + 1) >= kept).all()
+    kept = temporally_consistent(similarity, hits, reach)
+    np.testing.assert_array_equal(temporally_consistent(similarity, 1, reach), similarity)
+    assert (temporally_consistent(similarity, hits + 1, reach) <= kept).all()
+    assert (temporally_consistent(similarity, hits, reach + 1) >= kept).all()
 
 
 def mean_oracle(similarity, places, reach):
@@ -109,16 +109,16 @@ def mean_oracle(similarity, places, reach):
 @settings(max_examples=60)
 @given(similarities, st.integers(1, 15), st.integers(0, 3))
 def test_the_mean_along_the_way_is_that_of_its_terms(similarity, places, reach):
-    mean = along_the_way(similarity, places, reach)
+    mean = sequence_similarity(similarity, places, reach)
     np.testing.assert_allclose(mean, mean_oracle(similarity, places, reach), atol=1e-12)
-    np.testing.assert_array_equal(along_the_way(similarity, 1, reach), similarity)
-    assert (along_the_way(similarity, places, reach + 1) >= mean).all()
-    np.testing.assert_allclose(along_the_way(3.0 * similarity, places, reach), 3.0 * mean)
+    np.testing.assert_array_equal(sequence_similarity(similarity, 1, reach), similarity)
+    assert (sequence_similarity(similarity, places, reach + 1) >= mean).all()
+    np.testing.assert_allclose(sequence_similarity(3.0 * similarity, places, reach), 3.0 * mean)
 
 
 @given(similarities, st.integers(1, 4), st.integers(0, 3))
 def test_a_way_driven_back_counts_as_one_driven_again(similarity, length, reach):
-    for way in (in_a_row, along_the_way):
+    for way in (temporally_consistent, sequence_similarity):
         np.testing.assert_array_equal(way(similarity[:, ::-1], length, reach)[:, ::-1], way(similarity, length, reach))
 
 
@@ -129,7 +129,7 @@ def test_an_alias_more_similar_than_the_true_place_loses_along_the_way(backwards
         similarity[t, 20 - t if backwards else 20 + t] = 0.5
     similarity[4, 3] = 0.8
     assert similarity[4].argmax() == 3
-    assert along_the_way(similarity, 3, 1)[4].argmax() == (16 if backwards else 24)
+    assert sequence_similarity(similarity, 3, 1)[4].argmax() == (16 if backwards else 24)
 
 
 def test_a_single_alias_between_places_that_match_elsewhere_is_dropped():
@@ -137,12 +137,14 @@ def test_a_single_alias_between_places_that_match_elsewhere_is_dropped():
     for t, j in enumerate((3, 4, 5, 30, 7, 8)):
         similarity[t, j] = 0.5
     similarity[3, 6] = 0.4
-    kept = in_a_row(similarity, hits=3, reach=1)
+    kept = temporally_consistent(similarity, hits=3, reach=1)
     assert [(int(t), int(j)) for t, j in np.argwhere(kept)] == [(2, 5), (3, 6)]
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 4), (3, 0)])
 def test_nothing_gives_nothing(shape):
-    assert in_a_row(np.zeros(shape), 3, 2).shape == along_the_way(np.zeros(shape), 3, 2).shape == shape
+    assert (
+        temporally_consistent(np.zeros(shape), 3, 2).shape == sequence_similarity(np.zeros(shape), 3, 2).shape == shape
+    )
     assert normalised_by_previous(np.zeros(shape), np.zeros(shape[0])).shape == shape
-    assert long_before(np.zeros(0), 1.0).shape == (0, 0)
+    assert excluding_recent(np.zeros(0), 1.0).shape == (0, 0)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.places.thinning import crowded_out
+from fcslam.places.thinning import surplus_places
 
 coordinates = st.floats(-4.0, 4.0)
 ways = st.lists(st.tuples(coordinates, coordinates), max_size=60)
@@ -22,7 +22,7 @@ def driven(way, side_m, most):
     kept = []
     for number in range(len(way)):
         kept.append(number)
-        gone = crowded_out(np.array([way[k] for k in kept], float), side_m, most).tolist()
+        gone = surplus_places(np.array([way[k] for k in kept], float), side_m, most).tolist()
         kept = [k for row, k in enumerate(kept) if row not in gone]
     return kept
 
@@ -50,4 +50,4 @@ def test_a_robot_that_sweeps_a_floor_lane_by_lane_keeps_all_of_the_floor():
 
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_few_places_are_never_too_many(count):
-    assert not len(crowded_out(np.zeros((count, 2)), 5.0, 3))
+    assert not len(surplus_places(np.zeros((count, 2)), 5.0, 3))

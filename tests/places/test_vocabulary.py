@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fcslam.config import parse
 from fcslam.errors import ConfigError
 from fcslam.features.codes import code_words
-from fcslam.places.kmeans_tree import TreeShape, _majorities, bare_root, descend, grow, near_leaves
+from fcslam.places.kmeans_tree import TreeShape, _majorities, bare_root, find_leaves, grow_tree, near_leaves
 from fcslam.places.vocabulary import Vocabulary, VocabularyConfig
 
 SMALL = TreeShape(branching=4, depth=3, smallest_split=8, iterations=8)
@@ -54,16 +54,16 @@ def beam_oracle(tree, code, beam):
 
 def test_leaves_are_those_of_a_walk_down_the_tree():
     rng = np.random.default_rng(0)
-    tree = grow(clustered_codes(rng, 600), SMALL, np.uint64(1))
+    tree = grow_tree(clustered_codes(rng, 600), SMALL, np.uint64(1))
     fresh = clustered_codes(rng, 200)
-    np.testing.assert_array_equal(descend(tree, fresh), [walk(tree, code) for code in fresh])
+    np.testing.assert_array_equal(find_leaves(tree, fresh), [walk(tree, code) for code in fresh])
     assert (tree.child_count == 0).sum() > 16
 
 
 @pytest.mark.parametrize("beam", [1, 2, 5, 64])
 def test_near_leaves_are_those_of_a_search_by_levels(beam):
     rng = np.random.default_rng(1)
-    tree = grow(clustered_codes(rng, 600), SMALL, np.uint64(1))
+    tree = grow_tree(clustered_codes(rng, 600), SMALL, np.uint64(1))
     for code in clustered_codes(rng, 50):
         found = [leaf for leaf in near_leaves(tree, code[None], beam)[0].tolist() if leaf >= 0]
         expected = beam_oracle(tree, code, beam)
@@ -77,7 +77,7 @@ def test_near_leaves_are_those_of_a_search_by_levels(beam):
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not():
     codes = clustered_codes(np.random.default_rng(1), 600)
-    first, second, other = (grow(codes, SMALL, np.uint64(seed)) for seed in (5, 5, 6))
+    first, second, other = (grow_tree(codes, SMALL, np.uint64(seed)) for seed in (5, 5, 6))
     assert [array.tobytes() for array in first] == [array.tobytes() for array in second]
     assert first.centres.tobytes() != other.centres.tobytes()
 
@@ -86,8 +86,8 @@ def test_clear_clusters_become_words_and_centres_are_bit_majorities():
     rng = np.random.default_rng(3)
     centres = rng.integers(0, 256, (4, 32), dtype=np.uint8)
     codes = np.concatenate([clustered_codes(rng, 101, centre[None]) for centre in centres])
-    tree = grow(codes, TreeShape(branching=4, depth=1, smallest_split=2, iterations=20), np.uint64(0))
-    leaves = descend(tree, codes)
+    tree = grow_tree(codes, TreeShape(branching=4, depth=1, smallest_split=2, iterations=20), np.uint64(0))
+    leaves = find_leaves(tree, codes)
     assert all(len(set(leaves[101 * k : 101 * (k + 1)])) == 1 for k in range(4))
     for leaf in set(leaves.tolist()):
         bits = np.unpackbits(codes[leaves == leaf].view(np.uint8), axis=1)
@@ -109,18 +109,18 @@ def test_majorities_of_bits_are_those_of_counting_them(seed, count, clusters):
 def test_limits_of_the_shape_hold():
     codes = code_words(np.random.default_rng(4).integers(0, 256, (500, 32), dtype=np.uint8))
     for depth in (1, 2, 3):
-        tree = grow(codes, TreeShape(branching=3, depth=depth, smallest_split=10, iterations=8), np.uint64(0))
+        tree = grow_tree(codes, TreeShape(branching=3, depth=depth, smallest_split=10, iterations=8), np.uint64(0))
         assert 1 < (tree.child_count == 0).sum() <= 3**depth
-    coarse = grow(codes, TreeShape(branching=3, depth=3, smallest_split=501, iterations=8), np.uint64(0))
+    coarse = grow_tree(codes, TreeShape(branching=3, depth=3, smallest_split=501, iterations=8), np.uint64(0))
     assert len(coarse.centres) == 1
 
 
 @pytest.mark.parametrize("count", [0, 1, 300])
 def test_nothing_to_tell_apart_gives_one_word(count):
-    tree = grow(np.zeros((count, 4), np.uint64), SMALL, np.uint64(0))
+    tree = grow_tree(np.zeros((count, 4), np.uint64), SMALL, np.uint64(0))
     assert len(tree.centres) == len(bare_root().centres) == 1
-    assert descend(tree, np.full((3, 4), 7, np.uint64)).tolist() == [0, 0, 0]
-    assert descend(tree, np.empty((0, 4), np.uint64)).shape == (0,)
+    assert find_leaves(tree, np.full((3, 4), 7, np.uint64)).tolist() == [0, 0, 0]
+    assert find_leaves(tree, np.empty((0, 4), np.uint64)).shape == (0,)
 
 
 @settings(max_examples=30, deadline=None)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import CloudError, StateError
-from fcslam.features.release import file_of
+from fcslam.features.detector_file import describe_detector_file
 from fcslam.geometry import se2
 from fcslam.records import Channel, Place
 from fcslam.robot.agent import Agent, LocalizationState, PlaybackPace
@@ -182,7 +182,7 @@ def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
 
 def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tmp_path):
     tiny_network(tmp_path / "tiny.onnx", version="tiny-2")
-    file = file_of(tmp_path / "tiny.onnx")
+    file = describe_detector_file(tmp_path / "tiny.onnx")
     cloud = FakeCloud()
 
     def patient(records):

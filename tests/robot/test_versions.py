@@ -7,9 +7,9 @@ import pytest
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import FeatureError
-from fcslam.features.detector import SHIPPED_NETWORK
-from fcslam.features.kinds import DetectorKind
-from fcslam.features.release import file_of
+from fcslam.features.detector import BUNDLED_NETWORK
+from fcslam.features.detector_file import describe_detector_file
+from fcslam.features.detector_kinds import DetectorKind
 from fcslam.records import CameraImage, Channel, DetectorFile, LaserScan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.image_buffer import ImageBufferConfig
@@ -22,7 +22,7 @@ from tests.small_fleet import fingerprint
 
 WITH_ORB = RobotConfig(channels=(Channel.CAMERA,), views=ViewsConfig(detector=DetectorKind.ORB))
 WITH_NETWORK = RobotConfig(channels=(Channel.CAMERA,))
-SHIPPED = file_of(SHIPPED_NETWORK)
+SHIPPED = describe_detector_file(BUNDLED_NETWORK)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def driven(robot, records, switch_after=None):
     packets = []
     for number, record in enumerate(records):
         if number == switch_after:
-            robot.set_detector(SHIPPED, SHIPPED_NETWORK)
+            robot.set_detector(SHIPPED, BUNDLED_NETWORK)
         packets += robot.process(record)
     return packets + robot.finish()
 
@@ -94,12 +94,12 @@ def test_going_back_and_forth_describes_nothing_twice(seen, tmp_path):
     """A release that was withdrawn: places of the version before are there already."""
     tiny_network(tmp_path / "tiny.onnx", version="tiny-1")
     robot, packets = RobotFrontend("r", WITH_NETWORK), []
-    changes = {len(seen) // 3: tmp_path / "tiny.onnx", len(seen) // 2: SHIPPED_NETWORK, len(seen) - 1: SHIPPED_NETWORK}
+    changes = {len(seen) // 3: tmp_path / "tiny.onnx", len(seen) // 2: BUNDLED_NETWORK, len(seen) - 1: BUNDLED_NETWORK}
     for number, record in enumerate(seen):
         if number in changes:
-            robot.set_detector(file_of(changes[number]), changes[number])
+            robot.set_detector(describe_detector_file(changes[number]), changes[number])
         packets += robot.process(record)
-    robot.set_detector(file_of(tmp_path / "tiny.onnx"), tmp_path / "tiny.onnx")
+    robot.set_detector(describe_detector_file(tmp_path / "tiny.onnx"), tmp_path / "tiny.onnx")
     packets += robot.finish()  # the last change is told even though no scan comes after it
     announced = [packet.body.detector_versions[Channel.CAMERA] for packet in packets if isinstance(packet.body, Hello)]
     assert announced == [SHIPPED.version, "tiny-1", SHIPPED.version, "tiny-1"]
@@ -111,7 +111,7 @@ def test_going_back_and_forth_describes_nothing_twice(seen, tmp_path):
 
 def test_what_is_not_the_file_that_was_announced_changes_nothing(seen, tmp_path):
     tiny_network(tmp_path / "tiny.onnx", version="tiny-1")
-    tiny = file_of(tmp_path / "tiny.onnx")
+    tiny = describe_detector_file(tmp_path / "tiny.onnx")
     (tmp_path / "cut.onnx").write_bytes((tmp_path / "tiny.onnx").read_bytes()[:-1])
     robot = RobotFrontend("r", WITH_ORB)
     for file, path, reason in (

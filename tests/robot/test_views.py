@@ -11,7 +11,7 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.config import dump, load
 from fcslam.errors import FeatureError
 from fcslam.features.detector import OnnxConfig, OnnxDetector
-from fcslam.features.kinds import DetectorKind
+from fcslam.features.detector_kinds import DetectorKind
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend

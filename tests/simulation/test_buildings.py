@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fcslam.simulation.floorplan import DOOR_M, Kind, draw_floor_plan, move_furniture
-from fcslam.simulation.kinds import Building, Lighting
+from fcslam.simulation.floorplan import DOOR_M, PieceKind, draw_floor_plan, move_furniture
 from fcslam.simulation.lighting import light_of
+from fcslam.simulation.options import Building, Lighting
 from fcslam.simulation.route import drive, schedule
 from tests.simulation.driving import distances, route
 
@@ -23,7 +23,7 @@ def test_every_room_has_a_door_and_lies_in_the_building(building):
         assert np.all(room.low >= 0.0)
         assert np.all(room.high <= np.array(plan.size_m) + 1e-9)
         assert np.all((room.inside > room.low) & (room.inside < room.high))
-    lintels = [piece for piece in plan.pieces if piece.kind is Kind.LINTEL]
+    lintels = [piece for piece in plan.pieces if piece.kind is PieceKind.LINTEL]
     assert len(lintels) == len(plan.rooms)
     assert all(piece.size[0] == pytest.approx(DOOR_M + 0.12) for piece in lintels)
 
@@ -56,7 +56,7 @@ def test_the_corridor_has_twenty_doors_that_are_alike():
         np.testing.assert_allclose(np.diff([room.doorway[0] for room in side], n=2), 0.0, atol=1e-9)
         np.testing.assert_allclose([room.high - room.low for room in side], [side[0].high - side[0].low] * 10)
     lane_y = plan.lanes[0][0][1]
-    furniture = [piece for piece in plan.pieces if piece.kind in (Kind.CABINET, Kind.COLUMN)]
+    furniture = [piece for piece in plan.pieces if piece.kind in (PieceKind.CABINET, PieceKind.COLUMN)]
     assert min(abs(piece.outline[:, 1] - lane_y).min() for piece in furniture) > 1.1
 
 
@@ -68,7 +68,7 @@ def test_moving_leaves_walls_and_keeps_furniture_in_its_room(building):
     for before, after in zip(plan.pieces, moved.pieces, strict=True):
         same = np.array_equal(before.outline, after.outline)
         changed += not same
-        assert same or before.kind in (Kind.CABINET, Kind.COLUMN)
+        assert same or before.kind in (PieceKind.CABINET, PieceKind.COLUMN)
         np.testing.assert_allclose(after.size, before.size)
         if not same:
             (room,) = (r for r in plan.rooms if np.all(before.centre > r.low) and np.all(before.centre < r.high))

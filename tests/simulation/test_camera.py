@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from fcslam.records import CameraImage, LaserScan
-from fcslam.simulation.decoration import Picture, decorate
+from fcslam.simulation.decoration import WallPicture, decorate
 from fcslam.simulation.engine import mujoco
-from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.simulation.floorplan import draw_floor_plan
-from fcslam.simulation.kinds import Building, Lighting
 from fcslam.simulation.lighting import light_of
 from fcslam.simulation.noise import LidarSettings
+from fcslam.simulation.options import Building, Lighting
 from fcslam.simulation.route import drive
 from fcslam.simulation.scene import furnished_model
 from fcslam.simulation.sensors import Camera
+from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from tests.simulation.driving import route
 from tests.simulation.gl import require_gl
 
@@ -64,7 +64,7 @@ def test_a_point_is_seen_where_the_intrinsics_and_the_mounting_say(flat, target,
     ahead, left, up = target
     cos, sin = math.cos(heading), math.sin(heading)
     centre = (x + cos * ahead - sin * left, y + sin * ahead + cos * left, up)
-    plate = Picture(RED, centre, (0.12, 0.12), heading + math.pi / 2.0)
+    plate = WallPicture(RED, centre, (0.12, 0.12), heading + math.pi / 2.0)
     empty = replace(plan, pieces=(), rooms=())
     bare = replace(decoration, looks=(), heights_m=(), room_floors=(), pictures=(plate,))
     light = light_of(plan, Lighting.DAY, np.random.default_rng(0))

@@ -9,11 +9,11 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.records import GroundTruth, LaserScan, Odometry
-from fcslam.simulation.fleet import CameraSettings, SimulatedRobot, SimulationSettings, simulate_fleet
-from fcslam.simulation.kinds import Building
 from fcslam.simulation.noise import LidarSettings
+from fcslam.simulation.options import Building
 from fcslam.simulation.recording import record_robot
 from fcslam.simulation.sensors import Camera, RayCaster
+from fcslam.simulation.simulated_fleet import CameraSettings, SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.sources import RecordingWriter, open_source
 from tests.simulation.gl import require_gl
 

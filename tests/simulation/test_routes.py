@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from fcslam.errors import SimulationError
-from fcslam.simulation.floorplan import FloorPlan, Kind, Piece, Room, draw_floor_plan, move_furniture
-from fcslam.simulation.free_space import ROBOT_RADIUS_M, FreeSpace
-from fcslam.simulation.kinds import Building
+from fcslam.simulation.drivable_space import ROBOT_RADIUS_M, DrivableSpace
+from fcslam.simulation.floorplan import FloorPlan, Piece, PieceKind, Room, draw_floor_plan, move_furniture
+from fcslam.simulation.options import Building
 from fcslam.simulation.route import SPEED_M_S, TURN_RATE_RAD_S, draw_goals, drive, plan_route, schedule
 from tests.simulation.driving import distances, route
 
 
 def box(west, south, east, north):
-    return Piece(Kind.WALL, np.array([[west, south], [east, south], [east, north], [west, north]], dtype=float))
+    return Piece(PieceKind.WALL, np.array([[west, south], [east, south], [east, north], [west, north]], dtype=float))
 
 
 def halves(*walls):
@@ -50,7 +50,7 @@ def test_robots_touch_nothing_wherever_furniture_stands(building, seed):
 
 def test_free_points_are_those_with_clearance():
     plan = draw_floor_plan(np.random.default_rng(1), Building.FLAT)
-    space = FreeSpace(plan)
+    space = DrivableSpace(plan)
     assert distances(space.points, plan.segments).min() > ROBOT_RADIUS_M + 0.01
     grid = np.stack(np.meshgrid(np.arange(0.3, 9.0, 0.1), np.arange(0.3, 8.0, 0.1)), axis=-1).reshape(-1, 2)
     wide = grid[distances(grid, plan.segments) > 0.6]
@@ -58,7 +58,7 @@ def test_free_points_are_those_with_clearance():
 
 
 def test_a_path_in_the_open_is_straight():
-    space = FreeSpace(halves())
+    space = DrivableSpace(halves())
     start, end = space.nearest(np.array([1.5, 1.5])), space.nearest(np.array([6.5, 4.0]))
     path = space.path(start, end)
     np.testing.assert_array_equal(path, space.points[[start, end]])
@@ -67,7 +67,7 @@ def test_a_path_in_the_open_is_straight():
 
 
 def test_a_path_goes_through_the_middle_of_the_door():
-    space = FreeSpace(halves((0.0, 4.0), (5.0, 6.0)))
+    space = DrivableSpace(halves((0.0, 4.0), (5.0, 6.0)))
     start, end = space.nearest(np.array([1.0, 1.0])), space.nearest(np.array([7.0, 1.0]))
     path = space.path(start, end)
     (crossing,) = (
@@ -79,7 +79,7 @@ def test_a_path_goes_through_the_middle_of_the_door():
 
 
 def test_what_cannot_be_reached_is_not_free():
-    space = FreeSpace(halves((0.0, 5.6)))
+    space = DrivableSpace(halves((0.0, 5.6)))
     sides = space.points[:, 0] > 4.0
     assert np.all(sides) or not np.any(sides)
 
@@ -132,7 +132,7 @@ def test_neighbours_share_ground_and_return_to_their_own(building, seed):
 
 def test_goals_move_aside_where_furniture_came():
     plan = halves()
-    chest = Piece(Kind.CABINET, np.array([[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0]]))
+    chest = Piece(PieceKind.CABINET, np.array([[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0]]))
     filled = replace(plan, pieces=(*plan.pieces, chest))
     goals = np.array([[1.5, 1.5], [6.0, 4.0]])
     waypoints = plan_route(filled, goals, 20.0, np.random.default_rng(0))

@@ -7,14 +7,16 @@ from fcslam import config
 from fcslam.errors import ConfigError
 from fcslam.geometry import se2
 from fcslam.records import LaserModel
-from fcslam.simulation.fleet import SimulationSettings
 from fcslam.simulation.floorplan import draw_floor_plan
-from fcslam.simulation.noise import LidarSettings, disturb
-from fcslam.simulation.odometry import DriftSettings, drift
+from fcslam.simulation.noise import LidarSettings, simulate_ranges
+from fcslam.simulation.odometry import OdometryNoiseSettings, simulate_odometry
 from fcslam.simulation.route import drive
+from fcslam.simulation.simulated_fleet import SimulationSettings
 from tests.simulation.driving import route
 
-NO_DRIFT = DriftSettings(travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0)
+NO_DRIFT = OdometryNoiseSettings(
+    travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0
+)
 STRAIGHT = np.column_stack((np.linspace(0.0, 20.0, 401), np.zeros((401, 2))))
 
 
@@ -27,18 +29,18 @@ def test_noise_and_dropouts_are_as_large_as_said():
     laser = LaserModel(400, -np.pi, 2.0 * np.pi / 400, 12.0)
     true = np.random.default_rng(1).uniform(0.5, 14.0, (300, 400)).clip(max=12.0)
     settings = LidarSettings(range_noise_m=0.02, dropout=0.1)
-    ranges = disturb(true, laser, settings, np.random.default_rng(0))
+    ranges = simulate_ranges(true, laser, settings, np.random.default_rng(0))
     hit, returned = true < laser.max_range_m, ranges < laser.max_range_m
     assert not np.any(returned & ~hit)
     assert np.mean(~returned[hit]) == pytest.approx(0.1, abs=0.01)
     assert np.std((ranges - true)[returned]) == pytest.approx(0.02, rel=0.05)
     exact = LidarSettings(range_noise_m=0.0, dropout=0.0)
-    np.testing.assert_array_equal(disturb(true, laser, exact, np.random.default_rng(0)), true)
+    np.testing.assert_array_equal(simulate_ranges(true, laser, exact, np.random.default_rng(0)), true)
 
 
 def test_wheels_without_faults_tell_the_truth():
     truth = true_drive(0)
-    odometry = drift(truth, NO_DRIFT, np.random.default_rng(0))
+    odometry = simulate_odometry(truth, NO_DRIFT, np.random.default_rng(0))
     np.testing.assert_allclose(odometry[0], 0.0)
     np.testing.assert_allclose(se2.between(se2.compose(truth[0], odometry), truth), 0.0, atol=1e-9)
 
@@ -46,7 +48,7 @@ def test_wheels_without_faults_tell_the_truth():
 def test_heading_noise_grows_with_the_square_root_of_the_way():
     settings = NO_DRIFT.model_copy(update={"heading_noise_rad": 0.01})
     rng = np.random.default_rng(5)
-    headings = np.array([drift(STRAIGHT, settings, rng)[:, 2] for _ in range(400)])
+    headings = np.array([simulate_odometry(STRAIGHT, settings, rng)[:, 2] for _ in range(400)])
     assert np.std(headings[:, 80]) == pytest.approx(0.02, rel=0.15)
     assert np.std(headings[:, 320]) == pytest.approx(0.04, rel=0.15)
 
@@ -59,7 +61,7 @@ def test_biases_grow_with_what_causes_them(bias, turn_share, travel_share):
     driving = np.column_stack((np.linspace(0.0, 3.0, 101), np.zeros((101, 2))))
     settings, rng = NO_DRIFT.model_copy(update={bias: 0.01}), np.random.default_rng(6)
     for truth, share in ((turning, turn_share), (driving, travel_share)):
-        wrong = np.array([drift(truth, settings, rng)[:, 2] - truth[:, 2] for _ in range(400)])
+        wrong = np.array([simulate_odometry(truth, settings, rng)[:, 2] - truth[:, 2] for _ in range(400)])
         assert np.std(wrong[:, 100]) == pytest.approx(share * 0.03, rel=0.15, abs=1e-12)
         np.testing.assert_allclose(wrong[:, 50], wrong[:, 100] / 2.0, atol=1e-9)
 
@@ -67,7 +69,7 @@ def test_biases_grow_with_what_causes_them(bias, turn_share, travel_share):
 def test_slips_make_odometry_longer_and_nothing_else():
     settings = NO_DRIFT.model_copy(update={"slips_per_m": 0.5, "slip_m": 0.04})
     rng = np.random.default_rng(0)
-    ends = np.array([drift(STRAIGHT, settings, rng)[-1] for _ in range(300)])
+    ends = np.array([simulate_odometry(STRAIGHT, settings, rng)[-1] for _ in range(300)])
     assert np.mean(ends[:, 0]) == pytest.approx(20.0 + 20.0 * 0.5 * 0.04, abs=0.04)
     np.testing.assert_allclose(ends[:, 1:], 0.0, atol=1e-12)
 
@@ -75,7 +77,7 @@ def test_slips_make_odometry_longer_and_nothing_else():
 @pytest.mark.parametrize("seed", range(3))
 def test_default_odometry_is_bad_enough_to_need_a_map(seed):
     truth = true_drive(seed)
-    odometry = drift(truth, SimulationSettings().drift, np.random.default_rng(seed))
+    odometry = simulate_odometry(truth, SimulationSettings().drift, np.random.default_rng(seed))
     end = se2.between(se2.between(truth[0], truth[-1]), odometry[-1])
     assert 0.1 < np.hypot(end[0], end[1]) < 10.0
 

@@ -11,13 +11,13 @@ from fcslam.errors import SimulationError
 from fcslam.geometry import se2
 from fcslam.records import GroundTruth, LaserModel, LaserScan
 from fcslam.simulation import engine, textures
-from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
-from fcslam.simulation.floorplan import Kind, draw_floor_plan
-from fcslam.simulation.kinds import Building
+from fcslam.simulation.floorplan import PieceKind, draw_floor_plan
 from fcslam.simulation.noise import LidarSettings
+from fcslam.simulation.options import Building
 from fcslam.simulation.route import drive
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster
+from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from tests.simulation.driving import route
 
 TINY = SimulationSettings(
@@ -45,8 +45,8 @@ def test_rays_agree_with_lines_that_cross(building):
     plan = draw_floor_plan(rng, building)
     _, poses = drive(route(plan, 40.0, rng), 8.0)
     # Columns are round here and have eight corners there.
-    pieces = tuple(piece for piece in plan.pieces if piece.kind is not Kind.COLUMN)
-    sides = [np.hstack((p.outline, np.roll(p.outline, -1, axis=0))) for p in pieces if p.kind is not Kind.LINTEL]
+    pieces = tuple(piece for piece in plan.pieces if piece.kind is not PieceKind.COLUMN)
+    sides = [np.hstack((p.outline, np.roll(p.outline, -1, axis=0))) for p in pieces if p.kind is not PieceKind.LINTEL]
     laser = LaserModel(120, -np.pi, 2.0 * np.pi / 120, 9.0, T_base_laser=(0.1, 0.02, 0.3))
     caster = RayCaster(bare_model(replace(plan, pieces=pieces)), laser)
     ranges = np.array([caster.cast(pose) for pose in poses])
@@ -60,7 +60,7 @@ def test_rays_agree_with_lines_that_cross(building):
 
 def test_nothing_to_hit_is_the_maximum_range():
     plan = draw_floor_plan(np.random.default_rng(0), Building.FLAT)
-    column = next(piece for piece in plan.pieces if piece.kind is Kind.COLUMN)
+    column = next(piece for piece in plan.pieces if piece.kind is PieceKind.COLUMN)
     caster = RayCaster(bare_model(replace(plan, pieces=(column,))), LaserModel(4, -np.pi, 0.5 * np.pi, 7.0))
     assert np.all(caster.cast(np.array([*column.centre + 20.0, 0.0])) == 7.0)
 
@@ -68,7 +68,7 @@ def test_nothing_to_hit_is_the_maximum_range():
 def test_a_round_column_lies_within_its_corners():
     rng = np.random.default_rng(3)
     plan = draw_floor_plan(rng)
-    column = next(piece for piece in plan.pieces if piece.kind is Kind.COLUMN)
+    column = next(piece for piece in plan.pieces if piece.kind is PieceKind.COLUMN)
     laser = LaserModel(8, -np.pi, np.pi / 4.0, 9.0)
     caster = RayCaster(bare_model(replace(plan, pieces=(column,))), laser)
     ahead = caster.cast(np.array([column.centre[0] - 2.0, column.centre[1], 0.0]))[4]

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import SourceError
-from fcslam.sources import BagOptions, Fault, Tally, open_source
+from fcslam.sources import BagOptions, Fault, FaultCount, open_source
 from tests.sources.bag_messages import (
     Said,
     drive,
@@ -155,14 +155,14 @@ def test_a_gap_in_the_odometry_is_counted(tmp_path):
     source = open_source(save(tmp_path / "run.bag", said))
     assert len(scans_of(source)) == 60
     assert source.faults[Fault.ODOMETRY_GAP].count == 15
-    assert source.survey().faults.tallies == source.faults.tallies
+    assert source.survey().faults.counts == source.faults.counts
 
 
 def test_scans_before_the_odometry_are_left_out_and_counted(tmp_path):
     said = [message for message in drive(60) if message.topic != "/odom" or message.bag_time > 104.0]
     source = open_source(save(tmp_path / "run.bag", said))
     assert len(scans_of(source)) == 60 - 16 == source.survey().scan_count
-    assert source.faults[Fault.NO_ODOMETRY] == Tally(16, 1)
+    assert source.faults[Fault.NO_ODOMETRY] == FaultCount(16, 1)
     assert source.faults[Fault.HELD_ODOMETRY].count == 5
 
 
@@ -220,7 +220,7 @@ def test_broken_messages_are_skipped_and_counted(tmp_path, name):
     source = open_source(save(tmp_path / name, [*drive(60), *broken]))
     assert len(scans_of(source)) == 60
     assert source.faults[Fault.BROKEN_MESSAGE].count == 22
-    assert source.faults.tallies.keys() == {Fault.BROKEN_MESSAGE}
+    assert source.faults.counts.keys() == {Fault.BROKEN_MESSAGE}
     assert "broken messages skipped: 22 (first: message 1)" in str(source.faults)
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.sources.bags.messages import Beams, OdometryReading, ScanMessage
-from fcslam.sources.bags.pairing import MAX_GAP_S, PosedScan, paired
+from fcslam.sources.bags.pairing import MAX_GAP_S, PosedScan, pair_with_odometry
 from fcslam.sources.faults import Fault
 
 
@@ -23,7 +23,7 @@ def reading(stamp, pose=None):
 
 def run(items):
     """The scans that come out, in order; checks that nothing is lost and odometry keeps its order."""
-    out = list(paired(enumerate(items, start=1)))
+    out = list(pair_with_odometry(enumerate(items, start=1)))
     assert [number for number, _ in out] == list(range(1, len(items) + 1))
     return [entry for _, entry in out if isinstance(entry, PosedScan)]
 
@@ -125,5 +125,5 @@ def test_what_waits_is_bounded():
             yield k, scan(1e6 + k) if k % 2 else reading(0.1 * k)
 
     fed: list[int] = []
-    behind = [len(fed) - number for number, _ in paired(items()) if len(fed) < 5000]
+    behind = [len(fed) - number for number, _ in pair_with_odometry(items()) if len(fed) < 5000]
     assert max(behind) <= 1010

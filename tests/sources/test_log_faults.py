@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import SourceError
-from fcslam.sources import Fault, Tally, open_source
+from fcslam.sources import Fault, FaultCount, open_source
 from tests.sources.carmen_text import BEAMS, drive, flaser, odom, pose_at, save, scans_of
 
 
@@ -119,7 +119,7 @@ def test_one_broken_line_is_skipped_counted_and_located(tmp_path, damage, where)
     source = open_source(save(tmp_path / "run.log", ["# CARMEN Logfile", *lines]))
     stamps = [scan.stamp for scan in scans_of(source)]
     assert stamps == [step for step in range(20) if step != where]
-    assert source.faults[Fault.BROKEN_LINE] == Tally(1, where + 2)
+    assert source.faults[Fault.BROKEN_LINE] == FaultCount(1, where + 2)
     assert f"broken lines skipped: 1 (first: line {where + 2})" in str(source.faults)
 
 
@@ -129,9 +129,9 @@ def test_a_few_misfits_are_skipped_and_counted(tmp_path):
     lines[301] = flaser(3.0, pose_at(150))
     source = open_source(save(tmp_path / "run.log", lines))
     assert len(scans_of(source)) == source.survey().scan_count == 198
-    assert source.faults[Fault.BEAM_COUNT] == Tally(1, 102)
+    assert source.faults[Fault.BEAM_COUNT] == FaultCount(1, 102)
     assert source.faults[Fault.MISPLACED_SCAN].first_line == 302
-    assert source.survey().faults.tallies == source.faults.tallies
+    assert source.survey().faults.counts == source.faults.counts
 
 
 def test_small_steps_back_in_time_are_kept_in_file_order(tmp_path):
@@ -141,14 +141,14 @@ def test_small_steps_back_in_time_are_kept_in_file_order(tmp_path):
     assert source.survey().duration_s == 3.0
     assert source.faults[Fault.TIME_REVERSAL].count == 2
     assert source.faults[Fault.TIME_REVERSAL].largest_s == pytest.approx(0.9)
-    assert source.faults[Fault.REPEATED_STAMP] == Tally(1, 5)
+    assert source.faults[Fault.REPEATED_STAMP] == FaultCount(1, 5)
 
 
 def test_one_stamp_far_ahead_does_not_cost_the_scans_behind_it(tmp_path):
     stamps = [*range(50), 9000, *range(51, 100)]
     source = open_source(save(tmp_path / "run.log", [flaser(t, pose_at(k)) for k, t in enumerate(stamps)]))
     assert [scan.stamp for scan in scans_of(source)] == stamps
-    assert source.faults[Fault.TIME_REVERSAL] == Tally(1, 52, 9000 - 51)
+    assert source.faults[Fault.TIME_REVERSAL] == FaultCount(1, 52, 9000 - 51)
 
 
 def test_a_log_without_a_clock_is_read(tmp_path):
@@ -165,8 +165,8 @@ def test_bad_ranges_become_nan_and_are_counted(tmp_path):
     np.testing.assert_array_equal(np.isnan(first), [False, True, True, True, True, False, False, False])
     assert np.isfinite(first[[0, 5, 6, 7]]).all()
     assert first[7] > 50.0
-    assert source.faults[Fault.NON_FINITE_RANGE] == Tally(6, 1)
-    assert source.faults[Fault.NEGATIVE_RANGE] == Tally(2, 1)
+    assert source.faults[Fault.NON_FINITE_RANGE] == FaultCount(6, 1)
+    assert source.faults[Fault.NEGATIVE_RANGE] == FaultCount(2, 1)
 
 
 def test_faults_belong_to_the_latest_pass(tmp_path):
@@ -177,7 +177,7 @@ def test_faults_belong_to_the_latest_pass(tmp_path):
         assert len(scans_of(source)) == 19
         assert source.faults[Fault.BROKEN_LINE].count == 1
     assert bool(source.faults)
-    assert source.faults[Fault.NEGATIVE_RANGE] == Tally()
+    assert source.faults[Fault.NEGATIVE_RANGE] == FaultCount()
 
 
 def test_a_file_without_line_ends_does_not_fill_the_memory(tmp_path):

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.simulation.kinds import Building
+from fcslam.simulation.options import Building
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.mission import MissionConfig
-    from fcslam.simulation.fleet import SimulatedFleet, SimulationSettings
+    from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
     from fcslam.sources import Source
 
 RECORDINGS, LEARNING, RUN, FIGURE, TABLE = "recordings", "learning", "run", "figure.png", "evaluation.csv"
@@ -40,8 +40,8 @@ def demo(
 
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
-    from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
     from fcslam.simulation.recording import prepare_fleet_folder
+    from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
     from fcslam.sources import open_source
 
     began = time.perf_counter()
@@ -145,12 +145,12 @@ def _evaluate(output: Path, console: "Console") -> None:
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.evaluation.fleet.charts import Outline, fleet_charts
     from fcslam.evaluation.fleet.figure import write_figure
-    from fcslam.simulation.floorplan import Kind
+    from fcslam.simulation.floorplan import PieceKind
 
     _announce(console, 5, "draw")
     with _busy(console, "drawing"):
-        solid = [piece for piece in fleet.plan.pieces if piece.kind is not Kind.LINTEL]
-        outlines = [Outline(piece.outline, piece.kind is not Kind.WALL) for piece in solid]
+        solid = [piece for piece in fleet.plan.pieces if piece.kind is not PieceKind.LINTEL]
+        outlines = [Outline(piece.outline, piece.kind is not PieceKind.WALL) for piece in solid]
         write_figure(fleet_charts(output / RUN, output / RECORDINGS, outlines), output / FIGURE)
 
 

@@ -46,7 +46,7 @@ def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console
     """
     from fcslam.cli.federate import line_of
     from fcslam.config import parse
-    from fcslam.features.detector import SHIPPED_NETWORK
+    from fcslam.features.detector import BUNDLED_NETWORK
     from fcslam.federated.history import RoundReport
     from fcslam.federated.job import FederatedJob, ProgressCallbacks
     from fcslam.federated.local import federate_locally
@@ -64,7 +64,7 @@ def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console
         console.print(line_of(report.row(), settings.rounds), highlight=False, soft_wrap=True)
 
     files = federate_locally(
-        homes, FederatedJob(folder, settings, SHIPPED_NETWORK), ExecutionOptions(), ProgressCallbacks(rounds=tell)
+        homes, FederatedJob(folder, settings, BUNDLED_NETWORK), ExecutionOptions(), ProgressCallbacks(rounds=tell)
     )
     return files[0] if released else None
 

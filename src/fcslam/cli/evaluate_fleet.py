@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from fcslam.evaluation.fleet.closures import Within
+    from fcslam.evaluation.fleet.closures import ClosureScope
     from fcslam.evaluation.fleet.report import FleetReport
 
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
@@ -58,9 +58,9 @@ def fleet(
 
 def show_fleet(report: "FleetReport", console: "Console", explained: bool = True) -> None:
     """The report as tables and, if it is to be ``explained``, what they rest on."""
-    from fcslam.evaluation.fleet.closures import Within
+    from fcslam.evaluation.fleet.closures import ClosureScope
 
-    closures = (_closures(report, within) for within in Within)
+    closures = (_closures(report, within) for within in ClosureScope)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
         console.print(table)
     for line in (*_findings(report), *(_explanations(report) if explained else ())):
@@ -94,7 +94,7 @@ def _relative(report: "FleetReport") -> "Table":
     return table
 
 
-def _closures(report: "FleetReport", within: "Within") -> "Table":
+def _closures(report: "FleetReport", within: "ClosureScope") -> "Table":
     """Of the channels that closed something; of both together where both did."""
     from rich.table import Table
 
@@ -144,7 +144,7 @@ def _findings(report: "FleetReport") -> "Iterator[str]":
 
 def _explanations(report: "FleetReport") -> "Iterator[str]":
     from fcslam.evaluation.fleet.closure_stages import LIKE_HEADING_DEG
-    from fcslam.evaluation.fleet.closures import Within
+    from fcslam.evaluation.fleet.closures import ClosureScope
     from fcslam.metrics.grid import TOLERANCE_M
     from fcslam.metrics.revisits import RevisitCriteria
 
@@ -154,7 +154,7 @@ def _explanations(report: "FleetReport") -> "Iterator[str]":
     yield "ATE: root mean square, each map moved onto the truth as a whole, no scale; 'alone': each robot by itself."
     yield "Relative poses: drawn evenly from pairs of scans less than 5 m apart in truth, 2,000 at most."
     yield f"Wrong, of closures and joins: off by more than {criteria.wrong_m:g} m or {criteria.wrong_deg:g} deg."
-    counts = ", ".join(_revisits(report, within) for within in Within)
+    counts = ", ".join(_revisits(report, within) for within in ClosureScope)
     yield (
         f"Recall: share of revisits found: {counts}. At every {asked.every_m:g} m of each path there is one for each "
         f"robot whose path passes within {asked.radius_m:g} m (its own: over {asked.within_gap_s:g} s away), found "
@@ -169,7 +169,7 @@ def _explanations(report: "FleetReport") -> "Iterator[str]":
         )
 
 
-def _revisits(report: "FleetReport", within: "Within") -> str:
+def _revisits(report: "FleetReport", within: "ClosureScope") -> str:
     from fcslam.evaluation.fleet.closure_stages import BOTH
     from fcslam.records import ClosureStatus
 

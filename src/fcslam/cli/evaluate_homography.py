@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.features.kinds import ContenderKind
-from fcslam.metrics.framing import GroundTruth
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
+from fcslam.metrics.framing import HomographyGroundTruth
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,7 +23,7 @@ def homography(
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENES...", help="Folders of scenes as HPatches has them.")],
     *,
     detector: Annotated[
-        list[ContenderKind] | None,
+        list[EvaluatedDetectorKind] | None,
         typer.Option(help="Only this one; may be given several times."),
     ] = None,
     weights: Annotated[
@@ -41,8 +41,8 @@ def homography(
         ),
     ] = None,
     ground_truth: Annotated[
-        GroundTruth, typer.Option(help="legacy repeats a fault on which published tables rest.")
-    ] = GroundTruth.CORRECTED,
+        HomographyGroundTruth, typer.Option(help="legacy repeats a fault on which published tables rest.")
+    ] = HomographyGroundTruth.CORRECTED,
     csv: Annotated[Path | None, typer.Option(help="Write every measure of every pair to this file.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Draw matches and curves into this folder.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 1,
@@ -51,37 +51,37 @@ def homography(
     from rich.console import Console
     from rich.progress import Progress
 
-    from fcslam.evaluation.detectors.contenders import choose_contenders
+    from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
     from fcslam.evaluation.detectors.figures import draw_figures
     from fcslam.evaluation.detectors.homography import evaluate_homography
     from fcslam.evaluation.detectors.measures import write_pairs
     from fcslam.evaluation.detectors.scenes import find_scenes
 
     found = find_scenes(scenes)
-    contenders = choose_contenders(detector or (), weights or (), features or ())
+    detectors = choose_detectors(detector or (), weights or (), features or ())
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("evaluating", total=len(found) * len(contenders))
-        report = evaluate_homography(found, contenders, ground_truth, lambda: bar.advance(task))
+        task = bar.add_task("evaluating", total=len(found) * len(detectors))
+        report = evaluate_homography(found, detectors, ground_truth, lambda: bar.advance(task))
         if figures is not None:
             task = bar.add_task("drawing", total=len(found))
-            draw_figures(figures, report, found, contenders, ground_truth, lambda: bar.advance(task))
+            draw_figures(figures, report, found, detectors, ground_truth, lambda: bar.advance(task))
     if csv is not None:
         write_pairs(report, csv)
     _show(Console(), report, ground_truth, seed)
 
 
-def _show(console: "Console", report: "HomographyReport", truth: GroundTruth, seed: int) -> None:
-    described = [name for name in report.contenders if report.of(name)[0].matching]
+def _show(console: "Console", report: "HomographyReport", truth: HomographyGroundTruth, seed: int) -> None:
+    described = [name for name in report.detectors if report.of(name)[0].matching]
     console.print(_repeatability_table(report, seed))
     if described:
         console.print(_homography_table(report, described, seed))
         console.print(_matching_table(report, described))
     console.print(_scene_table(report))
-    if len(report.contenders) > 1:
+    if len(report.detectors) > 1:
         console.print(_difference_table(report, seed))
     for line in (
-        f"{len(report.of(report.contenders[0]))} pairs, {truth} ground truth. In brackets: 95 % intervals by bootstrap "
+        f"{len(report.of(report.detectors[0]))} pairs, {truth} ground truth. In brackets: 95 % intervals by bootstrap "
         "over pairs.",
         "Repeatability at 320 x 240, NMS 4, of the 300 strongest keypoints in common view; correct to 3 px.",
         "Homography at 640 x 480 by mutual nearest neighbours among the 1000 strongest in common view, RANSAC at 3 px: "
@@ -105,7 +105,7 @@ def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":
     table = Table(title="I. Repeatability", title_justify="left")
     for heading in ("", "illumination", "viewpoint", "all", "localisation error, px", "ms 320x240", "ms 640x480"):
         table.add_column(heading)
-    for name in report.contenders:
+    for name in report.detectors:
         pairs = report.of(name)
         kinds = (mean(pairs, "repeatability", kind) for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT))
         times = (report.milliseconds.get((name, size), math.nan) for size in (SMALL, LARGE))
@@ -176,7 +176,7 @@ def _scene_table(report: "HomographyReport") -> "Table":
     }
     table = Table("scene", "", *titles.values(), title="Scene by scene", title_justify="left")
     for scene in dict.fromkeys(pair.scene for pair in report.pairs):
-        for name in report.contenders:
+        for name in report.detectors:
             pairs: list[PairResult] = [pair for pair in report.of(name) if pair.scene == scene]
             table.add_row(scene, name, *(_share(mean(pairs, measure)) for measure in titles))
         table.add_section()
@@ -188,7 +188,7 @@ def _difference_table(report: "HomographyReport", seed: int) -> "Table":
 
     from fcslam.evaluation.detectors.measures import difference
 
-    first, *others = report.contenders
+    first, *others = report.detectors
     titles = {
         "repeatability": "repeatability",
         **{f"homography_3px_nms{nms}": f"homography e=3, NMS {nms}" for nms in (8, 0)},

@@ -72,11 +72,11 @@ def _evaluate(
     from rich.console import Console
     from rich.progress import Progress
 
-    from fcslam.evaluation.places.checks import PairChecker
     from fcslam.evaluation.places.features import choose_features, describe_sets, describe_training
     from fcslam.evaluation.places.report import evaluate_set
     from fcslam.evaluation.places.scoring import choose_scorers
     from fcslam.evaluation.places.sequences import in_sequence, plain
+    from fcslam.evaluation.places.verification import PairVerifier
     from fcslam.places.vocabulary import VocabularyConfig
 
     chosen = choose_features(features)
@@ -90,7 +90,7 @@ def _evaluate(
         variants = in_sequence if sequence else plain
         return [
             evaluate_set(
-                each, scorers, PairChecker(each) if verify else None, seed, lambda: bar.advance(task), variants
+                each, scorers, PairVerifier(each) if verify else None, seed, lambda: bar.advance(task), variants
             )
             for each in described
         ]

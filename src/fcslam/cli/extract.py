@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fcslam.features.kinds import DetectorKind
+from fcslam.features.detector_kinds import DetectorKind
 
 
 def extract(
@@ -41,12 +41,12 @@ def extract(
     from rich.progress import track
 
     from fcslam.errors import FeatureError
-    from fcslam.features.choice import make_detector
     from fcslam.features.classical import OrbConfig
-    from fcslam.features.detector import SHIPPED_NETWORK, OnnxConfig
+    from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig
     from fcslam.features.extraction import extract_all, find_files
+    from fcslam.features.factory import make_detector
 
-    is_network = weights is not None or SHIPPED_NETWORK.is_file() if detector is None else detector is DetectorKind.ONNX
+    is_network = weights is not None or BUNDLED_NETWORK.is_file() if detector is None else detector is DetectorKind.ONNX
     kind = DetectorKind.ONNX if is_network else DetectorKind.ORB
     if weights is not None and not is_network:
         raise FeatureError(f"{weights}: detector orb has no weights; leave --weights out, or --detector")

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.simulation.kinds import Building, Lighting
+from fcslam.simulation.options import Building, Lighting
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
     from fcslam.records import RecordedItem
-    from fcslam.simulation.fleet import SimulatedFleet
+    from fcslam.simulation.simulated_fleet import SimulatedFleet
 
 
 def simulate(
@@ -47,8 +47,8 @@ def simulate(
     from rich.console import Console
 
     from fcslam.errors import OutputError
-    from fcslam.simulation.fleet import CameraSettings, SimulationSettings, simulate_fleet
     from fcslam.simulation.recording import prepare_fleet_folder
+    from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 
     settings = SimulationSettings(
         building=building,
@@ -80,8 +80,8 @@ def record_fleet(
     import numpy as np
 
     from fcslam.errors import OutputError
+    from fcslam.simulation.ground_truth import write_ground_truth
     from fcslam.simulation.recording import record_robot
-    from fcslam.simulation.truth import write_truth
     from fcslam.sources import open_source, write_bag
 
     began = time.perf_counter()
@@ -97,7 +97,7 @@ def record_fleet(
         finally:
             watch.stop()
     try:
-        write_truth(fleet, output, np.random.default_rng(seed))
+        write_ground_truth(fleet, output, np.random.default_rng(seed))
         if bag:
             for place in recordings:
                 # A bag is whole or not there.

@@ -28,7 +28,7 @@ from fcslam.cloud.visits import Visit, visits_near
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch, PlaceMatcher
-from fcslam.places.thinning import crowded_out
+from fcslam.places.thinning import surplus_places
 from fcslam.records import (
     Channel,
     ClosureStatus,
@@ -245,7 +245,7 @@ class Fleet:
         sessions = {session for session in mates if robot_of(session) == robot_of(robot)}
         ids = [i for i in matcher if i.robot in sessions]
         positions = np.array([self._graph.pose(i)[:2] for i in ids])
-        for row in crowded_out(positions, settings.nearby_m, settings.most_nearby):
+        for row in surplus_places(positions, settings.nearby_m, settings.most_nearby):
             matcher.forget(ids[row])
 
     def _forget(self, place: Place) -> None:

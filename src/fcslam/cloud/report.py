@@ -12,7 +12,7 @@ from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.drawing import Meeting, map_png
+from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse
 from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure, frozen
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
@@ -143,11 +143,11 @@ def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> Occup
     return fuse(keyscans, poses, {robot.robot: robot.laser for robot in members}, grid)
 
 
-def _meetings(closures: Sequence[LoopClosure], members: Sequence[MappedRobot]) -> list[Meeting]:
+def _meetings(closures: Sequence[LoopClosure], members: Sequence[MappedRobot]) -> list[DrawnClosure]:
     """Accepted closures between robots, as lines of the picture."""
     poses = {robot.robot: robot.T_map_base for robot in members}
     return [
-        Meeting(poses[c.i.robot][c.i.number][:2], poses[c.j.robot][c.j.number][:2], c.i.robot, c.j.robot)
+        DrawnClosure(poses[c.i.robot][c.i.number][:2], poses[c.j.robot][c.j.number][:2], c.i.robot, c.j.robot)
         for c in closures
         if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot and c.i.robot in poses
     ]

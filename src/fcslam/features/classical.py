@@ -48,7 +48,7 @@ class Orb:
 
     @property
     def version(self) -> str:
-        """As in ``Detector``."""
+        """As in ``FeatureDetector``."""
         return ORB_VERSION
 
     def detect(self, image: GreyImage) -> ImageFeatures:
@@ -103,7 +103,7 @@ class Harris:
         return _strongest(np.column_stack((columns, rows)), response[rows, columns], self._nms_px)
 
 
-class Shi:
+class ShiTomasi:
     """Good features to track (Shi and Tomasi 1994)."""
 
     def __init__(self, nms_px: float = 4.0) -> None:

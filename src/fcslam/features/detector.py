@@ -25,7 +25,7 @@ from fcslam.features.onnx_runtime import load_onnx_runtime
 from fcslam.records import CODE_BYTES, NAME, Codes, frozen
 
 NETWORK_FORMAT: Final = "1"
-SHIPPED_NETWORK: Final = Path(__file__).parent / "networks" / "detector.onnx"
+BUNDLED_NETWORK: Final = Path(__file__).parent / "networks" / "detector.onnx"
 """Network weights that come with the package, where they do."""
 
 GreyImage = NDArray[np.uint8]
@@ -75,7 +75,7 @@ class KeypointDetector(Protocol):
         """Keypoints of an image; none where there is nothing to see."""
 
 
-class Detector(KeypointDetector, Protocol):
+class FeatureDetector(KeypointDetector, Protocol):
     """Finds keypoints and describes each by 256 bits."""
 
     @property
@@ -108,9 +108,9 @@ class OnnxDetector:
             FeatureError: there is no such file, or it is no network of this contract.
         """
         self._config = config
-        if config.weights is None and not SHIPPED_NETWORK.is_file():
+        if config.weights is None and not BUNDLED_NETWORK.is_file():
             raise FeatureError("no network weights come with this version of fcslam; name an .onnx file, or take orb")
-        path = SHIPPED_NETWORK if config.weights is None else config.weights
+        path = BUNDLED_NETWORK if config.weights is None else config.weights
         self._session, metadata = _load(path, config.threads)
         if metadata.get("fcslam_format") != NETWORK_FORMAT:
             found = metadata.get("fcslam_format", "none")
@@ -124,7 +124,7 @@ class OnnxDetector:
 
     @property
     def version(self) -> str:
-        """As in ``Detector``."""
+        """As in ``FeatureDetector``."""
         return self._version
 
     def detect(self, image: GreyImage) -> ImageFeatures:

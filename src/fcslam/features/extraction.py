@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from fcslam.errors import FeatureError, OutputError
-from fcslam.features.detector import Detector, GreyImage, ImageFeatures
+from fcslam.features.detector import FeatureDetector, GreyImage, ImageFeatures
 from fcslam.features.files import read_grey, write_features
 from fcslam.features.nms import box_nms
 from fcslam.records import frozen
@@ -37,7 +37,7 @@ def find_files(images: Path) -> list[Path]:
 
 
 def extract_all(
-    files: list[Path], root: Path, output: Path, detector: Detector, longest_side_px: int, nms_px: float
+    files: list[Path], root: Path, output: Path, detector: FeatureDetector, longest_side_px: int, nms_px: float
 ) -> Iterator[Extraction]:
     """Write the features of each image to the same place below ``output`` as it has below ``root``.
 
@@ -67,7 +67,7 @@ def extract_all(
         yield Extraction(path, len(features.scores))
 
 
-def extract(image: GreyImage, detector: Detector, longest_side_px: int) -> ImageFeatures:
+def extract(image: GreyImage, detector: FeatureDetector, longest_side_px: int) -> ImageFeatures:
     """Features of an image; one that is larger is shrunk for the detector, its keypoints are in its own pixels."""
     height, width = image.shape
     share = longest_side_px / max(height, width)

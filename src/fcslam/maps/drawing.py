@@ -33,12 +33,12 @@ SWATCH_PX: Final = 34
 GAP_PX: Final = 14
 FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE: Final = 0.75
-MEETINGS_APART_M: Final = 1.5
+CLOSURES_APART_M: Final = 1.5
 """Closures are drawn no closer than this to one another."""
 SUBPIXEL_BITS: Final = 4
 
 
-class Meeting(NamedTuple):
+class DrawnClosure(NamedTuple):
     """A loop closure as it is drawn: where its two ends are in ``map``."""
 
     xy_a: FloatArray
@@ -60,7 +60,7 @@ ROBOTS: Final = tuple(map(_bgr, palette.ROBOTS))
 
 
 @dataclass(frozen=True, slots=True)
-class _View:
+class _Viewport:
     """The part of the map that is shown, and how map coordinates become pixels."""
 
     cells: Cells  # row 0 at the lowest y
@@ -77,7 +77,7 @@ class _View:
         return np.asarray(np.clip(np.stack((column, row), axis=-1), -FARTHEST_PX, FARTHEST_PX))
 
 
-def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closures: Sequence[Meeting]) -> bytes:
+def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closures: Sequence[DrawnClosure]) -> bytes:
     """PNG of the map, about 1600 pixels on its long side; what is known and where robots were fits in.
 
     ``trajectories`` holds each robot's poses or points in ``map``, shape (N, 2+), drawn from a dot at the first;
@@ -86,31 +86,31 @@ def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closure
     view = _view(fused, trajectories.values())
     canvas = _canvas(view)
     ways = [(view.pixels(points), color) for points, color in zip(trajectories.values(), cycle(ROBOTS), strict=False)]
-    meetings = [closure for closure in closures if closure.robot_a != closure.robot_b]
+    shared = [closure for closure in closures if closure.robot_a != closure.robot_b]
     for pixels, color in ways:
         _draw_trajectory(canvas, pixels, color)
-    for meeting in _spread(meetings):
-        _draw_line(canvas, view.pixels(np.array((meeting.xy_a, meeting.xy_b))), CLOSURE, 1)
+    for closure in _spread(shared):
+        _draw_line(canvas, view.pixels(np.array((closure.xy_a, closure.xy_b))), CLOSURE, 1)
     for pixels, color in ways:
         _draw_start(canvas, pixels, color)
     labels = list(zip(trajectories, cycle(ROBOTS), strict=False))
-    if meetings:
-        labels.append((f"{len(meetings)} closure{'s' * (len(meetings) > 1)} between robots", CLOSURE))
+    if shared:
+        labels.append((f"{len(shared)} closure{'s' * (len(shared) > 1)} between robots", CLOSURE))
     picture = np.vstack((canvas, _legend(labels, canvas.shape[1], view.cell_px / view.cell_m)))
     return bytes(cv2.imencode(".png", picture)[1])
 
 
-def _spread(meetings: Sequence[Meeting]) -> list[Meeting]:
-    """The shortest meetings that keep their distance from one another."""
-    drawn: list[Meeting] = []
-    for meeting in sorted(meetings, key=lambda m: float(np.hypot(*(m.xy_b - m.xy_a)))):
-        middle = meeting.xy_a + meeting.xy_b
-        if all(np.hypot(*(middle - (m.xy_a + m.xy_b))) > 2.0 * MEETINGS_APART_M for m in drawn):
-            drawn.append(meeting)
+def _spread(closures: Sequence[DrawnClosure]) -> list[DrawnClosure]:
+    """The shortest closures that keep their distance from one another."""
+    drawn: list[DrawnClosure] = []
+    for closure in sorted(closures, key=lambda m: float(np.hypot(*(m.xy_b - m.xy_a)))):
+        middle = closure.xy_a + closure.xy_b
+        if all(np.hypot(*(middle - (m.xy_a + m.xy_b))) > 2.0 * CLOSURES_APART_M for m in drawn):
+            drawn.append(closure)
     return drawn
 
 
-def _view(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> _View:
+def _view(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> _Viewport:
     """Crop to what matters, then whole pixels per cell, or whole cells per pixel where the map is large."""
     low, high = _shown_box(fused, trajectories)
     cells = fused.cells[low[0] : high[0], low[1] : high[1]]
@@ -119,7 +119,7 @@ def _view(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> _View:
     cells_per_pixel, cell_px = max(1, round(1.0 / ratio)), max(1, round(ratio))
     cells = _shrunk(cells, cells_per_pixel)
     offset = max(MARGIN_PX, (NARROWEST_PX - cells.shape[1] * cell_px) // 2)
-    return _View(cells, corner, fused.resolution_m * cells_per_pixel, cell_px, offset)
+    return _Viewport(cells, corner, fused.resolution_m * cells_per_pixel, cell_px, offset)
 
 
 def _shown_box(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -153,7 +153,7 @@ def _shrunk(cells: Cells, factor: int) -> Cells:
     return np.asarray(blocks.max(axis=(1, 3)))
 
 
-def _canvas(view: _View) -> Image:
+def _canvas(view: _Viewport) -> Image:
     colors = np.zeros((len(Occupancy), 3), np.uint8)
     colors[Occupancy.UNKNOWN], colors[Occupancy.FREE], colors[Occupancy.OCCUPIED] = PAPER, FLOOR, WALL
     rows = view.cells[::-1].repeat(view.cell_px, axis=0).repeat(view.cell_px, axis=1)

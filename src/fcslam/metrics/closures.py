@@ -54,7 +54,7 @@ class Reference(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class PlacedReference:
+class PoseReference:
     """Reference poses in components; poses of different components are not placed to each other."""
 
     run: PoseTable
@@ -85,7 +85,7 @@ class PlacedReference:
         return np.flatnonzero((away_s <= self.bridge_s) & (robots[self.rows] == robots[row]))
 
 
-class SingleRelations:
+class RelationReference:
     """Reference motions each for itself, in both directions: nothing is chained and nothing adjusted."""
 
     def __init__(self, run: PoseTable, bridge_s: float, ends: Rows, T_1_2: FloatArray) -> None:

@@ -11,7 +11,7 @@ Size = tuple[int, int]
 """Width and height in pixels."""
 
 
-class GroundTruth(StrEnum):
+class HomographyGroundTruth(StrEnum):
     """Which homography counts as true between two scaled and cropped images."""
 
     CORRECTED = "corrected"
@@ -42,9 +42,9 @@ class Framing:
         return np.array([[self.scale, 0.0, -self.crop_px[0]], [0.0, self.scale, -self.crop_px[1]], [0.0, 0.0, 1.0]])
 
 
-def framed_homography(H: FloatArray, first: Framing, second: Framing, truth: GroundTruth) -> FloatArray:
+def framed_homography(H: FloatArray, first: Framing, second: Framing, truth: HomographyGroundTruth) -> FloatArray:
     """H between the framed images, shape (3, 3)."""
-    if truth is GroundTruth.LEGACY:
+    if truth is HomographyGroundTruth.LEGACY:
         scaling = np.diag([first.scale, first.scale, 1.0])
         return scaling @ H @ np.linalg.inv(scaling)
     return second.matrix @ H @ np.linalg.inv(first.matrix)

@@ -80,7 +80,7 @@ def recall_at(similarity: FloatArray, truth: PairTruth, k: int) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Answers:
+class RetrievedPlaces:
     """What every query says at most once: its most similar place."""
 
     scores: FloatArray
@@ -101,12 +101,12 @@ class Answers:
         return _curve(scores[given], right[given], int(self.answerable[queries].sum()))
 
 
-def single_best(similarity: FloatArray, truth: PairTruth) -> Answers:
+def single_best(similarity: FloatArray, truth: PairTruth) -> RetrievedPlaces:
     """The most similar place of every query, ignored pairs left out."""
     best = _best(similarity, truth.matches | truth.different)
     first = (similarity == best[:, None]) & (similarity > 0.0)
     right, wrong = ((first & of).sum(axis=1) for of in (truth.matches, truth.different))
-    return Answers(best, right / np.maximum(right + wrong, 1), truth.answerable)
+    return RetrievedPlaces(best, right / np.maximum(right + wrong, 1), truth.answerable)
 
 
 def multi_match_curve(similarity: FloatArray, truth: PairTruth) -> PrecisionRecall:

@@ -70,7 +70,7 @@ def position_errors(T_truth_map: FloatArray, T_truth_base: FloatArray, T_map_bas
 
 
 @dataclass(frozen=True, slots=True)
-class TrackPair:
+class TrajectoryPair:
     """Poses of one robot at the same stamps: where it was and where its map says that it was."""
 
     T_truth_base: FloatArray
@@ -85,7 +85,7 @@ class TrackPair:
         return n_point_alignment(truth, estimate)
 
 
-def placement_error(a: TrackPair, b: TrackPair) -> tuple[float, float]:
+def placement_error(a: TrajectoryPair, b: TrajectoryPair) -> tuple[float, float]:
     """How wrongly two robots of one map lie to each other: metres and degrees.
 
     Each robot by itself says where the map lies in the truth. If the robots lie rightly to each other, both say the

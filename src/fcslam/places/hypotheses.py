@@ -1,6 +1,6 @@
-"""How two places may lie to each other: rigid motions on which many of their matches agree.
+"""Rigid motions between two places that many of their keypoint matches support (two-point RANSAC, all pairs tried).
 
-A hypothesis proposes; how many matches agree with it says little about whether it is true.
+A hypothesis is a proposal: its inlier count says little about whether it is true. ``lidar.verification`` decides.
 """
 
 from dataclasses import dataclass
@@ -16,37 +16,51 @@ from fcslam.features.codes import Matches
 from fcslam.records import FloatArray, frozen
 
 _REFINEMENTS = 5
-"""Least squares and inliers are taken in turn until the inliers stay; they nearly always do after two or three."""
+"""Most rounds of least squares and inlier selection. The inliers nearly always stop changing after two or three."""
 
 
 class HypothesisConfig(Settings):
     """Search for rigid motions between the keypoints of two places."""
 
-    seeds: int = Field(default=50, ge=2, le=1000, description="closest matches of which every two propose a motion")
-    inlier_distance_m: float = Field(default=0.3, gt=0.0, le=5.0, description="distance up to which a match agrees [m]")
-    minimum_inliers: int = Field(default=4, ge=2, description="matches that must agree")
-    most_hypotheses: int = Field(default=2, ge=1, le=20, description="hypotheses returned, the best first")
-    distinct_distance_m: float = Field(default=1.0, ge=0.0, description="shift that makes two hypotheses different [m]")
-    distinct_angle_rad: float = Field(default=0.26, ge=0.0, le=3.2, description="turn that makes them different [rad]")
+    seeds: int = Field(
+        default=50,
+        ge=2,
+        le=1000,
+        description="closest matches that seed the search: every two of them propose a motion",
+    )
+    inlier_distance_m: float = Field(
+        default=0.3, gt=0.0, le=5.0, description="largest distance between the matched keypoints of an inlier [m]"
+    )
+    minimum_inliers: int = Field(default=4, ge=2, description="fewest inliers of a motion hypothesis")
+    most_hypotheses: int = Field(default=2, ge=1, le=20, description="most motion hypotheses of a pair of places")
+    distinct_distance_m: float = Field(
+        default=1.0, ge=0.0, description="two motion hypotheses are distinct if their positions differ by more [m]"
+    )
+    distinct_angle_rad: float = Field(
+        default=0.26,
+        ge=0.0,
+        le=3.2,
+        description="two motion hypotheses are distinct if their angles differ by more [rad]",
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A rigid motion and the matches that agree with it."""
+    """A rigid motion and its inliers."""
 
     T_a_b: FloatArray
-    """Shape (3,): takes coordinates of place b to place a."""
+    """Shape (3,): x, y in metres and theta in radians; takes coordinates of place b to place a."""
     inliers: NDArray[np.int64]
     """Shape (K,): rows of ``matches.pairs``, ascending."""
 
     @property
     def inlier_count(self) -> int:
-        """How many matches agree."""
+        """Number of inliers."""
         return len(self.inliers)
 
 
 class _Limits(NamedTuple):
-    """What compiled code needs of the configuration."""
+    """The part of the configuration that compiled code needs."""
 
     inlier_distance_m: float
     minimum_inliers: int
@@ -55,19 +69,22 @@ class _Limits(NamedTuple):
     distinct_angle_rad: float
 
 
-def propose(
+def rigid_hypotheses(
     keypoints_a: NDArray[np.float32], keypoints_b: NDArray[np.float32], matches: Matches, config: HypothesisConfig
 ) -> list[Hypothesis]:
-    """The motions with most agreement, the best first; none if too few matches agree on any.
+    """Find the motions that most matches support, the best first.
 
-    Every pair among the ``seeds`` closest matches proposes a motion (two-point alignment), all matches judge it, and
-    least squares over the inliers refines the best. No chance is involved. Mirror images are never proposed.
+    Every two of the ``seeds`` closest matches propose a motion (two-point alignment). All matches score it, and least
+    squares over the inliers refines the best. The search is deterministic and never proposes a reflection.
 
     Args:
         keypoints_a: shape (N, 2), metres in place a's coordinate frame.
         keypoints_b: shape (M, 2), metres in place b's coordinate frame.
         matches: pairs of their indices.
-        config: the search.
+        config: thresholds of the search.
+
+    Returns:
+        At most ``most_hypotheses``; an empty list if no motion has ``minimum_inliers``.
     """
     if len(matches.pairs) < config.minimum_inliers:
         return []
@@ -91,9 +108,9 @@ def propose(
 
 @njit(cache=True)
 def _trials(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64], tolerance_m: float) -> FloatArray:
-    """Motions from every two seeds whose keypoints lie equally far apart in both places: rows x, y, theta, score.
+    """Motions of every two seeds whose keypoints are equally far apart in both places: rows x, y, theta, score.
 
-    Two keypoints closer than twice the tolerance fix no angle.
+    Pairs of keypoints closer than twice the tolerance are skipped, because they do not determine the angle.
     """
     trials = np.empty((seeds.shape[0] * (seeds.shape[0] - 1) // 2, 4))
     count = 0
@@ -118,7 +135,7 @@ def _trials(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64], tolerance_m:
 
 @njit(cache=True)
 def _score(a: FloatArray, b: FloatArray, motion: tuple[float, float, float, float], tolerance_m: float) -> float:
-    """Sum over the inliers of 1 - (distance / tolerance)^2: closer agreement breaks ties of the count."""
+    """Sum over the inliers of 1 - (distance / tolerance)^2 (MSAC): smaller residuals break ties of the inlier count."""
     x, y, cos, sin = motion
     score = 0.0
     scale = 1.0 / tolerance_m**2
@@ -131,7 +148,7 @@ def _score(a: FloatArray, b: FloatArray, motion: tuple[float, float, float, floa
 
 @njit(cache=True)
 def _best(a: FloatArray, b: FloatArray, trials: FloatArray, limits: _Limits) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Refine the best trials one after another, leaving out what lies near a hypothesis found before."""
+    """Refine the best trials one after another and suppress trials near a hypothesis that was found before."""
     scores = trials[:, 3].copy()
     poses = np.empty((limits.most, 3))
     agreeing = np.empty((limits.most, a.shape[0]), np.bool_)

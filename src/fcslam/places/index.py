@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from fcslam.features.codes import CODE_WORDS, CodeWords, code_words
 from fcslam.places.kmeans_tree import TreeShape
-from fcslam.places.likeness import Found, Likeness, PlaceId
-from fcslam.places.postings import GROWTH, Postings
-from fcslam.places.scoring import TINY, blank_tally, score_matches, score_words
+from fcslam.places.postings import GROWTH_FACTOR, Postings
+from fcslam.places.query_result import PlaceId, QueryResult, ScoredPlace
+from fcslam.places.scoring import TINY, empty_buffers, score_matches, score_words
 from fcslam.places.similarity import BagOfWords, similarity
 from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
 from fcslam.records import Codes, FloatArray
@@ -55,7 +55,7 @@ class PlaceIndex(Generic[PlaceId]):
         self._descriptor_version = descriptor_version
         self._vocabulary = Vocabulary(_shape(config), int(rng.integers(0, 2**63)))
         self._postings = self._no_postings()
-        self._tally = blank_tally(0)
+        self._buffers = empty_buffers(0)
         self._ids: list[PlaceId] = []
         """By row; what stood there once stays after the place was forgotten, until rows are closed up."""
         self._row_of: dict[PlaceId, int] = {}
@@ -102,25 +102,27 @@ class PlaceIndex(Generic[PlaceId]):
         elif self._training and self._config.strategy is Strategy.INCREMENTAL:
             self._split(self._overfull(leaves))
 
-    def query(self, descriptors: Codes, top_k: int, exclude: Container[PlaceId] = frozenset()) -> list[Found[PlaceId]]:
+    def query(
+        self, descriptors: Codes, top_k: int, exclude: Container[PlaceId] = frozenset()
+    ) -> list[ScoredPlace[PlaceId]]:
         """The ``top_k`` stored places most similar to these descriptors (N, 32): the best of ``compare``."""
         return self.compare(descriptors).best(top_k, lambda place: place not in exclude)
 
-    def compare(self, descriptors: Codes) -> Likeness[PlaceId]:
+    def compare(self, descriptors: Codes) -> QueryResult[PlaceId]:
         """How alike all stored places are to these descriptors (N, 32); nothing before the first training."""
         codes = code_words(descriptors)
         entries, count = self._postings.entries, len(self)
         if not self._training or not count:
-            return Likeness()
-        if self._postings.row_count > len(self._tally.scores):
-            self._tally = blank_tally(int(GROWTH * self._postings.row_count))
+            return QueryResult()
+        if self._postings.row_count > len(self._buffers.scores):
+            self._buffers = empty_buffers(int(GROWTH_FACTOR * self._postings.row_count))
         if self._config.scoring is Scoring.MATCHES:
             beam, near_bits = self._config.beam, self._config.near_bits
-            rows, scores = score_matches(entries, self._vocabulary.tree, self._tally, count, codes, beam, near_bits)
+            rows, scores = score_matches(entries, self._vocabulary.tree, self._buffers, count, codes, beam, near_bits)
         else:
             leaves, weights = self._weigh(codes)
-            rows, scores = score_words(entries, self._tally, count, leaves, weights)
-        return Likeness(self._ids, rows, scores)
+            rows, scores = score_words(entries, self._buffers, count, leaves, weights)
+        return QueryResult(self._ids, rows, scores)
 
     def similarity(self, a: Codes, b: Codes) -> float:
         """Eq. (4) on [0, 1] of two places, each (N, 32), in the present words; 0 before the first training."""

@@ -1,6 +1,6 @@
-"""A k-means tree over binary codes: growing it and finding the leaves near a code, all compiled.
+"""A k-means tree over binary codes, as in DBoW2: how to grow it and how to find the leaves near a code. All compiled.
 
-The centres are binary too: each bit is the majority of its cluster.
+The centres are binary: each bit is the majority of its cluster.
 """
 
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from fcslam.features.codes import CODE_BITS, CODE_WORDS, CodeWords, popcount
 from fcslam.places.prefetch import prefetch
 
 _MOST_PLANES = 32
-"""Counters of a bit: more codes than 2 ** 32 are in no cluster."""
+"""Bits of a counter: no cluster has 2 ** 32 codes."""
 
 
 class TreeShape(NamedTuple):
@@ -32,7 +32,7 @@ class Tree(NamedTuple):
     centres: CodeWords
     """Shape (V, 4)."""
     families: NDArray[np.int32]
-    """Shape (V, 2), side by side since whoever needs one needs the other: the first child, and how many there are."""
+    """Shape (V, 2): first child, number of children; side by side in memory because they are always read together."""
 
     @property
     def first_child(self) -> NDArray[np.int32]:
@@ -51,10 +51,10 @@ def bare_root() -> Tree:
 
 
 @njit(cache=True)
-def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
-    """The leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
+def find_leaves(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
+    """Find the leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
     reached = np.zeros(codes.shape[0], np.int32)
-    while _announce_children(tree, reached):
+    while _prefetch_children(tree, reached):
         for k in range(codes.shape[0]):
             first, children = tree.families[reached[k], 0], tree.families[reached[k], 1]
             if children:
@@ -64,18 +64,18 @@ def descend(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
 
 @njit(cache=True)
 def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
-    """At most ``beam`` leaves whose centres are near each code (K, 4), the first of them that of ``descend``.
+    """Find at most ``beam`` leaves near each code (K, 4) by beam search; the first is that of ``find_leaves``.
 
-    Level by level the nearest ``beam`` vertices are kept, and always the one that ``descend`` passes. All codes go down
-    abreast: what the next level needs is read for all of them at once, so that cache misses overlap.
+    Each level keeps the ``beam`` nearest vertices, and always the one on the path of ``find_leaves``. All codes descend
+    together, one level at a time, so that their cache misses overlap.
 
     Returns:
-        Shape (K, beam), -1 after the last one.
+        Shape (K, beam), -1 after the last leaf.
     """
     kept, distances = np.full((codes.shape[0], beam), -1, np.int32), np.zeros((codes.shape[0], beam), np.int32)
     above, reached = np.empty(beam, np.int32), np.empty(beam, np.int32)
     kept[:, 0] = 0
-    while _announce_children(tree, kept.reshape(-1)):
+    while _prefetch_children(tree, kept.reshape(-1)):
         for k in range(codes.shape[0]):
             for position in range(beam):
                 above[position], reached[position] = kept[k, position], distances[k, position]
@@ -84,8 +84,8 @@ def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
 
 
 @njit(cache=True)
-def _announce_children(tree: Tree, kept: NDArray[np.int32]) -> int:
-    """Announce the centres of the children of these vertices, -1 for none; tells how many of the vertices have any."""
+def _prefetch_children(tree: Tree, kept: NDArray[np.int32]) -> int:
+    """Prefetch the centres of the children of these vertices (-1: none); returns how many vertices have children."""
     parents = 0
     for vertex in kept:
         first, children = tree.families[vertex, 0], tree.families[vertex, 1]
@@ -107,10 +107,10 @@ def _go_down(
     kept: NDArray[np.int32],
     distances: NDArray[np.int32],
 ) -> None:
-    """From the vertices above (-1 after the last), which code k reached, to the nearest of their children; leaves stay.
+    """Replace the vertices that code k reached (-1 after the last) by the nearest of their children; leaves stay.
 
-    The children of the first vertex come first and may take the first place, which is for the way of ``descend``; the
-    children of others stay behind it, sorted by distance.
+    The first entry follows the path of ``find_leaves``: only children of the first vertex may take it. The children of
+    the other vertices follow it, sorted by distance.
     """
     found, beam = 0, above.shape[0]
     for position in range(beam):
@@ -132,8 +132,8 @@ def _go_down(
 
 
 @njit(cache=True)
-def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
-    """Split the codes (N, 4) level by level; the codes of one vertex stay together in ``members``."""
+def grow_tree(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
+    """Train a tree on codes (N, 4): split them level by level. ``members`` keeps the codes of a vertex together."""
     most = 1 + shape.branching * (1 + shape.depth * (codes.shape[0] // shape.smallest_split))
     centres = np.zeros((most, CODE_WORDS), np.uint64)
     families = np.zeros((most, 2), np.int32)
@@ -159,9 +159,15 @@ def grow(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
 
 @njit(cache=True)
 def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tuple[CodeWords, NDArray[np.int64]]:
-    """At most ``shape.branching`` centres, none without members, and the centre nearest to every code.
+    """Cluster codes (N, 4) by Hamming distance.
 
-    ``state``: shape (1,), of the random numbers; it moves on.
+    Args:
+        codes: shape (N, 4).
+        shape: ``branching`` clusters at most, ``iterations`` rounds at most.
+        state: shape (1,), state of the random generator; it is advanced.
+
+    Returns:
+        Centres (C, 4), none without members, and the cluster of every code, shape (N,).
     """
     centres = _seed_centres(codes, shape.branching, state)
     labels = np.full(codes.shape[0], -1, np.int64)
@@ -177,7 +183,7 @@ def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tu
 
 @njit(cache=True)
 def _distance(codes: CodeWords, k: int, centres: CodeWords, vertex: int) -> Any:
-    """Bits between code k and a centre, by their numbers: to cut out rows would cost more than to compare them."""
+    """Hamming distance of code k and a centre. Takes indices, because slicing rows costs more than comparing them."""
     bits = popcount(codes[k, 0] ^ centres[vertex, 0]) + popcount(codes[k, 1] ^ centres[vertex, 1])
     bits += popcount(codes[k, 2] ^ centres[vertex, 2]) + popcount(codes[k, 3] ^ centres[vertex, 3])
     return np.int32(bits)
@@ -185,7 +191,7 @@ def _distance(codes: CodeWords, k: int, centres: CodeWords, vertex: int) -> Any:
 
 @njit(cache=True)
 def _nearest(codes: CodeWords, k: int, centres: CodeWords, first: int, end: int) -> Any:
-    """The number, from ``first`` to before ``end``, of the centre nearest to code k."""
+    """Index of the centre nearest to code k, from ``first`` (included) to ``end`` (excluded)."""
     best, best_distance = first, np.int32(CODE_BITS + 1)
     for candidate in range(first, end):
         distance = _distance(codes, k, centres, candidate)
@@ -206,7 +212,7 @@ def _assign(codes: CodeWords, centres: CodeWords, labels: NDArray[np.int64]) -> 
 
 @njit(cache=True)
 def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -> CodeWords:
-    """k-means++: the next centre is a code drawn by its squared distance to the centres so far."""
+    """k-means++ (Arthur and Vassilvitskii 2007): draw each next centre by its squared distance to those so far."""
     centres = np.empty((branching, CODE_WORDS), np.uint64)
     centres[0] = codes[int(_uniform(state) * codes.shape[0])]
     nearest = np.full(codes.shape[0], CODE_BITS + 1, np.int64)
@@ -224,9 +230,9 @@ def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -
 
 @njit(cache=True)
 def _majorities(codes: CodeWords, labels: NDArray[np.int64], count: int) -> CodeWords:
-    """The majority of every bit in every cluster; a tie, as in a cluster without members, is 0.
+    """Majority of every bit in every cluster; 0 in a tie and in a cluster without members.
 
-    The ones of 64 bits are counted at once: plane p holds bit p of each of the 64 counts.
+    Counts the ones of 64 bits at once (bit-sliced counters): plane p holds bit p of each of the 64 counts.
     """
     planes = np.zeros((count, CODE_WORDS, _MOST_PLANES), np.uint64)
     for k in range(codes.shape[0]):
@@ -254,7 +260,7 @@ def _majorities(codes: CodeWords, labels: NDArray[np.int64], count: int) -> Code
 
 @njit(cache=True)
 def _uniform(state: NDArray[np.uint64]) -> float:
-    """The next number in [0, 1) of splitmix64 (Steele, Lea, Flood 2014): the tree depends on the seed alone."""
+    """Next number in [0, 1) of splitmix64 (Steele, Lea, Flood 2014), so that the tree depends on the seed alone."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
     z = state[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -1,7 +1,8 @@
-"""Place matching in the cloud: a place comes in, out comes M_ij (Algorithm 1), decided by geometry.
+"""Place matching in the cloud: compares a new place with stored ones and returns M_ij (FC-SLAM, Algorithm 1).
 
-Words propose while the fleet is large, every place does while it is small, and where two robots already share a map,
-nearness does. A proposal is a rigid motion; the submaps laid on each other by it decide.
+Candidates are all places while the fleet is small, and those that the vocabulary retrieves once it is large. Between
+robots in one map, candidates are the places that the map predicts to be near. Each candidate gives a rigid motion, and
+the overlap of the two submaps under this motion decides.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,8 +16,8 @@ from fcslam.geometry import se2
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import Verification, VerificationConfig, verify
 from fcslam.places.index import PlaceIndex
-from fcslam.places.likeness import Likeness
-from fcslam.places.motions import Motion, MotionConfig, motions
+from fcslam.places.motions import Motion, MotionConfig, propose_motions
+from fcslam.places.query_result import QueryResult
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 
@@ -25,59 +26,81 @@ class MatcherConfig(Settings):
     """Place matching."""
 
     small_fleet: int = Field(
-        default=150, ge=0, description="up to this many places are all compared; then words choose"
+        default=150,
+        ge=0,
+        description="up to this many places of unaligned robots are all compared; beyond, the vocabulary proposes some",
     )
-    candidates: int = Field(default=20, gt=0, description="places that words propose for one place")
+    candidates: int = Field(
+        default=20, gt=0, description="places of unaligned robots that the vocabulary proposes for a new place"
+    )
     most_places: int = Field(
-        default=100_000, gt=0, description="places kept of one channel; of more the oldest are forgotten"
+        default=100_000, gt=0, description="most places stored of one channel; beyond, the oldest are forgotten"
     )
     most_nearby: int = Field(
-        default=12, gt=0, description="places kept of one robot and channel in a square; of more the oldest goes"
+        default=12,
+        gt=0,
+        description="most places of one robot and channel in a square of nearby_m; beyond, the oldest is forgotten",
     )
-    nearby_m: float = Field(default=2.0, gt=0.0, description="side of these squares, in a map")
-    doubts: int = Field(
-        default=2, ge=0, description="places of robots in the same map that are compared wherever the map puts them"
+    nearby_m: float = Field(
+        default=2.0, gt=0.0, description="side of the squares of the map in which most_nearby limits the places [m]"
+    )
+    aligned_candidates: int = Field(
+        default=2,
+        ge=0,
+        description="most similar places of other robots in the same map that are compared although the map puts them "
+        "elsewhere, to find evidence against the join",
     )
     vocabulary: VocabularyConfig = Field(default=VocabularyConfig(), description="dynamic vocabulary")
-    motions: MotionConfig = Field(default=MotionConfig(), description="rigid motions from keypoints")
-    borne_out_m: float = Field(default=1.0, gt=0.0, description="images bear out a prediction that is off by no more")
-    borne_out_rad: float = Field(default=0.3, gt=0.0, description="and turned by no more")
+    motions: MotionConfig = Field(default=MotionConfig(), description="motions between places from keypoints")
+    prediction_tolerance_m: float = Field(
+        default=1.0, gt=0.0, description="largest distance at which an image motion confirms a predicted pose [m]"
+    )
+    prediction_tolerance_rad: float = Field(
+        default=0.3, gt=0.0, description="largest angle at which an image motion confirms a predicted pose [rad]"
+    )
     verification: VerificationConfig = Field(default=VerificationConfig(), description="verification of closures")
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceMatch:
-    """Two places compared: i was there before, j is the new one."""
+    """The comparison of a stored place i with the new place j."""
 
     i: KeyscanId
     j: KeyscanId
     channel: Channel
     similarity: float
-    """In [0, 1], as the index scores; before the first vocabulary the share of matching descriptors, where asked."""
+    """In [0, 1], by the place index; before the first vocabulary, the share of matching descriptors if it is known."""
     check: Verification
     predicted: bool
-    """Whether the robots shared a map already, which put the places here."""
+    """Whether the robots were in one map already and it predicted this pair."""
 
     @property
     def M(self) -> bool:
-        """The paper's matching flag: the same place."""
+        """The matching flag M_ij of FC-SLAM: whether both are the same place."""
         return self.check.loose if self.predicted else self.check.strict
 
 
 class PlaceMatcher:
-    """All places of one channel and detector version, and the vocabulary that follows them."""
+    """The places of one channel and detector version, with their dynamic vocabulary."""
 
     def __init__(
         self,
         config: MatcherConfig,
         submap_of: Callable[[Place], Submap],
         rng: np.random.Generator,
-        forgotten: Callable[[Place], None] = lambda _: None,
+        on_forget: Callable[[Place], None] = lambda _: None,
     ) -> None:
-        """``forgotten`` is told of every place that is never compared again."""
+        """Start without places.
+
+        Args:
+            config: thresholds.
+            submap_of: the submap that a place was described on.
+            rng: seeds the vocabulary.
+            on_forget: called with each place that is forgotten.
+        """
         self._config = config
         self._submap_of = submap_of
-        self._forgotten = forgotten
+        self._on_forget = on_forget
         self._places: dict[KeyscanId, Place] = {}
         self._index: PlaceIndex[KeyscanId] = PlaceIndex(config.vocabulary, rng)
         self._backlog: list[Place] = []
@@ -94,37 +117,40 @@ class PlaceMatcher:
         return place in self._places
 
     def __iter__(self) -> Iterator[KeyscanId]:
-        """The oldest first."""
+        """Identifiers of the stored places, the oldest first."""
         return iter(self._places)
 
     def match(
-        self, place: Place, predicted: Mapping[KeyscanId, FloatArray], strangers: Callable[[KeyscanId], bool]
+        self, place: Place, predicted: Mapping[KeyscanId, FloatArray], is_unaligned: Callable[[KeyscanId], bool]
     ) -> list[PlaceMatch]:
-        """Compare a new place with those that may be the same, then store it.
+        """Compare a new place with the stored places that may be the same, then store it.
 
-        ``predicted``: T_i_j of stored places i that the joint map says are near; ``strangers``: whether a stored
-        place belongs to a robot whose relative pose is not known yet. Forgotten places are left out.
+        Args:
+            place: the new place, j.
+            predicted: T_i_j, shape (3,), of the stored places i that the joint map predicts to be near; forgotten
+                places are ignored.
+            is_unaligned: whether a stored place belongs to a robot in another map, whose relative pose is unknown.
         """
-        comparable = bool(predicted) or any(strangers(i) for i in self._places)
-        likeness = self._likeness(place) if comparable else Likeness[KeyscanId]()  # Algorithm 1, lines 11-13
+        comparable = bool(predicted) or any(is_unaligned(i) for i in self._places)
+        result = self._query(place) if comparable else QueryResult[KeyscanId]()  # Algorithm 1, lines 11-13
         kept = {i: T_i_j for i, T_i_j in predicted.items() if i in self._places}
-        near = [self._near_match(i, place, T_i_j, likeness) for i, T_i_j in kept.items()]
-        doubtful = self._doubtful(place.id.robot, likeness, predicted, strangers)
-        others = (*self._candidates(likeness, strangers), *doubtful)
-        far = [self._far_match(i, place, likeness) for i in others]
+        near = [self._near_match(i, place, T_i_j, result) for i, T_i_j in kept.items()]
+        lookalikes = self._lookalikes(place.id.robot, result, predicted, is_unaligned)
+        others = (*self._candidates(result, is_unaligned), *lookalikes)
+        far = [self._far_match(i, place, result) for i in others]
         self._places[place.id] = place
         self._backlog.append(place)
         self._forget_oldest()
         return [match for match in (*near, *far) if match is not None]
 
-    def _likeness(self, place: Place) -> Likeness[KeyscanId]:
-        for stored in self._backlog:  # a robot alone never needs its words
+    def _query(self, place: Place) -> QueryResult[KeyscanId]:
+        for stored in self._backlog:  # a single robot never needs the vocabulary
             self._index.add(stored.id, stored.descriptors)
         self._backlog.clear()
         return self._index.compare(place.descriptors)
 
     def forget(self, place: KeyscanId) -> None:
-        """Never compare this place again.
+        """Remove a place.
 
         Raises:
             KeyError: it is not stored.
@@ -134,70 +160,75 @@ class PlaceMatcher:
             self._index.forget(place)
         else:
             self._backlog = [stored for stored in self._backlog if stored.id != place]
-        self._forgotten(gone)
+        self._on_forget(gone)
 
     def _forget_oldest(self) -> None:
-        """Bounds the memory: a fleet that goes on for ever keeps its newest places."""
+        """Bound the memory of long missions: keep the newest places."""
         while len(self._places) > self._config.most_places:
             self.forget(next(iter(self._places)))
 
-    def _candidates(self, likeness: Likeness[KeyscanId], strangers: Callable[[KeyscanId], bool]) -> list[KeyscanId]:
-        """Every stranger's place while there are few, else those that are most alike."""
-        eligible = [i for i in self._places if strangers(i)]
+    def _candidates(self, result: QueryResult[KeyscanId], is_unaligned: Callable[[KeyscanId], bool]) -> list[KeyscanId]:
+        """All places of unaligned robots while they are few, else the most similar ones."""
+        eligible = [i for i in self._places if is_unaligned(i)]
         if len(eligible) <= self._config.small_fleet or self._index.training is None:
             return eligible
-        return [found.id for found in likeness.best(self._config.candidates, strangers)]
+        return [found.id for found in result.best(self._config.candidates, is_unaligned)]
 
-    def _doubtful(
+    def _lookalikes(
         self,
         robot: str,
-        likeness: Likeness[KeyscanId],
+        result: QueryResult[KeyscanId],
         predicted: Mapping[KeyscanId, FloatArray],
-        strangers: Callable[[KeyscanId], bool],
+        is_unaligned: Callable[[KeyscanId], bool],
     ) -> list[KeyscanId]:
-        """Places of robots in the same map that look most alike without lying near: the map may be wrong."""
+        """Most similar places of other robots in the same map that are not predicted: the join may be false."""
 
         def is_known(i: KeyscanId) -> bool:
-            return i.robot != robot and i not in predicted and not strangers(i)
+            return i.robot != robot and i not in predicted and not is_unaligned(i)
 
-        return [found.id for found in likeness.best(self._config.doubts, is_known)]
+        return [found.id for found in result.best(self._config.aligned_candidates, is_known)]
 
     def _near_match(
-        self, i: KeyscanId, place: Place, T_i_j: FloatArray, likeness: Likeness[KeyscanId]
+        self, i: KeyscanId, place: Place, T_i_j: FloatArray, result: QueryResult[KeyscanId]
     ) -> PlaceMatch | None:
-        """Verify a prediction. Submaps that are near show the same; images need not, so they have to bear it out.
+        """Verify a predicted pair.
 
-        Images that show something else instead are compared as if nothing were known: the map may be wrong.
+        Submaps at nearby poses overlap, so LiDAR places need no further evidence. Images at nearby poses may show
+        different things, so one of their motions must confirm the prediction. If none does, the pair is compared
+        without the prediction, because the map may be wrong.
         """
         stored = self._places[i]
         if place.channel is Channel.LIDAR:
             check = verify(self._submap_of(stored), self._submap_of(place), T_i_j, self._config.verification)
-            return PlaceMatch(i, place.id, place.channel, likeness.of(i), check, predicted=True)
-        proposed = motions(stored, place, self._config.motions)
-        motion = next((motion for motion in proposed if self._bears_out(motion, T_i_j)), None)
+            return PlaceMatch(i, place.id, place.channel, result.similarity_of(i), check, predicted=True)
+        proposed = propose_motions(stored, place, self._config.motions)
+        motion = next((motion for motion in proposed if self._confirms(motion, T_i_j)), None)
         if motion is None:
-            return self._best(stored, place, proposed, likeness)
+            return self._best(stored, place, proposed, result)
         check = self._verify(stored, place, motion)
-        return PlaceMatch(i, place.id, place.channel, likeness.of(i, motion.share), check, predicted=True)
+        return PlaceMatch(i, place.id, place.channel, result.similarity_of(i, motion.share), check, predicted=True)
 
-    def _bears_out(self, motion: Motion, T_i_j: FloatArray) -> bool:
+    def _confirms(self, motion: Motion, T_i_j: FloatArray) -> bool:
         off = se2.between(T_i_j, motion.T_a_b)
-        return bool(np.hypot(off[0], off[1]) <= self._config.borne_out_m and abs(off[2]) <= self._config.borne_out_rad)
+        return bool(
+            np.hypot(off[0], off[1]) <= self._config.prediction_tolerance_m
+            and abs(off[2]) <= self._config.prediction_tolerance_rad
+        )
 
-    def _far_match(self, i: KeyscanId, place: Place, likeness: Likeness[KeyscanId]) -> PlaceMatch | None:
-        """Verify the motions that the keypoints propose; the most convincing one, None if there is none."""
+    def _far_match(self, i: KeyscanId, place: Place, result: QueryResult[KeyscanId]) -> PlaceMatch | None:
+        """Verify the motions from keypoints and return the best match, None without a motion."""
         stored = self._places[i]
-        return self._best(stored, place, motions(stored, place, self._config.motions), likeness)
+        return self._best(stored, place, propose_motions(stored, place, self._config.motions), result)
 
     def _best(
-        self, stored: Place, place: Place, proposed: Sequence[Motion], likeness: Likeness[KeyscanId]
+        self, stored: Place, place: Place, proposed: Sequence[Motion], result: QueryResult[KeyscanId]
     ) -> PlaceMatch | None:
         if not proposed:
             return None
         checks = [self._verify(stored, place, motion) for motion in proposed]
         best = max(checks, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
-        alike = likeness.of(stored.id, proposed[0].share)
-        return PlaceMatch(stored.id, place.id, place.channel, alike, best, predicted=False)
+        similarity = result.similarity_of(stored.id, proposed[0].share)
+        return PlaceMatch(stored.id, place.id, place.channel, similarity, best, predicted=False)
 
     def _verify(self, stored: Place, place: Place, motion: Motion) -> Verification:
         a, b = self._submap_of(stored), self._submap_of(place)

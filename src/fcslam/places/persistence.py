@@ -18,7 +18,7 @@ from fcslam.config import parse
 from fcslam.errors import InputError, OutputError
 from fcslam.features.codes import CODE_WORDS
 from fcslam.places.index import IndexState, PlaceIndex
-from fcslam.places.likeness import PlaceId
+from fcslam.places.query_result import PlaceId
 from fcslam.places.vocabulary import Training, TreeState, VocabularyConfig
 from fcslam.storage.files import replacing
 

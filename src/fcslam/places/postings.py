@@ -18,7 +18,7 @@ from fcslam.records import FloatArray, Scalar
 BLOCK = 8
 """Entries of a block: more waste memory in words of few descriptors, fewer cost jumps."""
 
-GROWTH = 1.06
+GROWTH_FACTOR = 1.06
 """Of arrays that run out of room."""
 
 ROWS = 2 * CODE_WORDS * BLOCK
@@ -152,8 +152,8 @@ class Postings:
         entries = self.entries
         before = len(entries.heads)
         if vertices > before:
-            length = max(vertices, int(GROWTH * before))
-            heads, documents = longer(entries.heads, length), longer(entries.documents, length)
+            length = max(vertices, int(GROWTH_FACTOR * before))
+            heads, documents = grown_rows(entries.heads, length), grown_rows(entries.documents, length)
             heads[before:], documents[before:] = _heads(length - before), 0
             self.entries = entries._replace(heads=heads, documents=documents)
 
@@ -170,20 +170,20 @@ class Postings:
         entries = self.entries
         block_count = int(entries.free[1]) + blocks
         if block_count > len(entries.blocks):
-            grown = longer(entries.blocks, max(block_count, int(GROWTH * len(entries.blocks))))
+            grown = grown_rows(entries.blocks, max(block_count, int(GROWTH_FACTOR * len(entries.blocks))))
             entries = entries._replace(blocks=grown, numbers=grown.view(np.int32))
         if self.row_count + rows > len(entries.starts):
-            length = max(self.row_count + rows, int(GROWTH * len(entries.starts)), 64)
-            norms = longer(entries.log_documents, length) if self._has_norms else entries.log_documents
-            starts, counts = longer(entries.starts, length), longer(entries.counts, length)
+            length = max(self.row_count + rows, int(GROWTH_FACTOR * len(entries.starts)), 64)
+            norms = grown_rows(entries.log_documents, length) if self._has_norms else entries.log_documents
+            starts, counts = grown_rows(entries.starts, length), grown_rows(entries.counts, length)
             entries = entries._replace(starts=starts, counts=counts, log_documents=norms)
         if self.descriptor_count + descriptors > len(entries.leaves):
-            length = max(self.descriptor_count + descriptors, int(GROWTH * len(entries.leaves)))
-            entries = entries._replace(leaves=longer(entries.leaves, length))
+            length = max(self.descriptor_count + descriptors, int(GROWTH_FACTOR * len(entries.leaves)))
+            entries = entries._replace(leaves=grown_rows(entries.leaves, length))
         self.entries = entries
 
 
-def longer(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
+def grown_rows(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
     """``array`` with room for ``length`` rows, those it had being kept; the array given is not to be used any more.
 
     Large arrays grow in place: the system maps their pages anew instead of copying them, so that no place that comes
@@ -207,7 +207,7 @@ def newest_block(entries: Entries, leaf: int) -> tuple[int, int]:
 
 
 @njit(cache=True)
-def announce_block(entries: Entries, block: int) -> None:
+def prefetch_block(entries: Entries, block: int) -> None:
     """Announce what a query reads of a block, which begins anywhere in a line."""
     for number in range(0, OLDER, _LINE):
         prefetch(entries.numbers, block, number)
@@ -221,7 +221,7 @@ def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int3
         prefetch(entries.heads, leaf, 0)
     for leaf in leaves:
         if entries.heads[leaf, 0] >= 0:
-            announce_block(entries, entries.heads[leaf, 0])
+            prefetch_block(entries, entries.heads[leaf, 0])
     norms = entries.log_documents
     for index in range(codes.shape[0]):
         leaf = leaves[index]

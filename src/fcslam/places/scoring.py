@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 
 from fcslam.features.codes import CodeWords, popcount
 from fcslam.places.kmeans_tree import Tree, near_leaves
-from fcslam.places.postings import BLOCK, OLDER, ROWS, Entries, announce_block, newest_block
+from fcslam.places.postings import BLOCK, OLDER, ROWS, Entries, newest_block, prefetch_block
 from fcslam.places.prefetch import prefetch
 from fcslam.records import FloatArray
 
-_ABREAST = 32
+_CODES_AT_ONCE = 32
 """Codes of a query whose words are read together: so many that cache misses overlap, so few that all stays there."""
 TINY = 1e-300
 """In the place of a sum that may be zero."""
 
 
-class Tally(NamedTuple):
+class ScoreBuffers(NamedTuple):
     """What is known of every row while a query is answered.
 
     Zeros between queries: to clear what was touched costs less than as many zeros as there are places.
@@ -34,25 +34,25 @@ class Tally(NamedTuple):
     """Shape (R,): rows that have a mark."""
 
 
-def blank_tally(rows: int) -> Tally:
+def empty_buffers(rows: int) -> ScoreBuffers:
     """For so many rows."""
-    return Tally(np.zeros(rows), np.zeros(rows, np.int32), np.empty(rows, np.int32), np.empty(rows, np.int32))
+    return ScoreBuffers(np.zeros(rows), np.zeros(rows, np.int32), np.empty(rows, np.int32), np.empty(rows, np.int32))
 
 
 @njit(cache=True)
 def score_words(
-    entries: Entries, tally: Tally, place_count: int, leaves: NDArray[np.int32], weights: FloatArray
+    entries: Entries, buffers: ScoreBuffers, place_count: int, leaves: NDArray[np.int32], weights: FloatArray
 ) -> tuple[NDArray[np.int32], FloatArray]:
     """Sum of min(query, place) over the common words: rows that have one, and their scores.
 
     Args:
         entries: the stored places, with their norms.
-        tally: blank, for all rows; it is left so.
+        buffers: blank, for all rows; it is left so.
         place_count: N of the inverse document frequencies.
         leaves: shape (K,), the query's words, each once.
         weights: shape (K,), tf-idf of the query, L1 norm 1.
     """
-    scores, counts, touched, here = tally
+    scores, counts, touched, here = buffers
     total = 0
     for k in range(leaves.shape[0]):
         leaf, found = leaves[k], 0
@@ -74,13 +74,13 @@ def score_words(
             norm = entries.counts[row] * np.log(place_count) - entries.log_documents[row]
             scores[row] += min(weights[k], counts[row] * idf / norm)
             counts[row] = 0
-    taken: tuple[NDArray[np.int32], FloatArray] = _taken(tally, total)
+    taken: tuple[NDArray[np.int32], FloatArray] = _taken(buffers, total)
     return taken
 
 
 @njit(cache=True)
 def score_matches(
-    entries: Entries, tree: Tree, tally: Tally, place_count: int, codes: CodeWords, beam: int, near_bits: int
+    entries: Entries, tree: Tree, buffers: ScoreBuffers, place_count: int, codes: CodeWords, beam: int, near_bits: int
 ) -> tuple[NDArray[np.int32], FloatArray]:
     """Share of the query's descriptors that a place has, too, in [0, 1]; a place is wholly like itself.
 
@@ -92,19 +92,19 @@ def score_matches(
     Args:
         entries: the stored places.
         tree: the words.
-        tally: blank, for all rows; it is left so.
+        buffers: blank, for all rows; it is left so.
         place_count: N, the places that are stored.
         codes: shape (K, 4), of the query.
         beam: words that are looked through for each code.
         near_bits: codes that differ in no more bits are of the same thing.
     """
-    scores, closeness, touched, here = tally  # closeness: bits that are missing to one more than near_bits
+    scores, closeness, touched, here = buffers  # closeness: bits that are missing to one more than near_bits
     gives = 1.0 - ((near_bits + 1.0 - np.arange(near_bits + 2)) / (near_bits + 1.0)) ** 2
     total, whole = 0, 0.0
     leaves = near_leaves(tree, codes, beam)
     for k in range(codes.shape[0]):
-        if k % _ABREAST == 0:
-            _announce(entries, leaves[k : k + _ABREAST].ravel())
+        if k % _CODES_AT_ONCE == 0:
+            _prefetch_leaves(entries, leaves[k : k + _CODES_AT_ONCE].ravel())
         found = 0
         for leaf in leaves[k]:
             if leaf < 0:
@@ -131,18 +131,18 @@ def score_matches(
                 total += 1
             scores[row] += weight * gives[closeness[row]]
             closeness[row] = 0
-    rows, shares = _taken(tally, total)
+    rows, shares = _taken(buffers, total)
     for position, row in enumerate(rows):
         shares[position] *= np.sqrt(min(1.0, codes.shape[0] / entries.counts[row])) / max(whole, TINY)
     return rows, shares
 
 
 @njit(cache=True)
-def _taken(tally: Tally, total: int) -> tuple[NDArray[np.int32], FloatArray]:
+def _taken(buffers: ScoreBuffers, total: int) -> tuple[NDArray[np.int32], FloatArray]:
     """The rows that were touched and their scores, which are cleared."""
-    rows = tally.touched[:total].copy()
-    scores = tally.scores[rows]
-    tally.scores[rows] = 0.0
+    rows = buffers.touched[:total].copy()
+    scores = buffers.scores[rows]
+    buffers.scores[rows] = 0.0
     return rows, scores
 
 
@@ -155,7 +155,7 @@ def _distance(codes: CodeWords, k: int, blocks: NDArray[np.uint64], block: int, 
 
 
 @njit(cache=True)
-def _announce(entries: Entries, leaves: NDArray[np.int32]) -> None:
+def _prefetch_leaves(entries: Entries, leaves: NDArray[np.int32]) -> None:
     """Announce the blocks of these leaves, -1 for none.
 
     A chain is read block after block, each a cache miss in a large index. Abreast, the misses of all chains overlap.
@@ -170,7 +170,7 @@ def _announce(entries: Entries, leaves: NDArray[np.int32]) -> None:
             count += 1
     while count:
         for block in blocks[:count]:
-            announce_block(entries, block)
+            prefetch_block(entries, block)
         left = 0
         for block in blocks[:count]:
             older = entries.numbers[block, OLDER]

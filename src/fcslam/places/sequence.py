@@ -14,7 +14,7 @@ LEAST_TO_PREVIOUS = 0.005
 """A query less like the place before it, as after a quick turn or a covered lens, has nothing to be measured by."""
 
 
-def long_before(stamps: NDArray[np.int64] | FloatArray, gap: float) -> NDArray[np.bool_]:
+def excluding_recent(stamps: NDArray[np.int64] | FloatArray, gap: float) -> NDArray[np.bool_]:
     """Which places (columns) a query (row) may be answered by: those that came ``gap`` or more before it.
 
     Every place is like the ones just before it, and to find these again says nothing.
@@ -44,7 +44,7 @@ def normalised_by_previous(
     return np.divide(similarity, to_previous[:, None], out=np.zeros(similarity.shape), where=known[:, None])
 
 
-def in_a_row(similarity: FloatArray, hits: int, reach: int) -> FloatArray:
+def temporally_consistent(similarity: FloatArray, hits: int, reach: int) -> FloatArray:
     """The similarities of those pairs that end a run of ``hits`` queries whose matches lie side by side, else 0.
 
     Each query before the last one matches what is most similar to it, equals included; the next match of a run lies at
@@ -65,7 +65,7 @@ def in_a_row(similarity: FloatArray, hits: int, reach: int) -> FloatArray:
     return np.where(lengths >= hits, similarity, 0.0)
 
 
-def along_the_way(similarity: FloatArray, places: int, reach: int) -> FloatArray:
+def sequence_similarity(similarity: FloatArray, places: int, reach: int) -> FloatArray:
     """Mean similarity of the last ``places`` queries with what lies side by side in the same order, or in the opposite.
 
     Where the query and a stored place are t and j, query t - k takes part with the most similar place at most

@@ -1,4 +1,4 @@
-"""Which places may be forgotten where a robot has stored very many."""
+"""Which places the cloud may forget where a robot has stored very many (density limit per area)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,21 +6,20 @@ from numpy.typing import NDArray
 from fcslam.records import FloatArray
 
 
-def crowded_out(positions_m: FloatArray, side_m: float, most: int) -> NDArray[np.int64]:
-    """All but the newest ``most`` places in the square of the newest one, which is one of them.
+def surplus_places(positions_m: FloatArray, side_m: float, most: int) -> NDArray[np.int64]:
+    """Find the oldest places in the newest place's grid square beyond the ``most`` that it may hold.
 
-    Asked after every new place, each square keeps its newest ``most`` places, and all of them if they are fewer: as
-    long as places stay where they are, memory is bounded by the area that a robot drives in and not by how long it
-    drives, and no area loses its last place. Squares tell that, and discs around the newest place would not: on its
-    way a robot would sweep away what it had stored behind it.
+    Called after every new place, it keeps at most the newest ``most`` places of each square. Memory is then bounded by
+    the area that a robot drives in, not by how long it drives, and no area loses its last place. Discs around the
+    newest place would not do this: a moving robot would delete the places behind it.
 
     Args:
-        positions_m: shape (N, 2), the oldest first, the newest last.
-        side_m: of the squares, which lie side by side; the origin, where a robot starts, is the middle of one.
-        most: 1 or more, so that the newest always stays.
+        positions_m: shape (N, 2), x and y in ``map``, metres; the oldest place first, the newest last.
+        side_m: side of the squares, metres. The origin of ``map`` is the centre of a square.
+        most: places that a square may hold, 1 or more.
 
     Returns:
-        Rows of ``positions_m``; none if there is room.
+        Rows of ``positions_m`` to forget, shape (K,), ascending; empty if the square is not full.
     """
     if len(positions_m) <= most:
         return np.empty(0, np.int64)

@@ -14,8 +14,8 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.features.codes import CodeWords
-from fcslam.places.kmeans_tree import Tree, TreeShape, bare_root, descend, grow, k_means
-from fcslam.places.postings import GROWTH, longer
+from fcslam.places.kmeans_tree import Tree, TreeShape, bare_root, find_leaves, grow_tree, k_means
+from fcslam.places.postings import GROWTH_FACTOR, grown_rows
 
 
 class Strategy(StrEnum):
@@ -118,7 +118,7 @@ class Vocabulary:
     def train(self, codes: CodeWords) -> None:
         """Grow a new tree from codes (N, 4)."""
         self.version += 1
-        self.tree = grow(codes, self._shape, self._state(self.version)[0])
+        self.tree = grow_tree(codes, self._shape, self._state(self.version)[0])
         self.vertex_count = len(self.tree.centres)
         leaves = np.flatnonzero(self.tree.child_count == 0)
         self.words = np.full(self.vertex_count, -1, np.int64)
@@ -156,7 +156,7 @@ class Vocabulary:
 
     def leaves(self, codes: CodeWords) -> NDArray[np.int32]:
         """The vertex of the leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
-        leaves: NDArray[np.int32] = descend(self.tree, codes)
+        leaves: NDArray[np.int32] = find_leaves(self.tree, codes)
         return leaves
 
     def split(self, leaf: int, codes: CodeWords) -> NDArray[np.int32] | None:
@@ -198,9 +198,9 @@ class Vocabulary:
         first = self.vertex_count
         self.vertex_count += size
         if self.vertex_count > len(self.words):
-            length = max(self.vertex_count, int(GROWTH * len(self.words)))
-            self.tree = Tree(longer(self.tree.centres, length), longer(self.tree.families, length))
-            self.words, self.parents = longer(self.words, length), longer(self.parents, length)
+            length = max(self.vertex_count, int(GROWTH_FACTOR * len(self.words)))
+            self.tree = Tree(grown_rows(self.tree.centres, length), grown_rows(self.tree.families, length))
+            self.words, self.parents = grown_rows(self.words, length), grown_rows(self.parents, length)
             self.words[first:] = -1
         return first
 

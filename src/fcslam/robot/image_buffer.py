@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.placing import LidarView
+from fcslam.features.lidar_depth import LidarView
 from fcslam.records import CameraModel, FloatArray
 
 

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.choice import make_detector
 from fcslam.features.classical import OrbConfig
 from fcslam.features.detector import GreyImage, OnnxConfig, decode_grey
-from fcslam.features.kinds import DetectorKind
-from fcslam.features.placing import LidarView, place_keypoints
-from fcslam.features.release import open_release
+from fcslam.features.detector_file import open_detector_file
+from fcslam.features.detector_kinds import DetectorKind
+from fcslam.features.factory import make_detector
+from fcslam.features.lidar_depth import LidarView, locate_keypoints
 from fcslam.geometry import se2
 from fcslam.lidar.mapper import ScanPose
 from fcslam.lidar.scan import point_scan
@@ -104,7 +104,7 @@ class ViewExtractor:
         Raises:
             FeatureError: it is another file, or cannot be used; nothing has changed.
         """
-        self._detector = open_release(file, path, self._config.onnx)
+        self._detector = open_detector_file(file, path, self._config.onnx)
 
     def reset(self) -> None:
         """What was seen is of a session that has ended."""
@@ -119,7 +119,7 @@ class ViewExtractor:
 
     def _describe(self, shot: KeyframeImage, picture: GreyImage) -> CameraView | None:
         features = self._detector.detect(picture)
-        positions, placed = place_keypoints(
+        positions, placed = locate_keypoints(
             features.keypoints_px, shot.camera, shot.surroundings, self._config.ceiling_m
         )
         if placed.sum() < self._config.fewest_keypoints:

@@ -4,7 +4,7 @@ import tempfile
 import threading
 from pathlib import Path
 
-from fcslam.features.release import file_of
+from fcslam.features.detector_file import describe_detector_file
 from fcslam.records import Channel, DetectorFile
 
 LONGEST_FILE_BYTES = 64 * 2**20
@@ -21,7 +21,7 @@ class DetectorShelf:
         self._root = root
         self._lock = threading.Lock()
         self._announced = {
-            channel: file_of(self.path(channel, told.read_text(encoding="utf-8")))
+            channel: describe_detector_file(self.path(channel, told.read_text(encoding="utf-8")))
             for channel in Channel
             if (told := root / channel / _ANNOUNCED).is_file()
         }
@@ -51,7 +51,9 @@ class DetectorShelf:
         with tempfile.TemporaryDirectory(dir=self._root, prefix=STAGING) as folder:
             staging = Path(folder) / "network.onnx"
             staging.write_bytes(content)
-            file = file_of(staging)  # loads the network: robots that ask what is announced do not wait for that
+            file = describe_detector_file(
+                staging
+            )  # loads the network: robots that ask what is announced do not wait for that
             place = self.path(file.channel, file.version)
             place.parent.mkdir(exist_ok=True)
             with self._lock:

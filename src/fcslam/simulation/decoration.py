@@ -6,7 +6,7 @@ import numpy as np
 
 from fcslam.records import FloatArray, frozen
 from fcslam.simulation import textures
-from fcslam.simulation.floorplan import WALL_M, FloorPlan, Kind, Piece, Room
+from fcslam.simulation.floorplan import WALL_M, FloorPlan, Piece, PieceKind, Room
 from fcslam.simulation.textures import Image
 
 WALL_HEIGHT_M = 2.5
@@ -21,7 +21,7 @@ _SIGN_M = 0.24
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class WallPicture:
     """Something flat on a wall."""
 
     image: Image
@@ -48,7 +48,7 @@ class Decoration:
     """For each piece of the floor plan."""
     room_floors: tuple[int, ...]
     """For each room which of ``floors`` it has."""
-    pictures: tuple[Picture, ...]
+    pictures: tuple[WallPicture, ...]
 
 
 def decorate(plan: FloorPlan, rng: np.random.Generator) -> Decoration:
@@ -71,16 +71,16 @@ def decorate(plan: FloorPlan, rng: np.random.Generator) -> Decoration:
 
 
 def _is_wall(piece: Piece) -> bool:
-    return piece.kind in (Kind.WALL, Kind.LINTEL)
+    return piece.kind in (PieceKind.WALL, PieceKind.LINTEL)
 
 
 def _height_m(piece: Piece, rng: np.random.Generator) -> float:
-    if _is_wall(piece) or (piece.kind is Kind.COLUMN and rng.random() < 0.5):
+    if _is_wall(piece) or (piece.kind is PieceKind.COLUMN and rng.random() < 0.5):
         return WALL_HEIGHT_M
     return float(rng.uniform(_LOW_M, _HIGH_M))
 
 
-def _pictures(room: Room, rng: np.random.Generator) -> list[Picture]:
+def _pictures(room: Room, rng: np.random.Generator) -> list[WallPicture]:
     """On the walls inside a room, and outside beside its door."""
     inward = float(np.sign(room.inside[1] - room.doorway[1]))
     front, back = (room.low[1], room.high[1]) if inward > 0 else (room.high[1], room.low[1])
@@ -97,7 +97,7 @@ def _pictures(room: Room, rng: np.random.Generator) -> list[Picture]:
             pictures.append(_hang((side, y), size, np.pi / 2.0, rng))
     outside, door = front - inward * _PICTURE_OFF_M, float(room.doorway[0])
     sign = textures.door_sign(rng)
-    pictures.append(Picture(sign, (door + 0.72, outside, 1.45), (_SIGN_M, _SIGN_M), 0.0))
+    pictures.append(WallPicture(sign, (door + 0.72, outside, 1.45), (_SIGN_M, _SIGN_M), 0.0))
     for low, high in ((west, door - 0.6), (door + 0.9, east)):
         size = rng.uniform((0.6, 0.5), (1.1, 0.9))
         if high - low > size[0] + 0.3 and rng.random() < 0.6:
@@ -111,7 +111,7 @@ def _between(low: float, high: float, width: float, rng: np.random.Generator) ->
     return float(rng.uniform(low + margin, high - margin))
 
 
-def _hang(place: tuple[float, float], size: FloatArray, heading_rad: float, rng: np.random.Generator) -> Picture:
+def _hang(place: tuple[float, float], size: FloatArray, heading_rad: float, rng: np.random.Generator) -> WallPicture:
     centre = (float(place[0]), float(place[1]), float(rng.uniform(1.2, 1.5)))
     width, height = frozen(size).tolist()
-    return Picture(textures.picture(rng), centre, (width, height), heading_rad)
+    return WallPicture(textures.picture(rng), centre, (width, height), heading_rad)

@@ -11,7 +11,7 @@ from fcslam.errors import SimulationError
 
 _GL = "MUJOCO_GL"
 _BACKENDS = ("egl", "osmesa")
-ALONE = RLock()
+GL_LOCK = RLock()
 """Robots are simulated side by side in threads. Whoever loads a library or calls GL does so alone: Mesa's software
 renderer looks through what all contexts of the process are drawing, without asking whether one of them is at it."""
 
@@ -24,7 +24,7 @@ def mujoco() -> Any:
     Raises:
         SimulationError: it is not installed.
     """
-    with ALONE:
+    with GL_LOCK:
         if loaded := sys.modules.get("mujoco"):
             return loaded
         wanted = os.environ.get(_GL)

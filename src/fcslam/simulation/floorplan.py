@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 
 from fcslam.records import FloatArray, frozen
-from fcslam.simulation.kinds import Building
 from fcslam.simulation.layouts import Lane, Layout, Row, draw_layout
+from fcslam.simulation.options import Building
 
 WALL_M = 0.12
 DOOR_M = 1.0
@@ -26,7 +26,7 @@ _SHIFT_M, _TURN_RAD = 0.4, 0.3
 """Standard deviations of what moving does to a piece of furniture."""
 
 
-class Kind(StrEnum):
+class PieceKind(StrEnum):
     """What a piece is."""
 
     WALL = "wall"
@@ -40,7 +40,7 @@ class Kind(StrEnum):
 class Piece:
     """Something that stands in the building, seen from above."""
 
-    kind: Kind
+    kind: PieceKind
     outline: FloatArray
     """Corners counter-clockwise: (4, 2) of a rectangle, (8, 2) of a column."""
 
@@ -52,7 +52,7 @@ class Piece:
     @property
     def size(self) -> tuple[float, float]:
         """Length along its first side and across; a column's diameter twice."""
-        if self.kind is Kind.COLUMN:
+        if self.kind is PieceKind.COLUMN:
             diameter = float(np.linalg.norm(self.outline[4] - self.outline[0]))
             return diameter, diameter
         sides = np.linalg.norm(np.diff(self.outline[:3], axis=0), axis=1)
@@ -107,7 +107,7 @@ def build(layout: Layout, rng: np.random.Generator) -> FloorPlan:
     """Walls, doors and furniture for a layout, one's own for instance."""
     walls = [_wall(0, 0, layout.width, 0), _wall(0, layout.height, layout.width, layout.height)]
     walls += [_wall(x, 0, x, layout.height) for x in (0.0, layout.width)]
-    pieces = [Piece(Kind.WALL, outline) for outline in walls]
+    pieces = [Piece(PieceKind.WALL, outline) for outline in walls]
     rooms: list[Room] = []
     for row in layout.rows:
         row_pieces, row_rooms = _build_row(row, layout, rng)
@@ -143,7 +143,7 @@ def _moved(piece: Piece, room: Room, rng: np.random.Generator) -> Piece:
 
 def _room_of(piece: Piece, plan: FloorPlan) -> Room | None:
     """The room in which a piece of furniture stands; None for walls and for what stands in a corridor."""
-    if piece.kind not in (Kind.CABINET, Kind.COLUMN):
+    if piece.kind not in (PieceKind.CABINET, PieceKind.COLUMN):
         return None
     centre = piece.centre
     inside = (room for room in plan.rooms if np.all(centre > room.low) and np.all(centre < room.high))
@@ -156,16 +156,16 @@ def _build_row(row: Row, layout: Layout, rng: np.random.Generator) -> tuple[list
     edges = row.x[0] + (row.x[1] - row.x[0]) * np.insert(shares / shares[-1], 0, 0.0)
     walls = [_wall(row.x[0], row.back, row.x[1], row.back)]
     walls += [_wall(edge, row.back, edge, row.front) for edge in edges]
-    pieces = [Piece(Kind.WALL, outline) for outline in walls]
+    pieces = [Piece(PieceKind.WALL, outline) for outline in walls]
     rooms = []
     low, high = sorted((row.front, row.back))
     for west, east in pairwise(edges):
         across = 0.5 if layout.alike else rng.uniform(0.25, 0.75)
         door = float(np.clip(west + across * (east - west), *layout.door_limits))
         left, right = door - DOOR_M / 2.0, door + DOOR_M / 2.0
-        pieces.append(Piece(Kind.WALL, _wall(west, row.front, left, row.front)))
-        pieces.append(Piece(Kind.WALL, _wall(right, row.front, east, row.front)))
-        pieces.append(Piece(Kind.LINTEL, _wall(left, row.front, right, row.front)))
+        pieces.append(Piece(PieceKind.WALL, _wall(west, row.front, left, row.front)))
+        pieces.append(Piece(PieceKind.WALL, _wall(right, row.front, east, row.front)))
+        pieces.append(Piece(PieceKind.LINTEL, _wall(left, row.front, right, row.front)))
         depth = row.front + rng.uniform(0.45, 0.65) * (row.back - row.front)
         corner_low, corner_high = np.array([west, low]), np.array([east, high])
         room = Room(frozen([door, row.lane]), frozen([door, depth]), frozen(corner_low), frozen(corner_high))
@@ -186,7 +186,7 @@ def _furniture(room: Room, rng: np.random.Generator) -> list[Piece]:
         for _ in range(_ATTEMPTS):
             centre = rng.uniform(room.low + margin, room.high - margin)
             if _distance(centre, path) > CLEARANCE_M + margin:
-                pieces.append(Piece(Kind.COLUMN if column else Kind.CABINET, frozen(outline + centre)))
+                pieces.append(Piece(PieceKind.COLUMN if column else PieceKind.CABINET, frozen(outline + centre)))
                 break
     return pieces
 
@@ -204,13 +204,13 @@ def _corridor_cabinets(layout: Layout, paths: list[Lane], rng: np.random.Generat
         ways = [*paths, *(other for k, other in enumerate(layout.lanes) if k != lane)]
         if all(_distance(centre, way) > CLEARANCE_M + length / 2.0 for way in ways):
             outline = _rectangle((length, depth), float(np.arctan2(along[1], along[0]))) + centre
-            pieces.append(Piece(Kind.CABINET, frozen(outline)))
+            pieces.append(Piece(PieceKind.CABINET, frozen(outline)))
     return pieces
 
 
 def _segments(pieces: Sequence[Piece]) -> FloatArray:
     """The sides of everything that a beam at the laser's height meets, shape (S, 4)."""
-    return frozen(np.concatenate([_sides(piece.outline) for piece in pieces if piece.kind is not Kind.LINTEL]))
+    return frozen(np.concatenate([_sides(piece.outline) for piece in pieces if piece.kind is not PieceKind.LINTEL]))
 
 
 def _wall(x1: float, y1: float, x2: float, y2: float) -> FloatArray:

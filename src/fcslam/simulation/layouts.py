@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fcslam.records import FloatArray
-from fcslam.simulation.kinds import Building
+from fcslam.simulation.options import Building
 
 Lane = tuple[FloatArray, FloatArray]
 """Ends (2,) of a corridor's centre line."""

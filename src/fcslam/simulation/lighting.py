@@ -6,7 +6,7 @@ import numpy as np
 
 from fcslam.records import FloatArray, frozen
 from fcslam.simulation.floorplan import FloorPlan
-from fcslam.simulation.kinds import Lighting
+from fcslam.simulation.options import Lighting
 
 LAMP_HEIGHT_M = 2.4
 _LAMP_SPACING_M = 6.0

@@ -19,7 +19,9 @@ class LidarSettings(Settings):
     rate_hz: float = Field(default=5.0, gt=0.0, description="scans a second")
 
 
-def disturb(ranges: FloatArray, laser: LaserModel, settings: LidarSettings, rng: np.random.Generator) -> FloatArray:
+def simulate_ranges(
+    ranges: FloatArray, laser: LaserModel, settings: LidarSettings, rng: np.random.Generator
+) -> FloatArray:
     """True ranges (..., beams) with noise and dropouts."""
     hit = ranges < laser.max_range_m
     noisy = np.clip(ranges + rng.normal(0.0, settings.range_noise_m, ranges.shape), 0.0, laser.max_range_m)

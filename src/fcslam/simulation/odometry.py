@@ -8,7 +8,7 @@ from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
 
-class DriftSettings(Settings):
+class OdometryNoiseSettings(Settings):
     """How wheel odometry goes wrong: chance along the way, and a bias drawn once for each robot."""
 
     travel_noise_m: float = Field(
@@ -26,7 +26,9 @@ class DriftSettings(Settings):
     slip_m: float = Field(default=0.05, ge=0.0, description="mean travel that a slip makes up")
 
 
-def drift(T_building_base: FloatArray, settings: DriftSettings, rng: np.random.Generator) -> FloatArray:
+def simulate_odometry(
+    T_building_base: FloatArray, settings: OdometryNoiseSettings, rng: np.random.Generator
+) -> FloatArray:
     """Odometry (N, 3) of a robot that drove the true poses (N, 3): zero at first, then ever more wrong."""
     twists = se2.log(se2.relative(T_building_base))
     travel, turn = np.abs(twists[:, 0]), np.abs(twists[:, 2])

@@ -12,7 +12,7 @@ import fcslam
 from fcslam.config import dump
 from fcslam.errors import OutputError
 from fcslam.records import GroundTruth, RecordedItem
-from fcslam.simulation.fleet import SimulatedRobot, SimulationSettings
+from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings
 from fcslam.sources import RecordingWriter
 from fcslam.sources.recording.layout import META
 from fcslam.storage.files import write_file
@@ -54,9 +54,9 @@ def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter, resum
         SourceError: what is there is no recording that can go on.
     """
     with _writer(robot, folder, resume) as writer:
-        held = writer.held
-        known = held.ground_truth
-        with closing(robot.items(held.scans, held.images)) as items:
+        counts = writer.counts
+        known = counts.ground_truth
+        with closing(robot.items(counts.scans, counts.images)) as items:
             for item in watch(items):
                 if isinstance(item, GroundTruth) and known:
                     known -= 1

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from fcslam.errors import SimulationError
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, frozen
+from fcslam.simulation.drivable_space import DrivableSpace
 from fcslam.simulation.floorplan import FloorPlan
-from fcslam.simulation.free_space import FreeSpace
 
 SPEED_M_S = 0.5
 TURN_RATE_RAD_S = 0.9
@@ -32,7 +32,7 @@ def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Gen
     Raises:
         SimulationError: the building has no free space, or too little to drive about in.
     """
-    space = FreeSpace(plan)
+    space = DrivableSpace(plan)
     spots = _draw_spots(plan, space, rng)
     _check_spread(space.points[spots])
     wanted_m = (_STRETCH + _SHIFT * (robots - 1)) * length_m
@@ -58,7 +58,7 @@ def plan_route(plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.rand
     Raises:
         SimulationError: there is no free space, or too little to drive about in.
     """
-    space = FreeSpace(plan)
+    space = DrivableSpace(plan)
     goals = space.points[[space.nearest(goal) for goal in goals]]
     _check_spread(goals)
     goals = np.roll(goals, rng.integers(len(goals)), axis=0)[:: rng.choice((-1, 1))]
@@ -117,7 +117,7 @@ def drive(waypoints: FloatArray, period_s: float) -> tuple[FloatArray, FloatArra
     return stamps, plan.at(stamps)
 
 
-def _draw_spots(plan: FloorPlan, space: FreeSpace, rng: np.random.Generator) -> NDArray[np.intp]:
+def _draw_spots(plan: FloorPlan, space: DrivableSpace, rng: np.random.Generator) -> NDArray[np.intp]:
     """Numbers (S,) of free points worth going to: one in each room, and some along each corridor."""
     spots = []
     for room in plan.rooms:
@@ -137,7 +137,7 @@ def _check_spread(points: FloatArray) -> None:
         raise SimulationError("the building's free space is too small or too divided to drive in; take a larger one")
 
 
-def _swayed(leg: FloatArray, space: FreeSpace, rng: np.random.Generator) -> FloatArray:
+def _swayed(leg: FloatArray, space: DrivableSpace, rng: np.random.Generator) -> FloatArray:
     """The leg (K, 2) with its corners moved a little, where that keeps it free."""
     swayed = leg.copy()
     for k in range(1, len(leg) - 1):

@@ -10,7 +10,7 @@ import numpy as np
 from fcslam.records import FloatArray
 from fcslam.simulation.decoration import DOOR_HEIGHT_M, WALL_HEIGHT_M, Decoration
 from fcslam.simulation.engine import mujoco
-from fcslam.simulation.floorplan import FloorPlan, Kind, Piece
+from fcslam.simulation.floorplan import FloorPlan, Piece, PieceKind
 from fcslam.simulation.lighting import LAMP_HEIGHT_M, Light
 from fcslam.simulation.textures import Image
 
@@ -58,7 +58,7 @@ def furnished_model(
     builder.material("corridor", decoration.corridor_floor, repeats_per_m=1.0 / _TEXTURE_M)
     builder.material("ceiling", decoration.ceiling, repeats_per_m=1.0 / _TEXTURE_M)
     for number, piece in _standing(plan):
-        look = "wall" if piece.kind in (Kind.WALL, Kind.LINTEL) else "front"
+        look = "wall" if piece.kind in (PieceKind.WALL, PieceKind.LINTEL) else "front"
         builder.piece(piece, decoration.heights_m[number], f"{look} {decoration.looks[number]}")
     for low, high in _squares(plan.size_m):
         builder.slab(low, high, -0.008, "corridor")
@@ -84,7 +84,7 @@ def _standing(plan: FloorPlan) -> Iterator[tuple[int, Piece]]:
     """Pieces with their numbers, without walls that lie within others: two faces in one place would flicker."""
     boxes = [(piece.outline.min(axis=0), piece.outline.max(axis=0)) for piece in plan.pieces]
     kept: list[int] = []
-    walls = [k for k, piece in enumerate(plan.pieces) if piece.kind is Kind.WALL]
+    walls = [k for k, piece in enumerate(plan.pieces) if piece.kind is PieceKind.WALL]
     for k in sorted(walls, key=lambda k: -float(np.linalg.norm(boxes[k][1] - boxes[k][0]))):
         low, high = boxes[k]
         if not any(np.all(boxes[j][0] < low + 1e-6) and np.all(boxes[j][1] > high - 1e-6) for j in kept):
@@ -150,11 +150,11 @@ class _Builder:
     def piece(self, piece: Piece, height_m: float, material: str) -> None:
         """A wall, a lintel, or a piece of furniture that stands on the floor."""
         x, y = piece.centre
-        if piece.kind is Kind.COLUMN:
+        if piece.kind is PieceKind.COLUMN:
             kinds = self._mujoco.mjtGeom
             half = (piece.size[0] / 2.0, height_m / 2.0, 0.0)
             self._geom(kinds.mjGEOM_CYLINDER, half, (x, y, height_m / 2.0), (1.0, 0.0, 0.0, 0.0), material, SOLID)
-        elif piece.kind is Kind.CABINET:
+        elif piece.kind is PieceKind.CABINET:
             half = (piece.size[0] / 2.0, piece.size[1] / 2.0, height_m / 2.0)
             turn = (math.cos(piece.heading_rad / 2.0), 0.0, 0.0, math.sin(piece.heading_rad / 2.0))
             self._box(half, (x, y, height_m / 2.0), turn, material, SOLID)
@@ -162,9 +162,9 @@ class _Builder:
             (length, thick), heading = piece.size, piece.heading_rad
             if length < thick:
                 length, thick, heading = thick, length, heading + math.pi / 2.0
-            low = DOOR_HEIGHT_M if piece.kind is Kind.LINTEL else 0.0
+            low = DOOR_HEIGHT_M if piece.kind is PieceKind.LINTEL else 0.0
             half = (length / 2.0 - _SEAM_M, (height_m - low) / 2.0, thick / 2.0)
-            group = SEEN if piece.kind is Kind.LINTEL else SOLID
+            group = SEEN if piece.kind is PieceKind.LINTEL else SOLID
             self.upright(half, (x, y, (low + height_m) / 2.0), heading, material, group)
 
     def upright(

@@ -9,7 +9,7 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraModel, FloatArray, LaserModel
-from fcslam.simulation.engine import ALONE, gl_context, mujoco
+from fcslam.simulation.engine import GL_LOCK, gl_context, mujoco
 from fcslam.simulation.lighting import Light
 from fcslam.simulation.scene import SEEN, SOLID
 from fcslam.simulation.textures import Image
@@ -55,7 +55,7 @@ class Camera:
     def __init__(self, model: Any, camera: CameraModel, light: Light) -> None:
         self._mujoco = mujoco()
         self._model, self._camera, self._lamps = model, camera, light.lamps
-        with ALONE:
+        with GL_LOCK:
             self._gl = gl_context(camera.width, camera.height)
             self._context = self._mujoco.MjrContext(model, self._mujoco.mjtFontScale.mjFONTSCALE_100.value)
             self._mujoco.mjr_setBuffer(self._mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
@@ -89,7 +89,7 @@ class Camera:
         self._mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._view, everything, self._scene)
         frame = self._mujoco.MjrRect(0, 0, self._camera.width, self._camera.height)
         pixels = np.empty((self._camera.height, self._camera.width, 3), dtype=np.uint8)
-        with ALONE:
+        with GL_LOCK:
             self._gl.make_current()
             self._mujoco.mjr_render(frame, self._scene, self._context)
             self._mujoco.mjr_readPixels(pixels, None, frame, self._context)
@@ -103,7 +103,7 @@ class Camera:
 
     def close(self) -> None:
         """Free what GL holds."""
-        with ALONE:
+        with GL_LOCK:
             self._gl.make_current()
             self._context.free()
             self._gl.free()

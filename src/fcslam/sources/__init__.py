@@ -2,9 +2,9 @@
 
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
-from fcslam.sources.faults import Fault, Faults, Tally
+from fcslam.sources.faults import Fault, FaultCount, Faults
+from fcslam.sources.formats import FORMATS, Format, open_source
 from fcslam.sources.logs.carmen_writer import write_carmen
-from fcslam.sources.opening import FORMATS, Format, open_source
 from fcslam.sources.recording.reader import Recording
 from fcslam.sources.recording.writer import RecordingWriter, write_recording
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
@@ -16,6 +16,7 @@ __all__ = [
     "WHOLE",
     "BagOptions",
     "Fault",
+    "FaultCount",
     "Faults",
     "Format",
     "Recording",
@@ -23,7 +24,6 @@ __all__ = [
     "ScanRange",
     "Source",
     "Survey",
-    "Tally",
     "open_source",
     "split",
     "write_bag",

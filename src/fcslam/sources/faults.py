@@ -28,7 +28,7 @@ class Fault(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Tally:
+class FaultCount:
     """How often a kind of fault occurred."""
 
     count: int = 0
@@ -44,23 +44,23 @@ class Tally:
 class Faults:
     """The faults of one pass over a recording; false when there are none, its text is one line for people."""
 
-    tallies: Mapping[Fault, Tally]
+    counts: Mapping[Fault, FaultCount]
     unit: str = "line"
-    """What the recording is made of and ``Tally.first_line`` counts."""
+    """What the recording is made of and ``FaultCount.first_line`` counts."""
 
-    def __getitem__(self, kind: Fault) -> Tally:
-        return self.tallies.get(kind, Tally())
+    def __getitem__(self, kind: Fault) -> FaultCount:
+        return self.counts.get(kind, FaultCount())
 
     def __bool__(self) -> bool:
-        return bool(self.tallies)
+        return bool(self.counts)
 
     def __str__(self) -> str:
-        return ", ".join(self._describe(kind) for kind in Fault if kind in self.tallies) or "no faults"
+        return ", ".join(self._describe(kind) for kind in Fault if kind in self.counts) or "no faults"
 
     def _describe(self, kind: Fault) -> str:
-        tally = self.tallies[kind]
-        largest = f", largest {tally.largest_s:.3g} s" if tally.largest_s else ""
-        return f"{kind}: {tally.count} (first: {self.unit} {tally.first_line}{largest})"
+        found = self.counts[kind]
+        largest = f", largest {found.largest_s:.3g} s" if found.largest_s else ""
+        return f"{kind}: {found.count} (first: {self.unit} {found.first_line}{largest})"
 
 
 class Audit:
@@ -68,17 +68,17 @@ class Audit:
 
     def __init__(self, unit: str = "line") -> None:
         self._unit = unit
-        self._tallies: dict[Fault, Tally] = {}
+        self._counts: dict[Fault, FaultCount] = {}
 
     def add(self, kind: Fault, line: int, count: int = 1, step_s: float = 0.0) -> None:
         """Count ``count`` faults at ``line``."""
-        before = self._tallies.get(kind, Tally(first_line=line))
-        self._tallies[kind] = Tally(before.count + count, before.first_line, max(before.largest_s, step_s))
+        before = self._counts.get(kind, FaultCount(first_line=line))
+        self._counts[kind] = FaultCount(before.count + count, before.first_line, max(before.largest_s, step_s))
 
     def clear(self) -> None:
         """Forget what was counted."""
-        self._tallies.clear()
+        self._counts.clear()
 
     def faults(self) -> Faults:
         """The faults counted so far."""
-        return Faults(MappingProxyType(dict(self._tallies)), self._unit)
+        return Faults(MappingProxyType(dict(self._counts)), self._unit)

@@ -63,7 +63,7 @@ class ScanGate:
         return True
 
 
-def window(
+def scan_window(
     entries: Iterable[tuple[int, Entry]], scans: ScanRange, is_scan: Callable[[Entry], bool], audit: Audit
 ) -> Iterator[tuple[int, Entry]]:
     """The entries of a range of scans; odometry goes with the scan before it.
@@ -82,7 +82,7 @@ def window(
             yield number, entry
 
 
-def refuse_misfits(path: Path, faults: Faults, scan_count: int, odometry_count: int, beam_count: int) -> None:
+def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int, beam_count: int) -> None:
     """Refuse a recording of which too much does not fit the rest.
 
     Raises:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fcslam.features.detector import SHIPPED_NETWORK
+from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.service.http.missions import FILE
 from fcslam.service.http.robots import NETWORK
 from fcslam.wire.batches import MEDIA_TYPE
@@ -33,7 +33,7 @@ def test_the_service_answers_as_it_is_described(tmp_path, scripted, tokens, opti
         for robot, data in (("a", A), ("b", B)):
             desk.told(desk.send(robot, data))
         exported = desk.ask("GET", "/api/v1/missions/mission/export", "boss").content
-        for media_type, body in ((MEDIA_TYPE, b""), (NETWORK, SHIPPED_NETWORK.read_bytes()), (FILE, exported)):
+        for media_type, body in ((MEDIA_TYPE, b""), (NETWORK, BUNDLED_NETWORK.read_bytes()), (FILE, exported)):
             (bodies / media_type.removeprefix("application/")).write_bytes(body)
         url = f"{desk.client.base_url}/openapi.json"
         (config := tmp_path / "schemathesis.toml").write_text((HERE / "schemathesis.toml").read_text() + more)

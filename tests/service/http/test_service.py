@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import ServiceError
-from fcslam.features.detector import SHIPPED_NETWORK
+from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.records import Channel, Correction, Keyscan
 from fcslam.runs import open_run
 from fcslam.service import intake
@@ -338,7 +338,7 @@ def test_a_robot_can_fetch_a_detector(desk):
 
 
 def test_robots_with_a_camera_are_told_of_a_newer_detector_until_they_have_it(desk):
-    network = SHIPPED_NETWORK.read_bytes()
+    network = BUNDLED_NETWORK.read_bytes()
     version = desk.ask("POST", f"{API}/detectors", "boss", content=network).json()["version"]
     hello = Hello("a", 0, LASER, {Channel.CAMERA: "orb-1", Channel.LIDAR: "test-1"})
     told = desk.told(desk.send("a", [encode(Packet("a", 0, 0, 0.0, hello))]))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fcslam.errors import OutputError
-from fcslam.evaluation.detectors.contenders import Contender, frame
+from fcslam.evaluation.detectors.evaluated_detectors import EvaluatedDetector, frame
 from fcslam.evaluation.detectors.homography import (
     ACCURACY_PX,
     LARGE,
@@ -20,7 +20,7 @@ from fcslam.evaluation.detectors.homography import (
 )
 from fcslam.evaluation.detectors.measures import mean
 from fcslam.evaluation.detectors.scenes import Scene
-from fcslam.metrics.framing import GroundTruth, framed_homography
+from fcslam.metrics.framing import HomographyGroundTruth, framed_homography
 from fcslam.metrics.homography import match_errors
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ def draw_figures(
     folder: Path,
     report: HomographyReport,
     scenes: Sequence[Scene],
-    contenders: Sequence[Contender],
-    truth: GroundTruth,
+    detectors: Sequence[EvaluatedDetector],
+    truth: HomographyGroundTruth,
     watch: Callable[[], None] = lambda: None,
 ) -> None:
     """Write ``matching_accuracy.png`` and, for each scene, ``SCENE.png``: matches of a pair of middling difficulty.
@@ -46,7 +46,7 @@ def draw_figures(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _draw_accuracy(folder / "matching_accuracy.png", report)
-        shown = [each for each in contenders if report.of(each.name)[0].matching]
+        shown = [each for each in detectors if report.of(each.name)[0].matching]
         for scene in scenes:
             if shown:
                 _draw_scene(folder / f"{scene.name}.png", scene, shown, truth)
@@ -58,11 +58,11 @@ def draw_figures(
 def _draw_accuracy(path: Path, report: HomographyReport) -> None:
     figure, axes = _figure(1, len(MATCHING_NMS_PX), (10.0, 4.0))
     for axis, nms_px in zip(axes.flat, MATCHING_NMS_PX, strict=True):
-        for contender in report.contenders:
-            pairs = report.of(contender)
+        for detector in report.detectors:
+            pairs = report.of(detector)
             if pairs[0].matching:
                 shares = [mean(pairs, f"accuracy_{px}px_nms{nms_px}") for px in ACCURACY_PX]
-                axis.plot(ACCURACY_PX, shares, marker=".", label=contender)
+                axis.plot(ACCURACY_PX, shares, marker=".", label=detector)
         axis.set(xlabel="threshold, px", ylabel="mean matching accuracy", ylim=(0.0, 1.0), title=_nms_title(nms_px))
         axis.grid(alpha=0.3)
         if axis.lines:
@@ -70,19 +70,19 @@ def _draw_accuracy(path: Path, report: HomographyReport) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _draw_scene(path: Path, scene: Scene, contenders: Sequence[Contender], truth: GroundTruth) -> None:
-    """One row a contender: image 1 beside the one in the middle of the others."""
+def _draw_scene(path: Path, scene: Scene, detectors: Sequence[EvaluatedDetector], truth: HomographyGroundTruth) -> None:
+    """One row a detector: image 1 beside the one in the middle of the others."""
     other, H = scene.others[len(scene.others) // 2]
     first, second = frame(scene.reference, LARGE), frame(other, LARGE)
     true = framed_homography(H, first.framing, second.framing, truth)
-    figure, axes = _figure(len(contenders), 1, (10.0, 4.0 * len(contenders)))
-    for axis, contender in zip(axes.flat, contenders, strict=True):
-        found = (thinned(described(contender.find(each)), MATCHING_NMS_PX[0]) for each in (first, second))
+    figure, axes = _figure(len(detectors), 1, (10.0, 4.0 * len(detectors)))
+    for axis, detector in zip(axes.flat, detectors, strict=True):
+        found = (thinned(described(detector.find(each)), MATCHING_NMS_PX[0]) for each in (first, second))
         here, there = matched_points(*(each.take(slice(MATCHED)) for each in found))
         right = match_errors(here, there, true) <= RIGHT_PX
         axis.imshow(np.hstack((first.grey, second.grey)), cmap="gray", vmin=0, vmax=255)
         _draw_lines(axis, here, there + np.array([LARGE[0], 0]), right)
-        axis.set_title(f"{contender.name}, {scene.name} 1-{other.stem}: {right.sum()} of {len(right)} matches right")
+        axis.set_title(f"{detector.name}, {scene.name} 1-{other.stem}: {right.sum()} of {len(right)} matches right")
         axis.axis("off")
     figure.savefig(path, dpi=120)
 

@@ -15,12 +15,12 @@ from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from fcslam.evaluation.detectors.contenders import Contender, Picture, Stopwatch, frame, one_thread
+from fcslam.evaluation.detectors.evaluated_detectors import EvaluatedDetector, FramedImage, Stopwatch, frame, one_thread
 from fcslam.evaluation.detectors.scenes import Scene, SceneKind
 from fcslam.features.detector import FloatFeatures, ImageFeatures, Keypoints
 from fcslam.features.matching import mutual_pairs, nearest_neighbours
 from fcslam.features.nms import box_nms
-from fcslam.metrics.framing import GroundTruth, Size, framed_homography
+from fcslam.metrics.framing import HomographyGroundTruth, Size, framed_homography
 from fcslam.metrics.homography import (
     corner_error,
     estimate_homography,
@@ -61,9 +61,9 @@ NO_MATCHES = MatchingResult(np.inf, np.zeros(len(ACCURACY_PX)), 0.0, 0)
 
 @dataclass(frozen=True, slots=True)
 class PairResult:
-    """What one contender makes of one pair of images."""
+    """What one detector makes of one pair of images."""
 
-    contender: str
+    detector: str
     scene: str
     kind: SceneKind
     image: str
@@ -75,30 +75,30 @@ class PairResult:
 
 @dataclass(frozen=True, slots=True)
 class HomographyReport:
-    """Every pair by every contender, in this order, and how long a picture takes."""
+    """Every pair by every detector, in this order, and how long a picture takes."""
 
-    contenders: tuple[str, ...]
+    detectors: tuple[str, ...]
     pairs: tuple[PairResult, ...]
     milliseconds: Mapping[tuple[str, Size], float]
     """Median processor time for one picture on one thread, from grey levels to described keypoints."""
 
-    def of(self, contender: str) -> tuple[PairResult, ...]:
-        """Its pairs; those of all contenders are in one order."""
-        return tuple(pair for pair in self.pairs if pair.contender == contender)
+    def of(self, detector: str) -> tuple[PairResult, ...]:
+        """Its pairs; those of all detectors are in one order."""
+        return tuple(pair for pair in self.pairs if pair.detector == detector)
 
 
 class _Found(NamedTuple):
-    picture: Picture
+    picture: FramedImage
     keypoints: Keypoints
 
 
 def evaluate_homography(
     scenes: Sequence[Scene],
-    contenders: Sequence[Contender],
-    truth: GroundTruth = GroundTruth.CORRECTED,
+    detectors: Sequence[EvaluatedDetector],
+    truth: HomographyGroundTruth = HomographyGroundTruth.CORRECTED,
     watch: Callable[[], None] = lambda: None,
 ) -> HomographyReport:
-    """Run every contender on every scene; ``watch`` is called after each scene of each.
+    """Run every detector on every scene; ``watch`` is called after each scene of each.
 
     Raises:
         FeatureError: an image, or features extracted elsewhere, cannot be read.
@@ -107,31 +107,31 @@ def evaluate_homography(
     stopwatch, pairs = Stopwatch(), list[PairResult]()
     with one_thread():
         for scene in scenes:
-            for contender in contenders:
-                pairs += _evaluate_scene(scene, contender, truth, stopwatch)
+            for detector in detectors:
+                pairs += _evaluate_scene(scene, detector, truth, stopwatch)
                 watch()
-    return HomographyReport(tuple(each.name for each in contenders), tuple(pairs), stopwatch.milliseconds())
+    return HomographyReport(tuple(each.name for each in detectors), tuple(pairs), stopwatch.milliseconds())
 
 
 def _evaluate_scene(
-    scene: Scene, contender: Contender, truth: GroundTruth, stopwatch: Stopwatch
+    scene: Scene, detector: EvaluatedDetector, truth: HomographyGroundTruth, stopwatch: Stopwatch
 ) -> Iterator[PairResult]:
-    small = _find_all(scene, contender, SMALL, stopwatch)
+    small = _find_all(scene, detector, SMALL, stopwatch)
     is_described = isinstance(small[0].keypoints, DescribedKeypoints)
-    large = _find_all(scene, contender, LARGE, stopwatch) if is_described else []
+    large = _find_all(scene, detector, LARGE, stopwatch) if is_described else []
     for number, (path, H) in enumerate(scene.others, start=1):
         again = repeat_pair(small[0].keypoints, small[number].keypoints, _true(H, small[0], small[number], truth))
         matching = _match_all(large[0], large[number], _true(H, large[0], large[number], truth)) if large else {}
-        yield PairResult(contender.name, scene.name, scene.kind, path.stem, again, matching)
+        yield PairResult(detector.name, scene.name, scene.kind, path.stem, again, matching)
 
 
-def _find_all(scene: Scene, contender: Contender, size: Size, stopwatch: Stopwatch) -> list[_Found]:
+def _find_all(scene: Scene, detector: EvaluatedDetector, size: Size, stopwatch: Stopwatch) -> list[_Found]:
     """Keypoints in image 1, then in the others."""
     pictures = [frame(path, size) for path in (scene.reference, *(path for path, _ in scene.others))]
-    return [_Found(picture, stopwatch.find(contender, picture)) for picture in pictures]
+    return [_Found(picture, stopwatch.find(detector, picture)) for picture in pictures]
 
 
-def _true(H: FloatArray, first: _Found, second: _Found, truth: GroundTruth) -> FloatArray:
+def _true(H: FloatArray, first: _Found, second: _Found, truth: HomographyGroundTruth) -> FloatArray:
     return framed_homography(H, first.picture.framing, second.picture.framing, truth)
 
 

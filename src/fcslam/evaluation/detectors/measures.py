@@ -54,7 +54,7 @@ def difference(first: Sequence[PairResult], other: Sequence[PairResult], measure
 
 
 def write_pairs(report: HomographyReport, path: Path) -> None:
-    """Write a CSV file with a line for every pair by every contender, a column for every measure.
+    """Write a CSV file with a line for every pair by every detector, a column for every measure.
 
     Raises:
         OutputError: the file cannot be written.
@@ -67,7 +67,7 @@ def write_pairs(report: HomographyReport, path: Path) -> None:
             writer.writerow(["detector", "scene", "kind", "image", *names])
             for pair, measures in rows:
                 cells = (f"{measures[name]:.6g}" if name in measures else "" for name in names)
-                writer.writerow([pair.contender, pair.scene, pair.kind, pair.image, *cells])
+                writer.writerow([pair.detector, pair.scene, pair.kind, pair.image, *cells])
     except OSError as error:
         raise OutputError(f"{path}: cannot write the table ({error})") from error
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from fcslam.errors import EvaluationError
 from fcslam.features.codes import mutual_matches
-from fcslam.features.detector import Detector
+from fcslam.features.detector import FeatureDetector
 from fcslam.learning.images import ImageFile, is_usable, read_image
 from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import AugmentedView, TrainingExample, ViewPair, draw_pair
@@ -50,13 +50,15 @@ def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[V
     return pairs
 
 
-def detect_features(detector: Detector, view: AugmentedView) -> DetectedFeatures:
+def detect_features(detector: FeatureDetector, view: AugmentedView) -> DetectedFeatures:
     """What a detector finds, of 8 bits a pixel as a camera gives them."""
     found = detector.detect(np.rint(255.0 * view.image).astype(np.uint8))
     return DetectedFeatures(found.keypoints_px.astype(np.float64), found.descriptors)
 
 
-def measure_pair(detector: Detector, pair: ViewPair, former: DetectedFeatures) -> tuple[float, float, float, float]:
+def measure_pair(
+    detector: FeatureDetector, pair: ViewPair, former: DetectedFeatures
+) -> tuple[float, float, float, float]:
     """``MEASURES`` of one pair: homography right to 3 px at the corners or not, MMA at 3 px, repeatability, former MMA.
 
     The last is that of the codes which a ``former`` detector gave the first view and this one gives the second.

@@ -6,13 +6,13 @@ from types import MappingProxyType
 
 import numpy as np
 
-from fcslam.evaluation.fleet.closures import STAGES, Within, closure_rows, closure_sets
+from fcslam.evaluation.fleet.closures import STAGES, ClosureScope, closure_rows, closure_sets
 from fcslam.evaluation.fleet.ground_truth import KnownPoses
 from fcslam.metrics.closures import (
     ClosureCriteria,
     ClosureErrors,
     Mask,
-    PlacedReference,
+    PoseReference,
     Precision,
     Recall,
     Rows,
@@ -47,7 +47,7 @@ class FleetClosureScore:
     """Of all revisits, by those closures alone that are more similar than every wrong one of their channel."""
 
 
-FleetClosures = Mapping[tuple[Within, ClosureStatus, str], FleetClosureScore]
+FleetClosures = Mapping[tuple[ClosureScope, ClosureStatus, str], FleetClosureScore]
 """Scores by kind, stage and name in ``CHANNELS``."""
 
 
@@ -55,9 +55,9 @@ def score_closures(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> Fl
     """Scores of all sets of closures; one with an end at which the truth is not known is not covered."""
     judged, sets = _judge(run, known, criteria), closure_sets(run)
     scores = {}
-    for within in Within:
+    for within in ClosureScope:
         asked = RevisitCriteria(within_gap_s=criteria.within_gap_s)
-        across = within is Within.FLEET
+        across = within is ClosureScope.FLEET
         revisits = find_revisits(known.truth, asked, across)
         alike = find_revisits(known.truth, replace(asked, turn_deg=LIKE_HEADING_DEG), across)
         for status in STAGES:
@@ -111,7 +111,7 @@ def _judge(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> _Judged:
     T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
     every_row, one_frame = np.arange(len(truth.stamps)), np.zeros(len(truth.stamps), dtype=np.int64)
     # Closures end at stamps at which the truth is known: nothing has to be bridged by what the run believes.
-    reference = PlacedReference(truth, 0.0, every_row, truth.T_map_base, one_frame)
+    reference = PoseReference(truth, 0.0, every_row, truth.T_map_base, one_frame)
     return _Judged(
         truth, criteria, pairs, closure_errors(pairs, T_i_j, truth, reference),
         np.array([closure.similarity for closure in run.closures]),

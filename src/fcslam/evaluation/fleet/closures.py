@@ -14,11 +14,11 @@ from fcslam.metrics.closures import (
     ClosureCriteria,
     ClosureErrors,
     Mask,
-    PlacedReference,
+    PoseReference,
     Precision,
     Recall,
+    RelationReference,
     Rows,
-    SingleRelations,
     closure_errors,
     precision,
     revisits_found,
@@ -35,11 +35,11 @@ STAGES: Mapping[ClosureStatus, frozenset[ClosureStatus]] = {
 """By which last status a closure has passed a stage. What was rejected or revoked was verified before; what was revoked
 was accepted once or vetoed by hand: the graph does without it."""
 
-TURNED_DOWN = (ClosureStatus.REJECTED, ClosureStatus.REVOKED)
+DISCARDED = (ClosureStatus.REJECTED, ClosureStatus.REVOKED)
 """Shown beside the stages."""
 
 
-class Within(StrEnum):
+class ClosureScope(StrEnum):
     """Whether a closure ties two moments of one robot or two robots."""
 
     ROBOT = "intra_robot"
@@ -64,7 +64,7 @@ class ClosureScore:
 class ClosureReport:
     """A run's closures against a file of relations."""
 
-    scores: Mapping[tuple[Within, ClosureStatus], ClosureScore]
+    scores: Mapping[tuple[ClosureScope, ClosureStatus], ClosureScore]
     relations: RelationGraph
     stamps_in_run: int
     """Of the relations' stamps, those at which the run has a pose of a robot."""
@@ -152,7 +152,7 @@ class _Evidence:
     revisits: Rows
     """Pairs of rows that the relations name, shape (R, 2)."""
 
-    def score(self, members: Mask, within: Within, is_stage: bool) -> ClosureScore:
+    def score(self, members: Mask, within: ClosureScope, is_stage: bool) -> ClosureScore:
         """Of the closures for which ``members``, shape (K,), holds."""
         covered = self.chains[members & self.by_graph.covered]
         return ClosureScore(
@@ -162,9 +162,9 @@ class _Evidence:
             (_quantile(covered, 0.5), _quantile(covered, 1.0)),
         )
 
-    def _recall(self, members: Mask, within: Within) -> Recall:
+    def _recall(self, members: Mask, within: ClosureScope) -> Recall:
         first, second = self.poses.robots[self.revisits].T
-        revisits = self.revisits[(first == second) == (within is Within.ROBOT)]
+        revisits = self.revisits[(first == second) == (within is ClosureScope.ROBOT)]
         correct = self.pairs[members & self.by_graph.correct(self.criteria)]
         found = revisits_found(revisits, correct, self.poses, self.criteria.reach_m)
         return Recall(len(revisits), int(found.sum()))
@@ -176,7 +176,7 @@ def _gather(run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows, c
     ends = node_rows[graph.ends]
     usable = np.all(ends >= 0, axis=1) & graph.holds
     placed = _placed_reference(graph, node_rows, poses, criteria.bridge_s)
-    single = SingleRelations(poses, criteria.bridge_s, ends[usable], graph.relations.T_1_2[usable])
+    single = RelationReference(poses, criteria.bridge_s, ends[usable], graph.relations.T_1_2[usable])
     by_graph = closure_errors(pairs, T_i_j, poses, placed)
     return _Evidence(
         poses, criteria, pairs, by_graph, closure_errors(pairs, T_i_j, poses, single),
@@ -184,10 +184,10 @@ def _gather(run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows, c
     )  # fmt: skip
 
 
-def _placed_reference(graph: RelationGraph, node_rows: Rows, poses: PoseTable, bridge_s: float) -> PlacedReference:
+def _placed_reference(graph: RelationGraph, node_rows: Rows, poses: PoseTable, bridge_s: float) -> PoseReference:
     """The graph's poses at which the run has one, too."""
     known = np.flatnonzero(node_rows >= 0)
-    return PlacedReference(poses, bridge_s, node_rows[known], graph.T_component_base[known], graph.components[known])
+    return PoseReference(poses, bridge_s, node_rows[known], graph.T_component_base[known], graph.components[known])
 
 
 def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable, criteria: ClosureCriteria) -> Mask:
@@ -198,12 +198,12 @@ def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable, criteria: Clos
     return longer
 
 
-def closure_sets(run: Run) -> dict[tuple[Within, ClosureStatus], Mask]:
+def closure_sets(run: Run) -> dict[tuple[ClosureScope, ClosureStatus], Mask]:
     """The closures of each stage, and those turned down, as masks (K,)."""
     between = np.array([c.robot_i != c.robot_j for c in run.closures], dtype=np.bool_)
-    sets: dict[tuple[Within, ClosureStatus], Mask] = {}
-    for within, kind in ((Within.ROBOT, ~between), (Within.FLEET, between)):
-        for status in (*STAGES, *TURNED_DOWN):
+    sets: dict[tuple[ClosureScope, ClosureStatus], Mask] = {}
+    for within, kind in ((ClosureScope.ROBOT, ~between), (ClosureScope.FLEET, between)):
+        for status in (*STAGES, *DISCARDED):
             passed = STAGES.get(status, {status})
             sets[within, status] = kind & np.array([c.status in passed for c in run.closures], dtype=np.bool_)
     return sets

@@ -14,7 +14,7 @@ from fcslam.metrics.grid import GridAgreement, grid_agreement
 from fcslam.metrics.relations import RelationErrors
 from fcslam.metrics.trajectory import (
     PositionErrors,
-    TrackPair,
+    TrajectoryPair,
     align,
     near_pairs,
     placement_error,
@@ -149,7 +149,7 @@ def _robot_scores(
 
 
 def _joins(run: Run, known: KnownPoses) -> tuple[Join, ...]:
-    tracks = [TrackPair(*_poses(known, known.truth.robots == number)) for number in range(len(run.trajectories))]
+    tracks = [TrajectoryPair(*_poses(known, known.truth.robots == number)) for number in range(len(run.trajectories))]
     robots = list(zip(run.trajectories.values(), tracks, strict=True))
     return tuple(
         Join(a.robot, b.robot, *placement_error(track_a, track_b))

@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.errors import EvaluationError, FeatureError
-from fcslam.evaluation.places.checks import agreeing_in_images
 from fcslam.evaluation.places.lidar_places import describe_recording
 from fcslam.evaluation.places.scoring import DescribedSet, PlaceFeatures
 from fcslam.evaluation.places.sets import PlaceSet, all_images, read_place_set
+from fcslam.evaluation.places.verification import epipolar_inliers
 from fcslam.features.classical import Orb, OrbConfig
-from fcslam.features.detector import Detector, ImageFeatures, OnnxConfig, OnnxDetector
+from fcslam.features.detector import FeatureDetector, ImageFeatures, OnnxConfig, OnnxDetector
+from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.extraction import extract, find_files
 from fcslam.features.files import read_features, read_grey
-from fcslam.features.kinds import DetectorKind
 from fcslam.records import Codes
 
 FEATURES_PER_IMAGE: Final = 500
@@ -30,7 +30,7 @@ class FeatureChoice:
     """A detector, or a folder with what another one found."""
 
     name: str
-    detector: Detector | None
+    detector: FeatureDetector | None
     extracted: Path | None = None
 
     def of(self, image: Path, root: Path) -> PlaceFeatures:
@@ -100,7 +100,7 @@ def describe_images(
         found[path] = features.of(path, root)
         watch()
     queries, gallery = ([found[path] for path in paths] for paths in (place_set.queries, place_set.gallery))
-    return DescribedSet(place_set, queries, gallery, agreeing_in_images)
+    return DescribedSet(place_set, queries, gallery, epipolar_inliers)
 
 
 def describe_training(

@@ -17,9 +17,9 @@ from fcslam.evaluation.places.sets import PlaceSet
 from fcslam.features.codes import mutual_matches
 from fcslam.lidar.lost import LostConfig
 from fcslam.metrics.retrieval import PairTruth
-from fcslam.places.hypotheses import HypothesisConfig, propose
+from fcslam.places.hypotheses import HypothesisConfig, rigid_hypotheses
 from fcslam.places.motions import MotionConfig
-from fcslam.places.sequence import long_before
+from fcslam.places.sequence import excluding_recent
 from fcslam.records import Channel, FloatArray, Keyscan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
@@ -55,19 +55,19 @@ def describe_recording(recording: Path) -> DescribedSet:
 
     apart_m = np.linalg.norm(poses[:, None, :2] - poses[:, :2], axis=2)
     seen = np.array([stamps[place.id] for place in places])
-    admitted = long_before(seen, REVISIT_S)
+    admitted = excluding_recent(seen, REVISIT_S)
     truth = PairTruth(admitted & (apart_m <= SAME_M), admitted & (apart_m > OTHER_M))
     names = tuple(Path(source.name, str(place.id.number)) for place in places)
     features = [PlaceFeatures(place.keypoints, place.descriptors) for place in places]
     return DescribedSet(
-        PlaceSet(source.name, names, names, admitted, {"revisits": truth}), features, features, agreeing_in_plane
+        PlaceSet(source.name, names, names, admitted, {"revisits": truth}), features, features, planar_inliers
     )
 
 
-def agreeing_in_plane(a: PlaceFeatures, b: PlaceFeatures) -> int:
+def planar_inliers(a: PlaceFeatures, b: PlaceFeatures) -> int:
     """The most matches of two LiDAR places that one rigid motion explains."""
     matches = mutual_matches(a.descriptors, b.descriptors, MotionConfig().hamming_limit)
-    found = propose(a.positions, b.positions, matches, HypothesisConfig())
+    found = rigid_hypotheses(a.positions, b.positions, matches, HypothesisConfig())
     return found[0].inlier_count if found else 0
 
 

@@ -9,15 +9,15 @@ from typing import Final
 import numpy as np
 
 from fcslam.errors import OutputError
-from fcslam.evaluation.places.checks import PairChecker
 from fcslam.evaluation.places.scoring import DescribedSet, Scorer
 from fcslam.evaluation.places.sequences import plain
 from fcslam.evaluation.places.sets import PlaceSet
+from fcslam.evaluation.places.verification import PairVerifier
 from fcslam.metrics.bootstrap import Interval, mean_interval, measure_interval
 from fcslam.metrics.retrieval import (
-    Answers,
     PairTruth,
     PrecisionRecall,
+    RetrievedPlaces,
     mismatches,
     multi_match_curve,
     recall_at,
@@ -42,10 +42,10 @@ class Score:
     """Those that have a match."""
     measures: Mapping[str, Interval]
     """By name, with 95 % intervals by bootstrap over queries: ``recall_at_<k>``, ``average_precision`` and
-    ``recall_at_full_precision`` of the single best answers, ``average_precision_multi`` (no interval),
+    ``recall_at_full_precision`` of the single best matches, ``average_precision_multi`` (no interval),
     ``mismatch_rate``, ``significance``, ``relative_significance``."""
     curve: PrecisionRecall
-    """Of the single best answers."""
+    """Of the single best matches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class SetResult:
 def evaluate_set(
     described: DescribedSet,
     scorers: Mapping[str, Scorer],
-    checker: PairChecker | None,
+    checker: PairVerifier | None,
     seed: int,
     watch: Callable[[], None] = lambda: None,
     variants: Callable[[DescribedSet, Scorer], Mapping[str, FloatArray]] = plain,
@@ -92,14 +92,16 @@ def _scores(place_set: PlaceSet, name: str, stages: Sequence[tuple[FloatArray, b
     """Every question, before and after geometry."""
     for question, truth in place_set.questions.items():
         for similarity, is_verified in stages:
-            measures, answers = measure(similarity, truth, np.random.default_rng(seed))
+            measures, retrieved = measure(similarity, truth, np.random.default_rng(seed))
             asked = int(truth.answerable.sum())
-            yield Score(place_set.name, question, name, is_verified, asked, measures, answers.curve())
+            yield Score(place_set.name, question, name, is_verified, asked, measures, retrieved.curve())
 
 
-def measure(similarity: FloatArray, truth: PairTruth, rng: np.random.Generator) -> tuple[dict[str, Interval], Answers]:
-    """All measures of a similarity matrix (Q, G) under the names of ``Score``, and the single best answers."""
-    answers = single_best(similarity, truth)
+def measure(
+    similarity: FloatArray, truth: PairTruth, rng: np.random.Generator
+) -> tuple[dict[str, Interval], RetrievedPlaces]:
+    """All measures of a similarity matrix (Q, G) under the names of ``Score``, and the single best matches."""
+    retrieved = single_best(similarity, truth)
     count = len(similarity)
     per_query = {
         **{f"recall_at_{k}": recall_at(similarity, truth, k) for k in RANKS},
@@ -108,13 +110,13 @@ def measure(similarity: FloatArray, truth: PairTruth, rng: np.random.Generator) 
         "relative_significance": relative_significance(similarity, truth),
     }
     measures = {name: mean_interval(values, rng) for name, values in per_query.items()}
-    measures["average_precision"] = measure_interval(lambda rows: answers.curve(rows).average_precision, count, rng)
+    measures["average_precision"] = measure_interval(lambda rows: retrieved.curve(rows).average_precision, count, rng)
     measures["recall_at_full_precision"] = measure_interval(
-        lambda rows: answers.curve(rows).recall_at_full_precision, count, rng
+        lambda rows: retrieved.curve(rows).recall_at_full_precision, count, rng
     )
     multi = multi_match_curve(similarity, truth).average_precision
     measures["average_precision_multi"] = Interval(multi, np.nan, np.nan)
-    return measures, answers
+    return measures, retrieved
 
 
 def write_results(folder: Path, results: Sequence[SetResult]) -> None:

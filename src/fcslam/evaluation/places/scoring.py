@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fcslam.evaluation.places.sets import PlaceSet
 from fcslam.features.codes import code_words, mutual_matches
 from fcslam.places.index import PlaceIndex
-from fcslam.places.kmeans_tree import Tree, TreeShape, descend, grow
+from fcslam.places.kmeans_tree import Tree, TreeShape, find_leaves, grow_tree
 from fcslam.places.similarity import BagOfWords, bag_of_words
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes, FloatArray
@@ -42,7 +42,7 @@ class DescribedSet:
     place_set: PlaceSet
     queries: Sequence[PlaceFeatures]
     gallery: Sequence[PlaceFeatures]
-    agreeing: Callable[[PlaceFeatures, PlaceFeatures], int]
+    count_inliers: Callable[[PlaceFeatures, PlaceFeatures], int]
     """Geometry: how many matches of two places one motion explains."""
 
 
@@ -62,16 +62,16 @@ def matching_descriptors(a: Codes, b: Codes) -> float:
     return float(len(mutual_matches(a, b, BRUTE_FORCE_BITS).pairs))
 
 
-class ForeignTree:
+class PretrainedVocabulary:
     """Bags of words as DBoW2 has them: a k-means tree and idf of other images, and neither ever changes."""
 
     def __init__(self, training: Sequence[Codes], seed: int, shape: TreeShape = FOREIGN_SHAPE) -> None:
         """Grow the tree on the descriptors (N, 32) of each of the other images."""
         images = [code_words(codes) for codes in training]
-        self._tree: Tree = grow(np.concatenate(images), shape, np.uint64(seed))
+        self._tree: Tree = grow_tree(np.concatenate(images), shape, np.uint64(seed))
         documents = np.zeros(len(self._tree.centres))
         for codes in images:
-            documents[np.unique(descend(self._tree, codes))] += 1.0
+            documents[np.unique(find_leaves(self._tree, codes))] += 1.0
         self._idf = np.log(len(images) / np.maximum(documents, 1.0))
 
     @property
@@ -81,7 +81,7 @@ class ForeignTree:
 
     def bag(self, descriptors: Codes) -> BagOfWords:
         """The words of descriptors (N, 32)."""
-        return bag_of_words(descend(self._tree, code_words(descriptors)).astype(np.int64), self._idf, 0)
+        return bag_of_words(find_leaves(self._tree, code_words(descriptors)).astype(np.int64), self._idf, 0)
 
     def __call__(self, described: DescribedSet) -> FloatArray:
         """The scores of DBoW2: sum of min over the words."""
@@ -134,7 +134,7 @@ def choose_scorers(
     """Brute force, the foreign tree if there are other images to train it on, and the index with each strategy."""
     scorers: dict[str, Scorer] = {BRUTE_FORCE: brute_force}
     if training:
-        scorers[FOREIGN_TREE] = ForeignTree(training, seed)
+        scorers[FOREIGN_TREE] = PretrainedVocabulary(training, seed)
     for strategy in strategies:
         scorers[strategy] = strategy_scorer(vocabulary.model_copy(update={"strategy": strategy}), seed)
     return scorers

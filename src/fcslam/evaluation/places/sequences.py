@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from fcslam.evaluation.places.scoring import DescribedSet, Scorer
-from fcslam.places.sequence import along_the_way, in_a_row, normalised_by_previous
+from fcslam.places.sequence import normalised_by_previous, sequence_similarity, temporally_consistent
 from fcslam.records import FloatArray
 
 PLACES: Final = 3
@@ -33,7 +33,7 @@ def in_sequence(described: DescribedSet, scorer: Scorer) -> Mapping[str, FloatAr
     return {
         "": similarity,
         "NSS": shares,
-        f"{PLACES} in a row": in_a_row(similarity, PLACES, REACH),
-        f"along {PLACES}": along_the_way(similarity, PLACES, REACH),
-        f"NSS along {PLACES}": along_the_way(shares, PLACES, REACH),
+        f"{PLACES} in a row": temporally_consistent(similarity, PLACES, REACH),
+        f"along {PLACES}": sequence_similarity(similarity, PLACES, REACH),
+        f"NSS along {PLACES}": sequence_similarity(shares, PLACES, REACH),
     }

@@ -32,7 +32,7 @@ from fcslam.evaluation.places.simulated_views import read_fleet_views
 from fcslam.evaluation.places.tum_sequence import read_sequence
 from fcslam.evaluation.places.view_overlap import view_overlap
 from fcslam.metrics.retrieval import Pairs, PairTruth
-from fcslam.places.sequence import long_before
+from fcslam.places.sequence import excluding_recent
 
 LABELLED: Final = "dataset.csv"
 FLEET: Final = "simulation.yaml"
@@ -144,7 +144,7 @@ def _read_tour(folder: Path) -> PlaceSet:
     matches[later, earlier] = True
     for i, j in zip(earlier, later, strict=True):
         near[max(0, j - NEAR_PAIR) : j + NEAR_PAIR + 1, max(0, i - NEAR_PAIR) : i + NEAR_PAIR + 1] = True
-    admitted = long_before(np.arange(count), TOUR_GAP)
+    admitted = excluding_recent(np.arange(count), TOUR_GAP)
     paths = tuple(images[number] for number in numbers)
     return _stream(folder, paths, admitted, "loops", PairTruth(matches, ~near))
 
@@ -152,7 +152,7 @@ def _read_tour(folder: Path) -> PlaceSet:
 def _read_sequence(folder: Path) -> PlaceSet:
     sequence = read_sequence(folder)
     overlap = view_overlap(sequence.depths_m, sequence.T_world_camera, sequence.camera)
-    admitted = long_before(sequence.stamps, SEQUENCE_GAP_S)
+    admitted = excluding_recent(sequence.stamps, SEQUENCE_GAP_S)
     truth = PairTruth(overlap > SAME_OVERLAP, overlap < OTHER_OVERLAP)
     return _stream(folder, sequence.images, admitted, "overlap", truth)
 

@@ -38,7 +38,7 @@ class FleetViews:
     """Shape (N, N), in [0, 1]: as ``lidar_overlap``."""
 
 
-class _View(NamedTuple):
+class _ImagePlace(NamedTuple):
     image: Path
     T_building_base: FloatArray
     ranges_m: Ranges
@@ -108,7 +108,7 @@ def lidar_overlap(
     return np.minimum(shares, shares.T)
 
 
-def _views(robot: Path, laser: LaserModel) -> Iterator[_View]:
+def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
     """Images with the scan before each, as they are new: by travel or by turn."""
     images, stamps, scans = [], [], []
     scan = None
@@ -125,7 +125,7 @@ def _views(robot: Path, laser: LaserModel) -> Iterator[_View]:
     if len(known) < 2 or not images:
         return
     last = None
-    for view in map(_View, images, interpolate(known, poses, np.array(stamps), GAP_S), scans):
+    for view in map(_ImagePlace, images, interpolate(known, poses, np.array(stamps), GAP_S), scans):
         if np.isnan(view.T_building_base[0]) or not view.image.is_file():
             continue
         x, y, turn = (EVERY_M, 0.0, 0.0) if last is None else se2.between(last, view.T_building_base)

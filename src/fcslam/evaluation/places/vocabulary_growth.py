@@ -13,7 +13,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fcslam.evaluation.places.scoring import BRUTE_FORCE, FOREIGN_TREE, DescribedSet, ForeignTree, matching_descriptors
+from fcslam.evaluation.places.scoring import (
+    BRUTE_FORCE,
+    FOREIGN_TREE,
+    DescribedSet,
+    PretrainedVocabulary,
+    matching_descriptors,
+)
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.places.index import PlaceIndex
 from fcslam.places.similarity import similarity
@@ -161,7 +167,7 @@ def grow_vocabulary(
     asked = np.zeros((len(groups), 1 + DISTRACTORS))
     for g, group in enumerate(groups):
         answer = index.compare(group.target)
-        asked[g] = [answer.of(name) for name in group.names]
+        asked[g] = [answer.similarity_of(name) for name in group.names]
     return Growth(_counts(updates), similarities, words, seconds, asked)
 
 
@@ -186,7 +192,7 @@ def fixed_growths(
     brute = [[matching_descriptors(g.target, other) / max(1, len(g.target)) for other in g.others] for g in groups]
     fixed = {BRUTE_FORCE: _fixed(np.array(brute), updates, np.nan)}
     if training:
-        tree = ForeignTree(training, seed)
+        tree = PretrainedVocabulary(training, seed)
         scores = [[similarity(tree.bag(g.target), tree.bag(other)) for other in g.others] for g in groups]
         fixed[FOREIGN_TREE] = _fixed(np.array(scores), updates, float(tree.word_count))
     return fixed

@@ -1,4 +1,4 @@
-"""Lasers whose beams vary from scan to scan, brought to the same beams."""
+"""Lasers whose beams vary from scan to scan, resampled to the same beams."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -10,14 +10,14 @@ from fcslam.sources.bags.messages import Beams, ScanMessage
 _SAME_FIELD_OF_VIEW_RAD = 0.05
 
 
-class UsualBeams:
+class NominalBeams:
     """The beams that most of the first scans have."""
 
     def __init__(self, first_scans: Sequence[ScanMessage]) -> None:
         count, _ = Counter(scan.beam_count for scan in first_scans).most_common(1)[0]
         self.beams = next(scan.beams for scan in first_scans if scan.beam_count == count)
 
-    def brought(self, scan: ScanMessage) -> ScanMessage | None:
+    def resampled(self, scan: ScanMessage) -> ScanMessage | None:
         """The scan if it has the usual beams; if it sees about the same, its nearest range for each of them; else None.
 
         A usual beam that lies outside the scan is invalid (NaN).

@@ -1,4 +1,4 @@
-"""What a bag's camera says: images, kept or brought into an encoded form, and the calibration."""
+"""What a bag's camera says: images, as sent or encoded as PNG, and the calibration."""
 
 from typing import Any, NamedTuple
 

@@ -45,7 +45,7 @@ class PosedImage(NamedTuple):
     """None: there is none within 1 s."""
 
 
-class _Match(NamedTuple):
+class _PoseMatch(NamedTuple):
     T_odom_base: Pose
     fault: Fault | None
 
@@ -55,42 +55,42 @@ Entry = PosedScan | PosedImage | OdometryReading
 
 
 @dataclass(slots=True)
-class _Waiting:
+class _QueuedItem:
     number: int
     item: Message
-    match: _Match | None
+    match: _PoseMatch | None
 
 
-def paired(
+def pair_with_odometry(
     items: Iterable[tuple[int, Message]],
 ) -> Iterator[tuple[int, Entry]]:
     """The items in their order, each with its number, scans and images with their poses."""
     readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
-    queue: deque[_Waiting] = deque()
+    queue: deque[_QueuedItem] = deque()
     for number, item in items:
         if isinstance(item, OdometryReading):
-            _tell(queue, readings[-1] if readings else None, item)
+            _assign_poses(queue, readings[-1] if readings else None, item)
             readings.append(item)
-            queue.append(_Waiting(number, item, _Match(item.T_odom_base, None)))
+            queue.append(_QueuedItem(number, item, _PoseMatch(item.T_odom_base, None)))
         else:
-            queue.append(_Waiting(number, item, _look_back(readings, item.stamp)))
+            queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
         while queue and (queue[0].match or len(queue) > _LONGEST_QUEUE):
-            yield _leave(queue.popleft(), readings)
+            yield _with_pose(queue.popleft(), readings)
     for waiting in queue:
-        yield _leave(waiting, readings)
+        yield _with_pose(waiting, readings)
 
 
-def _leave(waiting: _Waiting, readings: deque[OdometryReading]) -> tuple[int, Entry]:
+def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[int, Entry]:
     if isinstance(waiting.item, OdometryReading):
         return waiting.number, waiting.item
-    match = waiting.match or _hold(readings, waiting.item.stamp)
+    match = waiting.match or _nearest_pose(readings, waiting.item.stamp)
     if isinstance(waiting.item, ImageMessage):
         unknown = match.fault is Fault.NO_ODOMETRY
         return waiting.number, PosedImage(waiting.item, None if unknown else match.T_odom_base)
     return waiting.number, PosedScan(waiting.item, *match)
 
 
-def _tell(queue: deque[_Waiting], previous: OdometryReading | None, newest: OdometryReading) -> None:
+def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, newest: OdometryReading) -> None:
     """A new reading has come: some that wait have their pose now."""
     for waiting in queue:
         stamp = waiting.item.stamp
@@ -99,17 +99,17 @@ def _tell(queue: deque[_Waiting], previous: OdometryReading | None, newest: Odom
         if previous is not None and previous.stamp <= stamp <= newest.stamp:
             waiting.match = _between(previous, newest, stamp)
         elif previous is not None and newest.stamp < previous.stamp:
-            waiting.match = _hold([previous, newest], stamp)
+            waiting.match = _nearest_pose([previous, newest], stamp)
         elif stamp <= newest.stamp:
-            waiting.match = _hold([newest], stamp)
+            waiting.match = _nearest_pose([newest], stamp)
 
 
-def _look_back(readings: deque[OdometryReading], stamp: float) -> _Match | None:
+def _look_back(readings: deque[OdometryReading], stamp: float) -> _PoseMatch | None:
     """The pose if the readings so far have it; None: wait for later ones."""
     if not readings or stamp > readings[-1].stamp:
         return None
     if stamp == readings[-1].stamp:
-        return _Match(readings[-1].T_odom_base, None)
+        return _PoseMatch(readings[-1].T_odom_base, None)
     oldest = readings[-1]
     for after, before in pairwise(reversed(readings)):
         if before.stamp > after.stamp:
@@ -117,20 +117,20 @@ def _look_back(readings: deque[OdometryReading], stamp: float) -> _Match | None:
         if before.stamp <= stamp:
             return _between(before, after, stamp)
         oldest = before
-    return _hold([oldest], stamp)
+    return _nearest_pose([oldest], stamp)
 
 
-def _between(before: OdometryReading, after: OdometryReading, stamp: float) -> _Match:
+def _between(before: OdometryReading, after: OdometryReading, stamp: float) -> _PoseMatch:
     for reading in (after, before):
         if stamp == reading.stamp:
-            return _Match(reading.T_odom_base, None)
+            return _PoseMatch(reading.T_odom_base, None)
     span_s = after.stamp - before.stamp
     pose = interpolated_pose(before.T_odom_base, after.T_odom_base, (stamp - before.stamp) / span_s)
-    return _Match(pose, Fault.ODOMETRY_GAP if span_s > MAX_GAP_S else None)
+    return _PoseMatch(pose, Fault.ODOMETRY_GAP if span_s > MAX_GAP_S else None)
 
 
-def _hold(readings: Iterable[OdometryReading], stamp: float) -> _Match:
+def _nearest_pose(readings: Iterable[OdometryReading], stamp: float) -> _PoseMatch:
     nearest = min(readings, key=lambda reading: abs(reading.stamp - stamp), default=None)
     if nearest is None or abs(nearest.stamp - stamp) > MAX_GAP_S:
-        return _Match((0.0, 0.0, 0.0), Fault.NO_ODOMETRY)
-    return _Match(nearest.T_odom_base, Fault.HELD_ODOMETRY if nearest.stamp != stamp else None)
+        return _PoseMatch((0.0, 0.0, 0.0), Fault.NO_ODOMETRY)
+    return _PoseMatch(nearest.T_odom_base, Fault.HELD_ODOMETRY if nearest.stamp != stamp else None)

@@ -21,9 +21,9 @@ from fcslam.sources.bags.pairing import Entry, PosedImage, PosedScan
 from fcslam.sources.bags.stream import BagStream
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import refuse_misfits, window
+from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.images import check_image
-from fcslam.sources.logs.overview import Track
+from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
@@ -58,7 +58,7 @@ class RosBag:
         whole = self._reading.survey
         if scans == WHOLE:
             return whole
-        audit, track = _audit(), Track()
+        audit, track = _audit(), PathSummary()
         for _, entry in self._entries(scans, audit):
             if isinstance(entry, PosedScan):
                 track.add(entry.scan.stamp, entry.T_odom_base)
@@ -87,13 +87,13 @@ class RosBag:
 
     def _entries(self, scans: ScanRange, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
         entries = self._stream.entries(audit, with_images=with_images)
-        return window(entries, scans, lambda entry: isinstance(entry, PosedScan), audit)
+        return scan_window(entries, scans, lambda entry: isinstance(entry, PosedScan), audit)
 
     @cached_property
     def _reading(self) -> _Reading:
         """How to read this bag, from one pass over all of it; refuses what cannot be mapped."""
         audit, tree = _audit(), TransformTree()
-        scans, odometry = Track(), Track()
+        scans, odometry = PathSummary(), PathSummary()
         base_frame = ""
         for _, entry in self._stream.entries(audit, tree):
             if isinstance(entry, PosedScan):
@@ -110,9 +110,9 @@ class RosBag:
         survey = Survey(scans.count, scans.duration_s, scans.length_m, laser, audit.faults(), notes, camera)
         return _Reading(survey, mounted.upside_down)
 
-    def _refuse(self, faults: Faults, scans: Track, odometry: Track) -> None:
+    def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
         path, topics, first = self._stream.path, self._stream.topics, self._stream.first_scans[0]
-        refuse_misfits(path, faults, scans.count, odometry.count, first.beam_count)
+        check_consistency(path, faults, scans.count, odometry.count, first.beam_count)
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
             raise SourceError(
@@ -122,7 +122,7 @@ class RosBag:
             )
 
     def _laser(self, mounted: Mounting) -> LaserModel:
-        beams = self._stream.usual.beams
+        beams = self._stream.nominal.beams
         angle_min_rad = -(beams.angle_min_rad + beams.span_rad) if mounted.upside_down else beams.angle_min_rad
         max_range_m = self._stream.first_scans[0].range_max_m
         return LaserModel(beams.beam_count, angle_min_rad, beams.angle_increment_rad, max_range_m, mounted.T_base_laser)

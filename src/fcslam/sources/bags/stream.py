@@ -6,7 +6,7 @@ from itertools import islice
 from pathlib import Path
 
 from fcslam.errors import SourceError
-from fcslam.sources.bags.beams import UsualBeams
+from fcslam.sources.bags.beams import NominalBeams
 from fcslam.sources.bags.camera import (
     Calibration,
     ImageMessage,
@@ -24,7 +24,7 @@ from fcslam.sources.bags.messages import (
     transforms_of,
 )
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.pairing import Entry, Message, PosedScan, paired
+from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry
 from fcslam.sources.bags.topics import Topics, choose_topics
 from fcslam.sources.bags.transforms import TransformTree, planar
 from fcslam.sources.faults import Audit, Fault
@@ -67,9 +67,9 @@ class BagStream:
         return scans
 
     @cached_property
-    def usual(self) -> UsualBeams:
-        """The beams to which all scans are brought."""
-        return UsualBeams(self.first_scans)
+    def nominal(self) -> NominalBeams:
+        """The beams to which all scans are resampled."""
+        return NominalBeams(self.first_scans)
 
     @cached_property
     def calibration(self) -> Calibration | None:
@@ -89,8 +89,8 @@ class BagStream:
 
         ``tree`` hears all tf on the way, if it is given.
         """
-        gate = ScanGate(self.usual.beams.beam_count, audit)
-        for number, entry in paired(self._items(audit, tree, with_images)):
+        gate = ScanGate(self.nominal.beams.beam_count, audit)
+        for number, entry in pair_with_odometry(self._items(audit, tree, with_images)):
             if not isinstance(entry, PosedScan):
                 yield number, entry
             elif gate.admits(number, entry.scan):
@@ -119,7 +119,7 @@ class BagStream:
         """A scan with the usual beams, or None; what is no scan as it is."""
         if not isinstance(item, ScanMessage):
             return item
-        scan = self.usual.brought(item)
+        scan = self.nominal.resampled(item)
         if scan is not item:
             audit.add(Fault.BEAM_COUNT if scan is None else Fault.RESAMPLED, number)
         return scan

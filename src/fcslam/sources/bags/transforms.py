@@ -35,7 +35,7 @@ IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
-    """Checked, with the quaternion brought to length 1; raises ValueError when it is no sane transform."""
+    """Checked, with the quaternion scaled to length 1; raises ValueError when it is no sane transform."""
     x, y, z, w = rotation
     length = sqrt(x * x + y * y + z * z + w * w)
     if not (abs(length - 1.0) < 0.1 and all(map(isfinite, translation_m))):

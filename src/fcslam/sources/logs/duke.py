@@ -27,7 +27,7 @@ _NUMBER = rb"[ \t]+[-+]?[0-9]+(\.[0-9]*)?([eE][-+]?[0-9]+)?"
 _KNOWN = re.compile(rb"^(Odometry(" + _NUMBER + rb"){3}\s*$|Laser[ \t]+[0-9]+(" + _NUMBER + rb"){2})", re.MULTILINE)
 
 
-class _Parser:
+class _DukeParser:
     """Holds the latest odometry and counts the scans, which are the log's only clock."""
 
     def __init__(self) -> None:
@@ -58,4 +58,4 @@ class _Parser:
         return ScanLine(stamp, self._T_odom_base, T_odom_laser, beam_count, range_text, geometry)
 
 
-DUKE = Dialect("DP-SLAM log", lambda head: _KNOWN.search(head) is not None, _Parser, timed=False)
+DUKE = Dialect("DP-SLAM log", lambda head: _KNOWN.search(head) is not None, _DukeParser, timed=False)

@@ -42,7 +42,7 @@ _MAX_STEP_M = 10.0
 _NUMBER_LETTERS = b"0123456789.+-eE"
 
 
-class _Layout(NamedTuple):
+class _EncoderColumns(NamedTuple):
     """Where a line has its encoders, and the sign of the right one."""
 
     left: int
@@ -50,11 +50,11 @@ class _Layout(NamedTuple):
     right_sign: int
 
 
-_LAYOUTS = {25 + _BEAM_COUNT: _Layout(2, 3, 1), 13 + _BEAM_COUNT: _Layout(1, 2, -1)}
+_LAYOUTS = {25 + _BEAM_COUNT: _EncoderColumns(2, 3, 1), 13 + _BEAM_COUNT: _EncoderColumns(1, 2, -1)}
 """By the number of words."""
 
 
-class _Parser:
+class _MinesParser:
     """Adds up what the wheels turned from line to line."""
 
     def __init__(self) -> None:
@@ -124,4 +124,4 @@ def _recognises(head: bytes) -> bool:
     )
 
 
-MINES = Dialect("CoreSLAM log", _recognises, _Parser, _METRES)
+MINES = Dialect("CoreSLAM log", _recognises, _MinesParser, _METRES)

@@ -1,15 +1,14 @@
 """What one pass over a text log shows, and whether the log can be mapped."""
 
-from dataclasses import dataclass
-from math import hypot, inf
 from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
 from fcslam.sources.faults import Faults
-from fcslam.sources.gate import TOLERATED_SHARE, refuse_misfits
+from fcslam.sources.gate import TOLERATED_SHARE, check_consistency
 from fcslam.sources.logs.dialect import Line, OdometryLine, ParameterLine, ScanLine
 from fcslam.sources.logs.laser import laser_model, parameter
+from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import Pose, relative_pose
 from fcslam.sources.source import Survey
 
@@ -19,7 +18,7 @@ _MOUNTING_TOLERANCE = 0.01
 """Metres or radians between two scans' words on where the laser sits."""
 
 
-class Reading(NamedTuple):
+class LogReading(NamedTuple):
     """How a log is to be read."""
 
     survey: Survey
@@ -27,34 +26,7 @@ class Reading(NamedTuple):
     """Scans take the pose of the latest odometry message: their own never changes."""
 
 
-@dataclass(slots=True)
-class Track:
-    """Stamps and poses along the way."""
-
-    count: int = 0
-    length_m: float = 0.0
-    moves: bool = False
-    earliest: float = inf
-    latest: float = -inf
-    _pose: Pose | None = None
-
-    def add(self, stamp: float, pose: Pose) -> None:
-        """Go on to ``pose``."""
-        if self._pose is not None and pose != self._pose:
-            self.moves = True
-            self.length_m += hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
-        self._pose = pose
-        self.count += 1
-        self.earliest = min(self.earliest, stamp)
-        self.latest = max(self.latest, stamp)
-
-    @property
-    def duration_s(self) -> float:
-        """Between the earliest and the latest stamp."""
-        return max(0.0, self.latest - self.earliest)
-
-
-class Mounting:
+class MountingEstimate:
     """Where the laser sits on the robot, from the two poses of every scan."""
 
     def __init__(self) -> None:
@@ -89,9 +61,9 @@ class Overview:
     """Gathers what the lines of a log say together."""
 
     def __init__(self) -> None:
-        self._scans = Track()
-        self._odometry = Track()
-        self._mounting = Mounting()
+        self._scans = PathSummary()
+        self._odometry = PathSummary()
+        self._mounting = MountingEstimate()
         self._parameters: dict[str, str] = {}
         self._scan: ScanLine | None = None
 
@@ -107,14 +79,14 @@ class Overview:
         elif isinstance(line, ParameterLine):
             self._parameters[line.name] = line.value
 
-    def conclude(self, path: Path, faults: Faults) -> Reading:
+    def conclude(self, path: Path, faults: Faults) -> LogReading:
         """How to read the log at ``path``.
 
         Raises:
             SourceError: it cannot be mapped.
         """
         assert self._scan is not None
-        refuse_misfits(path, faults, self._scans.count, self._odometry.count, self._scan.beam_count)
+        check_consistency(path, faults, self._scans.count, self._odometry.count, self._scan.beam_count)
         pose_from_odometry = not self._scans.moves and self._odometry.moves
         if not (self._scans.moves or pose_from_odometry) and self._scans.count >= SCANS_THAT_MUST_MOVE:
             raise SourceError(
@@ -124,4 +96,6 @@ class Overview:
         offset_m = parameter(self._parameters, "robot_frontlaser_offset") or 0.0
         laser = laser_model(self._scan, self._parameters, self._mounting.T_base_laser(offset_m))
         length_m = self._odometry.length_m if pose_from_odometry else self._scans.length_m
-        return Reading(Survey(self._scans.count, self._scans.duration_s, length_m, laser, faults), pose_from_odometry)
+        return LogReading(
+            Survey(self._scans.count, self._scans.duration_s, length_m, laser, faults), pose_from_odometry
+        )

@@ -19,10 +19,11 @@ import numpy as np
 from fcslam.errors import SourceError
 from fcslam.records import LaserScan, Odometry, Ranges, SensorRecord
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, window
+from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, scan_window
 from fcslam.sources.logs.archive import numbered_lines
 from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ScanLine
-from fcslam.sources.logs.overview import Overview, Reading, Track
+from fcslam.sources.logs.overview import LogReading, Overview
+from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
@@ -47,7 +48,7 @@ class TextLog:
         """As in Source; the pass over the whole log is made once."""
         if scans == WHOLE:
             return self._reading.survey
-        audit, track = Audit(), Track()
+        audit, track = Audit(), PathSummary()
         for _, line in self._entries(scans, audit):
             if isinstance(line, ScanLine):
                 track.add(line.stamp, line.T_odom_base)
@@ -70,7 +71,7 @@ class TextLog:
                 yield LaserScan(line.stamp, ranges_m, laser, T_odom_base)
 
     @cached_property
-    def _reading(self) -> Reading:
+    def _reading(self) -> LogReading:
         """How to read this log, from one pass over all of it; refuses what cannot be mapped."""
         audit = Audit()
         overview = Overview()
@@ -105,7 +106,7 @@ class TextLog:
 
     def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, ScanLine | OdometryLine]]:
         """Scans and odometry of the range, with the poses to use; in the end ``audit`` holds this range's faults."""
-        for number, line in window(self._posed(audit), scans, lambda line: isinstance(line, ScanLine), audit):
+        for number, line in scan_window(self._posed(audit), scans, lambda line: isinstance(line, ScanLine), audit):
             if isinstance(line, ScanLine):
                 self._note_clock(number, audit)
             yield number, line

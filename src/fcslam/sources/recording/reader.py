@@ -27,9 +27,9 @@ from fcslam.records import (
 )
 from fcslam.runs import read_tum
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import ScanGate, refuse_misfits, window
+from fcslam.sources.gate import ScanGate, check_consistency, scan_window
 from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
-from fcslam.sources.logs.overview import Track
+from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_array
 from fcslam.sources.recording.frames import Frame, frame_count, merged_frames
 from fcslam.sources.recording.layout import (
@@ -74,7 +74,7 @@ class Recording:
         whole = self._survey
         if scans == WHOLE:
             return whole
-        track, audit = Track(), _audit()
+        track, audit = PathSummary(), _audit()
         for _, frame in self._entries(scans, audit):
             if frame.is_scan:
                 track.add(frame.stamp, frame.T_odom_base)
@@ -116,14 +116,14 @@ class Recording:
     @cached_property
     def _survey(self) -> Survey:
         """From one pass over all of it; refuses what cannot be mapped."""
-        audit, scans, odometry = _audit(), Track(), Track()
+        audit, scans, odometry = _audit(), PathSummary(), PathSummary()
         for _, frame in self._checked(audit):
             if frame.is_scan:
                 scans.add(frame.stamp, frame.T_odom_base)
             elif frame.file is ODOMETRY_FILE:
                 odometry.add(frame.stamp, frame.T_odom_base)
         laser, faults = self._meta.laser, audit.faults()
-        refuse_misfits(self._path, faults, scans.count, odometry.count, laser.beam_count)
+        check_consistency(self._path, faults, scans.count, odometry.count, laser.beam_count)
         if not scans.count:
             seen = f"; {faults}" if faults else ""
             raise SourceError(f"{self._path}: no laser scan in this recording{seen}; give one with scans")
@@ -139,7 +139,7 @@ class Recording:
         return camera, ()
 
     def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, Frame]]:
-        return window(self._checked(audit), scans, lambda frame: frame.is_scan, audit)
+        return scan_window(self._checked(audit), scans, lambda frame: frame.is_scan, audit)
 
     def _checked(self, audit: Audit) -> Iterator[tuple[int, Frame]]:
         """The frames that can be used, each with its number."""

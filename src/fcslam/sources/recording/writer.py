@@ -35,7 +35,7 @@ from fcslam.sources.recording.layout import (
 _NO_POSE = (nan, nan, nan)
 
 
-class Held(NamedTuple):
+class RecordCounts(NamedTuple):
     """How many records of each kind a recording holds."""
 
     scans: int
@@ -45,7 +45,7 @@ class Held(NamedTuple):
 
 
 class RecordingWriter:
-    """A recording that grows. Nothing is held back: what ``write`` has returned from outlives this process."""
+    """A recording that grows. Nothing is buffered: what ``write`` has returned from outlives this process."""
 
     def __init__(self, folder: Path, meta: Meta) -> None:
         """For ``create`` and ``resume`` only."""
@@ -105,16 +105,16 @@ class RecordingWriter:
         return self._meta.camera
 
     @property
-    def held(self) -> Held:
+    def counts(self) -> RecordCounts:
         """What is there already."""
         truth = self._appenders[GROUND_TRUTH]
         scans, odometry, images = (self._count(frames) for frames in (self._scans, ODOMETRY_FILE, IMAGES_FILE))
-        return Held(scans, odometry, images, truth.content(0, truth.size).count(b"\n"))
+        return RecordCounts(scans, odometry, images, truth.content(0, truth.size).count(b"\n"))
 
     @property
     def is_gapless(self) -> bool:
         """Whether no record before another one is missing, as a power cut may have left it."""
-        return self._next_sequence == sum(self.held[:3])
+        return self._next_sequence == sum(self.counts[:3])
 
     def write(self, item: RecordedItem) -> None:
         """Append one record.

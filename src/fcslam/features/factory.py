@@ -1,11 +1,11 @@
 """The detector that describes camera images."""
 
 from fcslam.features.classical import Orb, OrbConfig
-from fcslam.features.detector import Detector, OnnxConfig, OnnxDetector
-from fcslam.features.kinds import DetectorKind
+from fcslam.features.detector import FeatureDetector, OnnxConfig, OnnxDetector
+from fcslam.features.detector_kinds import DetectorKind
 
 
-def make_detector(kind: DetectorKind, orb: OrbConfig, onnx: OnnxConfig) -> Detector:
+def make_detector(kind: DetectorKind, orb: OrbConfig, onnx: OnnxConfig) -> FeatureDetector:
     """The detector of that kind.
 
     Raises:

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from fcslam.errors import SimulationError
 from fcslam.records import FloatArray, frozen
-from fcslam.simulation.floorplan import FloorPlan, Kind
+from fcslam.simulation.floorplan import FloorPlan, PieceKind
 
 ROBOT_RADIUS_M = 0.25
 _CLEARANCE_M = ROBOT_RADIUS_M + 0.05
@@ -36,7 +36,7 @@ _CORNER_M = 0.2
 Cells = NDArray[np.bool_]
 
 
-class FreeSpace:
+class DrivableSpace:
     """Where the middle of a robot may be: the largest connected part of what has enough clearance."""
 
     def __init__(self, plan: FloorPlan) -> None:
@@ -131,7 +131,7 @@ def _obstacles(plan: FloorPlan) -> Cells:
     occupied = np.zeros((height, width), dtype=bool)
     reach = _CELL_M * np.sqrt(0.5)
     for piece in plan.pieces:
-        if piece.kind is Kind.LINTEL:
+        if piece.kind is PieceKind.LINTEL:
             continue
         low = np.maximum(((piece.outline.min(axis=0) - reach) / _CELL_M).astype(int), 0)
         high = ((piece.outline.max(axis=0) + reach) / _CELL_M).astype(int) + 1

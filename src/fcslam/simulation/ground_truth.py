@@ -10,9 +10,9 @@ from fcslam.geometry import se2
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
 from fcslam.records import FloatArray, LaserModel, frozen
 from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
-from fcslam.simulation.fleet import SimulatedFleet, SimulatedRobot
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster
+from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot
 
 RESOLUTION_M = 0.05
 
@@ -26,7 +26,7 @@ _FRACTION_BITS = 8
 """Of cells, when beams are drawn."""
 
 
-class HasTruth(Protocol):
+class HasTruePoses(Protocol):
     """A robot whose true poses are known."""
 
     @property
@@ -38,7 +38,7 @@ class HasTruth(Protocol):
         """The truth at these stamps, shape (N, 3)."""
 
 
-def write_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -> None:
+def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -> None:
     """Write ``ground_truth/relations``, ``map.pgm`` and ``map.yaml`` into ``folder``.
 
     Where each robot was stands in its recording. The relations let a map be measured without a common frame.
@@ -55,7 +55,7 @@ def write_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -
 
 
 def true_relations(
-    robots: Sequence[HasTruth], rng: np.random.Generator, count: int = 2000, reach_m: float = 5.0
+    robots: Sequence[HasTruePoses], rng: np.random.Generator, count: int = 2000, reach_m: float = 5.0
 ) -> Relations:
     """Up to ``count`` true relations between scans of any robots less than ``reach_m`` and more than 20 s apart."""
     stamps = np.concatenate([robot.stamps for robot in robots])

@@ -21,7 +21,7 @@ _TRIALS = 1000
 _CONFIDENCE = 0.999
 
 
-class PairChecker:
+class PairVerifier:
     """Checks pairs of a set, each once, however many ask."""
 
     def __init__(self, described: DescribedSet) -> None:
@@ -43,11 +43,11 @@ class PairChecker:
         """Matches that agree on one scene."""
         if (query, place) not in self._inliers:
             pair = self._described.queries[query], self._described.gallery[place]
-            self._inliers[query, place] = self._described.agreeing(*pair)
+            self._inliers[query, place] = self._described.count_inliers(*pair)
         return self._inliers[query, place]
 
 
-def agreeing_in_images(a: PlaceFeatures, b: PlaceFeatures) -> int:
+def epipolar_inliers(a: PlaceFeatures, b: PlaceFeatures) -> int:
     """Matches of two images that one fundamental matrix explains; of a plane it explains as many as a homography."""
     first, second = distinct_matches(a, b)
     if len(first) < _FEWEST:

@@ -30,10 +30,10 @@ from fcslam.records import (
 )
 from fcslam.simulation.decoration import Decoration, decorate
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
-from fcslam.simulation.kinds import Building, Lighting
 from fcslam.simulation.lighting import light_of
-from fcslam.simulation.noise import LidarSettings, disturb
-from fcslam.simulation.odometry import DriftSettings, drift
+from fcslam.simulation.noise import LidarSettings, simulate_ranges
+from fcslam.simulation.odometry import OdometryNoiseSettings, simulate_odometry
+from fcslam.simulation.options import Building, Lighting
 from fcslam.simulation.route import Schedule, draw_goals, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster
@@ -84,7 +84,7 @@ class SimulationSettings(Settings):
         default=0.0, ge=0.0, le=1.0, description="share of the rooms' furniture that moved before each further robot"
     )
     lidar: LidarSettings = LidarSettings(rate_hz=10.0)
-    drift: DriftSettings = DriftSettings(slips_per_m=0.05)
+    drift: OdometryNoiseSettings = OdometryNoiseSettings(slips_per_m=0.05)
     camera: CameraSettings | None = CameraSettings()
 
 
@@ -148,15 +148,15 @@ class SimulatedRobot:
         """
         caster = RayCaster(bare_model(self.plan), self.laser)
         for k in range(first, len(self.stamps)):
-            rng = self._generator(_Chance.SCANS, k)
-            ranges = disturb(caster.cast(self.T_building_base[k]), self.laser, self.settings.lidar, rng)
+            rng = self._generator(_RandomStream.SCANS, k)
+            ranges = simulate_ranges(caster.cast(self.T_building_base[k]), self.laser, self.settings.lidar, rng)
             yield LaserScan(float(self.stamps[k]), frozen(ranges, np.float32), self.laser, self.T_odom_base[k])
 
     def _images(self, first: int) -> Generator[CameraImage, None, None]:
         settings = self.settings.camera
         if self.camera is None or self.decoration is None or settings is None:
             return
-        light = light_of(self.plan, self.lighting, self._generator(_Chance.LAMPS))
+        light = light_of(self.plan, self.lighting, self._generator(_RandomStream.LAMPS))
         fov_y_rad = 2.0 * math.atan(0.5 * self.camera.height / self.camera.fy)
         model = furnished_model(self.plan, self.decoration, light, (settings.width, settings.height), fov_y_rad)
         poses = self.route.at(self.image_stamps - self.first_stamp)
@@ -164,16 +164,16 @@ class SimulatedRobot:
         shape = (settings.height, settings.width, 1)
         with Camera(model, self.camera, light) as camera:
             for k in range(first, len(self.image_stamps)):
-                noise = self._generator(_Chance.IMAGES, k).standard_normal(shape, dtype=np.float32)
+                noise = self._generator(_RandomStream.IMAGES, k).standard_normal(shape, dtype=np.float32)
                 encoded = _jpeg(camera.take(poses[k]) + settings.noise * noise, settings.jpeg_quality)
                 yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, frozen(odometry[k]))
 
-    def _generator(self, purpose: "_Chance", record: int = 0) -> np.random.Generator:
+    def _generator(self, purpose: "_RandomStream", record: int = 0) -> np.random.Generator:
         """Each record has its own, so that a recording can go on anywhere."""
         return _generator(self.seed, purpose, self.number, record)
 
 
-class _Chance(IntEnum):
+class _RandomStream(IntEnum):
     """What chance decides: each with a generator of its own, so that none moves another."""
 
     BUILDING = 0
@@ -186,7 +186,7 @@ class _Chance(IntEnum):
     IMAGES = 6
 
 
-def _generator(seed: int, purpose: _Chance, robot: int = 0, record: int = 0) -> np.random.Generator:
+def _generator(seed: int, purpose: _RandomStream, robot: int = 0, record: int = 0) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose, robot, record)))
 
 
@@ -204,10 +204,10 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
     Raises:
         SimulationError: the building is too small for so many robots, or to drive in.
     """
-    plan = draw_floor_plan(_generator(seed, _Chance.BUILDING), settings.building)
+    plan = draw_floor_plan(_generator(seed, _RandomStream.BUILDING), settings.building)
     _check_room(plan, settings)
-    goals = draw_goals(plan, settings.robots, settings.path_length_m, _generator(seed, _Chance.GOALS))
-    decoration = decorate(plan, _generator(seed, _Chance.LOOKS)) if settings.camera else None
+    goals = draw_goals(plan, settings.robots, settings.path_length_m, _generator(seed, _RandomStream.GOALS))
+    decoration = decorate(plan, _generator(seed, _RandomStream.LOOKS)) if settings.camera else None
     robots = (_robot(plan, decoration, number, goals[number], settings, seed) for number in range(settings.robots))
     return SimulatedFleet(plan, tuple(robots))
 
@@ -230,7 +230,7 @@ def _robot(
     settings: SimulationSettings,
     seed: int,
 ) -> SimulatedRobot:
-    rng = _generator(seed, _Chance.ROBOTS, number)
+    rng = _generator(seed, _RandomStream.ROBOTS, number)
     if number:
         plan = move_furniture(plan, settings.moved_furniture, rng)
     route = schedule(plan_route(plan, goals, settings.path_length_m, rng))
@@ -244,7 +244,7 @@ def _robot(
         camera=camera.model() if camera else None,
         stamps=frozen(np.round(first_stamp + times, 6)),
         T_building_base=frozen(poses),
-        T_odom_base=frozen(drift(poses, settings.drift, rng)),
+        T_odom_base=frozen(simulate_odometry(poses, settings.drift, rng)),
         image_stamps=frozen(np.round(first_stamp + image_times, 6)),
         plan=plan,
         lighting=settings.lighting[number % len(settings.lighting)],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fcslam.features.placing import LidarView, place_keypoints
+from fcslam.features.lidar_depth import LidarView, locate_keypoints
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, Transform
 from tests.features.pictures import CAMERA
@@ -23,7 +23,7 @@ def project(points, camera=CAMERA):
 
 def located(points, walls, pose=POSE, camera=CAMERA):
     scan = scan_at(pose, walls, LASER)
-    return place_keypoints(project(points, camera), camera, seen_in(scan), 3.0)
+    return locate_keypoints(project(points, camera), camera, seen_in(scan), 3.0)
 
 
 def seen_in(scan):
@@ -75,7 +75,7 @@ def test_where_nothing_returned_nothing_is_placed():
     points = np.array([[3.0, 1.0, 1.0], [3.0, -1.0, 1.0]])
     _, placed = located(points, walls, np.zeros(3))
     assert placed.tolist() == [True, False]
-    _, placed = place_keypoints(project(points), CAMERA, LidarView(np.empty((0, 2)), np.zeros(2), 0.02), 3.0)
+    _, placed = locate_keypoints(project(points), CAMERA, LidarView(np.empty((0, 2)), np.zeros(2), 0.02), 3.0)
     assert not placed.any()
 
 
@@ -108,13 +108,13 @@ def test_the_mounting_of_the_camera_is_heeded():
     turned = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5, Transform((0.0, 0.1, 0.6), tuple(left)))
     centre = np.array([[159.5, 119.5]], np.float32)
     scan = scan_at(np.zeros(3), walls, LASER)
-    found, placed = place_keypoints(centre, turned, seen_in(scan), 3.0)
+    found, placed = locate_keypoints(centre, turned, seen_in(scan), 3.0)
     assert placed[0]
     assert np.allclose(found[0], (0.0, 4.0, 0.6), atol=0.01)
     pitch = np.array([0.0, np.sin(np.deg2rad(5)), 0.0, np.cos(np.deg2rad(5))])
     down = product(pitch, np.array(CAMERA.T_base_camera.rotation))
     lowered = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5, Transform((0.0, 0.0, 0.9), tuple(down)))
-    found, placed = place_keypoints(centre, lowered, seen_in(scan), 3.0)
+    found, placed = locate_keypoints(centre, lowered, seen_in(scan), 3.0)
     assert placed[0]
     assert np.allclose(found[0], (4.0, 0.0, 0.9 - 4.0 * np.tan(np.deg2rad(10))), atol=0.01)
 

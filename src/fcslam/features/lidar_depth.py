@@ -39,7 +39,7 @@ class LidarView(NamedTuple):
     """Between neighbouring beams."""
 
 
-def place_keypoints(
+def locate_keypoints(
     keypoints_px: NDArray[np.float32], camera: CameraModel, lidar: LidarView, ceiling_m: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Positions of keypoints in ``base``, shape (K, 3) in metres, and for which of them there is one, shape (K,).

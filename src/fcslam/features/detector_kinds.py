@@ -10,7 +10,7 @@ class DetectorKind(StrEnum):
     ONNX = "onnx"
 
 
-class ContenderKind(StrEnum):
+class EvaluatedDetectorKind(StrEnum):
     """Detectors that can be compared."""
 
     ONNX = "onnx"

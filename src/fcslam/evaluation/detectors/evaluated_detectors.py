@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from fcslam.errors import EvaluationError
-from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, Shi, Sift
+from fcslam.features.classical import Fast, Harris, Orb, OrbConfig, ShiTomasi, Sift
 from fcslam.features.detector import (
-    SHIPPED_NETWORK,
+    BUNDLED_NETWORK,
     GreyImage,
     ImageFeatures,
     KeypointDetector,
@@ -21,19 +21,19 @@ from fcslam.features.detector import (
     OnnxConfig,
     OnnxDetector,
 )
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.files import read_features, read_grey
-from fcslam.features.kinds import ContenderKind
 from fcslam.metrics.framing import Framing, Size
 from fcslam.metrics.homography import inside
 
 _CANDIDATES = 1500
 """Features that ORB and SIFT are asked for, as in SuperPoint's evaluation."""
 _NETWORK_CANDIDATES = 2000
-_NETWORKS = (ContenderKind.ONNX, ContenderKind.LOGITS)
+_NETWORKS = (EvaluatedDetectorKind.ONNX, EvaluatedDetectorKind.LOGITS)
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class FramedImage:
     """An image of a scene, brought to a size."""
 
     path: Path
@@ -44,36 +44,36 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Contender:
+class EvaluatedDetector:
     """Something that finds keypoints in pictures, the strongest first, in pixels of the framed picture."""
 
     name: str
-    find: Callable[[Picture], Keypoints]
+    find: Callable[[FramedImage], Keypoints]
     is_timed: bool
     """Whether its time is that of finding."""
 
 
 class Stopwatch:
-    """How long contenders take for a picture: processor time, which other work on the machine hardly changes."""
+    """How long detectors take for a picture: processor time, which other work on the machine hardly changes."""
 
     def __init__(self) -> None:
         self._seconds: defaultdict[tuple[str, Size], list[float]] = defaultdict(list)
 
-    def find(self, contender: Contender, picture: Picture) -> Keypoints:
-        """What the contender finds."""
+    def find(self, detector: EvaluatedDetector, picture: FramedImage) -> Keypoints:
+        """What the detector finds."""
         began = time.process_time()
-        found = contender.find(picture)
-        if contender.is_timed:
+        found = detector.find(picture)
+        if detector.is_timed:
             height, width = picture.grey.shape
-            self._seconds[contender.name, (width, height)].append(time.process_time() - began)
+            self._seconds[detector.name, (width, height)].append(time.process_time() - began)
         return found
 
     def milliseconds(self) -> Mapping[tuple[str, Size], float]:
-        """Median for each contender and size."""
+        """Median for each detector and size."""
         return {key: 1e3 * float(np.median(seconds)) for key, seconds in self._seconds.items()}
 
 
-def frame(path: Path, size: Size) -> Picture:
+def frame(path: Path, size: Size) -> FramedImage:
     """The image in a file, scaled bilinearly and cropped to ``size``.
 
     Raises:
@@ -84,32 +84,32 @@ def frame(path: Path, size: Size) -> Picture:
     framing = Framing.of((width, height), size)
     scaled = cv2.resize(image, (max(size[0], int(width * framing.scale)), max(size[1], int(height * framing.scale))))
     left, top = framing.crop_px
-    return Picture(path, (width, height), framing, np.ascontiguousarray(scaled[top:, left:][: size[1], : size[0]]))
+    return FramedImage(path, (width, height), framing, np.ascontiguousarray(scaled[top:, left:][: size[1], : size[0]]))
 
 
-def choose_contenders(
-    names: Sequence[ContenderKind], weights: Sequence[Path], folders: Sequence[Path]
-) -> tuple[Contender, ...]:
+def choose_detectors(
+    names: Sequence[EvaluatedDetectorKind], weights: Sequence[Path], folders: Sequence[Path]
+) -> tuple[EvaluatedDetector, ...]:
     """The folders' features first, then the named detectors; if nothing is named, all there are.
 
-    ``weights``: of networks, each of which is a contender; if none is given, those that come with fcslam.
+    ``weights``: of networks, each of which is a detector; if none is given, those that come with fcslam.
 
     Raises:
         FeatureError: a network's weights cannot be used.
-        EvaluationError: two contenders have one name, or there is no folder of that name.
+        EvaluationError: two detectors have one name, or there is no folder of that name.
     """
     if not names and not folders:
-        has_network = bool(weights) or SHIPPED_NETWORK.is_file()
-        names = [name for name in ContenderKind if has_network or name not in _NETWORKS]
-    contenders, networks = [_extracted(folder) for folder in folders], list[Path | None](weights) or [None]
+        has_network = bool(weights) or BUNDLED_NETWORK.is_file()
+        names = [name for name in EvaluatedDetectorKind if has_network or name not in _NETWORKS]
+    detectors, networks = [_extracted(folder) for folder in folders], list[Path | None](weights) or [None]
     for name in names:
-        contenders += [_network(name, path) for path in networks] if name in _NETWORKS else [_classical(name)]
-    doubled = {each.name for each in contenders if [other.name for other in contenders].count(each.name) > 1}
+        detectors += [_network(name, path) for path in networks] if name in _NETWORKS else [_classical(name)]
+    doubled = {each.name for each in detectors if [other.name for other in detectors].count(each.name) > 1}
     if doubled:
         raise EvaluationError(
             f"{min(doubled)}: named twice; give each detector and network once, and folders other names"
         )
-    return tuple(contenders)
+    return tuple(detectors)
 
 
 @contextmanager
@@ -123,36 +123,36 @@ def one_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _network(name: ContenderKind, weights: Path | None) -> Contender:
+def _network(name: EvaluatedDetectorKind, weights: Path | None) -> EvaluatedDetector:
     network = OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES))
-    if name is ContenderKind.LOGITS:
+    if name is EvaluatedDetectorKind.LOGITS:
         return _run_here(f"{network.version}-logits", network.detect_floats)
     return _run_here(network.version, network.detect)
 
 
-def _classical(name: ContenderKind) -> Contender:
-    detectors: dict[ContenderKind, KeypointDetector] = {
-        ContenderKind.FAST: Fast(),
-        ContenderKind.HARRIS: Harris(),
-        ContenderKind.SHI: Shi(),
-        ContenderKind.SIFT: Sift(_CANDIDATES),
-        ContenderKind.ORB: Orb(OrbConfig(most_features=_CANDIDATES, fast_threshold=20)),
+def _classical(name: EvaluatedDetectorKind) -> EvaluatedDetector:
+    detectors: dict[EvaluatedDetectorKind, KeypointDetector] = {
+        EvaluatedDetectorKind.FAST: Fast(),
+        EvaluatedDetectorKind.HARRIS: Harris(),
+        EvaluatedDetectorKind.SHI: ShiTomasi(),
+        EvaluatedDetectorKind.SIFT: Sift(_CANDIDATES),
+        EvaluatedDetectorKind.ORB: Orb(OrbConfig(most_features=_CANDIDATES, fast_threshold=20)),
     }
     return _run_here(name.value, detectors[name].detect)
 
 
-def _run_here(name: str, find: Callable[[GreyImage], Keypoints]) -> Contender:
+def _run_here(name: str, find: Callable[[GreyImage], Keypoints]) -> EvaluatedDetector:
     find(np.zeros((32, 32), np.uint8))  # what the first call alone costs is nobody's time
-    return Contender(name, lambda picture: find(picture.grey), is_timed=True)
+    return EvaluatedDetector(name, lambda picture: find(picture.grey), is_timed=True)
 
 
-def _extracted(folder: Path) -> Contender:
+def _extracted(folder: Path) -> EvaluatedDetector:
     if not folder.is_dir():
         raise EvaluationError(f"{folder}: no such folder; name one with features, SCENE/1.npz ...")
-    return Contender(folder.resolve().name, lambda picture: _read_framed(folder, picture), is_timed=False)
+    return EvaluatedDetector(folder.resolve().name, lambda picture: _read_framed(folder, picture), is_timed=False)
 
 
-def _read_framed(folder: Path, picture: Picture) -> ImageFeatures:
+def _read_framed(folder: Path, picture: FramedImage) -> ImageFeatures:
     """Features of the image in its file, brought to where they are in the framed picture."""
     path = folder / picture.path.parent.name / f"{picture.path.stem}.npz"
     features, size = read_features(path)

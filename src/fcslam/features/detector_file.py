@@ -4,11 +4,11 @@ import hashlib
 from pathlib import Path
 
 from fcslam.errors import FeatureError
-from fcslam.features.detector import NETWORK_FORMAT, Detector, OnnxConfig, OnnxDetector
+from fcslam.features.detector import NETWORK_FORMAT, FeatureDetector, OnnxConfig, OnnxDetector
 from fcslam.records import Channel, DetectorFile
 
 
-def file_of(path: Path) -> DetectorFile:
+def describe_detector_file(path: Path) -> DetectorFile:
     """What a fleet is told of a network for its cameras.
 
     Raises:
@@ -20,7 +20,7 @@ def file_of(path: Path) -> DetectorFile:
     return DetectorFile(Channel.CAMERA, version, int(NETWORK_FORMAT), len(content), digest)
 
 
-def open_release(file: DetectorFile, path: Path, config: OnnxConfig) -> Detector:
+def open_detector_file(file: DetectorFile, path: Path, config: OnnxConfig) -> FeatureDetector:
     """The detector in a file that was fetched, run as ``config`` says.
 
     Raises:

@@ -9,11 +9,11 @@ import yaml
 
 from fcslam.metrics.relations import PoseTable, read_relations, relation_errors
 from fcslam.runs.map_files import Occupancy
-from fcslam.simulation.fleet import SimulationSettings, simulate_fleet
-from fcslam.simulation.floorplan import Kind
-from fcslam.simulation.kinds import Building
+from fcslam.simulation.floorplan import PieceKind
+from fcslam.simulation.ground_truth import true_map, true_relations, write_ground_truth
 from fcslam.simulation.noise import LidarSettings
-from fcslam.simulation.truth import true_map, true_relations, write_truth
+from fcslam.simulation.options import Building
+from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from tests.simulation.driving import distances
 
 SETTINGS = SimulationSettings(
@@ -48,7 +48,7 @@ def test_occupied_cells_are_surfaces_and_free_ones_are_not_inside_anything(fleet
     # Columns are round for beams, and have eight corners in the plan.
     assert distances(occupied, fleet.plan.segments).max() < half_diagonal + 0.03
     deep = distances(free, fleet.plan.segments) > seen.resolution_m
-    solid = [piece.outline for piece in fleet.plan.pieces if piece.kind is not Kind.LINTEL]
+    solid = [piece.outline for piece in fleet.plan.pieces if piece.kind is not PieceKind.LINTEL]
     assert not np.any([is_inside(free[deep], outline) for outline in solid])
 
 
@@ -75,7 +75,7 @@ def test_noise_does_not_reach_the_truth(fleet, seen):
 
 
 def test_the_files_hold_the_map_and_relations_that_are_true(fleet, seen, tmp_path):
-    write_truth(fleet, tmp_path, np.random.default_rng(0))
+    write_ground_truth(fleet, tmp_path, np.random.default_rng(0))
     assert sorted(path.name for path in (tmp_path / "ground_truth").iterdir()) == ["map.pgm", "map.yaml", "relations"]
     about = yaml.safe_load((tmp_path / "ground_truth" / "map.yaml").read_text())
     assert about["resolution"] == 0.05
