@@ -19,7 +19,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system check bench proto
+.PHONY: help install gl learning demo test test-fast test-system check bench docs proto
 .DEFAULT_GOAL := help
 
 help:
@@ -32,6 +32,7 @@ help:
 	@echo "make install      .venv alone; EXTRAS=dev,train,federated,sim,foxglove for more"
 	@echo "make learning     torch and Flower, for training the detector, if they can be had"
 	@echo "make gl           the GL library of the simulated cameras, if it may be installed without a question"
+	@echo "make docs         write docs/settings.md, the reference of all settings"
 	@echo "make proto        generate the wire format's Python code anew"
 
 install: $(INSTALLED)
@@ -79,6 +80,9 @@ check: $(INSTALLED)
 
 bench: $(INSTALLED)
 	@set -e; for script in $(BENCHMARKS); do echo "$$script"; $(BIN)/python "$$script"; done
+
+docs: $(INSTALLED)
+	@$(BIN)/python tools/settings_reference.py
 
 proto: $(INSTALLED)
 	@cd src && ../$(BIN)/python -m grpc_tools.protoc --proto_path=. --python_out=. --pyi_out=. fcslam/wire/*.proto

@@ -1,0 +1,192 @@
+"""Write docs/settings.md, the reference of all settings, from the settings themselves.
+
+    make docs
+
+A row's effect is the description of the field, and its unit follows from the key's suffix. To correct the page, correct
+the description of the field in the code.
+"""
+
+import sys
+import types
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+import yaml
+from annotated_types import Ge, Gt, Le, Lt, MultipleOf
+from pydantic.fields import FieldInfo
+
+from fcslam.cloud.settings import CloudConfig
+from fcslam.config import Settings
+from fcslam.federated.settings import FederatedSettings
+from fcslam.learning.settings import TrainingSettings
+from fcslam.mission import MissionConfig
+
+PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
+
+UNITS = {
+    "rad_m": "rad/m",
+    "per_m": "1/m",
+    "m": "m",
+    "rad": "rad",
+    "s": "s",
+    "hz": "Hz",
+    "px": "px",
+    "mb": "MB",
+    "bits": "bit",
+    "megabytes": "MB",
+}
+"""By the suffix of a key; longer ones come first."""
+
+NO_UNIT = "-"
+
+HEAD = """\
+# Settings
+
+With this page you find the setting that you want to change, its default value and its effect. `make docs` writes the
+page from the code.
+
+## How to set them
+
+Write the complete default configuration to a file, change it, and give it to a command:
+
+```sh
+fcslam config dump > mission.yaml
+fcslam map robot1.clf robot2.clf -o runs/building --config mission.yaml
+```
+
+- A file needs only the keys that you change. Missing keys have their default values.
+- An unknown key or a value out of range is an error. The message names the nearest known key.
+- Every run folder contains the complete configuration of the run, `config.yaml`.
+- In Python, `fcslam.map_recordings(..., config={"map": {"resolution_m": 0.1}})` takes the same keys.
+
+A key path such as `map.resolution_m` stands for nested keys:
+
+```yaml
+map:
+  resolution_m: 0.1
+```
+
+Units are SI; angles are in radians. A setting without unit is a count, a ratio or a choice.
+"""
+
+MISSION = """\
+## Mission
+
+Commands that map, serve or run a robot read these keys with `--config`. `robot` applies on each robot, `fleet` and
+`map` in the cloud. The service keeps {cloud} with each mission, so that it can rebuild the mission from its packets.
+"""
+
+TRAINING = """\
+## Training
+
+`fcslam train --config` reads these keys from a YAML file.
+"""
+
+FEDERATED = """\
+## Federated training
+
+The federated commands read these keys from a YAML file. `training` holds the keys of [Training](#training).
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    cloud = ", ".join(f"`{key}`" for key in CloudConfig.model_fields)
+    parts = [HEAD, MISSION.format(cloud=cloud), *tables(MissionConfig()), TRAINING, *tables(TrainingSettings())]
+    return "\n".join([*parts, FEDERATED, *tables(FederatedSettings(), documented=(TrainingSettings,))])
+
+
+def tables(settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = ()) -> Iterator[str]:
+    """One table of the plain keys of ``settings``, and after it those of the settings nested in it."""
+    rows, nested = [], []
+    for key, field in type(settings).model_fields.items():
+        value = getattr(settings, key)
+        if not isinstance(value, Settings):
+            rows.append(row(f"{path}{key}", field, value))
+        elif type(value) not in documented:
+            nested.append((key, field, value))
+    if rows:
+        yield "\n".join(["| key | default | unit | allowed | effect |", "|---|---|---|---|---|", *rows, ""])
+    for key, field, value in nested:
+        yield f"### `{path}{key}`\n\n{sentence(field.description)}\n"
+        yield from tables(value, f"{path}{key}.", documented)
+
+
+def row(path: str, field: FieldInfo, value: Any) -> str:
+    """One line of a table."""
+    cells = [f"`{path}`", f"`{flow(value)}`", unit(path), allowed(field), sentence(field.description)]
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def unit(path: str) -> str:
+    """The unit by the suffix of the key."""
+    key = path.rpartition(".")[2].lower()
+    return next((name for suffix, name in UNITS.items() if key == suffix or key.endswith(f"_{suffix}")), NO_UNIT)
+
+
+def allowed(field: FieldInfo) -> str:
+    """Choices or bounds."""
+    choices = list(choices_of(field.annotation))
+    if choices:
+        return ", ".join(f"`{flow(choice)}`" for choice in choices)
+    bounds = []
+    for bound in field.metadata:
+        match bound:
+            case Ge(value):
+                bounds.append(f">= {value:g}")
+            case Gt(value):
+                bounds.append(f"> {value:g}")
+            case Le(value):
+                bounds.append(f"<= {value:g}")
+            case Lt(value):
+                bounds.append(f"< {value:g}")
+            case MultipleOf(value):
+                bounds.append(f"multiple of {value}")
+    if type(None) in get_args(field.annotation):
+        bounds.append("`null`")
+    return ", ".join(bounds)
+
+
+def choices_of(annotation: Any) -> Iterator[Any]:
+    """Values of an enumeration, of literals or of a truth value, alone or in a tuple."""
+    if annotation is bool:
+        yield from (True, False)
+    elif isinstance(annotation, type) and issubclass(annotation, Enum):
+        yield from (member.value for member in annotation)
+    elif get_origin(annotation) is Literal:
+        yield from get_args(annotation)
+    elif get_origin(annotation) in (tuple, Union, types.UnionType):
+        for part in get_args(annotation):
+            yield from choices_of(part)
+
+
+def flow(value: Any) -> str:
+    """A value as YAML on one line."""
+    if isinstance(value, tuple):
+        value = [item.value if isinstance(item, Enum) else item for item in value]
+    elif isinstance(value, Enum):
+        value = value.value
+    elif isinstance(value, Path):
+        value = str(value)
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=10_000)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def sentence(description: str | None) -> str:
+    """A description with a capital letter and a full stop."""
+    if not description:
+        raise SystemExit("a setting has no description")
+    return f"{description[0].upper()}{description[1:]}" + ("" if description.endswith(".") else ".")
+
+
+def main() -> int:
+    """Write the page."""
+    PAGE.write_text(page(), encoding="utf-8")
+    print(f"{PAGE}: {page().count(chr(10) + '| `')} settings")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
