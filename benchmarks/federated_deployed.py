@@ -98,11 +98,11 @@ def deploy(folder: Path, options: Sequence[object]) -> Path:
 
     where, output, log = f"127.0.0.1:{free_port()}", folder / "deployed", folder / "server.log"
     with ExitStack() as running:
-        server = running.enter_context(federate("--serve", where, "-o", output, *options, "--insecure", log=log))
+        server = running.enter_context(federate("serve", where, "-o", output, *options, "--insecure", log=log))
         wait_for(lambda: "waiting: 0 robots" in log.read_text(), "the server's start", log)
         robots = {}
         for robot in ROBOTS:
-            words = ["--join", where, folder / robot, "-o", folder / f"home-{robot}", "--insecure"]
+            words = ["join", where, folder / robot, "-o", folder / f"home-{robot}", "--insecure"]
             robots[robot] = running.enter_context(federate(*words, log=folder / f"{robot}.log"))
         # It labels its images when the first order to train has come.
         labels = folder / f"home-{KILLED}" / "labels"
@@ -132,7 +132,7 @@ def compare(report: common.Report, folder: Path) -> None:
     (folder / "tiny.yaml").write_text(TINY)
     options = ["--config", folder / "tiny.yaml", "--public", drawn(folder / "public", 4, 99), "--device", "cpu"]
     embedded, rest = folder / "embedded", [folder / robot for robot in ROBOTS if robot != KILLED]
-    common.run_fcslam("federate", "--local", *rest, "-o", embedded, *options)
+    common.run_fcslam("federate", "local", *rest, "-o", embedded, *options)
     began = time.perf_counter()
     deployed = deploy(folder, options)
     wall_s = time.perf_counter() - began

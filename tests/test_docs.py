@@ -152,7 +152,7 @@ def test_the_documented_example_writes_a_log_that_can_be_read(tmp_path, monkeypa
     ("line", "complete", "fine"),
     [
         ("fcslam map a.clf b.clf -o out", True, True),
-        ("fcslam map a.clf", True, False),
+        ("fcslam map", True, False),
         ("fcslam map", False, True),
         ("fcslam map --config", False, True),
         ("fcslam map --pieces 3", False, False),

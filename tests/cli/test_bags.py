@@ -209,8 +209,3 @@ def test_a_log_without_a_clock_before_zero_cannot_be_a_bag(tmp_path, capsys):
     log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40, start_stamp=-5.0))
     assert "ROS counts from 0 s" in refused(capsys, "convert", log, tmp_path / "a.bag")
     assert {path.name for path in tmp_path.iterdir()} == {"a.log"}
-
-
-def test_the_help_has_examples(capsys):
-    assert run("convert", "--help") == 0
-    assert "Example: fcslam convert robot1.clf.gz robot1.bag" in capsys.readouterr().out

@@ -44,7 +44,7 @@ def fleet(tmp_path_factory):
 def federate(fleet, output, *more, robots=("one", "two", "bare")):
     folders = [str(fleet / robot) for robot in robots]
     settings = ["--config", str(fleet / "tiny.yaml"), "--device", "cpu"]
-    return main(["federate", "--local", *folders, "--output", str(output), *settings, *more])
+    return main(["federate", "local", *folders, "--output", str(output), *settings, *more])
 
 
 @pytest.fixture(scope="module")
@@ -95,21 +95,20 @@ def test_the_same_command_with_more_rounds_goes_on(fleet, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["federate", "--local", "{fleet}/one", "{fleet}/one", "-o", "{out}"], "two folders are called one"),
-        (["federate", "--local", "{fleet}/nobody", "-o", "{out}"], "nobody: is no folder"),
-        (["federate", "{fleet}/one", "-o", "{out}"], "--local"),
-        (["federate", "--local", "{fleet}/one", "-o", "{out}", "--strategy", "best"], "strategy"),
-        (["federate", "--local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
-        (["federate", "--local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"], "cannot be used as the output folder"),
-        (["federate", "--local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"], "is no checkpoint"),
-        (["federate", "--local", "-o", "{out}"], "--local needs a folder"),
-        (["federate", "--local", "--serve", "a:1", "-o", "{out}"], "say where the robots are"),
-        (["federate", "--serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is no HOST:PORT"),
-        (["federate", "--serve", "a:1", "{fleet}/one", "-o", "{out}", "--insecure"], "robots bring their own images"),
-        (["federate", "--serve", "a:1", "-o", "{out}"], "give --ca"),
-        (["federate", "--serve", "a:1", "-o", "{out}", "--ca", "{fleet}/no.crt"], "no.crt: is no file"),
-        (["federate", "--serve", "a:1", "-o", "{out}", "--insecure", "--ca", "{fleet}/tiny.yaml"], "leave out one"),
-        (["federate", "--join", "a:1", "-o", "{out}", "--insecure"], "--join needs one folder"),
+        (["federate", "local", "{fleet}/one", "{fleet}/one", "-o", "{out}"], "two folders are called one"),
+        (["federate", "local", "{fleet}/nobody", "-o", "{out}"], "nobody: is no folder"),
+        (["federate", "local", "{fleet}/one", "-o", "{out}", "--strategy", "best"], "strategy"),
+        (["federate", "local", "{fleet}/one", "-o", "{out}", "--public", "{fleet}/bare"], "holds no image"),
+        (["federate", "local", "{fleet}/one", "-o", "{fleet}/tiny.yaml"], "cannot be used as the output folder"),
+        (["federate", "local", "{fleet}/one", "-o", "{out}", "--start", "{fleet}/tiny.yaml"], "is no checkpoint"),
+        (["federate", "serve", "nowhere", "-o", "{out}", "--insecure"], "nowhere: is no HOST:PORT"),
+        (["federate", "serve", "a:1", "-o", "{out}"], "give --ca"),
+        (["federate", "serve", "a:1", "-o", "{out}", "--ca", "{fleet}/no.crt"], "no.crt: is no file"),
+        (["federate", "serve", "a:1", "-o", "{out}", "--insecure", "--ca", "{fleet}/tiny.yaml"], "leave out one"),
+        (["federate", "join", "a:1", "{fleet}/nobody", "-o", "{out}", "--insecure"], "nobody: is no folder"),
+        (["federate", "join", "a", "{fleet}/one", "-o", "{out}", "--insecure"], "a: is no HOST:PORT"),
+        (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"], "give --ca"),
+        (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", "--insecure", "--name", ""], "give --name"),
     ],
 )
 def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
@@ -118,6 +117,28 @@ def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1
     assert words in said[0]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["local"],
+        ["local", "{fleet}/one", "--insecure"],
+        ["local", "{fleet}/one", "--name", "one"],
+        ["serve", "a:1", "{fleet}/one"],
+        ["serve", "a:1", "--name", "one"],
+        ["join", "a:1"],
+        ["join", "a:1", "{fleet}/one", "{fleet}/two", "-o", "{out}"],
+        ["join", "a:1", "{fleet}/one", "-o", "{out}", "--rounds", "3"],
+        ["--local", "{fleet}/one"],
+    ],
+)
+def test_each_subcommand_has_its_own_options_only(arguments, fleet, tmp_path, capsys):
+    given = [word.format(fleet=fleet, out=tmp_path / "out") for word in arguments]
+    assert main(["federate", *given]) == BAD_INPUT
+    error = capsys.readouterr().err
+    assert "Usage: fcslam federate" in error
+    assert "Traceback" not in error
 
 
 def test_a_fleet_without_images_is_said(fleet, tmp_path, capsys):

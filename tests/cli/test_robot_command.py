@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 
 from fcslam.cli import main
-from fcslam.cli.robot import _progress
+from fcslam.cli.progress import ProgressDisplay
+from fcslam.cli.robot import _watch
 from fcslam.robot.agent import AgentProgress
 from fcslam.robot.outbox import WaitingPackets
 from fcslam.runs import read_tum
@@ -102,7 +103,7 @@ def test_a_stopped_robot_says_what_is_left_and_goes_on_later(log, cloud, tmp_pat
         robot.send_signal(number)
         err = robot.stderr.read()
     assert robot.returncode == 130
-    assert re.search(r"\d+ packets \(\d+ kB\) wait in .*--resume goes on", err.replace("\n", " "))
+    assert re.search(r"\d+ packets \(\d+ kB\) wait in .*; to continue, give --resume", err.replace("\n", " "))
     assert "Traceback" not in err
     assert main([*nowhere[:-3], "--server", cloud.url, "--resume"]) == 0
     assert list(cloud.cloud.stored) == [(0, k) for k in range(len(cloud.cloud.stored))]
@@ -117,7 +118,8 @@ def test_the_traffic_is_explained_without_a_recording(capsys):
 
 def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begins():
     console = Console(file=io.StringIO(), width=200)
-    with _progress(console, 100) as watch:
+    with ProgressDisplay(console) as display:
+        watch = _watch(display, console, 100)
         for times_lost, quality in [(0, 0.0), (1, 0.0), (1, 0.5), (1, 0.0), (2, 0.0)]:
             watch(AgentProgress(9, 9, WaitingPackets(0, 0), 9, 9, 0, 0, 0, 0.0, quality, times_lost, None, False, ()))
     said = [line.split(":")[0] for line in console.file.getvalue().splitlines()]

@@ -75,10 +75,10 @@ def test_certificates_that_do_not_fit_end_in_one_line(tmp_path, capsys):
     keys(ours, "robot")
     (tmp_path / "robot").mkdir()
     files = ["--ca", str(ours / "ca.crt"), "--certificate", str(theirs / "own.crt"), "--key", str(theirs / "own.key")]
-    common = ["federate", "-o", str(tmp_path / "out"), "--device", "cpu", *files, "--robot-key"]
-    assert main([*common, str(ours / "robot.pub"), "--serve", "127.0.0.1:8000"]) == 2
+    common = ["127.0.0.1:8000", "-o", str(tmp_path / "out"), "--device", "cpu", *files, "--robot-key"]
+    assert main(["federate", "serve", *common, str(ours / "robot.pub")]) == 2
     assert f"{theirs / 'own.crt'}: does not fit {ours / 'ca.crt'}" in line_of(capsys)
-    assert main([*common, str(ours / "robot"), "--join", "127.0.0.1:8000", str(tmp_path / "robot")]) == 2
+    assert main(["federate", "join", *common, str(ours / "robot"), str(tmp_path / "robot")]) == 2
     assert f"{theirs / 'own.crt'}: does not fit {ours / 'ca.crt'}" in line_of(capsys)
     assert not (tmp_path / "out").exists()
 
@@ -95,7 +95,7 @@ def embedded(tmp_path_factory):
     folders = [str(folder / robot) for robot in ("one", "two")]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", PATH)
-        words = ["--local", *folders, "-o", str(folder / "out"), "--config", str(folder / "tiny.yaml")]
+        words = ["local", *folders, "-o", str(folder / "out"), "--config", str(folder / "tiny.yaml")]
         process = start(*words, "--device", "cpu", log=folder / "log")
     assert process.wait(LIMIT_S) == 0, (folder / "log").read_text()
     return folder
@@ -112,14 +112,14 @@ class Deployment:
         self._tls = ["--ca", str(own / "ca.crt"), "--certificate", str(own / "own.crt"), "--key", str(own / "own.key")]
 
     def server(self):
-        words = ["--serve", self.where, "-o", str(self.folder / "deployed"), "--device", "cpu", *self._tls]
+        words = ["serve", self.where, "-o", str(self.folder / "deployed"), "--device", "cpu", *self._tls]
         for robot in ("one", "two"):
             words += ["--robot-key", str(self.folder / "keys" / f"{robot}.pub")]
         return self._started(*words, "--config", str(self._images / "tiny.yaml"), log="server")
 
     def robot(self, name, key=None):
         key = key or name
-        words = ["--join", self.where, str(self._images / name), "-o", str(self.folder / f"home-{key}")]
+        words = ["join", self.where, str(self._images / name), "-o", str(self.folder / f"home-{key}")]
         words += ["--device", "cpu", *self._tls, "--robot-key", str(self.folder / "keys" / key)]
         return self._started(*words, log=key)
 

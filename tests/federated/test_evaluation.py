@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.cli.federate import line_of
+from fcslam.cli.federate.rounds import round_line
 from fcslam.errors import TrainingError
 from fcslam.federated.client_app import build_client_app
 from fcslam.federated.evaluation import VersionComparison, valid_metrics
@@ -53,8 +53,8 @@ def test_only_some_rounds_are_judged_and_the_last(tmp_path):
     assert [report.released for report in reports] == [False, True, False, True, True]
     assert [bool(report.figures) for report in reports] == [False, True, False, True, True]
     assert state.best_round == 5
-    assert "not judged" in line_of(reports[0].row(), 5)
-    assert "released" in line_of(reports[1].row(), 5)
+    assert "not judged" in round_line(reports[0].row(), 5)
+    assert "released" in round_line(reports[1].row(), 5)
 
 
 def test_the_median_robot_decides(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.cli.federate_apart import _address
+from fcslam.cli.federate.options import parse_address
 from fcslam.errors import OutputError, TrainingError
 from fcslam.federated import launch
 from fcslam.federated.job import FederatedJob
@@ -104,10 +104,10 @@ def test_a_log_that_cannot_be_written_is_told(tmp_path):
 
 
 def test_an_ipv6_address_keeps_its_brackets_outside():
-    assert _address("[::1]:8000") == Address("::1", 8000)
-    assert str(_address("[::1]:8000")) == "[::1]:8000"
+    assert parse_address("[::1]:8000") == Address("::1", 8000)
+    assert str(parse_address("[::1]:8000")) == "[::1]:8000"
     with pytest.raises(TrainingError, match="is no HOST:PORT"):
-        _address("[]:8000")
+        parse_address("[]:8000")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1", "localhost", "LOCALHOST", "localhost.localdomain", "::1"])

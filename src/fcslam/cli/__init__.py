@@ -1,5 +1,6 @@
-"""The command line: one module a command. What a command needs is imported when it runs, so that help is quick."""
+"""The command line: one module for each command. Commands import what they need when they run, so help is quick."""
 
+import os
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -11,68 +12,80 @@ from fcslam.cli import certificates, config, demo, evaluate, extract, federate, 
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.cli import robot as robots
+from fcslam.cli.examples import examples
 from fcslam.errors import FcslamError
 
 BAD_INPUT, INTERRUPTED = 2, 130
-"""Exit codes: 2 for what the user can mend, 130 as a shell says it for Ctrl-C."""
+"""Exit codes: 2 for errors that the user can correct, 130 for Ctrl-C as in shells."""
+PROGRAM = "fcslam"
+COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
+"""Environment variable by which a shell asks for completions instead of running the command."""
 
 app = typer.Typer(
-    name="fcslam",
+    name=PROGRAM,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("map", epilog="Example: fcslam map robot1.clf.gz robot2.clf.gz --output runs/building")(
-    mapping.map_recordings
-)
+app.command(
+    "map",
+    epilog=examples(
+        "fcslam map robot1.clf.gz robot2.clf.gz",
+        "fcslam map anna=run1.bag ben=run2.mcap -o runs/building",
+        "fcslam map building.clf.gz --split 3 --quiet",
+    ),
+)(mapping.map_recordings)
 app.command(
     "convert",
-    epilog="Example: fcslam convert robot1.clf.gz robot1.bag, fcslam convert robot2.mcap robot2.clf.gz "
-    "--scan-topic /front/scan",
+    epilog=examples(
+        "fcslam convert robot1.clf.gz robot1.bag",
+        "fcslam convert robot2.mcap robot2.clf.gz --scan-topic /front/scan",
+    ),
 )(conversion.convert)
 app.command(
     "simulate",
-    epilog="Example: fcslam simulate --output office --building office --no-camera, "
-    "fcslam simulate --output day-and-evening --robots 2 --lighting day --lighting evening --moved-furniture 0.3, "
-    "and after an interruption the same with --resume",
+    epilog=examples(
+        "fcslam simulate --building office --no-camera",
+        "fcslam simulate --lighting day --lighting evening --moved-furniture 0.3",
+        "fcslam simulate --robots 20 --building office -o office --resume",
+    ),
 )(simulate.simulate)
-app.command("extract", epilog="Example: fcslam extract photos --output features --keypoints 1000")(extract.extract)
-app.command("demo", epilog="Example: fcslam demo --output demo --robots 4")(demo.demo)
-app.command("train", epilog="Example: fcslam train photos --output detector, fcslam train photos -o try --quick")(
-    train.train
-)
-app.command(
-    "federate",
-    epilog="Example: fcslam federate --local robot1 robot2 robot3 --output fleet --public photos, "
-    "fcslam federate --local robot1 robot2 --output try --quick",
-)(federate.federate)
+app.command("extract", epilog=examples("fcslam extract photos -o features --keypoints 1000"))(extract.extract)
+app.command("demo", epilog=examples("fcslam demo", "fcslam demo --robots 4 --no-camera -o demo4"))(demo.demo)
+app.command("train", epilog=examples("fcslam train photos -o detector", "fcslam train photos --quick"))(train.train)
 app.command(
     "robot",
-    epilog="Example: fcslam robot robot1.clf.gz --server https://cloud.example:8443 --state state/robot1 "
-    "--token-file robot1.token, fcslam robot --explain-traffic",
+    epilog=examples(
+        "fcslam robot robot1.clf.gz --server http://127.0.0.1:8340 --state state",
+        "fcslam robot robot1.bag --server https://cloud:8340 --state s --token-file t",
+        "fcslam robot --explain-traffic",
+    ),
 )(robots.robot)
 app.command(
     "serve",
-    epilog="Example: fcslam serve --data missions, fcslam serve --data missions --host 0.0.0.0 --tokens tokens.yaml "
-    "--tls-certificate cloud.pem --tls-key cloud.key",
+    epilog=examples(
+        "fcslam serve --data missions",
+        "fcslam serve --data missions --host 0.0.0.0 --tokens tokens.yaml",
+    ),
 )(serve.serve)
 app.command(
     "certificates",
-    epilog="Example: fcslam certificates --output credentials --host cloud.local --robot robot1 --robot robot2 "
-    "--viewer lab --admin boss",
+    epilog=examples("fcslam certificates --host cloud.local --robot robot1 --admin boss"),
 )(certificates.certificates)
-app.add_typer(config.app, name="config")
+app.add_typer(federate.app, name="federate")
 app.add_typer(evaluate.app, name="evaluate")
+app.add_typer(config.app, name="config")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that ``arguments`` (or the process's own) name, and return its exit code.
 
-    What the user can mend is one line on stderr, never a traceback.
+    An error that the user can correct is one line on stderr, never a traceback.
     """
+    if COMPLETION_VARIABLE in os.environ:
+        _leave_paths_to_the_shell()
     try:
-        code = app(arguments, standalone_mode=False) or 0
+        code = app(arguments, prog_name=PROGRAM, standalone_mode=False) or 0
     except FcslamError as error:
         return _fail(str(error), BAD_INPUT)
     except click.ClickException as error:
@@ -82,6 +95,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = INTERRUPTED
     # typer itself turns Ctrl-C into this code
     return _fail("interrupted", code) if code == INTERRUPTED else int(code)
+
+
+def _leave_paths_to_the_shell() -> None:
+    """Make a path complete to nothing, in this process, which only completes.
+
+    Shells then complete files. Typer would answer with the word as it stands, which ends the completion.
+    """
+    click.Path.shell_complete = lambda *_: []  # type: ignore[method-assign]
 
 
 def _fail(message: str, code: int) -> int:
@@ -95,10 +116,10 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(epilog=examples("fcslam demo", "fcslam map robot1.bag robot2.bag", "fcslam map --help"))
 def _fcslam(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Several robots map one building together: one map, every robot's trajectory in it."""
+    """Multi-robot 2D LiDAR SLAM: map the recordings of several robots together."""

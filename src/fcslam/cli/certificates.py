@@ -1,4 +1,4 @@
-"""`fcslam certificates`: what a service with TLS needs, for development and for closed networks."""
+"""`fcslam certificates`: credentials for a service with TLS, for development and closed networks."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,17 +8,23 @@ import typer
 
 def certificates(
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the credentials; what is there stays.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the credentials. Existing ones are kept.")
+    ] = Path("credentials"),
     host: Annotated[
-        list[str] | None, typer.Option(help="Name or address by which the cloud is reached; may be given again.")
+        list[str] | None, typer.Option(help="Host name or IP address of the service. Can be repeated.")
     ] = None,
     robot: Annotated[
-        list[str] | None, typer.Option(help="A robot to make a token and a certificate for; may be given again.")
+        list[str] | None, typer.Option(help="Name of a robot, which gets a token and a certificate. Can be repeated.")
     ] = None,
-    viewer: Annotated[list[str] | None, typer.Option(help="Somebody who may see everything.")] = None,
-    admin: Annotated[list[str] | None, typer.Option(help="Somebody who may decide about missions.")] = None,
+    viewer: Annotated[
+        list[str] | None, typer.Option(help="Name of a user who may read everything. Can be repeated.")
+    ] = None,
+    admin: Annotated[
+        list[str] | None, typer.Option(help="Name of a user who may also manage missions. Can be repeated.")
+    ] = None,
 ) -> None:
-    """Make a certificate authority, certificates of the cloud and of robots, and tokens for robots and people."""
+    """Make a certificate authority, certificates of the service and of robots, and tokens for robots and users."""
     import datetime
 
     from fcslam.cloud.sessions import check_robot
@@ -31,17 +37,17 @@ def certificates(
     names = [(name, role) for role, given in wanted.items() for name in given]
     for name, role in names:
         if [other for other, _ in names].count(name) > 1:
-            raise InputError(f"'{name}' is named twice; every token needs a name of its own")
+            raise InputError(f"'{name}' is named twice; every token needs another name")
         try:
             check_name(name, role)
             check_robot(name)
         except PacketError as error:
             raise InputError(str(error)) from error
     make_credentials(output, host or [], dict(names), datetime.datetime.now(datetime.UTC))
-    typer.echo(f"authority, for all who connect: {output / 'ca.pem'}")
-    typer.echo(f"for the cloud: {output / 'cloud.pem'}, {output / 'cloud.key'}, {output / 'tokens.yaml'}")
+    typer.echo(f"authority, for all clients: {output / 'ca.pem'}")
+    typer.echo(f"for the service: {output / 'cloud.pem'}, {output / 'cloud.key'}, {output / 'tokens.yaml'}")
     for name, role in names:
         typer.echo(f"for {role} {name}: {output / 'tokens' / name}")
         if role is Role.ROBOT:
             stem = output / "robots" / name
-            typer.echo(f"or, instead of the token, where the cloud is given --client-ca: {stem}.pem, {stem}.key")
+            typer.echo(f"or, for a service with --client-ca, instead of the token: {stem}.pem, {stem}.key")

@@ -2,13 +2,22 @@
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="The configuration of a run.")
+from fcslam.cli.examples import examples
+
+_DUMP = "fcslam config dump > mission.yaml"
+
+app = typer.Typer(no_args_is_help=True)
 
 
-@app.command(epilog="Example: fcslam config dump > mission.yaml")
+@app.callback(epilog=examples(_DUMP))
+def config() -> None:
+    """Print the configuration of a mission."""
+
+
+@app.command(epilog=examples(_DUMP, "fcslam map robot1.bag robot2.bag --config mission.yaml"))
 def dump() -> None:
-    """Print the complete default configuration as YAML, each key under a comment that explains it."""
-    from fcslam import config
+    """Print the complete default configuration as YAML. A comment above each key explains it."""
+    from fcslam.config import dump as as_yaml
     from fcslam.mission import MissionConfig
 
-    typer.echo(config.dump(MissionConfig()), nl=False)
+    typer.echo(as_yaml(MissionConfig()), nl=False)

@@ -1,4 +1,4 @@
-"""`fcslam convert`: a recording in another format."""
+"""`fcslam convert`: write a recording in another format."""
 
 import re
 import shutil
@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.options import Force, Quiet
+from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import (
     CameraTopic,
     LaserPose,
@@ -16,8 +18,8 @@ from fcslam.cli.recordings import (
     ScanTopic,
     bag_options,
     open_recording,
-    show_faults,
-    show_notes,
+    print_faults,
+    print_notes,
 )
 
 if TYPE_CHECKING:
@@ -29,17 +31,17 @@ if TYPE_CHECKING:
 _CARMEN = re.compile(r"\.(clf|log)(\.(gz|xz|bz2))?$")
 _RECORDING = ".fcslam"
 _FOLDER_MARKS = {"": "metadata.yaml", _RECORDING: "meta.yaml"}
-"""What a folder holds that may be replaced."""
+"""The file that marks a folder as a recording, which ``--force`` may replace; by suffix of the folder."""
 
 
 def convert(
-    recording: Annotated[str, typer.Argument(metavar="RECORDING", help="The recording to read.")],
+    recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Recording to read.")],
     output: Annotated[
         Path,
         typer.Argument(
             metavar="OUTPUT",
-            help="The file to write: .clf or .log (.gz, .xz, .bz2) is a CARMEN log, .bag a ROS 1 bag, .mcap and .db3 "
-            "ROS 2 bags, .fcslam a recording folder; without a suffix a ROS 2 bag folder.",
+            help="File to write. Its suffix chooses the format: .clf or .log (and .gz, .xz, .bz2) a CARMEN log, .bag a "
+            "ROS 1 bag, .mcap or .db3 a ROS 2 bag, no suffix a ROS 2 bag folder, .fcslam a recording folder.",
         ),
     ],
     *,
@@ -47,31 +49,30 @@ def convert(
     odom_topic: OdomTopic = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Replace what is there already.")] = False,
+    force: Force = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Write the scans, the odometry and the images of a recording in another format, told by OUTPUT's suffix."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
+    """Write the scans, odometry and images of a recording in another format."""
+    console = notices(quiet)
     source = open_recording(recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
     _prepare(output, force)
     survey = source.survey()
-    show_notes(console, survey.notes)
+    print_notes(console, survey.notes)
     if survey.camera is not None and _CARMEN.search(output.name):
-        show_notes(console, [f"{output}: a CARMEN log has no place for images, they are left out"])
-    _write(output, survey, _watched(source, survey.scan_count, console))
-    show_faults(console, [source])
-    Console().print(f"{survey.scan_count} scans: {output}", highlight=False, markup=False, soft_wrap=True)
+        print_line(console, f"{output}: a CARMEN log has no place for images, they are left out")
+    _write(output, survey, _with_progress(source, survey.scan_count, console))
+    print_faults(console, [source])
+    print_line(answers(), f"{survey.scan_count} scans: {output}")
 
 
 def _prepare(output: Path, force: bool) -> None:
-    """Check, before the work, that ``output`` can be written; its parents are made."""
+    """Check before the work that ``output`` can be written, and create its parents."""
     from fcslam.errors import OutputError
     from fcslam.sources import BAG_SUFFIXES
 
     if not (_CARMEN.search(output.name) or output.suffix in (*BAG_SUFFIXES, _RECORDING)):
         raise OutputError(
-            f"{output}: unknown format; end it in .clf (.gz, .xz, .bz2), .bag, .mcap, .db3, .fcslam, or in nothing"
+            f"{output}: unknown format; give .clf (.gz, .xz, .bz2), .bag, .mcap, .db3, .fcslam, or no suffix"
         )
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -85,7 +86,7 @@ def _prepare(output: Path, force: bool) -> None:
 
 
 def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") -> None:
-    """Write beside ``output`` and put it in its place when it is complete."""
+    """Write into a temporary folder beside ``output`` and move the complete recording to its place."""
     from fcslam.errors import OutputError
     from fcslam.sources import write_bag, write_carmen, write_recording
 
@@ -103,15 +104,14 @@ def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") ->
         raise OutputError(f"{output}: cannot be written ({error}); choose another place") from error
 
 
-def _watched(source: "Source", total: int, console: "Console") -> "Iterator[SensorRecord]":
-    """The recording's records, with a progress display."""
-    from rich.progress import Progress
-
+def _with_progress(source: "Source", total: int, console: "Console") -> "Iterator[SensorRecord]":
+    """The records of a recording of ``total`` scans, with a progress display."""
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.records import LaserScan
 
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("converting", total=total)
+    with ProgressDisplay(console) as display:
+        advance = display.start("converting", total)
         for record in source.records():
             yield record
             if isinstance(record, LaserScan):
-                bar.advance(task)
+                advance()

@@ -1,14 +1,15 @@
-"""`fcslam demo`: a fleet simulated, taught, mapped together, measured against the truth, and drawn."""
+"""`fcslam demo`: simulate a fleet, train its detector, map it, compare the map with the truth, and draw both."""
 
 import shutil
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet
+from fcslam.cli.output import answers, notices, print_line
 from fcslam.simulation.options import Building
 
 if TYPE_CHECKING:
@@ -21,23 +22,22 @@ if TYPE_CHECKING:
 RECORDINGS, LEARNING, RUN, FIGURE, TABLE = "recordings", "learning", "run", "figure.png", "evaluation.csv"
 STAGES = 5
 ABOUT = "about"
-"""It tells a folder that a demo wrote from one that holds somebody's work."""
+"""The file that marks a folder as the output of a demo, which the next demo may replace."""
 
 
 def demo(
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for everything; a demo there is replaced.")] = (
-        Path("demo")
-    ),
-    robots: Annotated[int, typer.Option(min=1, max=8, help="How many robots drive.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed draws another building.")] = 1,
-    building: Annotated[Building, typer.Option(help="What kind of building.")] = Building.DEFAULT,
-    path_length: Annotated[float, typer.Option(min=1.0, max=10_000.0, help="Metres that each robot drives.")] = 60.0,
-    no_camera: Annotated[bool, typer.Option("--no-camera", help="LiDAR only; needs no GL library.")] = False,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for all results. A demo in it is replaced.")
+    ] = Path("demo"),
+    robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 3,
+    seed: BuildingSeed = 1,
+    building: BuildingKind = Building.DEFAULT,
+    path_length: PathLength = 60.0,
+    no_camera: NoCamera = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Simulate a fleet whose robots do not know where they are, map it, compare the map with the truth, draw both."""
-    from rich.console import Console
-
+    """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
     from fcslam.simulation.recording import prepare_fleet_folder
@@ -51,22 +51,22 @@ def demo(
     fleet = simulate_fleet(settings, seed)
     _prepare(output)
     prepare_fleet_folder(output / RECORDINGS, settings, seed, resume=False)
-    console = Console(stderr=True)
-    _announce(console, 1, f"simulate: {robots} robots drive {path_length:g} m each; none is told where it starts")
+    console = notices(quiet)
+    _announce(console, 1, f"simulate: {robots} robots drive {path_length:g} m each; their starts are unknown")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, False, console)
     sources = [open_source(place) for place in recordings]
     config = _learn(sources, output / LEARNING, seed, camera is not None, console)
-    _announce(console, 3, "map each robot, recognise places, fuse")
-    map_sources(sources, config, output / RUN, force=True)
+    _announce(console, 3, "map each robot, recognise places, fuse the maps")
+    map_sources(sources, config, output / RUN, console, force=True)
     _evaluate(output, console)
     _draw(output, fleet, console)
     typer.echo(f"{time.perf_counter() - began:.0f} s in all")
-    for what, name in (("run folder", RUN), ("figure", FIGURE), ("every figure measured", TABLE)):
-        typer.echo(f"{what}: {output / name}")
+    for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
+        typer.echo(f"{content}: {output / name}")
 
 
 def _check_libraries(settings: "SimulationSettings") -> None:
-    """Refuse before the work, and before an earlier demo is removed."""
+    """Check before the work, and before an earlier demo is removed, that everything can run."""
     from fcslam.simulation.engine import gl_context, mujoco
 
     if settings.camera:
@@ -76,10 +76,10 @@ def _check_libraries(settings: "SimulationSettings") -> None:
 
 
 def _prepare(output: Path) -> None:
-    """A folder in which nothing of an earlier demo is left.
+    """Create the folder, and remove the results of an earlier demo from it.
 
     Raises:
-        OutputError: something else is there, or it cannot be written.
+        OutputError: the folder holds other files, or it cannot be written.
     """
     from fcslam.errors import OutputError
 
@@ -103,70 +103,58 @@ def _prepare(output: Path) -> None:
 
 
 def _learn(sources: "Sequence[Source]", folder: Path, seed: int, camera: bool, console: "Console") -> "MissionConfig":
-    """Train the detector for a moment where that can be done; the mission, with what came of it if it is no worse."""
+    """Train the detector for a moment if that is possible; returns a mission that uses it if it is no worse."""
     from fcslam.cli.demo_learning import learn_together, missing_libraries
     from fcslam.mission import MissionConfig
 
     config, missing = MissionConfig(seed=seed), missing_libraries()
     if not camera:
-        _announce(console, 2, "learn: left out, there is no camera")
+        _announce(console, 2, "learn: left out, because there is no camera")
         return config
     if missing:
-        how = "pip install 'fcslam\\[federated]'"  # escaped: brackets are the console's markup
-        _announce(console, 2, f"learn: left out, as {' and '.join(missing)} are not installed; to have it: {how}")
+        names = " and ".join(missing)
+        _announce(console, 2, f"learn: left out, because {names} are not installed: pip install 'fcslam[federated]'")
         return config
-    _announce(console, 2, "learn: the robots train the detector together, no image leaves its robot")
+    _announce(console, 2, "learn: the robots train the detector together, and no image leaves its robot")
     released = learn_together(sources, folder, seed, console)
     if released is None:
-        _say(console, "no round was as good on held-out images as what came with fcslam: the fleet keeps that")
+        print_line(console, "the fleet keeps the bundled detector: no round was as good on held-out images")
         return config
-    _say(console, "no worse on held-out images than what came with fcslam: the fleet takes it")
+    print_line(console, "the fleet takes it: the new detector is no worse than the bundled one on held-out images")
     onnx = config.robot.views.onnx.model_copy(update={"weights": released})
     views = config.robot.views.model_copy(update={"onnx": onnx})
     return config.model_copy(update={"robot": config.robot.model_copy(update={"views": views})})
 
 
 def _evaluate(output: Path, console: "Console") -> None:
-    from rich.console import Console
-
-    from fcslam.cli.evaluate_fleet import show_fleet
+    from fcslam.cli.evaluate.fleet import show_fleet
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.evaluation.fleet.metrics import fleet_metrics
     from fcslam.evaluation.fleet.relations import write_metrics
     from fcslam.evaluation.fleet.report import evaluate_fleet
 
     _announce(console, 4, "evaluate: compare with the truth")
-    with _busy(console, "evaluating"):
+    with ProgressDisplay(console) as display:
+        display.start("evaluating")
         report = evaluate_fleet(output / RUN, output / RECORDINGS)
         write_metrics(fleet_metrics(report), output / TABLE)
-    show_fleet(report, Console(), explained=False)
+    show_fleet(report, answers(), explained=False)
     typer.echo(f"What the columns mean: fcslam evaluate fleet {output / RUN}")
 
 
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.evaluation.fleet.charts import Outline, fleet_charts
     from fcslam.evaluation.fleet.figure import write_figure
     from fcslam.simulation.floorplan import PieceKind
 
     _announce(console, 5, "draw")
-    with _busy(console, "drawing"):
+    with ProgressDisplay(console) as display:
+        display.start("drawing")
         solid = [piece for piece in fleet.plan.pieces if piece.kind is not PieceKind.LINTEL]
         outlines = [Outline(piece.outline, piece.kind is not PieceKind.WALL) for piece in solid]
         write_figure(fleet_charts(output / RUN, output / RECORDINGS, outlines), output / FIGURE)
 
 
-def _announce(console: "Console", stage: int, what: str) -> None:
-    _say(console, f"[bold]{stage} of {STAGES}[/bold] {what}")
-
-
-def _say(console: "Console", text: str) -> None:
-    console.print(text, highlight=False, soft_wrap=True)
-
-
-@contextmanager
-def _busy(console: "Console", what: str) -> Iterator[None]:
-    """A sign of life where somebody watches."""
-    if not console.is_terminal:
-        yield
-        return
-    with console.status(what):
-        yield
+def _announce(console: "Console", stage: int, text: str) -> None:
+    print_line(console, f"{stage} of {STAGES} {text}")

@@ -1,4 +1,4 @@
-"""The demo's federated phase: the robots train the detector together on what their own cameras saw, for a moment."""
+"""The federated stage of the demo: the robots train the detector together on their own images, for a moment."""
 
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fcslam.cli.output import print_line
 from fcslam.errors import OutputError
 from fcslam.records import CameraImage
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from fcslam.sources import Source
 
 IMAGES = 24
-"""Taken from each robot's recording, evenly."""
+"""Number of images taken from each recording, evenly spaced."""
 ROUNDS, STEPS = 2, 6
 TRAINING = {"pairs": 4, "side_px": 160, "label_copies": 2}
 """Seconds, not hours: enough to see everything happen, too little to gain much."""
@@ -24,27 +25,28 @@ PNG = b"\x89PNG"
 
 
 def missing_libraries() -> list[str]:
-    """What the phase would need and what is not installed."""
+    """The libraries that this stage needs and that are not installed."""
     return [name for name in ("torch", "flwr", "onnx") if find_spec(name) is None]
 
 
 def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console: "Console") -> Path | None:
-    """Train from the detector that comes with fcslam, a line for each round; what was released, if it is no worse.
+    """Train the bundled detector further, and print a line for each round.
 
     Args:
-        sources: one recording a robot. The images go into folders of their own, which only their robot reads.
-        folder: for everything that is made.
+        sources: one recording for each robot. The images of each robot go into a folder that only this robot reads.
+        folder: output of the training.
         seed: of the training.
-        console: where rounds are told.
+        console: for progress and the lines of the rounds.
 
     Returns:
-        The network that the fleet takes; None where no round was as good as what it had.
+        The released network; None if no round was as good as the bundled one.
 
     Raises:
-        TrainingError: the robots saw too little to train on.
+        TrainingError: the recordings have too few images to train on.
         OutputError: something cannot be written.
     """
-    from fcslam.cli.federate import line_of
+    from fcslam.cli.federate.rounds import round_line
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import parse
     from fcslam.features.detector import BUNDLED_NETWORK
     from fcslam.federated.history import RoundReport
@@ -55,22 +57,24 @@ def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console
 
     given = {"rounds": ROUNDS, "local_steps": STEPS, "judge_every": 1, "normalisation": "frozen"}
     settings = parse(FederatedSettings, given | {"training": TRAINING | {"seed": seed}}, "the demo")
-    homes = [_own_images(source, folder / "images" / source.name) for source in sources]
+    folders = [_own_images(source, folder / "images" / source.name) for source in sources]
     released = False
 
-    def tell(report: RoundReport) -> None:
+    def watch(report: RoundReport) -> None:
         nonlocal released
         released |= report.released
-        console.print(line_of(report.row(), settings.rounds), highlight=False, soft_wrap=True)
+        print_line(console, round_line(report.row(), settings.rounds))
+        display.show("rounds", report.round_number, settings.rounds)
 
-    files = federate_locally(
-        homes, FederatedJob(folder, settings, BUNDLED_NETWORK), ExecutionOptions(), ProgressCallbacks(rounds=tell)
-    )
+    job = FederatedJob(folder, settings, BUNDLED_NETWORK)
+    with ProgressDisplay(console) as display:
+        display.show("rounds", 0, settings.rounds)
+        files = federate_locally(folders, job, ExecutionOptions(), ProgressCallbacks(rounds=watch))
     return files[0] if released else None
 
 
 def _own_images(source: "Source", home: Path) -> Path:
-    """A folder with some images of a recording."""
+    """Write some images of a recording into the folder ``home``."""
     images = [record.encoded for record in source.records() if isinstance(record, CameraImage)]
     try:
         home.mkdir(parents=True)

@@ -5,41 +5,45 @@ from typing import Annotated
 
 import typer
 
+from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.output import FEATURES, answers, new_folder, notices, print_line
 from fcslam.features.detector_kinds import DetectorKind
 
 
 def extract(
-    images: Annotated[Path, typer.Argument(help="An image, or a folder of images; folders below it count.")],
+    images: Annotated[Path, typer.Argument(help="An image, or a folder of images, searched with its subfolders.")],
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the features, one .npz an image.")],
+    output: Annotated[
+        Path | None, output_option("Folder for the features, one .npz file for each image.", FEATURES)
+    ] = None,
     detector: Annotated[
         DetectorKind | None,
-        typer.Option(help="If not said: onnx where weights are given or come with fcslam, else orb."),
+        typer.Option(help="Detector of keypoints.", show_default="onnx with a bundled or given network, else orb"),
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(help="Network weights (.onnx) of detector onnx, if not those that come with fcslam."),
+        typer.Option(help="Network weights (.onnx) of detector onnx.", show_default="the bundled network"),
     ] = None,
     keypoints: Annotated[
-        int, typer.Option(min=1, max=2000, help="Keypoints kept of an image, strongest first.")
+        int, typer.Option(min=1, max=2000, help="Number of keypoints to keep of each image, strongest first.")
     ] = 1000,
     nms: Annotated[
         float | None,
         typer.Option(
             min=0.0,
             max=64.0,
-            help="Side in pixels of boxes around keypoints that may hardly overlap; 0: all. If not said: 4, of orb 0.",
+            help="Side of the boxes of non-maximum suppression, in pixels; 0 keeps all keypoints.",
+            show_default="4 for onnx, 0 for orb",
         ),
     ] = None,
     longest_side: Annotated[
-        int, typer.Option(min=16, max=16384, help="Larger images are shrunk to so many pixels for the detector.")
+        int, typer.Option(min=16, max=16384, help="Shrink larger images to this longest side, in pixels.")
     ] = 2048,
-    threads: Annotated[int, typer.Option(min=1, max=64, help="Threads of the network.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=64, help="Number of threads of the network.")] = 1,
+    quiet: Quiet = False,
 ) -> None:
-    """Find keypoints in images and describe each by 256 bits."""
-    from rich.console import Console
-    from rich.progress import track
-
+    """Find keypoints in images and describe each with 256 bits."""
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import FeatureError
     from fcslam.features.classical import OrbConfig
     from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig
@@ -52,19 +56,22 @@ def extract(
         raise FeatureError(f"{weights}: detector orb has no weights; leave --weights out, or --detector")
     onnx = OnnxConfig(weights=weights, most_features=keypoints, nms_px=4.0 if nms is None else nms, threads=threads)
     finder = make_detector(kind, OrbConfig(most_features=keypoints), onnx)
-    files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may lie among them
+    files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
     root = images.parent if images.is_file() else images
-    console, done, empty = Console(stderr=True), 0, 0
-    # a network thins out its keypoints itself, before it keeps the strongest
+    output = output or new_folder(FEATURES)
+    console, done, empty = notices(quiet), 0, 0
+    # a network suppresses non-maxima itself, before it keeps the strongest keypoints
     outcomes = extract_all(files, root, output, finder, longest_side, 0.0 if is_network else nms or 0.0)
-    for outcome in track(outcomes, "extracting", len(files), console=console, transient=True):
-        if outcome.skipped:
-            console.print(f"skipped: {outcome.skipped}", highlight=False, markup=False, soft_wrap=True)
-            continue
-        done, empty = done + 1, empty + (not outcome.keypoints)
+    with ProgressDisplay(console) as display:
+        extracted_one = display.start("extracting", len(files))
+        for outcome in outcomes:
+            extracted_one()
+            if outcome.skipped:
+                print_line(console, f"skipped: {outcome.skipped}")
+                continue
+            done, empty = done + 1, empty + (not outcome.keypoints)
     if not done:
         raise FeatureError(f"{images}: no usable image there, {len(files)} files skipped; give JPEG, PNG, PPM or TIFF")
     without = f", {empty} of them without a keypoint" if empty else ""
     skipped = f", {len(files) - done} files skipped" if done < len(files) else ""
-    line = f"{finder.version}: features of {done} images{without}{skipped}: {output}"
-    Console().print(line, highlight=False, markup=False, soft_wrap=True)
+    print_line(answers(), f"{finder.version}: features of {done} images{without}{skipped}: {output}")

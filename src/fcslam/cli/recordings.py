@@ -1,4 +1,4 @@
-"""What commands share that read recordings: arguments, options, and what is said about a recording."""
+"""Commands that read recordings: the options of ROS bags, opening, and notices about a recording."""
 
 import math
 from collections.abc import Iterable
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.output import print_line
 from fcslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,22 +19,24 @@ _BAGS = "ROS bags"
 
 ScanTopic = Annotated[
     str | None,
-    typer.Option("--scan-topic", metavar="TOPIC", help="The laser scans to read.", rich_help_panel=_BAGS),
+    typer.Option("--scan-topic", metavar="TOPIC", help="Topic of the laser scans.", rich_help_panel=_BAGS),
 ]
 OdomTopic = Annotated[
     str | None,
-    typer.Option("--odom-topic", metavar="TOPIC", help="The odometry to read, or tf with it.", rich_help_panel=_BAGS),
+    typer.Option(
+        "--odom-topic", metavar="TOPIC", help="Topic of the odometry; /tf reads it from tf.", rich_help_panel=_BAGS
+    ),
 ]
 CameraTopic = Annotated[
     str | None,
-    typer.Option("--camera-topic", metavar="TOPIC", help="The images to read.", rich_help_panel=_BAGS),
+    typer.Option("--camera-topic", metavar="TOPIC", help="Topic of the camera images.", rich_help_panel=_BAGS),
 ]
 LaserPose = Annotated[
     str | None,
     typer.Option(
         "--laser-pose",
         metavar="X,Y,THETA",
-        help="Where the laser sits in base (metres, radians), in place of what tf says.",
+        help="Pose of the laser in the base frame (metres, radians). It replaces the transform in tf.",
         rich_help_panel=_BAGS,
     ),
 ]
@@ -55,7 +58,7 @@ def bag_options(
 
 
 def open_recording(argument: str, options: "BagOptions | None") -> "Source":
-    """The recording that ``LOG`` or ``NAME=LOG`` means; a file that is there is never taken for a name.
+    """Open the recording of an argument ``LOG`` or ``NAME=LOG``; an existing file is never read as ``NAME=LOG``.
 
     Raises:
         SourceError: it is no recording.
@@ -68,17 +71,17 @@ def open_recording(argument: str, options: "BagOptions | None") -> "Source":
     return open_source(Path(path), options, name)
 
 
-def show_notes(console: "Console", notes: Iterable[str]) -> None:
-    """Say what was chosen where recordings leave a choice, each thing once."""
+def print_notes(console: "Console", notes: Iterable[str]) -> None:
+    """Print which topics and frames were chosen where a recording has several, each note once."""
     for note in dict.fromkeys(notes):
-        console.print(note, highlight=False, markup=False, soft_wrap=True)
+        print_line(console, note)
 
 
-def show_faults(console: "Console", sources: "Iterable[Source]") -> None:
-    """Say what was wrong with recordings that could be read all the same."""
+def print_faults(console: "Console", sources: "Iterable[Source]") -> None:
+    """Print the faults that were tolerated in recordings."""
     for source in sources:
         if source.faults:
-            console.print(f"{source.name}: {source.faults}", highlight=False, markup=False, soft_wrap=True)
+            print_line(console, f"{source.name}: {source.faults}")
 
 
 def _pose(text: str) -> tuple[float, float, float]:

@@ -1,14 +1,17 @@
-"""`fcslam robot`: one robot of a mission whose cloud is elsewhere."""
+"""`fcslam robot`: one robot of a mission, which sends to a cloud service."""
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.mission_options import ConfigFile, mission_config
+from fcslam.cli.options import Quiet
+from fcslam.cli.output import answers, notices, print_line
 from fcslam.cli.recordings import (
     CameraTopic,
     LaserPose,
@@ -16,28 +19,28 @@ from fcslam.cli.recordings import (
     ScanTopic,
     bag_options,
     open_recording,
-    show_faults,
-    show_notes,
+    print_faults,
+    print_notes,
 )
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.robot.agent import Agent, AgentProgress, AgentWatch
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.robot.agent import Agent, AgentProgress
     from fcslam.robot.frontend import RobotConfig
     from fcslam.robot.outbox import Outbox
-    from fcslam.sources import Source, Survey
+    from fcslam.sources import Survey
 
 
 def _explain_traffic(wanted: bool) -> None:
     if not wanted:
         return
-    from rich.console import Console
     from rich.table import Table
 
     from fcslam.wire.disclosure import disclosures
 
-    console = Console()
+    console = answers()
     for message in disclosures():
         table = Table("field", "type", "what it could reveal", title=f"{message.name}: {message.direction}")
         table.title_justify = "left"
@@ -45,8 +48,8 @@ def _explain_traffic(wanted: bool) -> None:
             table.add_row(field.name, field.type, field.reveals)
         console.print(table)
     console.print(
-        "A message has no other field; unknown ones are refused. The network besides sees the robot's address and when "
-        "it sends, and without TLS everything; a token and a random number tell the cloud which robot speaks.",
+        "A message has no other field, and unknown fields are refused. The network sees the robot's address and the "
+        "times of its requests, and without TLS also their content. A token and a random number identify the robot.",
         soft_wrap=True,
     )
     raise typer.Exit
@@ -58,27 +61,31 @@ TokenFile = Annotated[Path | None, typer.Option(help="File with the robot's toke
 Ca = Annotated[
     Path | None,
     typer.Option(
-        help="PEM file of who signed the cloud's certificate; the system's if not given.", rich_help_panel=_NETWORK
+        help="Certificate of the authority that signed the cloud's certificate (PEM).",
+        show_default="the authorities of this system",
+        rich_help_panel=_NETWORK,
     ),
 ]
 Certificate = Annotated[
     Path | None,
-    typer.Option(help="PEM file of the robot's certificate, shown instead of a token.", rich_help_panel=_NETWORK),
+    typer.Option(help="The robot's certificate (PEM), which replaces the token.", rich_help_panel=_NETWORK),
 ]
-Key = Annotated[Path | None, typer.Option(help="PEM file of its private key.", rich_help_panel=_NETWORK)]
+Key = Annotated[Path | None, typer.Option(help="Private key of --certificate (PEM).", rich_help_panel=_NETWORK)]
 BudgetKbps = Annotated[
     float | None,
     typer.Option(
         "--budget-kBps", min=0.1, rich_help_panel=_NETWORK,
-        help="Most to send per second of the recording, in kB: places get what is left.",
+        help="Limit of the uplink, in kB per second of the recording. Keyscans and constraints are always sent; places "
+        "are sent with fewer descriptors or left out.",
     ),
 ]  # fmt: skip
 OutboxMb = Annotated[
     float,
     typer.Option(
-        min=0.1, help="Most that waits on disk; at three quarters places are left out.", rich_help_panel=_NETWORK
+        min=0.1, rich_help_panel=_NETWORK,
+        help="Limit of the packets that wait on disk, in MB. Above three quarters, places are left out.",
     ),
-]
+]  # fmt: skip
 ExplainTraffic = Annotated[
     bool,
     typer.Option(
@@ -89,22 +96,29 @@ ExplainTraffic = Annotated[
 
 
 def robot(
-    source: Annotated[str, typer.Argument(metavar="SOURCE", help="The robot's recording; NAME=LOG names it.")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="LOG", help="The robot's recording. The file names the robot; NAME=LOG gives another name."
+        ),
+    ],
     *,
-    server: Annotated[str, typer.Option(metavar="URL", help="The cloud, as https://cloud.example:8443.")],
+    server: Annotated[str, typer.Option(metavar="URL", help="Address of the cloud, as in https://cloud.example:8443.")],
     state: Annotated[
-        Path, typer.Option(help="Folder for what the cloud has not confirmed yet; one a robot, kept between starts.")
+        Path,
+        typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
     ],
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the recording if it was interrupted; else start anew.")
+        bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
     ] = False,
-    name: Annotated[str | None, typer.Option(help="The robot's name; the file's if not given.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the robot.", show_default="that of the file")] = None,
     speed: Annotated[
-        str, typer.Option(metavar="FACTOR", help="Play so many times as fast as it was recorded; max: no waiting.")
+        str,
+        typer.Option(
+            metavar="FACTOR", help="Playback speed as a multiple of real time; max plays as fast as possible."
+        ),
     ] = "max",
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="Configuration file; see `fcslam config dump`.")
-    ] = None,
+    config: ConfigFile = None,
     token_file: TokenFile = None,
     ca: Ca = None,
     certificate: Certificate = None,
@@ -115,34 +129,36 @@ def robot(
     odom_topic: OdomTopic = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
+    quiet: Quiet = False,
     _explain: ExplainTraffic = False,
 ) -> None:
-    """Be one robot: map a recording, send places and keyscans to the cloud, through outages and restarts."""
-    from rich.console import Console
-
+    """Map a recording as one robot and send places and keyscans to the cloud, through outages and restarts."""
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.robot.agent import PlaybackPace
 
     pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
-    settings = _settings(config)
+    settings = mission_config(config).robot
     argument = source if name is None else f"{name}={source}"
     recording = open_recording(argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
     _check_name(recording.name)
-    token, own = _token(token_file), _own(certificate, key)
+    token, own = _token(token_file), _own_certificate(certificate, key)
     survey = recording.survey()
-    console = Console(stderr=True)
-    show_notes(console, survey.notes)
+    console = notices(quiet)
+    print_notes(console, survey.notes)
     with _agent(recording.name, settings, server, state, token, ca, own, outbox_mb, budget_kbps) as (agent, outbox):
         known = outbox.begin(_fingerprint(recording.name, survey, settings, budget_kbps), resume)
         try:
-            with _interruptible(), _progress(console, survey.scan_count) as watch:
-                agent.run(recording.records(), known, pace, watch)
+            with _interruptible(), ProgressDisplay(console) as display:
+                agent.run(recording.records(), known, pace, _watch(display, console, survey.scan_count))
         except KeyboardInterrupt:
             left = outbox.waiting
-            console.print(
-                f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; --resume goes on", soft_wrap=True
+            print_line(
+                console,
+                f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume",
             )
             raise
-        _report(recording, agent, state, server)
+        print_faults(console, [recording])
+        _report(agent, state, server)
 
 
 @contextmanager
@@ -157,7 +173,7 @@ def _agent(
     outbox_mb: float,
     budget_kbps: float | None,
 ) -> "Iterator[tuple[Agent, Outbox]]":
-    """The robot, and its outbox in the state folder."""
+    """The robot and its outbox, which is in the state folder."""
     import numpy as np
 
     from fcslam.errors import StateError
@@ -172,7 +188,7 @@ def _agent(
     except OSError as error:
         raise StateError(f"{state}: cannot be made ({error.strerror}); give another --state") from error
     frontend = RobotFrontend(name, settings)
-    # Robots must not try again in step, so this is not the mission's seed.
+    # Not the mission's seed: robots must not retry at the same moments.
     rng = np.random.default_rng()
     budget = None if budget_kbps is None else Budget(1e3 * budget_kbps)
     with (
@@ -182,15 +198,8 @@ def _agent(
         yield Agent(frontend, outbox, transport, state, rng, time.monotonic, time.sleep, budget), outbox
 
 
-def _settings(config: Path | None) -> "RobotConfig":
-    from fcslam.config import load
-    from fcslam.mission import MissionConfig
-
-    return (MissionConfig() if config is None else load(MissionConfig, config)).robot
-
-
 def _speed(text: str) -> float | None:
-    """None: as fast as possible."""
+    """Playback speed as a multiple of real time; None: as fast as possible."""
     from fcslam.errors import InputError
 
     if text == "max":
@@ -211,10 +220,10 @@ def _check_name(name: str) -> None:
     try:
         check_name(name, "robot")
     except PacketError as error:
-        raise SourceError(f"{error}; name it by --name") from error
+        raise SourceError(f"{error}; give another --name") from error
     stem, plus, number = name.rpartition("+")
     if plus and number.isdigit():
-        raise SourceError(f"robot: {name!r} is how a later start of {stem!r} is called; name it otherwise by --name")
+        raise SourceError(f"robot: {name!r} is how a later start of {stem!r} is called; give another --name")
 
 
 def _token(path: Path | None) -> str | None:
@@ -226,36 +235,36 @@ def _token(path: Path | None) -> str | None:
         token = path.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path}: no token can be read ({error}); give the file that the cloud's owner made"
+            f"{path}: no token can be read ({error}); give the file that `fcslam certificates` wrote"
         ) from error
     if not token or not token.isprintable() or " " in token:
         raise InputError(f"{path}: holds no token; it should be one word")
     return token
 
 
-def _own(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:
+def _own_certificate(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:
     from fcslam.errors import InputError
 
     if (certificate is None) != (key is None):
-        raise InputError("--certificate and --key belong together; give both or none")
+        raise InputError("--certificate and --key belong together; give both or neither")
     return None if certificate is None or key is None else (certificate, key)
 
 
 def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kbps: float | None) -> str:
-    """What must be the same for the same packets; digests of the packets find out the rest."""
+    """A digest of the inputs that determine the packets; digests of the packets themselves reveal other changes."""
     import hashlib
 
     import fcslam
     from fcslam.config import dump
 
     length = survey.scan_count, survey.duration_s, survey.path_length_m
-    told = (fcslam.__version__, name, *length, survey.laser, budget_kbps)
-    return hashlib.sha256(f"{told} {dump(settings)}".encode()).hexdigest()
+    inputs = (fcslam.__version__, name, *length, survey.laser, budget_kbps)
+    return hashlib.sha256(f"{inputs} {dump(settings)}".encode()).hexdigest()
 
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """A service manager's SIGTERM is as good as Ctrl-C."""
+    """Treat SIGTERM, which service managers send, like Ctrl-C."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -267,80 +276,68 @@ def _interruptible() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-@contextmanager
-def _progress(console: "Console", total: int) -> "Iterator[AgentWatch]":
-    """A live line on a terminal; what happens to the connection is said everywhere."""
-    from rich import progress
-
-    columns = [
-        progress.TextColumn("{task.fields[stage]}"), progress.BarColumn(bar_width=24), progress.MofNCompleteColumn(),
-        progress.TextColumn("scans, {task.fields[what]}"),
-    ]  # fmt: skip
+def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[AgentProgress], None]":
+    """Show the progress of ``total`` scans, and print each change of the connection and of the robot's localisation."""
     trouble: str | None = "connecting"
-    notices: tuple[str, ...] = ()
-    whereabouts, times_lost = "mapping", 0
-    with progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=total, stage="mapping", what="")
+    notices_before: tuple[str, ...] = ()
+    localization, times_lost = "mapping", 0
 
-        def watch(now: "AgentProgress") -> None:
-            nonlocal trouble, notices, whereabouts, times_lost
-            lines = [now.trouble or "connected"] * (now.trouble != trouble)
-            if (now.localization, now.times_lost) != (whereabouts, times_lost):
-                lines.append(_found(now, times_lost))
-            whereabouts, times_lost = now.localization, now.times_lost
-            for line in [*lines, *(notice for notice in now.notices if notice not in notices)]:
-                console.print(line, highlight=False, markup=False, soft_wrap=True)
-            trouble, notices = now.trouble, now.notices
-            stage = "catching up" if now.catching_up else str(now.localization) if now.scans < total else "sending"
-            bar.update(task, completed=now.scans, stage=stage, what=_what(now))
+    def watch(now: "AgentProgress") -> None:
+        nonlocal trouble, notices_before, localization, times_lost
+        lines = [now.trouble or "connected"] * (now.trouble != trouble)
+        if (now.localization, now.times_lost) != (localization, times_lost):
+            lines.append(_localisation(now, times_lost))
+        localization, times_lost = now.localization, now.times_lost
+        for line in [*lines, *(notice for notice in now.notices if notice not in notices_before)]:
+            print_line(console, line)
+        trouble, notices_before = now.trouble, now.notices
+        display.show("mapping", now.scans, total, _details(now, is_complete=now.scans == total))
 
-        yield watch
+    return watch
 
 
-def _found(now: "AgentProgress", before: int) -> str:
-    """What a robot that was lost knows of its place; ``before``: how often it was when that was last said."""
+def _localisation(now: "AgentProgress", times_lost_before: int) -> str:
+    """What a robot that was lost knows about its place; ``times_lost_before``: its count at the last such line."""
     if now.quality > 0.0:
         return f"relocalised in map {now.map_index}, quality {now.quality:.2f}"
-    if now.times_lost > before:
-        return "lost: this is not the place of before; a new session begins here"
-    return "not relocalised: nobody bears out where it is"
+    if now.times_lost > times_lost_before:
+        return "lost: the scans contradict the map; a new session begins here"
+    return "not relocalised: no other closure supports the estimated place"
 
 
-def _what(now: "AgentProgress") -> str:
-    told = [
-        f"{now.keyscans} keyscans",
-        f"{now.sent_bytes / 1e3:.0f} kB sent",
-        f"{now.confirmed} packets confirmed",
-        f"{now.waiting.packets} waiting",
-        "alone"
-        if now.map_index is None
-        else f"map {now.map_index}, quality {now.quality:.2f}, corrected {now.correction_age_s or 0.0:.0f} s ago",
-    ]
-    told += [f"{now.left_out} places left out"] if now.left_out else []
-    told += [f"{now.refused} refused"] if now.refused else []
-    return ", ".join([*told, "offline" if now.trouble else "online"])
+def _details(now: "AgentProgress", is_complete: bool) -> str:
+    """The state of robot, connection, packets and map, the most important first: a narrow terminal cuts the end."""
+    stage = "catching up" if now.catching_up else "sending" if is_complete else str(now.localization)
+    details = [stage, "offline" if now.trouble else "online", f"{now.waiting.packets} waiting"]
+    details += [f"{now.refused} refused"] if now.refused else []
+    if now.map_index is None:
+        details.append("in no map")
+    else:
+        age_s = now.correction_age_s or 0.0
+        details.append(f"map {now.map_index}, quality {now.quality:.2f}, corrected {age_s:.0f} s ago")
+    details += [f"{now.confirmed} packets confirmed", f"{now.sent_bytes / 1e3:.0f} kB sent"]
+    details += [f"{now.left_out} places left out"] if now.left_out else []
+    return ", ".join([*details, f"{now.keyscans} keyscans"])
 
 
-def _report(recording: "Source", agent: "Agent", state: Path, server: str) -> None:
-    from rich.console import Console
-
+def _report(agent: "Agent", state: Path, server: str) -> None:
     from fcslam.runs import write_tum
 
     now = agent.progress()
-    show_faults(Console(stderr=True), [recording])
-    console = Console()
-    console.print(
-        f"{now.scans} scans, {now.keyscans} keyscans; {server} has all of it ({now.sent_bytes / 1e3:.0f} kB sent)",
-        highlight=False, soft_wrap=True,
-    )  # fmt: skip
+    console = answers()
+    print_line(
+        console,
+        f"{now.scans} scans, {now.keyscans} keyscans; {server} has confirmed all packets "
+        f"({now.sent_bytes / 1e3:.0f} kB sent)",
+    )
     if now.left_out:
-        console.print(f"{now.left_out} places were left out: too much waited, or the budget was spent", highlight=False)
+        print_line(console, f"{now.left_out} places were left out: the outbox was full or the budget was spent")
     if now.refused:
-        console.print(f"{now.refused} packets were refused: {state / 'refused'}", highlight=False, soft_wrap=True)
+        print_line(console, f"{now.refused} packets were refused: {state / 'refused'}")
     if now.times_lost:
         lost = f"lost {now.times_lost} times" if now.times_lost > 1 else "lost once"
-        console.print(f"{lost}; {_found(now, now.times_lost)}", highlight=False)
+        print_line(console, f"{lost}; {_localisation(now, now.times_lost)}")
     trajectory = agent.trajectory()
     if trajectory is not None:
         write_tum(state / "trajectory.tum", *trajectory)
-        console.print(f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}", highlight=False, soft_wrap=True)
+        print_line(console, f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")

@@ -1,10 +1,13 @@
-"""`fcslam serve`: the cloud as a service for robots in their own processes."""
+"""`fcslam serve`: the cloud as a service over HTTP."""
 
 import ipaddress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from fcslam.cli.mission_options import ConfigFile, mission_config
+from fcslam.cli.options import Quiet
 
 if TYPE_CHECKING:
     import socket
@@ -21,29 +24,34 @@ _TLS = "TLS"
 
 def serve(
     *,
-    data: Annotated[Path, typer.Option("--data", help="Folder of the missions; made if it is not there.")],
-    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen at; 0: any that is free.")] = 8340,
+    data: Annotated[Path, typer.Option("--data", help="Folder of the missions, created if it does not exist.")],
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 chooses a free one.")] = 8340,
     tokens: Annotated[
-        Path | None, typer.Option(help="Who may ask for what; `fcslam certificates` makes such a file.")
+        Path | None, typer.Option(help="File of tokens and roles; `fcslam certificates` makes one.")
     ] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Listen beyond this machine though nobody is asked for a token.")
+        bool, typer.Option("--insecure", help="Accept requests from other machines without authentication.")
     ] = False,
     tls_certificate: Annotated[
         Path | None, typer.Option(help="Certificate of this service (PEM).", rich_help_panel=_TLS)
     ] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="Its private key (PEM).", rich_help_panel=_TLS)] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option(help="Private key of --tls-certificate (PEM).", rich_help_panel=_TLS)
+    ] = None,
     client_ca: Annotated[
         Path | None,
-        typer.Option(help="Who signs robots' certificates (PEM): they need no token.", rich_help_panel=_TLS),
+        typer.Option(
+            help="Certificate of the authority that signs robots' certificates (PEM). Robots with such a certificate "
+            "need no token.",
+            rich_help_panel=_TLS,
+        ),
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="Configuration of new missions; see `fcslam config dump`.")
-    ] = None,
-    docs: Annotated[bool, typer.Option("--docs", help="Show the interface at /docs.")] = False,
+    config: ConfigFile = None,
+    docs: Annotated[bool, typer.Option("--docs", help="Serve the interactive API documentation at /docs.")] = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Take in what robots send, map it, and show the map; runs until it is stopped."""
+    """Receive packets of robots, map them, and serve map, trajectories and metrics; Ctrl-C stops the service."""
     import gc
     import logging
 
@@ -52,13 +60,13 @@ def serve(
     from fcslam.service.warmup import warm_up_decoding
 
     if tokens is None and client_ca is None and not insecure and not _is_loopback(host):
-        raise ServiceError(f"anybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
+        raise ServiceError(f"everybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
     _check_tls(tls_certificate, tls_key, client_ca)
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with _listen(host, port) as listening:
         state = _state(data, _authenticator(tokens, client_ca), _cloud_config(config))
         warm_up_decoding()
-        gc.freeze()  # what is there now stays: looking through it again and again would keep packets waiting
+        gc.freeze()  # collecting these objects again and again would delay packets
         server = _server(create_app(state, docs=docs), tls_certificate, tls_key, client_ca)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
@@ -116,13 +124,11 @@ def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig") ->
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events)
 
 
-def _cloud_config(path: Path | None) -> "CloudConfig":
+def _cloud_config(file: Path | None) -> "CloudConfig":
     from fcslam.cloud.settings import CloudConfig
-    from fcslam.config import load
-    from fcslam.mission import MissionConfig
 
-    settings = MissionConfig() if path is None else load(MissionConfig, path)
-    return CloudConfig(seed=settings.seed, fleet=settings.fleet, map=settings.map)
+    config = mission_config(file)
+    return CloudConfig(seed=config.seed, fleet=config.fleet, map=config.map)
 
 
 def _is_loopback(host: str) -> bool:
@@ -139,10 +145,10 @@ def _check_tls(certificate: Path | None, key: Path | None, client_ca: Path | Non
     from fcslam.wire.keys import no_passphrase
 
     if (certificate is None) != (key is None):
-        raise ServiceError("--tls-certificate and --tls-key belong together; give both or none")
+        raise ServiceError("--tls-certificate and --tls-key belong together; give both or neither")
     if certificate is None or key is None:
         if client_ca is not None:
-            raise ServiceError("--client-ca is for a service with TLS; give --tls-certificate and --tls-key")
+            raise ServiceError("--client-ca needs TLS; give --tls-certificate and --tls-key")
         return
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
@@ -166,4 +172,4 @@ def _listen(host: str, port: int) -> "socket.socket":
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=512)
     except OSError as error:
-        raise ServiceError(f"cannot listen at {host}:{port} ({error}); choose another --port or --host") from error
+        raise ServiceError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error

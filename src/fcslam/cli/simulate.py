@@ -1,20 +1,20 @@
-"""`fcslam simulate`: recordings of a fleet that drives in a building of our own making."""
+"""`fcslam simulate`: recordings of a fleet that drives in a simulated building."""
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet, output_option
+from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
 from fcslam.simulation.options import Building, Lighting
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress, TaskID
 
     from fcslam.records import RecordedItem
     from fcslam.simulation.simulated_fleet import SimulatedFleet
@@ -23,33 +23,37 @@ if TYPE_CHECKING:
 def simulate(
     *,
     output: Annotated[
-        Path,
-        typer.Option("--output", "-o", help="Folder for the recordings; new or empty, but for --resume."),
-    ],
-    robots: Annotated[int, typer.Option(min=1, max=100, help="How many robots drive.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed draws another building.")] = 1,
-    building: Annotated[Building, typer.Option(help="What kind of building.")] = Building.DEFAULT,
-    path_length: Annotated[float, typer.Option(min=1.0, max=10_000.0, help="Metres that each robot drives.")] = 60.0,
+        Path | None,
+        output_option("Folder for the recordings. It must be new or empty, except with --resume.", RECORDINGS),
+    ] = None,
+    robots: Annotated[int, typer.Option(min=1, max=100, help="Number of robots.")] = 3,
+    seed: BuildingSeed = 1,
+    building: BuildingKind = Building.DEFAULT,
+    path_length: PathLength = 60.0,
     lighting: Annotated[
         list[Lighting] | None,
-        typer.Option(help="What the first robot sees by, the second ...; in turn if given fewer times. [default: day]"),
+        typer.Option(
+            help="Light for the first robot; repeat it for the second and so on. Further robots take them in turn.",
+            show_default="day",
+        ),
     ] = None,
     moved_furniture: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Share of the rooms' furniture that moves between robots.")
+        float, typer.Option(min=0.0, max=1.0, help="Share of the furniture that moves between the drives of robots.")
     ] = 0.0,
-    no_camera: Annotated[bool, typer.Option("--no-camera", help="LiDAR only; needs no GL library.")] = False,
-    bag: Annotated[bool, typer.Option("--bag", help="Write a ROS 2 bag (.mcap) of each robot as well.")] = False,
+    no_camera: NoCamera = False,
+    bag: Annotated[bool, typer.Option("--bag", help="Also write a ROS 2 bag (.mcap) of each robot.")] = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with an interrupted simulation of the same settings.")
+        bool, typer.Option("--resume", help="Continue an interrupted simulation in --output with the same settings.")
     ] = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Draw a building, drive robots through it, record what their LiDARs and cameras see and where they really were."""
-    from rich.console import Console
-
+    """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
     from fcslam.errors import OutputError
     from fcslam.simulation.recording import prepare_fleet_folder
     from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 
+    if resume and output is None:
+        raise OutputError("--resume continues a simulation in its folder; give --output")
     settings = SimulationSettings(
         building=building,
         robots=robots,
@@ -59,19 +63,20 @@ def simulate(
         camera=None if no_camera else CameraSettings(),
     )
     fleet = simulate_fleet(settings, seed)
+    output = output or new_folder(RECORDINGS)
     prepare_fleet_folder(output, settings, seed, resume)
     try:
-        record_fleet(fleet, output, seed, bag, Console(stderr=True), resume)
+        record_fleet(fleet, output, seed, bag, notices(quiet), resume)
     except OutputError as error:
-        raise OutputError(f"{error}; with --resume the same command goes on") from error
+        raise OutputError(f"{error}; to continue, repeat the command with --resume --output {output}") from error
 
 
 def record_fleet(
     fleet: "SimulatedFleet", output: Path, seed: int, bag: bool, console: "Console", resume: bool = False
 ) -> list[Path]:
-    """Write one recording a robot into the folder ``output``, the truth beside them; returns the recordings.
+    """Write a recording of each robot and the truth into the folder ``output``; returns the recordings.
 
-    With ``resume`` recordings that are there already go on.
+    With ``resume``, unfinished recordings are continued.
 
     Raises:
         SimulationError: MuJoCo or a GL library is missing.
@@ -79,6 +84,7 @@ def record_fleet(
     """
     import numpy as np
 
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import OutputError
     from fcslam.simulation.ground_truth import write_ground_truth
     from fcslam.simulation.recording import record_robot
@@ -86,34 +92,38 @@ def record_fleet(
 
     began = time.perf_counter()
     recordings = [output / robot.name for robot in fleet.robots]
-    with _progress(fleet, console) as watch, ThreadPoolExecutor(os.cpu_count()) as pool:
-        jobs = [
-            pool.submit(record_robot, robot, place, watch, resume)
-            for robot, place in zip(fleet.robots, recordings, strict=True)
-        ]
+    total = sum(len(robot.stamps) + len(robot.image_stamps) for robot in fleet.robots)
+    with ProgressDisplay(console, f"output: {output}") as display:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            watch = _Watch(display.start("simulating", total))
+            jobs = [
+                pool.submit(record_robot, robot, place, watch, resume)
+                for robot, place in zip(fleet.robots, recordings, strict=True)
+            ]
+            try:
+                for job in jobs:
+                    job.result()
+            finally:
+                watch.stop()
+        display.start("writing")
         try:
-            for job in jobs:
-                job.result()
-        finally:
-            watch.stop()
-    try:
-        write_ground_truth(fleet, output, np.random.default_rng(seed))
-        if bag:
-            for place in recordings:
-                # A bag is whole or not there.
-                if not place.with_suffix(".mcap").exists():
-                    write_bag(place.with_suffix(".mcap"), open_source(place).records())
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
+            write_ground_truth(fleet, output, np.random.default_rng(seed))
+            if bag:
+                for place in recordings:
+                    # A bag is written under a temporary name first, so an existing one is complete.
+                    if not place.with_suffix(".mcap").exists():
+                        write_bag(place.with_suffix(".mcap"), open_source(place).records())
+        except OSError as error:
+            raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
     _report(fleet, recordings, time.perf_counter() - began, console)
     return recordings
 
 
 class _Watch:
-    """Lets robots' records through while somebody looks on, until it is stopped. Each record comes with its truth."""
+    """Passes the records of robots on and counts them, until it is stopped. Each record comes with its true pose."""
 
-    def __init__(self, bar: "Progress", task: "TaskID") -> None:
-        self._bar, self._task = bar, task
+    def __init__(self, advance: Callable[[], None]) -> None:
+        self._advance = advance
         self._stopped = False
 
     def stop(self) -> None:
@@ -128,21 +138,11 @@ class _Watch:
                 return
             yield item
             if isinstance(item, GroundTruth):
-                self._bar.advance(self._task)
-
-
-@contextmanager
-def _progress(fleet: "SimulatedFleet", console: "Console") -> "Iterator[_Watch]":
-    """A live line over all robots' scans and images."""
-    from rich.progress import Progress
-
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        total = sum(len(robot.stamps) + len(robot.image_stamps) for robot in fleet.robots)
-        yield _Watch(bar, bar.add_task("simulating", total=total))
+                self._advance()
 
 
 def _report(fleet: "SimulatedFleet", recordings: list[Path], elapsed_s: float, console: "Console") -> None:
     for robot, place in zip(fleet.robots, recordings, strict=True):
         typer.echo(f"{place}: {len(robot.stamps)} scans, {len(robot.image_stamps)} images, {robot.duration_s:.0f} s")
     speed = max(robot.duration_s for robot in fleet.robots) / elapsed_s
-    console.print(f"{elapsed_s:.1f} s, {speed:.1f} x real time", highlight=False)
+    print_line(console, f"{elapsed_s:.1f} s, {speed:.1f} x real time")

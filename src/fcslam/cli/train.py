@@ -1,60 +1,83 @@
-"""`fcslam train`: a detector from a folder of images."""
+"""`fcslam train`: train a detector on a folder of images."""
 
-from contextlib import contextmanager
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.output import TRAINING, new_folder, notices, print_line
+from fcslam.cli.training_options import (
+    TRAINING_OUTPUT,
+    Device,
+    Quick,
+    TrainingSeed,
+    compute_budget,
+    require_training_libraries,
+)
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.learning.settings import TrainingSettings
     from fcslam.learning.stages import StageCallback
     from fcslam.learning.trainer import TrainingProgress
 
 QUICK = {"steps": 40, "shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2}
-"""Enough to see that everything works, and no more."""
-LINE_EVERY = 500
-"""Steps between two lines of figures where there is no terminal."""
+"""Settings of ``--quick``: every stage runs, none long enough to learn much."""
 FIGURES = ("repeatability", "mma_3px", "shift_repeatability")
 
 
 def train(
-    images: Annotated[list[Path], typer.Argument(help="Folders of images; those inside are found too.")],
+    images: Annotated[list[Path], typer.Argument(help="Folders of images, searched with all their subfolders.")],
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for all that is made; the same one resumes.")],
-    config: Annotated[Path | None, typer.Option(help="YAML file of training settings.")] = None,
-    encoder: Annotated[str | None, typer.Option(help="light, or vgg as in the paper.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps of joint training; more than before goes on.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Another seed trains another detector.")] = None,
-    teacher: Annotated[Path | None, typer.Option(help="Folder of a teacher's points, see docs/training.md.")] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, or auto: cuda if there is one.")] = "auto",
-    quick: Annotated[
-        bool, typer.Option("--quick", help="A minute's run that only shows that everything works.")
-    ] = False,
+    output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file of training settings; see docs/training.md.")] = None,
+    encoder: Annotated[
+        str | None,
+        typer.Option(
+            help="Encoder of the network: light, or vgg as in the paper.", show_default="that of the settings"
+        ),
+    ] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Steps of joint training. More steps than before continue a finished run.",
+            show_default="that of the settings",
+        ),
+    ] = None,
+    seed: TrainingSeed = None,
+    teacher: Annotated[
+        Path | None, typer.Option(help="Folder with the keypoints of a teacher network; see docs/training.md.")
+    ] = None,
+    device: Device = "auto",
+    quick: Quick = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Train a detector of keypoints with 256-bit descriptors; needs no labels."""
-    import time
-
-    from rich.console import Console
+    """Train a detector of keypoints with 256-bit descriptors on images without labels."""
+    from fcslam.cli.progress import ProgressDisplay
 
     settings = _settings(config, quick, {"encoder": encoder, "steps": steps, "seed": seed})
-    need_torch()
+    require_training_libraries()
     from fcslam.learning.artifacts import write_training_artifacts
     from fcslam.learning.stages import train_detector
 
-    console = Console(stderr=True)
+    console = notices(quiet)
+    output = output or new_folder(TRAINING)
     began = time.perf_counter()
-    with _progress(console) as watch:
-        network, found = train_detector(images, output, settings, pace_on(device, quick), teacher, watch)
+    with ProgressDisplay(console, f"output: {output}") as display:
+        watch = _watch(display, console)
+        network, found = train_detector(images, output, settings, compute_budget(device, quick), teacher, watch)
     files = write_training_artifacts(network, output, settings, found, teacher)
     for file in files:
         typer.echo(str(file))
-    console.print(
+    print_line(
+        console,
         f"{time.perf_counter() - began:.0f} s; {len(found.train)} images, {len(found.held_out)} held out, "
         f"{found.skipped} left out",
-        highlight=False,
     )
 
 
@@ -67,67 +90,21 @@ def _settings(config: Path | None, quick: bool, given: dict[str, Any]) -> "Train
     return parse(TrainingSettings, base.model_dump() | changes, "the command line")
 
 
-def need_torch(*others: str, extra: str = "train") -> None:
-    """Raise TrainingError if a library of training, or one of ``others``, is missing."""
-    from importlib.util import find_spec
+def _watch(display: "ProgressDisplay", console: "Console") -> "StageCallback":
+    """Show each stage, and print its last figures and every alarm once."""
+    printed: set[str] = set()
 
-    from fcslam.errors import TrainingError
+    def print_once(text: str) -> None:
+        if text not in printed:
+            printed.add(text)
+            print_line(console, text)
 
-    missing = [name for name in ("torch", "onnx", "onnxruntime", *others) if find_spec(name) is None]
-    if missing:
-        raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
+    def watch(stage: str, status: "TrainingProgress") -> None:
+        figures = "  ".join(f"{name} {status.figures[name]:.3f}" for name in FIGURES if name in status.figures)
+        display.show(stage, status.step, status.steps, figures)
+        if figures and status.step == status.steps:
+            print_once(f"{stage} {status.step}/{status.steps}  {figures}")
+        for alarm in status.collapse_warnings:
+            print_once(f"warning: {alarm}")
 
-
-def pace_on(device: str, quick: bool) -> Any:
-    """How to train on a device; raises TrainingError if it cannot be used."""
-    import os
-
-    import torch
-
-    from fcslam.errors import TrainingError
-    from fcslam.learning.trainer import ExecutionOptions
-
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise TrainingError(f"--device {device}: cannot be used ({error}); give cpu") from error
-    threads = 1 if device == "cpu" else max((os.cpu_count() or 2) - 1, 1)
-    every = 20 if quick else 500
-    return ExecutionOptions(device=device, threads=threads, validate_every=every, log_every=every if quick else 50)
-
-
-@contextmanager
-def _progress(console: Any) -> "Iterator[StageCallback]":
-    """A live line a stage; without a terminal, a line of figures now and then."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    live = console.is_terminal
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[figures]}"),
-    )
-    with Progress(*columns, console=console, disable=not live) as bar:
-        tasks: dict[str, Any] = {}
-        said: set[str] = set()
-
-        def say(text: str) -> None:
-            if text not in said:
-                said.add(text)
-                console.print(text, highlight=False)
-
-        def watch(stage: str, status: "TrainingProgress") -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=status.steps, figures="")
-            text = "  ".join(f"{name} {status.figures[name]:.3f}" for name in FIGURES if name in status.figures)
-            bar.update(tasks[stage], completed=status.step, figures=text)
-            if not live and text and status.step % LINE_EVERY == 0:
-                say(f"{stage} {status.step}/{status.steps}  {text}")
-            for alarm in status.collapse_warnings:
-                say(f"warning: {alarm}")
-
-        yield watch
+    return watch

@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.evaluate.arguments import EvaluationSeed
+from fcslam.cli.options import Quiet
+from fcslam.cli.output import answers, notices, print_line
 from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.metrics.framing import HomographyGroundTruth
 
@@ -20,37 +23,41 @@ if TYPE_CHECKING:
 
 
 def homography(
-    scenes: Annotated[list[Path], typer.Argument(metavar="SCENES...", help="Folders of scenes as HPatches has them.")],
+    scenes: Annotated[
+        list[Path], typer.Argument(metavar="SCENES...", help="Folders of scenes in the layout of HPatches.")
+    ],
     *,
     detector: Annotated[
         list[EvaluatedDetectorKind] | None,
-        typer.Option(help="Only this one; may be given several times."),
+        typer.Option(help="Evaluate only this detector. Can be repeated.", show_default="all"),
     ] = None,
     weights: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Network weights (.onnx) of detectors onnx and logits, if not those that come with fcslam; may be "
-            "given several times."
+            help="Network weights (.onnx) of the detectors onnx and logits. Can be repeated.",
+            show_default="the bundled network",
         ),
     ] = None,
     features: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of extracted features, SCENE/1.npz ..., as fcslam extract writes them, instead of running "
-            "detectors; may be given several times, and beside --detector."
+            help="Folder of extracted features, SCENE/1.npz ..., as fcslam extract writes them, to evaluate instead of "
+            "detectors or, with --detector, beside them. Can be repeated."
         ),
     ] = None,
     ground_truth: Annotated[
-        HomographyGroundTruth, typer.Option(help="legacy repeats a fault on which published tables rest.")
+        HomographyGroundTruth,
+        typer.Option(
+            help="True homography: corrected, or legacy, which ignores crops and scales as published tables do."
+        ),
     ] = HomographyGroundTruth.CORRECTED,
-    csv: Annotated[Path | None, typer.Option(help="Write every measure of every pair to this file.")] = None,
+    csv: Annotated[Path | None, typer.Option(help="Write all measures of all pairs to this CSV file.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Draw matches and curves into this folder.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 1,
+    seed: EvaluationSeed = 1,
+    quiet: Quiet = False,
 ) -> None:
-    """Repeatability, homography accuracy, matching accuracy and matching score of detectors, side by side."""
-    from rich.console import Console
-    from rich.progress import Progress
-
+    """Measure repeatability, homography accuracy, matching accuracy and matching score of detectors."""
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
     from fcslam.evaluation.detectors.figures import draw_figures
     from fcslam.evaluation.detectors.homography import evaluate_homography
@@ -59,16 +66,14 @@ def homography(
 
     found = find_scenes(scenes)
     detectors = choose_detectors(detector or (), weights or (), features or ())
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("evaluating", total=len(found) * len(detectors))
-        report = evaluate_homography(found, detectors, ground_truth, lambda: bar.advance(task))
+    with ProgressDisplay(notices(quiet)) as display:
+        evaluated = display.start("evaluating", len(found) * len(detectors))
+        report = evaluate_homography(found, detectors, ground_truth, evaluated)
         if figures is not None:
-            task = bar.add_task("drawing", total=len(found))
-            draw_figures(figures, report, found, detectors, ground_truth, lambda: bar.advance(task))
+            draw_figures(figures, report, found, detectors, ground_truth, display.start("drawing", len(found)))
     if csv is not None:
         write_pairs(report, csv)
-    _show(Console(), report, ground_truth, seed)
+    _show(answers(), report, ground_truth, seed)
 
 
 def _show(console: "Console", report: "HomographyReport", truth: HomographyGroundTruth, seed: int) -> None:
@@ -92,7 +97,7 @@ def _show(console: "Console", report: "HomographyReport", truth: HomographyGroun
         "logits instead of by bits.",
         "Times: processor time on one thread, from grey levels to described keypoints.",
     ):
-        console.print(line, highlight=False, soft_wrap=True)
+        print_line(console, line)
 
 
 def _repeatability_table(report: "HomographyReport", seed: int) -> "Table":

@@ -1,4 +1,4 @@
-"""`fcslam evaluate places`: how well places are found again, by folders of images or recordings with their truth."""
+"""`fcslam evaluate places`: place recognition on folders of images or recordings with their truth."""
 
 import math
 from pathlib import Path
@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.place_options import Features, Label, Sets, TrainOn
+from fcslam.cli.evaluate.arguments import EvaluationSeed, Features, Label, Sets, TrainOn
+from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.output import EVALUATIONS, answers, new_folder, notices, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.evaluation.places.report import SetResult
     from fcslam.metrics.bootstrap import Interval
     from fcslam.places.vocabulary import Strategy
@@ -23,39 +26,46 @@ def places(
     sets: Sets,
     *,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for the table, the curves and the similarity matrices.")
-    ],
+        Path | None, output_option("Folder for the table, the curves and the similarity matrices.", EVALUATIONS)
+    ] = None,
     features: Features = "orb",
     strategy: Annotated[
         list[str] | None,
-        typer.Option(help="Of the vocabulary: static, rebuild, windowed, incremental; if not said, all but rebuild."),
+        typer.Option(
+            help="Strategy of the vocabulary: static, rebuild, windowed or incremental. Can be repeated.",
+            show_default="all but rebuild",
+        ),
     ] = None,
     train_on: TrainOn = None,
     label: Label = None,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Also check by geometry the places that look most alike.")
+        bool, typer.Option("--verify", help="Also verify the geometry of the most similar places.")
     ] = False,
     sequence: Annotated[
         bool,
         typer.Option(
             "--sequence",
-            help="Of sets that are one stream also: similarities as shares of the previous place's, and what "
-            "consecutive places agree on.",
+            help="For sets that are one stream, also evaluate similarities relative to the previous place's, and the "
+            "agreement of consecutive places.",
         ),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the vocabularies and the bootstrap.")] = 1,
+    seed: EvaluationSeed = 1,
+    quiet: Quiet = False,
 ) -> None:
-    """Recall, precision and mismatches of place recognition: each strategy of the vocabulary beside brute force."""
-    from rich.console import Console
-
+    """Measure recall, precision and mismatches of place recognition: each vocabulary strategy and brute force."""
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.evaluation.places.figures import curves_figure, save
     from fcslam.evaluation.places.report import write_results
 
     strategies = _strategies(strategy or ("static", "windowed", "incremental"))
-    results = _evaluate(sets, features, label or (), train_on or (), strategies, seed, verify=verify, sequence=sequence)
+    output = output or new_folder(EVALUATIONS)
+    with ProgressDisplay(notices(quiet)) as display:
+        results = _evaluate(
+            sets, features, label or (), train_on or (), strategies, seed, display, verify=verify, sequence=sequence
+        )
     write_results(output, results)
     save(curves_figure(results), output / "precision_recall.png")
-    _show(Console(), results, output)
+    _show(answers(), results, output)
 
 
 def _evaluate(
@@ -65,13 +75,11 @@ def _evaluate(
     train_on: "Sequence[Path]",
     strategies: "Sequence[Strategy]",
     seed: int,
+    display: "ProgressDisplay",
     *,
     verify: bool,
     sequence: bool,
 ) -> "list[SetResult]":
-    from rich.console import Console
-    from rich.progress import Progress
-
     from fcslam.evaluation.places.features import choose_features, describe_sets, describe_training
     from fcslam.evaluation.places.report import evaluate_set
     from fcslam.evaluation.places.scoring import choose_scorers
@@ -80,20 +88,16 @@ def _evaluate(
     from fcslam.places.vocabulary import VocabularyConfig
 
     chosen = choose_features(features)
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("describing", total=None)
-        training = describe_training(train_on, chosen, lambda: bar.advance(task))
-        described = describe_sets(sets, labels, chosen, lambda: bar.advance(task))
-        scorers = choose_scorers(strategies, VocabularyConfig(), training, seed)
-        task = bar.add_task("comparing", total=len(scorers) * len(described))
-        variants = in_sequence if sequence else plain
-        return [
-            evaluate_set(
-                each, scorers, PairVerifier(each) if verify else None, seed, lambda: bar.advance(task), variants
-            )
-            for each in described
-        ]
+    described_one = display.start("describing")
+    training = describe_training(train_on, chosen, described_one)
+    described = describe_sets(sets, labels, chosen, described_one)
+    scorers = choose_scorers(strategies, VocabularyConfig(), training, seed)
+    compared_one = display.start("comparing", len(scorers) * len(described))
+    variants = in_sequence if sequence else plain
+    return [
+        evaluate_set(each, scorers, PairVerifier(each) if verify else None, seed, compared_one, variants)
+        for each in described
+    ]
 
 
 def _strategies(names: "Sequence[str]") -> "list[Strategy]":
@@ -118,7 +122,7 @@ def _show(console: "Console", results: "Sequence[SetResult]", output: Path) -> N
         f"Similarity matrices, curves and all intervals: {output}",
     )
     for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        print_line(console, line)
 
 
 def _table(result: "SetResult", question: str) -> "Table":

@@ -1,10 +1,14 @@
-"""`fcslam evaluate fleet`: a run against where its robots really were."""
+"""`fcslam evaluate fleet`: compare a run with the true trajectories and the true map."""
 
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from fcslam.cli.evaluate.arguments import RunFolder
+from fcslam.cli.options import Csv, Quiet, WrongDeg, WrongM
+from fcslam.cli.output import answers, notices, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -19,52 +23,56 @@ _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
 
 def fleet(
-    run: Annotated[Path, typer.Argument(help="The run folder to measure.")],
+    run: RunFolder,
     *,
     truth: Annotated[
         Path | None,
         typer.Option(
-            help="Folder with ROBOT/ground_truth.tum or ROBOT.tum of each robot and, if it is known, the true map "
-            "ground_truth/map.yaml. [default: recordings beside the run, else the folder that the run is in]"
+            help="Folder with ROBOT/ground_truth.tum or ROBOT.tum of each robot and, if known, the true map in "
+            "ground_truth/map.yaml.",
+            show_default="recordings beside the run, else the parent of the run",
         ),
     ] = None,
-    wrong_m: Annotated[float, typer.Option(min=0.0, help="A closure or a join that is off by more is wrong.")] = 0.5,
-    wrong_deg: Annotated[float, typer.Option(min=0.0, help="Or turned by more.")] = 10.0,
-    csv: Annotated[
-        Path | None, typer.Option(help="Write the numbers to this file as well (as JSON if it ends in .json).")
-    ] = None,
+    wrong_m: WrongM = 0.5,
+    wrong_deg: WrongDeg = 10.0,
+    csv: Csv = None,
     figure: Annotated[
-        Path | None, typer.Option(help="Draw the robots' maps, matched places, the fused map and the truth to a PNG.")
+        Path | None,
+        typer.Option(help="PNG file to draw: the robots' maps, matched places, the fused map and the truth."),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
-    """A run against the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
-    from rich.console import Console
-
+    """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.evaluation.fleet.metrics import fleet_metrics
     from fcslam.evaluation.fleet.relations import write_metrics
     from fcslam.evaluation.fleet.report import evaluate_fleet
     from fcslam.metrics.closures import ClosureCriteria
 
-    report = evaluate_fleet(run, truth, ClosureCriteria(wrong_m=wrong_m, wrong_deg=wrong_deg))
-    show_fleet(report, Console())
+    with ProgressDisplay(notices(quiet)) as display:
+        display.start("evaluating")
+        report = evaluate_fleet(run, truth, ClosureCriteria(wrong_m=wrong_m, wrong_deg=wrong_deg))
+    show_fleet(report, answers())
     if csv is not None:
         write_metrics(fleet_metrics(report), csv)
     if figure is not None:
         from fcslam.evaluation.fleet.charts import fleet_charts
         from fcslam.evaluation.fleet.figure import write_figure
 
-        write_figure(fleet_charts(run, truth), figure)
+        with ProgressDisplay(notices(quiet)) as display:
+            display.start("drawing")
+            write_figure(fleet_charts(run, truth), figure)
 
 
 def show_fleet(report: "FleetReport", console: "Console", explained: bool = True) -> None:
-    """The report as tables and, if it is to be ``explained``, what they rest on."""
+    """Print the report as tables and, if ``explained``, the definitions behind them."""
     from fcslam.evaluation.fleet.closures import ClosureScope
 
     closures = (_closures(report, within) for within in ClosureScope)
     for table in (_robots(report), _relative(report), *closures, _traffic(report)):
         console.print(table)
     for line in (*_findings(report), *(_explanations(report) if explained else ())):
-        console.print(line, highlight=False, soft_wrap=True, markup=False)
+        print_line(console, line)
 
 
 def percent(share: float) -> str:

@@ -1,11 +1,13 @@
-"""`fcslam evaluate vocabulary`: what the words of a vocabulary tell while places arrive, the paper's figure 4."""
+"""`fcslam evaluate vocabulary`: how well vocabularies tell places apart as places arrive (figure 4 of the paper)."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.place_options import Features, Label, Sets, TrainOn
+from fcslam.cli.evaluate.arguments import EvaluationSeed, Features, Label, Sets, TrainOn
+from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.output import EVALUATIONS, answers, new_folder, notices, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,22 +21,23 @@ if TYPE_CHECKING:
 def vocabulary(
     sets: Sets,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and its table.")],
+    output: Annotated[Path | None, output_option("Folder for the figure and its table.", EVALUATIONS)] = None,
     features: Features = "orb",
     first: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of images that arrive before; may be given several times."),
+        list[Path] | None, typer.Option(help="Folder of images that arrive before the sets. Can be repeated.")
     ] = None,
     train_on: TrainOn = None,
     label: Label = None,
-    groups: Annotated[int, typer.Option(min=1, help="Targets, each with another view and 8 wrong places.")] = 120,
-    seed: Annotated[int, typer.Option(min=0, help="Of groups, vocabularies and the bootstrap.")] = 1,
+    groups: Annotated[
+        int, typer.Option(min=1, help="Number of target places, each with a second view and 8 wrong places.")
+    ] = 120,
+    seed: EvaluationSeed = 1,
+    quiet: Quiet = False,
 ) -> None:
-    """Significance, mismatches and words of every strategy as places arrive 40 at a time, set after set."""
+    """Measure significance, mismatches and words of every vocabulary strategy while places arrive, 40 at a time."""
     import numpy as np
-    from rich.console import Console
-    from rich.progress import Progress
 
+    from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import EvaluationError
     from fcslam.evaluation.places.features import choose_features, describe_sets, describe_training
     from fcslam.evaluation.places.growth_figure import write_growth
@@ -42,12 +45,12 @@ def vocabulary(
     from fcslam.places.vocabulary import Strategy, VocabularyConfig
 
     chosen = choose_features(features)
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("describing", total=None)
-        earlier = describe_training(first or (), chosen, lambda: bar.advance(task))
-        training = describe_training(train_on or (), chosen, lambda: bar.advance(task))
-        described = describe_sets(sets, label or (), chosen, lambda: bar.advance(task))
+    output = output or new_folder(EVALUATIONS)
+    with ProgressDisplay(notices(quiet)) as display:
+        described_one = display.start("describing")
+        earlier = describe_training(first or (), chosen, described_one)
+        training = describe_training(train_on or (), chosen, described_one)
+        described = describe_sets(sets, label or (), chosen, described_one)
         probes, arrivals = draw_groups(described, groups, np.random.default_rng(seed))
         arrivals = [Arrival(f"first {k}", codes) for k, codes in enumerate(earlier)] + arrivals
         if not probes or len(arrivals) < BATCH:
@@ -55,21 +58,18 @@ def vocabulary(
                 f"{len(arrivals)} places and {len(probes)} targets; give sets with {BATCH} places and a target at least"
             )
         growths = fixed_growths(arrivals, probes, training, seed)
-        task = bar.add_task("growing", total=len(Strategy) * (len(arrivals) // BATCH))
+        grown_one = display.start("growing", len(Strategy) * (len(arrivals) // BATCH))
         for strategy in Strategy:
-            growths[strategy] = grow_vocabulary(
-                strategy, arrivals, probes, VocabularyConfig(), seed, lambda: bar.advance(task)
-            )
+            growths[strategy] = grow_vocabulary(strategy, arrivals, probes, VocabularyConfig(), seed, grown_one)
     names = ", ".join(each.place_set.name for each in described)
     write_growth(output, growths, f"{len(arrivals)} places, {len(probes)} groups; sets: {names}", seed)
-    _show(Console(), growths, seed)
-    typer.echo(f"{len(probes)} groups, {len(arrivals)} places; written: {output}")
+    _show(answers(), growths, seed)
+    print_line(answers(), f"{len(probes)} groups, {len(arrivals)} places; written: {output}")
 
 
 def _show(console: "Console", growths: "Mapping[str, Growth]", seed: int) -> None:
     console.print(_table(growths, seed))
-    line = "After the last batch; in brackets: 95 % intervals by bootstrap over groups."
-    console.print(line, highlight=False, markup=False, soft_wrap=True)
+    print_line(console, "After the last batch; in brackets: 95 % intervals by bootstrap over groups.")
 
 
 def _table(growths: "Mapping[str, Growth]", seed: int) -> "Table":

@@ -1,0 +1,103 @@
+"""`fcslam evaluate closures`: precision and recall of the closures of a run."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.cli.evaluate.arguments import Reference, RunFolder
+from fcslam.cli.evaluate.fleet import percent
+from fcslam.cli.options import Csv, Quiet, WrongDeg, WrongM
+from fcslam.cli.output import answers, notices, print_line
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.evaluation.fleet.closures import ClosureReport
+    from fcslam.metrics.closures import ClosureCriteria, Precision
+
+
+def closures(
+    run: RunFolder,
+    reference: Reference,
+    *,
+    wrong_m: WrongM = 0.5,
+    wrong_deg: WrongDeg = 10.0,
+    bridge_s: Annotated[
+        float,
+        typer.Option(min=0.0, help="Largest time between the stamps of a closure and of the relations, in seconds."),
+    ] = 1.0,
+    reach_m: Annotated[
+        float,
+        typer.Option(
+            min=0.0, help="Largest distance along the path, at both ends, from a revisit to its closure, in m."
+        ),
+    ] = 2.0,
+    csv: Csv = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure precision and recall of a run's closures, by stage, against the optimised graph of the relations."""
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.evaluation.fleet.closures import closure_metrics, evaluate_closures
+    from fcslam.evaluation.fleet.relations import write_metrics
+    from fcslam.metrics.closures import ClosureCriteria
+
+    criteria = ClosureCriteria(bridge_s, wrong_m, wrong_deg, reach_m)
+    with ProgressDisplay(notices(quiet)) as display:
+        display.start("evaluating")
+        report = evaluate_closures(run, reference, criteria)
+    _show_closures(report, criteria)
+    if csv is not None:
+        write_metrics(closure_metrics(report), csv)
+
+
+def _show_closures(report: "ClosureReport", criteria: "ClosureCriteria") -> None:
+    from rich.table import Table
+
+    counts = Table("closures", "all", "covered", "wrong", "precision", "revisits found")
+    errors = Table("closures", "error, m", "error, deg", "chain", "one relation")
+    names = {"intra_robot": "within", "inter_robot": "between"}
+    for (within, status), score in report.scores.items():
+        name, graph, single, recall = f"{names[within]}, {status}", score.graph, score.single, score.recall
+        covered = f"{graph.covered}, {percent(graph.coverage)}"
+        found = "" if recall is None else f"{recall.found}/{recall.revisits}, {percent(recall.recall)}"
+        counts.add_row(name, str(graph.closures), covered, str(graph.wrong), percent(graph.precision), found)
+        if graph.covered:
+            chain = f"{score.chain[0]:.0f} / {score.chain[1]:.0f}"
+            errors.add_row(name, *_error_cells(graph), chain, f"{single.covered}, {single.wrong} wrong")
+    console = answers()
+    console.print(counts)
+    console.print(errors)
+    _explain_closures(console, report, criteria)
+
+
+def _explain_closures(console: "Console", report: "ClosureReport", criteria: "ClosureCriteria") -> None:
+    """Print the reference and the definitions behind the tables."""
+    from fcslam.evaluation.fleet.closures import closure_metrics
+    from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S
+
+    value = {metric.name: metric.value for metric in closure_metrics(report)}
+    lines = [
+        f"Reference: {value['relations']} relations optimised together; {value['relation_components']} components of "
+        f"{value['relation_stamps']} stamps ({value['relation_stamps_in_run']} in the run), "
+        f"{value['relation_stamps_in_largest_component']} in the largest.",
+        f"Residuals of the relations: median {value['relation_residual_translation_median']:.3f} m, "
+        f"{value['relation_residual_rotation_median']:.2f} deg; maximum "
+        f"{value['relation_residual_translation_max']:.3f} m, {value['relation_residual_rotation_max']:.2f} deg.",
+        f"Wrong: off by more than {criteria.wrong_m:g} m or {criteria.wrong_deg:g} deg. Errors: median / maximum; up "
+        f"to {criteria.bridge_s:g} s to the relations' stamps are bridged by the run's own trajectory.",
+        f"Revisits: relations over more than {criteria.within_gap_s:g} s within a robot, {ACROSS_ROBOTS_GAP_S:g} s "
+        f"between robots; found if a correct closure ends within {criteria.reach_m:g} m of path at both sides.",
+        "Chain: relations from one end to the other, median / maximum; a long one adds its own error.",
+        "One relation: closures that a single relation covers.",
+        "A robot reports only closures that it accepts, so candidates within robots are not known.",
+    ]
+    if value["relations_contradicted"]:
+        left_out = f"{value['relations_contradicted']} of {value['relations']} left out by the robust solve"
+        lines.insert(2, f"The relations contradict each other: {left_out}.")
+    for line in lines:
+        print_line(console, line)
+
+
+def _error_cells(found: "Precision") -> tuple[str, str]:
+    (middle_m, most_m), (middle_deg, most_deg) = found.translation_m, found.rotation_deg
+    return f"{middle_m:.3f} / {most_m:.3f}", f"{middle_deg:.2f} / {most_deg:.2f}"

@@ -1,0 +1,41 @@
+"""Where commands write: messages on stderr, answers on stdout, and new folders named by the time."""
+
+from datetime import datetime
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+RUNS, RECORDINGS, FEATURES, TRAINING, EVALUATIONS = "runs", "recordings", "features", "training", "evaluations"
+"""Default parents of output folders."""
+
+
+def new_folder(parent: str, now: datetime | None = None) -> Path:
+    """A folder that does not exist yet, ``parent/YYYY-MM-DD-HHMMSS`` in local time, with ``-2``, ``-3`` ... if taken.
+
+    The folder is not created.
+    """
+    first = Path(parent) / f"{now or datetime.now():%Y-%m-%d-%H%M%S}"
+    later = (first.with_name(f"{first.name}-{number}") for number in count(2))
+    return next(later_one for later_one in later if not later_one.exists()) if first.exists() else first
+
+
+def notices(quiet: bool) -> "Console":
+    """The console for progress and notices: stderr, or nothing if ``quiet``."""
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=quiet)
+
+
+def answers() -> "Console":
+    """The console for the answer of a command: stdout."""
+    from rich.console import Console
+
+    return Console()
+
+
+def print_line(console: "Console", text: str) -> None:
+    """Print ``text`` as it stands: no markup, no colours, no line breaks at the console's width."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,49 @@
+"""Options and checks of all commands that train detectors."""
+
+import os
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from fcslam.learning.trainer import ExecutionOptions
+
+TRAINING_OUTPUT = "Folder for everything that training writes. If it holds an unfinished run, training continues it."
+
+TrainingSeed = Annotated[
+    int | None, typer.Option("--seed", min=0, help="Seed of the training.", show_default="that of the settings")
+]
+Device = Annotated[str, typer.Option(help="cpu or cuda; auto uses cuda if there is one.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to see that everything works.")]
+
+
+def require_training_libraries(*others: str, extra: str = "train") -> None:
+    """Raise TrainingError if a library that training needs, or one of ``others``, is missing."""
+    from fcslam.errors import TrainingError
+
+    missing = [name for name in ("torch", "onnx", "onnxruntime", *others) if find_spec(name) is None]
+    if missing:
+        raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
+
+
+def compute_budget(device: str, quick: bool = False) -> "ExecutionOptions":
+    """How to train on ``device``: threads, and how often to validate and log.
+
+    Raises:
+        TrainingError: the device cannot be used.
+    """
+    import torch
+
+    from fcslam.errors import TrainingError
+    from fcslam.learning.trainer import ExecutionOptions
+
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise TrainingError(f"--device {device}: cannot be used ({error}); give cpu") from error
+    threads = 1 if device == "cpu" else max((os.cpu_count() or 2) - 1, 1)
+    every = 20 if quick else 500
+    return ExecutionOptions(device=device, threads=threads, validate_every=every, log_every=every if quick else 50)

@@ -1,0 +1,114 @@
+"""Help: every command has examples that can be copied, and shells complete commands, options and files."""
+
+import os
+import shlex
+import subprocess
+import sys
+
+import click
+import pytest
+import typer
+
+from fcslam.cli import app, main
+from tests.test_docs import complaint
+from tests.test_imports import HEAVY
+
+
+def tree(command, path=()):
+    """Every command and group with the words that call it."""
+    yield path, command
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from tree(inner, (*path, name))
+
+
+COMMANDS = dict(tree(typer.main.get_command(app)))
+every_command = pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+
+
+def helped(words, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([*words, "--help"]) == 0
+    return [line.strip() for line in capsys.readouterr().out.splitlines()]
+
+
+@every_command
+def test_every_command_has_examples_each_whole_on_its_line(words, capsys, monkeypatch):
+    heading, *examples = COMMANDS[words].epilog.split("\n\n")
+    assert heading == "Examples:"
+    assert examples
+    shown = helped(words, capsys, monkeypatch)
+    assert shown[shown.index("Examples:") + 1 :][: len(examples)] == examples
+
+
+@every_command
+def test_every_example_runs_this_command(words):
+    _, *examples = COMMANDS[words].epilog.split("\n\n")
+    assert [complaint(example, complete=True) for example in examples] == [""] * len(examples)
+    called = [tuple(shlex.split(example)[1 : len(words) + 1]) for example in examples]
+    assert words in called
+
+
+@every_command
+def test_every_argument_and_option_is_explained(words):
+    unexplained = [parameter.name for parameter in COMMANDS[words].params if not parameter.help]
+    assert unexplained == []
+
+
+def test_long_commands_can_be_quiet():
+    short = {("certificates",), ("config", "dump"), ("evaluate", "relations")}
+    commands = {words for words, command in COMMANDS.items() if not isinstance(command, click.Group)}
+    quiet = {words for words in commands if any("--quiet" in option.opts for option in COMMANDS[words].params)}
+    assert quiet == commands - short
+
+
+# Completion
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_completion_script_calls_fcslam(shell, capsys, monkeypatch):
+    monkeypatch.setattr("typer.completion._get_shell_name", lambda: shell)
+    with pytest.raises(SystemExit) as end:
+        main(["--show-completion"])
+    assert end.value.code == 0
+    assert f"_FCSLAM_COMPLETE=complete_{shell}" in capsys.readouterr().out
+
+
+def test_completion_is_installed_for_the_shell_in_use(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr("typer._completion_shared._get_shell_name", lambda: "bash")
+    with pytest.raises(SystemExit) as end:
+        main(["--install-completion"])
+    assert end.value.code == 0
+    assert "bash completion installed" in capsys.readouterr().out
+    assert ".bash_completions/fcslam.sh" in (tmp_path / ".bashrc").read_text()
+
+
+def completed(line):
+    """What bash would offer, and which heavy modules that loaded."""
+    words = line.split(" ")
+    program = (
+        "import atexit, sys\n"
+        f"atexit.register(lambda: print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr))\n"
+        "from fcslam.cli import main\n"
+        "main()"
+    )
+    asked = {"_FCSLAM_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env={**os.environ, **asked}, capture_output=True, text=True, check=True
+    )
+    return done.stdout.split(), done.stderr.strip()
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("fcslam ma", ["map"]),
+        ("fcslam federate ", ["local", "serve", "join"]),
+        ("fcslam map --no", ["--no-fuse"]),
+        ("fcslam simulate --building of", ["office"]),
+        ("fcslam extract pho", []),
+        ("fcslam map --output ru", []),
+    ],
+)
+def test_shells_complete_commands_options_and_choices_and_themselves_files(line, offered):
+    assert completed(line) == (offered, "[]")

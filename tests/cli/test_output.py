@@ -1,0 +1,52 @@
+"""Folders that commands make up when none is named."""
+
+from datetime import datetime
+from pathlib import Path
+
+from fcslam.cli import main
+from fcslam.cli.output import new_folder
+from tests.sources.carmen_text import drive, save
+
+NOW = datetime(2026, 2, 3, 14, 5, 6)
+
+
+def test_a_new_folder_is_called_by_the_time_and_never_taken(tmp_path):
+    parent = str(tmp_path)
+    assert new_folder(parent, NOW) == tmp_path / "2026-02-03-140506"
+    assert list(tmp_path.iterdir()) == []
+    for name in ("2026-02-03-140506", "2026-02-03-140506-2"):
+        (tmp_path / name).mkdir()
+    assert new_folder(parent, NOW) == tmp_path / "2026-02-03-140506-3"
+
+
+def test_map_makes_a_run_folder_and_prints_where(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save(tmp_path / "robot.log", drive(40))
+    for runs in (1, 2):
+        assert main(["map", "robot.log"]) == 0
+        last = capsys.readouterr().out.splitlines()[-1]
+        assert Path(last.removeprefix("map: ")).is_file()
+        assert len(list(Path("runs").iterdir())) == runs
+
+
+def test_quiet_map_prints_its_answer_only(tmp_path, capsys):
+    log = save(tmp_path / "robot.log", [*drive(40), "ODOM x"])
+    assert main(["map", str(log), "-o", str(tmp_path / "loud")]) == 0
+    assert "broken lines" in capsys.readouterr().err
+    assert main(["map", str(log), "-o", str(tmp_path / "run"), "--quiet"]) == 0
+    out, error = capsys.readouterr()
+    assert error == ""
+    assert out.endswith(f"map: {tmp_path / 'run' / 'map.png'}\n")
+
+
+def test_a_bad_recording_leaves_no_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["map", "none.log", "--quiet"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert list(tmp_path.rglob("runs/*")) == []
+
+
+def test_resuming_needs_the_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "--no-camera", "--resume"]) == 2
+    assert "give --output" in capsys.readouterr().err
