@@ -66,7 +66,8 @@ def complaint(line: str, complete: bool) -> str:
             return f"{line}: no such command" if complete else ""
         found = command.get_command(context, words[0])
         if found is None:
-            return "" if words[0] in ("--help", "--version") else f"{line}: no command {words[0]}"
+            options = {name for option in command.get_params(context) for name in option.opts}
+            return "" if words[0] in options else f"{line}: no command {words[0]}"
         command, context = found, click.Context(found, parent=context, info_name=words.pop(0))
     try:
         command.make_context(context.info_name, words)
@@ -161,6 +162,8 @@ def test_the_documented_example_writes_a_log_that_can_be_read(tmp_path, monkeypa
         ("fcslam config print", False, False),
         ("fcslam fly", False, False),
         ("fcslam --version", True, True),
+        ("fcslam --install-completion", False, True),
+        ("fcslam federate --local", False, False),
     ],
 )
 def test_the_rule_for_commands(line, complete, fine):
