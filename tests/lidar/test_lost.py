@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.lost import LostConfig, is_doubtful, is_enough, is_lost
+from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
 from fcslam.lidar.mapper import LidarConfig, Mapper
 from fcslam.records import frozen
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
@@ -103,10 +103,10 @@ def test_who_has_hardly_moved_cannot_be_lost(around, elsewhere):
 def test_it_takes_a_way_and_several_scans_or_very_many(around):
     still = [around[0]] * CONFIG.most_scans
     far = [replace(around[0], T_odom_base=frozen(np.array([0.3 * k, 0.0, 0.0]))) for k in range(CONFIG.fewest_scans)]
-    assert is_enough(still, CONFIG)
-    assert not is_enough(still[:-1], CONFIG)
-    assert is_enough(far, CONFIG)
-    assert not is_enough(far[:-1], CONFIG)
+    assert can_decide(still, CONFIG)
+    assert not can_decide(still[:-1], CONFIG)
+    assert can_decide(far, CONFIG)
+    assert not can_decide(far[:-1], CONFIG)
 
 
 def test_what_was_not_matched_is_not_doubted(around):

@@ -6,7 +6,7 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.mapper import LidarConfig, Mapper, motion_information
-from fcslam.lidar.tracker import TrackedScan
+from fcslam.lidar.tracker import OdometryConfig, TrackedScan
 from fcslam.records import ConstraintKind
 from tests.lidar.worlds import box, drifting, drive, path, pose_errors, recording, ring, ring_drive, shifted
 
@@ -129,7 +129,7 @@ def test_information_of_a_motion_turns_with_the_robot():
     information = np.diag((1e6, 1e1, 1e6))
     for heading in (0.0, np.pi / 2, 0.7):
         tracked = TrackedScan(np.array([1.0, 2.0, heading]), information, None)
-        found = motion_information(np.array([0.3, 0.0, 0.1]), tracked)
+        found = motion_information(np.array([0.3, 0.0, 0.1]), tracked, OdometryConfig())
         _, vectors = np.linalg.eigh(found[:2, :2])
         loose = np.array([np.sin(heading), np.cos(heading)])  # local y in the robot's base
         assert abs(vectors[:, 0] @ loose) > 0.999

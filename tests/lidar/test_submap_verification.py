@@ -5,7 +5,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, agreement, build_submap
-from fcslam.lidar.verification import VerificationConfig, _of_inverse, verify
+from fcslam.lidar.verification import VerificationConfig, _information_of_inverse, verify
 from tests.lidar.worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
 
 CONFIG = VerificationConfig()
@@ -206,5 +206,5 @@ def test_information_of_the_inverse_pose(pose):
     rng = np.random.default_rng(0)
     drawn = np.array(pose) + rng.multivariate_normal(np.zeros(3), np.linalg.inv(information), 200_000)
     spread = np.cov((se2.inverse(drawn) - se2.inverse(pose)).T)
-    expected = np.linalg.inv(_of_inverse(information, np.array(pose)))
+    expected = np.linalg.inv(_information_of_inverse(information, np.array(pose)))
     assert np.allclose(spread, expected, rtol=0.1, atol=0.05 * np.abs(expected).max())

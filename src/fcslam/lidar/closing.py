@@ -1,7 +1,8 @@
 """Loop closing inside one robot: a submap is compared with earlier ones that may show the same place.
 
-How far the estimate may be off grows with the shortest path through the pose graph (odometry and accepted closures),
-not with time: after a closure the search is narrow again. A wide search is branch and bound over the whole window.
+The error allowed for in the estimate grows with the shortest path through the pose graph (odometry and accepted
+closures), not with time: after a closure the search is narrow again. A wide search covers
+the whole window by branch and bound.
 """
 
 from collections.abc import Sequence
@@ -20,67 +21,105 @@ from fcslam.lidar.verification import Verification, VerificationConfig, verify
 from fcslam.records import FloatArray
 
 SURPRISE_M, SURPRISE_RAD = 0.15, 0.03
-"""A closure this far off its prediction asks for a solve at once."""
+"""A closure farther than this from its prediction contradicts the estimate, and the graph is solved at once."""
 NARROW_M = 0.8
-"""With so little drift to allow for, the prediction starts the alignment, and the loose gate is enough."""
+"""Up to this drift allowance the prediction itself starts the alignment, and the loose gate is enough."""
 PENDING_M = 60.0
-"""Travel after which a closure that found no support is given up."""
+"""Travel after which a pending closure without enough support is dropped, metres."""
+
+BASE_DRIFT_M, BASE_DRIFT_RAD = 0.3, 0.05
+"""Drift allowance at zero path length: the errors of the two submaps themselves."""
+ALIGNMENT_MARGIN_M, ALIGNMENT_MARGIN_RAD = 0.3, 0.1
+"""The refined alignment may lie this far outside the search window."""
+CLOSURE_PATH_M = 1.0
+"""Path length that crossing an accepted closure counts as, metres: a closure is not exact."""
+_MINIMUM_PATH_M = 1e-3
+"""Added to the path length between consecutive submaps: a sparse graph takes an edge of length 0 for none."""
+
+CONCLUSIVE_OVERLAP = 0.4
+"""Least overlap of a closure that is accepted after a wide search without support."""
+CONCLUSIVE_SHARE, CONCLUSIVE_M = 0.3, 0.2
+"""Such a closure lies within this share of the drift allowance, plus so many metres, of its prediction."""
+MINIMUM_SUPPORT = 3.0
+"""Sum of ``Verification.support`` that consistent pending closures need."""
+MINIMUM_SPREAD_M = 3.0
+"""Travel over which they are spread at least: closures from one place are one piece of evidence."""
+LOOP_M, LOOP_PER_M = 0.25, 0.02
+"""Two closures are consistent if their loop closes to this many metres, plus so many per metre of path in it."""
+LOOP_RAD, LOOP_RAD_PER_M = 0.05, 0.002
+"""The same for the heading, in radians and radians per metre."""
 
 
 class ClosingConfig(Settings):
     """Loop closing inside one robot."""
 
-    gap_m: float = Field(default=12.0, gt=0, description="travel that must lie between two submaps to be compared")
-    sight_m: float = Field(default=8.0, gt=0, description="anchors farther apart than this share too little tracking")
-    candidates: int = Field(default=4, gt=0, description="earlier visits compared with one submap")
-    drift: float = Field(default=0.03, gt=0, description="drift allowed for, per metre of path through the graph")
-    drift_rad_m: float = Field(default=0.006, gt=0, description="the same in heading")
-    widest_m: float = Field(default=15.0, gt=0, description="half side of the widest search")
-    widest_rad: float = Field(default=0.7, gt=0, description="half angle of the widest search")
-    least_score: float = Field(default=0.5, ge=0, le=1, description="likelihood a search must reach")
+    gap_m: float = Field(
+        default=12.0, gt=0, description="least travel between the anchors of two submaps that are compared [m]"
+    )
+    sight_m: float = Field(
+        default=8.0,
+        gt=0,
+        description="largest distance between the anchors of two submaps that are compared, besides the drift "
+        "allowance; farther ones overlap too little [m]",
+    )
+    candidates: int = Field(
+        default=4, gt=0, description="largest number of earlier visits that a submap is compared with"
+    )
+    drift: float = Field(
+        default=0.03, gt=0, description="drift of the position allowed for, per metre of path through the graph [m/m]"
+    )
+    drift_rad_m: float = Field(
+        default=0.006, gt=0, description="drift of the heading allowed for, per metre of path through the graph [rad/m]"
+    )
+    widest_m: float = Field(default=15.0, gt=0, description="largest half side of the search window [m]")
+    widest_rad: float = Field(default=0.7, gt=0, description="largest half angle of the search window [rad]")
+    least_score: float = Field(
+        default=0.5, ge=0, le=1, description="least mean likelihood of the points that a search must reach"
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class AnchoredSubmap:
-    """A submap with where it hangs in the pose graph."""
+    """A submap and the keyscan that anchors it in the pose graph."""
 
     keyscan: int
+    """Number of the anchor."""
     travel_m: float
-    """Path length up to the anchor (turning counts a little)."""
+    """Path length up to the anchor, metres (turns count a little)."""
     submap: Submap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalClosure:
-    """A verified closure between the anchors of two submaps (indices into the closer's list)."""
+    """A verified closure between the anchors of two submaps of one robot (indices into ``LoopCloser.submaps``)."""
 
     earlier: int
     later: int
     check: Verification
     innovation: FloatArray
-    """How far the measurement lies from the prediction (x, y, theta)."""
-    slack_m: float
-    """Drift allowed for when it was found."""
+    """Measurement relative to the prediction (x, y, theta), shape (3,), metres and radians."""
+    drift_m: float
+    """Drift allowance when the closure was found, metres."""
 
     @property
-    def off_m(self) -> float:
-        """Length of the innovation."""
+    def innovation_m(self) -> float:
+        """Distance between measurement and prediction, metres."""
         return float(np.hypot(self.innovation[0], self.innovation[1]))
 
     @property
     def is_surprising(self) -> bool:
-        """Whether it says that the estimate is off."""
-        return self.off_m > SURPRISE_M or abs(self.innovation[2]) > SURPRISE_RAD
+        """Whether it contradicts the estimate."""
+        return self.innovation_m > SURPRISE_M or abs(self.innovation[2]) > SURPRISE_RAD
 
 
 class LoopCloser:
-    """Collects a robot's submaps and says which closures hold."""
+    """Collects the submaps of one robot and decides which closures between them are accepted."""
 
     def __init__(self, config: ClosingConfig, search_config: SearchConfig, verification: VerificationConfig) -> None:
         self._config = config
         self._search = search_config
         self._verification = verification
-        self.places: list[AnchoredSubmap] = []
+        self.submaps: list[AnchoredSubmap] = []
         self._accepted: list[LocalClosure] = []
         self._pending: list[LocalClosure] = []
 
@@ -89,46 +128,52 @@ class LoopCloser:
         """Whether any closure was accepted."""
         return bool(self._accepted)
 
-    def add(self, place: AnchoredSubmap, poses: Sequence[FloatArray]) -> list[LocalClosure]:
-        """Take in the next submap; closures that hold now (of it, and of earlier ones it supports).
+    def add(self, submap: AnchoredSubmap, poses: Sequence[FloatArray]) -> list[LocalClosure]:
+        """Compare the next submap with earlier ones.
 
-        ``poses``: T_map_base of every keyscan so far.
+        Args:
+            submap: the next submap.
+            poses: ``T_map_base`` of every keyscan so far, shape (3,) each.
+
+        Returns:
+            The closures that are accepted now: of this submap, and pending ones that it supports.
         """
-        self.places.append(place)
-        later = len(self.places) - 1
+        self.submaps.append(submap)
+        later = len(self.submaps) - 1
         paths = self._paths_from(later)
-        anchors = np.array([poses[p.keyscan] for p in self.places])
+        anchors = np.array([poses[submap.keyscan] for submap in self.submaps])
         found = [
             closure
             for earlier in self._candidates(later, anchors, paths)
             if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
         ]
-        return self._judge(found, anchors)
+        return self._accept(found, anchors)
 
     def _paths_from(self, later: int) -> FloatArray:
-        """Shortest path through the graph from one submap to every other, metres, shape (P,)."""
-        n = len(self.places)
-        travel = np.array([p.travel_m for p in self.places])
+        """Shortest path through the pose graph from one submap to every other, metres, shape (S,)."""
+        n = len(self.submaps)
+        travel = np.array([submap.travel_m for submap in self.submaps])
         rows = [*range(n - 1), *(c.earlier for c in self._accepted)]
         columns = [*range(1, n), *(c.later for c in self._accepted)]
-        lengths = [*(np.diff(travel) + 1e-3), *(1.0 for _ in self._accepted)]
+        lengths = [*(np.diff(travel) + _MINIMUM_PATH_M), *(CLOSURE_PATH_M for _ in self._accepted)]
         links = coo_array((np.array(lengths), (np.array(rows), np.array(columns))), shape=(n, n))
         paths: FloatArray = dijkstra(links.tocsr(), directed=False, indices=[later])[0]
         return paths
 
-    def _slack(self, path_m: float) -> tuple[float, float]:
+    def _drift_allowance(self, path_m: float) -> tuple[float, float]:
+        """Error of the estimate allowed for after a path through the graph: metres and radians."""
         config = self._config
         return (
-            min(config.widest_m, 0.3 + config.drift * path_m),
-            min(config.widest_rad, 0.05 + config.drift_rad_m * path_m),
+            min(config.widest_m, BASE_DRIFT_M + config.drift * path_m),
+            min(config.widest_rad, BASE_DRIFT_RAD + config.drift_rad_m * path_m),
         )
 
     def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
         """The nearest submap of each earlier visit to the neighbourhood, nearest visits first."""
-        travel = np.array([p.travel_m for p in self.places])
+        travel = np.array([submap.travel_m for submap in self.submaps])
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
-        slack = np.array([self._slack(path)[0] for path in paths])
-        near = (travel[later] - travel > self._config.gap_m) & (distance < self._config.sight_m + slack)
+        drift = np.array([self._drift_allowance(path)[0] for path in paths])
+        near = (travel[later] - travel > self._config.gap_m) & (distance < self._config.sight_m + drift)
         indices = np.flatnonzero(near)
         if not len(indices):
             return []
@@ -138,9 +183,10 @@ class LoopCloser:
         return best[: self._config.candidates]
 
     def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> LocalClosure | None:
-        a, b = self.places[earlier].submap, self.places[later].submap
+        """Search where the drift allowance is wide, then verify; None if the submaps do not show the same place."""
+        a, b = self.submaps[earlier].submap, self.submaps[later].submap
         predicted = se2.between(anchors[earlier], anchors[later])
-        radius, angle = self._slack(path_m)
+        radius, angle = self._drift_allowance(path_m)
         guess = predicted
         if radius > NARROW_M:
             window = SearchWindow(radius, angle)
@@ -150,54 +196,61 @@ class LoopCloser:
             guess = result.T_field_base
         check = verify(a, b, guess, self._verification)
         innovation = se2.between(predicted, check.T_a_b)
-        off = np.hypot(innovation[0], innovation[1])
-        if not (check.loose or check.support) or off > radius + 0.3 or abs(innovation[2]) > angle + 0.1:
+        outside = (
+            np.hypot(innovation[0], innovation[1]) > radius + ALIGNMENT_MARGIN_M
+            or abs(innovation[2]) > angle + ALIGNMENT_MARGIN_RAD
+        )
+        if not (check.loose or check.support) or outside:
             return None
         return LocalClosure(earlier, later, check, innovation, radius)
 
-    def _judge(self, found: list[LocalClosure], anchors: FloatArray) -> list[LocalClosure]:
-        """Closures near their prediction hold at once; others wait until enough of them agree."""
-        sure = [c for c in found if self._is_expected(c) or self._is_plain(c)]
-        self._pending += [c for c in found if c not in sure and c.check.support]
+    def _accept(self, found: list[LocalClosure], anchors: FloatArray) -> list[LocalClosure]:
+        """Accept expected and conclusive closures at once; others wait until enough of them are consistent."""
+        accepted = [c for c in found if self._is_expected(c) or self._is_conclusive(c)]
+        self._pending += [c for c in found if c not in accepted and c.check.support]
         self._pending = [
-            c for c in self._pending if self.places[-1].travel_m - self.places[c.later].travel_m < PENDING_M
+            c for c in self._pending if self.submaps[-1].travel_m - self.submaps[c.later].travel_m < PENDING_M
         ]
         cluster = self._cluster(anchors)
-        sure += cluster
+        accepted += cluster
         self._pending = [c for c in self._pending if c not in cluster]
-        self._accepted += sure
-        return sure
+        self._accepted += accepted
+        return accepted
 
     @staticmethod
     def _is_expected(closure: LocalClosure) -> bool:
-        """Near the prediction while little drift is to be allowed for."""
-        return closure.check.loose and closure.slack_m <= NARROW_M
+        """Whether a closure passes the loose gate with a narrow drift allowance."""
+        return closure.check.loose and closure.drift_m <= NARROW_M
 
     @staticmethod
-    def _is_plain(closure: LocalClosure) -> bool:
-        """A wide closure that stands alone: informative, partial, and close to where it was expected."""
-        worse = closure.check.worse
-        near = closure.off_m < 0.3 * closure.slack_m + 0.2
-        return closure.check.strict and closure.check.informative and worse.overlap > 0.4 and near
+    def _is_conclusive(closure: LocalClosure) -> bool:
+        """Whether a closure needs no support: strict, informative, with much overlap, and near its prediction."""
+        overlap = closure.check.worse.overlap
+        near = closure.innovation_m < CONCLUSIVE_SHARE * closure.drift_m + CONCLUSIVE_M
+        return closure.check.strict and closure.check.informative and overlap > CONCLUSIVE_OVERLAP and near
 
     def _cluster(self, anchors: FloatArray) -> list[LocalClosure]:
-        """The pending closures that agree with the newest one, if they are enough."""
+        """The pending closures that are consistent with the newest one, if they are enough to be accepted."""
         if not self._pending:
             return []
         newest = self._pending[-1]
-        agreeing = [c for c in self._pending if self._agree(c, newest, anchors)]
-        spread = np.ptp([self.places[c.later].travel_m for c in agreeing])
-        support = sum(c.check.support for c in agreeing)
-        if support >= 3.0 and spread >= 3.0 and any(c.check.informative for c in agreeing):
-            return agreeing
+        consistent = [c for c in self._pending if self._are_consistent(c, newest, anchors)]
+        spread_m = np.ptp([self.submaps[c.later].travel_m for c in consistent])
+        support = sum(c.check.support for c in consistent)
+        informative = any(c.check.informative for c in consistent)
+        if support >= MINIMUM_SUPPORT and spread_m >= MINIMUM_SPREAD_M and informative:
+            return consistent
         return []
 
-    def _agree(self, a: LocalClosure, b: LocalClosure, anchors: FloatArray) -> bool:
-        """Whether going round both closures and the estimates between their ends leads back to the start."""
+    def _are_consistent(self, a: LocalClosure, b: LocalClosure, anchors: FloatArray) -> bool:
+        """Whether the loop over both closures and the estimated motions between their ends closes."""
         earlier = se2.between(anchors[a.earlier], anchors[b.earlier])
         later = se2.between(anchors[a.later], anchors[b.later])
         round_trip = se2.compose(se2.compose(a.check.T_a_b, later), se2.inverse(b.check.T_a_b))
-        rest = se2.between(earlier, round_trip)
-        path = abs(self.places[a.later].travel_m - self.places[b.later].travel_m)
-        path += float(np.hypot(earlier[0], earlier[1]))
-        return bool(np.hypot(rest[0], rest[1]) < 0.25 + 0.02 * path and abs(rest[2]) < 0.05 + 0.002 * path)
+        residual = se2.between(earlier, round_trip)
+        path_m = abs(self.submaps[a.later].travel_m - self.submaps[b.later].travel_m)
+        path_m += float(np.hypot(earlier[0], earlier[1]))
+        return bool(
+            np.hypot(residual[0], residual[1]) < LOOP_M + LOOP_PER_M * path_m
+            and abs(residual[2]) < LOOP_RAD + LOOP_RAD_PER_M * path_m
+        )

@@ -1,8 +1,8 @@
-"""Is the robot still where it thinks it is? What it sees now is compared with what it saw just before.
+"""Detection of a lost robot: its newest scans are compared with its newest keyscans.
 
-A robot that was picked up and put down elsewhere, or whose odometry broke, sees another place than the one around its
-last keyscans. One scan that explains little of the known area may be a crowd or a door; so scans are put by until they
-are enough for a submap of their own, and two submaps that contradict each other are two places.
+A robot that was picked up and put down elsewhere, or whose odometry failed, sees another place than its last keyscans
+did. A single scan that explains little of the known area may come from a crowd or an opened door. So doubtful scans are
+deferred until they are enough for a submap of their own; two submaps that contradict each other show two places.
 """
 
 from collections.abc import Sequence
@@ -19,62 +19,90 @@ from fcslam.records import FloatArray, LaserScan
 
 
 class LostConfig(Settings):
-    """When a robot is lost and begins a new session."""
+    """When a robot is lost and starts a new session."""
 
     doubted: float = Field(
-        default=0.8, ge=0, le=1, description="a scan that explains less of the known area is put by; 0: never lost"
+        default=0.8,
+        ge=0,
+        le=1,
+        description="a scan is doubtful if a smaller share of its points in known area lies on a surface; "
+        "0 disables the detection",
     )
-    travel_m: float = Field(default=1.0, ge=0, description="travel over which scans in a row have to be doubted")
-    fewest_scans: int = Field(default=5, ge=1, description="and how many at least")
-    most_scans: int = Field(default=100, ge=1, description="with so many it is decided, however short the way")
-    settled_m: float = Field(default=3.0, ge=0, description="who has mapped less of a way cannot be lost")
+    travel_m: float = Field(
+        default=1.0, ge=0, description="least travel over consecutive doubtful scans before they are compared [m]"
+    )
+    fewest_scans: int = Field(
+        default=5, ge=1, description="least number of consecutive doubtful scans before they are compared"
+    )
+    most_scans: int = Field(
+        default=100,
+        ge=1,
+        description="number of consecutive doubtful scans that are compared even without `travel_m` of travel",
+    )
+    settled_m: float = Field(
+        default=3.0, ge=0, description="travel that a session must have mapped before its robot can be lost [m]"
+    )
     agreeing: float = Field(
-        default=0.90, ge=0, le=1, description="scans put by tell nothing where they explain less of each other (median)"
+        default=0.90,
+        ge=0,
+        le=1,
+        description="least median share of points that the doubtful scans explain of each other; below it, nothing is "
+        "decided",
     )
     explained: float = Field(
-        default=0.60, ge=0, le=1, description="lost: of the points in known area fewer lie on a surface"
+        default=0.60,
+        ge=0,
+        le=1,
+        description="a lost robot sees a smaller share of its points in known area on a surface",
     )
-    violation: float = Field(default=0.30, ge=0, le=1, description="and more of them in free space")
-    overlap: float = Field(default=0.25, ge=0, le=1, description="least share of points in known area to tell")
+    violation: float = Field(
+        default=0.30,
+        ge=0,
+        le=1,
+        description="a lost robot sees a larger share of its points in known area in free space",
+    )
+    overlap: float = Field(
+        default=0.25, ge=0, le=1, description="least share of all points in known area; below it, nothing is decided"
+    )
 
 
 def is_doubtful(tracking: TrackingResult, mapper: Mapper, config: LostConfig) -> bool:
-    """Whether a scan seems to show another place than the scans before it."""
+    """Whether a scan may show another place than the scans before it."""
     # False for a scan that was not matched, as both are NaN.
     return mapper.travel_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
 
 
-def is_enough(scans: Sequence[LaserScan], config: LostConfig) -> bool:
-    """Whether so many doubtful scans in a row can be decided."""
+def can_decide(scans: Sequence[LaserScan], config: LostConfig) -> bool:
+    """Whether these consecutive doubtful scans are enough for a decision."""
     steps = se2.relative(np.array([scan.T_odom_base for scan in scans]))
     far = len(scans) >= config.fewest_scans and np.hypot(steps[:, 0], steps[:, 1]).sum() >= config.travel_m
     return bool(far) or len(scans) >= config.most_scans
 
 
 def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, mapper: Mapper, config: LostConfig) -> bool:
-    """Whether scans that the mapper has not processed show another place than its newest keyscans.
+    """Whether deferred scans show another place than the newest keyscans of the mapper.
 
     Args:
-        scans: in a row.
-        T_local_first: where the first of them was taken, as the mapper's tracker sees it, shape (3,).
-        mapper: of the robot.
-        config: what tells two places apart.
+        scans: consecutive scans that the mapper has not processed.
+        T_local_first: pose of the first of them in the tracker's local frame, shape (3,), metres and radians.
+        mapper: the robot's mapper; it does not change.
+        config: thresholds.
     """
-    anew = Mapper(mapper.robot, mapper.config)
-    if not _agree(scans, anew, config):
+    fresh = Mapper(mapper.robot, mapper.config)
+    if not _are_consistent(scans, fresh, config):
         return False
-    (seen, T_local_seen), (now, T_first_now) = mapper.recent_submap(), anew.recent_submap()
-    predicted = se2.between(T_local_seen, se2.compose(T_local_first, T_first_now))
-    worse = verify(seen, now, predicted, mapper.config.verification).worse
+    (before, T_local_before), (now, T_first_now) = mapper.recent_submap(), fresh.recent_submap()
+    predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
+    worse = verify(before, now, predicted, mapper.config.verification).worse
     return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
 
 
-def _agree(scans: Sequence[LaserScan], anew: Mapper, config: LostConfig) -> bool:
-    """Whether scans explain one another, mapped anew: where even they do not, nothing can be told from the rest."""
+def _are_consistent(scans: Sequence[LaserScan], fresh: Mapper, config: LostConfig) -> bool:
+    """Map the scans with a fresh mapper; whether they explain one another. Otherwise nothing can be decided."""
     shares = []
     for scan in scans:
-        tracking = anew.localize(scan)
-        anew.process(scan, tracking)
+        tracking = fresh.localize(scan)
+        fresh.process(scan, tracking)
         if tracking.known > 0.0:  # not so for a scan that was not matched
             shares.append(tracking.explained / tracking.known)
     return bool(shares) and bool(np.median(shares) >= config.agreeing)

@@ -1,4 +1,4 @@
-"""The robot's LiDAR SLAM (Karto class): every scan tracked, keyscans in a pose graph, loops closed between submaps."""
+"""LiDAR SLAM of one robot, as in Karto: scan tracking, a pose graph of keyscans, loop closures between submaps."""
 
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
@@ -15,24 +15,51 @@ from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LocalClosure, Lo
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackerConfig, TrackingResult, odometry_information
+from fcslam.lidar.tracker import (
+    OdometryConfig,
+    ScanTracker,
+    TrackedScan,
+    TrackerConfig,
+    TrackingResult,
+    odometry_information,
+)
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, KeyscanId, LaserScan, Ranges, frozen
 
 SOLVE_AFTER, SOLVE_AFTER_SHARE = 20, 0.08
-"""Closures that may wait for a solve when none says that the estimate is off: so many, or this share of the keyscans.
-A solve takes as long as the graph is large, so they become rarer as it grows, and a scan's share stays the same."""
+"""The graph is solved once this many closures wait, or this share of the number of keyscans if that is more. The time
+of a solve grows with the graph, so solves become rarer and the mean cost per scan stays constant."""
 TURN_AS_TRAVEL_M = 0.1
-"""Progress that one radian of turning counts for: a robot that only turns finishes submaps, too."""
+"""Travel that one radian of turning counts as, metres: a robot that only turns completes submaps, too."""
+
+POINT_INFORMATION_SHARE = 0.1
+"""Share of the points' information that counts: errors of neighbouring points are correlated, ten count as one."""
+ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_PER_TRAVEL = 0.01, 0.1
+"""Standard deviation of odometry's position between two keyscans that were matched, in metres and per metre of travel.
+It fixes what the points leave open, as along a corridor. It is smaller than in the tracker (``OdometryConfig``):
+the match has shown that the wheels did not slip."""
+ODOMETRY_SIGMA_RAD, ODOMETRY_SIGMA_PER_TURN = 0.005, 0.1
+"""The same for the heading, in radians and per radian of turn."""
+FLOOR_SIGMA_M, FLOOR_SIGMA_PER_TRAVEL = 0.003, 0.01
+"""Least standard deviation of the position between two keyscans, in metres and per metre of travel: the error that more
+points do not reduce."""
+FLOOR_SIGMA_RAD, FLOOR_SIGMA_PER_TURN = 0.001, 0.01
+"""The same for the heading, in radians and per radian of turn."""
 
 
 class KeyscanConfig(Settings):
-    """Which scans carry the pose graph and the map, and the submaps around them."""
+    """Which scans become keyscans, and the size of submaps."""
 
-    minimum_travel_distance_m: float = Field(default=0.25, gt=0, description="a keyscan at least this often")
-    minimum_travel_heading_rad: float = Field(default=0.25, gt=0, description="or after this turn")
-    submap_every_m: float = Field(default=2.0, gt=0, description="travel between the anchors of submaps")
-    submap_reach_m: float = Field(default=5.0, gt=0, description="travel before and after the anchor in a submap")
+    minimum_travel_distance_m: float = Field(
+        default=0.25, gt=0, description="travel since the last keyscan after which a scan becomes a keyscan [m]"
+    )
+    minimum_travel_heading_rad: float = Field(
+        default=0.25, gt=0, description="turn since the last keyscan after which a scan becomes a keyscan [rad]"
+    )
+    submap_every_m: float = Field(default=2.0, gt=0, description="travel between the anchors of two submaps [m]")
+    submap_reach_m: float = Field(
+        default=5.0, gt=0, description="travel before and after its anchor that a submap covers [m]"
+    )
 
 
 class LidarConfig(Settings):
@@ -47,16 +74,17 @@ class LidarConfig(Settings):
 
 @dataclass(frozen=True, slots=True)
 class ScanPose:
-    """Where a raw scan was, relative to the keyscan before it."""
+    """Pose of a scan relative to the keyscan before it."""
 
     stamp: float
     keyscan: int
     T_keyscan_base: FloatArray
+    """Shape (3,), metres and radians."""
 
 
 @dataclass(frozen=True, slots=True)
 class FinishedSubmap:
-    """The submap around a keyscan is complete: what it shows, and the closures that it brought."""
+    """A complete submap: its surfaces, and the closures that were accepted with it."""
 
     anchor: int
     first: int
@@ -64,13 +92,13 @@ class FinishedSubmap:
     last: int
     """Last one (inclusive)."""
     surface: FloatArray
-    """Points of the surfaces in the anchor's base, shape (N, 2)."""
+    """Points of the surfaces in the anchor's base, shape (N, 2), metres."""
     closures: tuple[Constraint, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What one scan brought."""
+    """Everything that one scan added."""
 
     pose: ScanPose
     keyscan: Keyscan | None = None
@@ -79,7 +107,7 @@ class Step:
 
 
 class Mapper:
-    """One robot's SLAM on its own; poses are in its ``map``, which starts at its first keyscan's odometry pose."""
+    """SLAM of one robot. Poses are in its own ``map``, where the first keyscan has its odometry pose."""
 
     def __init__(self, robot: str, config: LidarConfig) -> None:
         self.robot = robot
@@ -96,42 +124,56 @@ class Mapper:
         self._unsolved = 0
 
     def localize(self, scan: LaserScan) -> TrackingResult:
-        """The next scan, which leaves no trace before it is processed."""
+        """Find the pose of the next scan; nothing changes before :meth:`process`."""
         return self._tracker.localize(scan)
 
     def process(self, scan: LaserScan, tracking: TrackingResult | None = None) -> Step:
-        """Take in the next scan, as it was seen if it was looked at before."""
+        """Process the next scan.
+
+        Args:
+            scan: the scan.
+            tracking: its result of :meth:`localize`, if that was called before.
+
+        Returns:
+            The pose of the scan, and what it added to the map.
+        """
+        # 1. Scan matching against the running buffer.
         tracking = self._tracker.localize(scan) if tracking is None else tracking
         self._tracker.commit(tracking)
         tracked = tracking.tracked
+        # 2. Keyscan: after enough motion the scan becomes a variable of the pose graph.
         if not self._is_keyscan(tracked):
             return Step(self._scan_pose(scan.stamp, tracked))
-        keyscan, odometry = self._add_keyscan(scan, tracked)  # pose graph grows
-        submap = self._finish_submap()  # loops are closed between submaps
+        keyscan, odometry = self._add_keyscan(scan, tracked)
+        # 3. Submap and loop closing: a complete submap is compared with earlier ones; closures start a solve.
+        submap = self._finish_submap()
         return Step(self._scan_pose(scan.stamp, tracked), keyscan, odometry, submap)
 
     @property
     def travel_m(self) -> float:
-        """Path length up to the newest keyscan; turning counts a little."""
+        """Path length up to the newest keyscan, metres; turns count as ``TURN_AS_TRAVEL_M`` per radian."""
         return self._travel[-1] if self._travel else 0.0
 
     def recent_submap(self) -> tuple[Submap, FloatArray]:
-        """What the robot saw on the last ``submap_reach_m`` of its way, and ``T_local_base`` of the anchor, the newest
-        keyscan."""
+        """The submap of the last ``submap_reach_m`` of travel.
+
+        Returns:
+            The submap, in the base of the newest keyscan, and ``T_local_base`` of this keyscan, shape (3,).
+        """
         anchor = self._local[-1]
         first = bisect_left(self._travel, self._travel[-1] - self.config.keyscans.submap_reach_m)
         numbers = range(first, len(self._local))
         return build_submap([(self._points[k], se2.between(anchor, self._local[k])) for k in numbers]), anchor
 
     def finish(self) -> list[FinishedSubmap]:
-        """The submaps still open at the end of the recording."""
+        """Complete the submaps that are still open at the end of the recording."""
         rest = []
         while submap := self._finish_submap(at_end=True):
             rest.append(submap)
         return rest
 
     def optimized(self) -> FloatArray:
-        """T_map_base of every keyscan after a robust solve (GNC), shape (N, 3)."""
+        """``T_map_base`` of every keyscan after a robust solve (GNC), shape (N, 3), metres and radians."""
         if self._closer.has_closures:
             self._poses = list(optimize_gnc(self._graph, self._poses, factors=self._factors).poses)
         return np.array(self._poses).reshape(-1, 3)
@@ -153,12 +195,14 @@ class Mapper:
         return ScanPose(stamp, number, se2.between(self._local[number], tracked.T_local_base))
 
     def _add_keyscan(self, scan: LaserScan, tracked: TrackedScan) -> tuple[Keyscan, Constraint | None]:
-        """New variable of the pose graph, tied to the keyscan before it."""
+        """Add a variable to the pose graph, with a constraint to the keyscan before it."""
         points = tracked.scan or point_scan(scan.ranges_m, scan.laser)
         number = len(self._local)
         self._tracker.insert(points, tracked.T_local_base)
         self._points[number] = points
-        keyscan = Keyscan(KeyscanId(self.robot, number), scan.stamp, _clean(scan.ranges_m, scan.laser.max_range_m))
+        keyscan = Keyscan(
+            KeyscanId(self.robot, number), scan.stamp, _valid_ranges(scan.ranges_m, scan.laser.max_range_m)
+        )
         if number == 0:
             start = np.array(scan.T_odom_base)
             self._local.append(tracked.T_local_base)
@@ -169,7 +213,7 @@ class Mapper:
         motion = se2.between(self._local[-1], tracked.T_local_base)
         constraint = Constraint(
             self.robot, number - 1, number, ConstraintKind.ODOMETRY, frozen(motion),
-            frozen(motion_information(motion, tracked)),
+            frozen(motion_information(motion, tracked, self.config.tracker.odometry)),
         )  # fmt: skip
         self._local.append(tracked.T_local_base)
         self._poses.append(se2.compose(self._poses[-1], motion))
@@ -180,7 +224,7 @@ class Mapper:
         return keyscan, constraint
 
     def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
-        """The next submap, once the robot is far enough past its anchor; closes loops to earlier ones."""
+        """Build the next submap once the robot is far enough past its anchor, and close loops to earlier ones."""
         gate, travel = self.config.keyscans, self._travel
         anchor = bisect_left(travel, self._next_anchor_m)
         if anchor == len(travel) or (not at_end and travel[-1] < travel[anchor] + gate.submap_reach_m):
@@ -195,9 +239,9 @@ class Mapper:
         closures = self._close_loops(AnchoredSubmap(anchor, travel[anchor], submap))
         return FinishedSubmap(anchor, first, last, submap.surface.points, closures)
 
-    def _close_loops(self, place: AnchoredSubmap) -> tuple[Constraint, ...]:
-        """Compare the new submap with earlier ones; what holds becomes constraints."""
-        closures = self._closer.add(place, self._poses)
+    def _close_loops(self, submap: AnchoredSubmap) -> tuple[Constraint, ...]:
+        """Compare a new submap with earlier ones; accepted closures become constraints."""
+        closures = self._closer.add(submap, self._poses)
         constraints = tuple(self._constraint(closure) for closure in closures)
         for c in constraints:
             self._graph.add_edge(Edge(c.i, c.j, c.T_i_j, c.information, robust=True))
@@ -205,14 +249,14 @@ class Mapper:
         return constraints
 
     def _constraint(self, closure: LocalClosure) -> Constraint:
-        places = self._closer.places
+        submaps = self._closer.submaps
         return Constraint(
-            self.robot, places[closure.earlier].keyscan, places[closure.later].keyscan, ConstraintKind.CLOSURE,
+            self.robot, submaps[closure.earlier].keyscan, submaps[closure.later].keyscan, ConstraintKind.CLOSURE,
             frozen(closure.check.T_a_b), frozen(closure.check.information),
         )  # fmt: skip
 
     def _optimize_if_needed(self, closures: list[LocalClosure]) -> None:
-        """Solve at once when a closure says that the estimate is off, else only now and then."""
+        """Solve at once if a closure contradicts the estimate, otherwise after ``SOLVE_AFTER`` closures."""
         self._unsolved += len(closures)
         enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._local))
         if self._unsolved >= enough or any(c.is_surprising for c in closures):
@@ -220,24 +264,36 @@ class Mapper:
             self._unsolved = 0
 
 
-def motion_information(motion: FloatArray, tracked: TrackedScan) -> FloatArray:
-    """Information of the motion between two keyscans, in the coordinates of the later one, shape (3, 3).
+def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: OdometryConfig) -> FloatArray:
+    """Information of the motion between two consecutive keyscans.
 
-    Neighbouring points err together, so they count a tenth; odometry holds what they leave open (along a corridor).
+    The sum of the points' information and odometry's, limited by a floor of the standard deviations.
+
+    Args:
+        motion: pose of the later keyscan in the earlier one, shape (3,), metres and radians.
+        tracked: the later keyscan.
+        odometry: error of the odometry, used if the scan was not matched.
+
+    Returns:
+        Information in the tangent space at ``motion`` (x, y, theta of the later keyscan), shape (3, 3).
     """
     moved, turned = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
     cos, sin = np.cos(tracked.T_local_base[2]), np.sin(tracked.T_local_base[2])
     turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
-    odometry = np.diag(((0.01 + 0.1 * moved) ** -2, (0.01 + 0.1 * moved) ** -2, (0.005 + 0.1 * turned) ** -2))
-    if not tracked.information.any():  # nothing but odometry, which may have slipped
-        odometry = odometry_information(moved, turned)
-    covariance = np.linalg.inv(0.1 * turn.T @ tracked.information @ turn + odometry)
-    floor = np.diag(((0.003 + 0.01 * moved) ** 2, (0.003 + 0.01 * moved) ** 2, (0.001 + 0.01 * turned) ** 2))
+    sigma_m = ODOMETRY_SIGMA_M + ODOMETRY_SIGMA_PER_TRAVEL * moved
+    sigma_rad = ODOMETRY_SIGMA_RAD + ODOMETRY_SIGMA_PER_TURN * turned
+    prior = np.diag((sigma_m**-2, sigma_m**-2, sigma_rad**-2))
+    if not tracked.information.any():  # odometry alone, and the wheels may have slipped
+        prior = odometry_information(moved, turned, odometry)
+    covariance = np.linalg.inv(POINT_INFORMATION_SHARE * turn.T @ tracked.information @ turn + prior)
+    floor_m = FLOOR_SIGMA_M + FLOOR_SIGMA_PER_TRAVEL * moved
+    floor_rad = FLOOR_SIGMA_RAD + FLOOR_SIGMA_PER_TURN * turned
+    floor = np.diag((floor_m**2, floor_m**2, floor_rad**2))
     information = np.linalg.inv(covariance + floor)
     return np.asarray(0.5 * (information + information.T))
 
 
-def _clean(ranges_m: Ranges, max_range_m: float) -> Ranges:
-    """Ranges of a keyscan: what is no return becomes 0."""
+def _valid_ranges(ranges_m: Ranges, max_range_m: float) -> Ranges:
+    """Ranges of a keyscan, metres; invalid ones become 0."""
     valid = np.isfinite(ranges_m) & (ranges_m > 0.0) & (ranges_m < max_range_m)
     return frozen(np.where(valid, ranges_m, 0.0), np.float32)

@@ -1,4 +1,4 @@
-"""Do two submaps show the same place, and how do they lie to each other? Geometry decides, and it may say no."""
+"""Geometric verification: whether two submaps show the same place, and the transform between them."""
 
 from dataclasses import dataclass
 
@@ -12,97 +12,151 @@ from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import Agreement, Submap, agreement
 from fcslam.records import FloatArray
 
-WEAKEST = 1e-2
-"""Information left in a direction that no point fixes: 10 m or 10 rad."""
+UNFIXED_INFORMATION = 1e-2
+"""Information in a direction that no point fixes: a standard deviation of 10 m or 10 rad."""
 ALIGNED_POINTS = 400
-"""At least so many points of a submap align it, if it has them."""
+"""Points of a submap that are aligned, at least, if it has so many."""
 NO_PRIOR = np.zeros((3, 3))
 _ALIGNMENT = MatchingConfig(wide_scale_m=0.4)
+"""A guess between submaps is worse than one between scans: the loss starts wider."""
 
 
 class Gate(Settings):
-    """What a pair of submaps has to show to count as the same place where nothing predicts it."""
+    """Thresholds for two submaps to show the same place where no estimate predicts it."""
 
     explained: float = Field(
-        default=0.80, ge=0, le=1, description="least share of points in known area that lie on a surface"
+        default=0.80,
+        ge=0,
+        le=1,
+        description="least share of the points in known area that lie on a surface, in either direction",
     )
-    violation: float = Field(default=0.05, ge=0, le=1, description="largest share of points in the other's free space")
-    count: int = Field(default=250, ge=0, description="least number of explained points, 0.1 m apart")
-    overlap: float = Field(default=0.25, ge=0, le=1, description="least share of points in known area")
+    violation: float = Field(
+        default=0.05,
+        ge=0,
+        le=1,
+        description="largest share of the points in known area that lie in the other submap's free space",
+    )
+    count: int = Field(default=250, ge=0, description="least number of points on a surface; points are 0.1 m apart")
+    overlap: float = Field(default=0.25, ge=0, le=1, description="least share of all points that lie in known area")
 
 
 class LooseGate(Gate):
-    """The same where the estimate predicts the closure."""
+    """Thresholds where an estimate predicts the closure."""
 
-    explained: float = Field(default=0.70, ge=0, le=1, description="as in strict")
-    violation: float = Field(default=0.10, ge=0, le=1, description="as in strict")
+    explained: float = Field(
+        default=0.70,
+        ge=0,
+        le=1,
+        description="least share of the points in known area that lie on a surface, in either direction",
+    )
+    violation: float = Field(
+        default=0.10,
+        ge=0,
+        le=1,
+        description="largest share of the points in known area that lie in the other submap's free space",
+    )
 
 
 class PartialGate(Gate):
-    """The same for half a witness: much is seen, but the submaps are bent (outdoors, on a slope)."""
+    """Thresholds of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope)."""
 
-    explained: float = Field(default=0.65, ge=0, le=1, description="as in strict")
-    violation: float = Field(default=0.22, ge=0, le=1, description="as in strict")
-    count: int = Field(default=500, ge=0, description="as in strict")
-    overlap: float = Field(default=0.5, ge=0, le=1, description="as in strict")
+    explained: float = Field(
+        default=0.65,
+        ge=0,
+        le=1,
+        description="least share of the points in known area that lie on a surface, in either direction",
+    )
+    violation: float = Field(
+        default=0.22,
+        ge=0,
+        le=1,
+        description="largest share of the points in known area that lie in the other submap's free space",
+    )
+    count: int = Field(default=500, ge=0, description="least number of points on a surface; points are 0.1 m apart")
+    overlap: float = Field(default=0.5, ge=0, le=1, description="least share of all points that lie in known area")
 
 
 class VerificationConfig(Settings):
-    """Two-way verification of closures between submaps."""
+    """Verification of closures between submaps, aligned in both directions."""
 
-    strict: Gate = Field(default=Gate(), description="gate without a prediction")
-    loose: LooseGate = Field(default=LooseGate(), description="gate where a closure is predicted")
-    partial: PartialGate = Field(default=PartialGate(), description="gate for half a witness: much is seen, but bent")
-    informative: float = Field(
-        default=30.0, ge=0, description="least small eigenvalue of the normal tensor: below, it may be a corridor"
+    strict: Gate = Field(default=Gate(), description="thresholds where no estimate predicts the closure")
+    loose: LooseGate = Field(default=LooseGate(), description="thresholds where an estimate predicts the closure")
+    partial: PartialGate = Field(
+        default=PartialGate(),
+        description="thresholds of a partially supported closure: it counts half in a cluster, and never alone",
     )
-    symmetry_m: float = Field(default=0.15, gt=0, description="both directions of the alignment agree this closely")
-    symmetry_rad: float = Field(default=0.03, gt=0, description="and turn alike to this")
-    closure_sigma_m: float = Field(default=0.03, gt=0, description="error of a closure that no point count removes")
-    closure_sigma_rad: float = Field(default=0.006, gt=0, description="the same of its heading")
+    informative: float = Field(
+        default=30.0,
+        ge=0,
+        description="least eigenvalue of the normal tensor of an informative closure; a corridor has less",
+    )
+    symmetry_m: float = Field(
+        default=0.15, gt=0, description="largest distance between the alignments of both directions [m]"
+    )
+    symmetry_rad: float = Field(
+        default=0.03, gt=0, description="largest turn between the alignments of both directions [rad]"
+    )
+    closure_sigma_m: float = Field(
+        default=0.03,
+        gt=0,
+        description="least standard deviation of a closure's position, however many points it has [m]",
+    )
+    closure_sigma_rad: float = Field(
+        default=0.006,
+        gt=0,
+        description="least standard deviation of a closure's heading, however many points it has [rad]",
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """The outcome of laying submap b on submap a."""
+    """Result of aligning submap b with submap a."""
 
     T_a_b: FloatArray
+    """Shape (3,), metres and radians."""
     information: FloatArray
-    """Of T_a_b, in the coordinates of b, shape (3, 3)."""
+    """Information of T_a_b in the tangent space at T_a_b (coordinates of b), shape (3, 3)."""
     worse: Agreement
-    """What the two directions have in common: of each measure the worse, but of the overlap the better one, since a
-    small submap may lie within a large one."""
+    """The worse of both directions in each measure; of the overlap the better one, as a small submap may lie within a
+    large one."""
     strict: bool
     loose: bool
     partial: bool
+    """Passes the gate of this name; ``partial`` closures are informative, too."""
     informative: bool
+    """Whether it fixes the pose in every direction."""
     reason: str
-    """Why it is not more, in words; empty if strict and informative."""
+    """Why it is not strict and informative; empty if it is."""
 
     @property
     def support(self) -> float:
-        """What it counts for in a cluster of closures that agree: 1 if strict, a half if only partial, else nothing."""
+        """Weight in a cluster of consistent closures: 1 if strict, 0.5 if only partial, else 0."""
         return 1.0 if self.strict else 0.5 * self.partial
 
 
 def verify(
     a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig, prior: FloatArray = NO_PRIOR
 ) -> Verification:
-    """Align both ways by Gauss-Newton from the guess, then judge by the worse side.
+    """Check whether two submaps show the same place: align them in both directions and rate the worse one.
 
     Args:
-        a: one submap.
-        b: the other.
-        T_a_b_guess: where the alignment starts, shape (3,).
-        config: what the pair has to show.
-        prior: information of the guess from elsewhere, of (x, y, theta) in a's coordinates, shape (3, 3): along a
-            corridor, where no wall holds the alignment, matched keypoints do. It makes nothing informative: what
-            repeats along a corridor repeats in images, too, and only walls may say that a match is fixed.
+        a: one submap, in the coordinate frame of its anchor.
+        b: the other submap, in the coordinate frame of its anchor.
+        T_a_b_guess: where the Gauss-Newton alignment starts, shape (3,), metres and radians.
+        config: thresholds.
+        prior: information of the guess from matched keypoints, over (x, y, theta) in the coordinates of a, shape
+            (3, 3). It fixes the alignment where no wall does, as along a corridor. It does not make a closure
+            informative: structure that repeats along a corridor repeats in images, too.
+
+    Returns:
+        The alignment halfway between both directions, and the gates that it passes.
     """
     forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, prior, _ALIGNMENT)
-    # A prior must not be believed twice: backward it holds the alignment where it did forward, at the guess.
+    # The prior must not count twice: backward it acts at the guess, as it does forward.
     start = T_a_b_guess if prior.any() else forward.T_field_base
-    backward = match_scan(_sample(a.surface), b.field, se2.inverse(start), _of_inverse(prior, start), _ALIGNMENT)
+    backward = match_scan(
+        _sample(a.surface), b.field, se2.inverse(start), _information_of_inverse(prior, start), _ALIGNMENT
+    )
     T_a_b, T_a_b_back = forward.T_field_base, se2.inverse(backward.T_field_base)
     gap = se2.between(T_a_b, T_a_b_back)
     T_a_b = se2.compose(T_a_b, 0.5 * gap)
@@ -132,12 +186,12 @@ def verify(
 
 
 def _sample(surface: PointScan) -> PointScan:
-    """Enough points to align by: more would say the same again. Copied: compiled code sees one layout of arrays."""
+    """About ``ALIGNED_POINTS`` points: more add little. Copied, so that compiled code sees one memory layout."""
     return surface.only(np.arange(0, len(surface), max(1, len(surface) // ALIGNED_POINTS)))
 
 
 def _shortfall(found: Agreement, gate: Gate) -> str:
-    """The first condition of the gate that is not met, in words."""
+    """The first threshold of the gate that is not reached, in words."""
     if found.explained < gate.explained:
         return f"only {found.explained:.2f} explained"
     if found.violation > gate.violation:
@@ -149,22 +203,24 @@ def _shortfall(found: Agreement, gate: Gate) -> str:
     return ""
 
 
-def _of_inverse(information: FloatArray, T_a_b: FloatArray) -> FloatArray:
-    """Information of T_a_b, of (x, y, theta) in a, as that of T_b_a, of (x, y, theta) in b."""
+def _information_of_inverse(information: FloatArray, T_a_b: FloatArray) -> FloatArray:
+    """Information of T_a_b over (x, y, theta) in a, shape (3, 3), as information of T_b_a over (x, y, theta) in b."""
     x, y, theta = T_a_b
     cos, sin = np.cos(theta), np.sin(theta)
-    # T_b_a = (-R' t, -theta); this is its derivative, which is its own inverse's shape
+    # The derivative of T_b_a = (-R' t, -theta) by T_a_b.
     jacobian = np.array([[-cos, -sin, sin * x - cos * y], [sin, -cos, cos * x + sin * y], [0.0, 0.0, -1.0]])
     inverse = np.linalg.inv(jacobian)
     return np.asarray(inverse.T @ information @ inverse)
 
 
 def _information(points: FloatArray, T_a_b: FloatArray, config: VerificationConfig) -> FloatArray:
-    """Points' information turned into b's coordinates, with the floor that neighbouring points share."""
+    """Information of the points in the coordinates of b, shape (3, 3), limited by the least standard deviations."""
     turn = np.eye(3)
     cos, sin = np.cos(T_a_b[2]), np.sin(T_a_b[2])
     turn[:2, :2] = ((cos, -sin), (sin, cos))
-    covariance = np.linalg.inv(turn.T @ points @ turn + np.diag((WEAKEST, WEAKEST, WEAKEST)))
+    covariance = np.linalg.inv(
+        turn.T @ points @ turn + np.diag((UNFIXED_INFORMATION, UNFIXED_INFORMATION, UNFIXED_INFORMATION))
+    )
     floor = np.diag((config.closure_sigma_m**2, config.closure_sigma_m**2, config.closure_sigma_rad**2))
     information = np.linalg.inv(covariance + floor)
     return np.asarray(0.5 * (information + information.T))

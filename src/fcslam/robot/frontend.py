@@ -11,7 +11,7 @@ from pathlib import Path
 from pydantic import Field
 
 from fcslam.errors import FeatureError
-from fcslam.lidar.lost import LostConfig, is_doubtful, is_enough, is_lost
+from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
 from fcslam.lidar.mapper import ScanPose
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord
 from fcslam.robot.session import RobotSession, SessionConfig
@@ -91,7 +91,7 @@ class RobotFrontend:
             self._T_local_doubted = tracking.tracked.T_local_base
         self._put_by.append(scan)
         scans = [record for record in self._put_by if isinstance(record, LaserScan)]
-        if not is_enough(scans, config):
+        if not can_decide(scans, config):
             return []
         if not is_lost(scans, self._T_local_doubted, mapper, config):
             return self._go_on()
