@@ -166,7 +166,7 @@ def test_settings_come_from_a_model_a_mapping_or_a_file_and_arguments_replace_th
         ({"recordings": "none.clf"}, fcslam.SourceError, "none.clf: no such file"),
         ({"recordings": []}, fcslam.SourceError, "no recording"),
         ({"recordings": ["LOG", "LOG"]}, fcslam.SourceError, "robot_1"),
-        ({"recordings": ["LOG", "LOG"], "split": 2}, fcslam.SourceError, "only one recording"),
+        ({"recordings": ["LOG", "LOG"], "split": 2}, fcslam.SourceError, "cuts one recording"),
         ({"split": 0}, fcslam.SourceError, "0 parts"),
         ({"seed": -1}, fcslam.ConfigError, "seed"),
         ({"config": {"sed": 1}}, fcslam.ConfigError, "did you mean 'seed'"),

@@ -76,7 +76,9 @@ def split_recordings(recordings: list[Source], parts: int) -> list[Source]:
     if parts == 1:
         return recordings
     if len(recordings) != 1:
-        raise SourceError(f"only one recording can be split, {len(recordings)} are given; map them one by one")
+        raise SourceError(
+            f"--split cuts one recording (in Python split={parts}), {len(recordings)} are given; map them one by one"
+        )
     return sources.split(recordings[0], parts)
 
 

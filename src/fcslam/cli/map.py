@@ -63,6 +63,7 @@ def map_recordings(
     quiet: Quiet = False,
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
+    from fcslam.api import split_recordings
     from fcslam.runs import prepare_output, read_vetoes
 
     output = output or new_folder(RUNS)
@@ -70,7 +71,7 @@ def map_recordings(
     settings = mission_config(config, seed, no_fuse, fusion)
     vetoes = read_vetoes(veto) if veto else ()
     options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
-    sources = _split([open_recording(log, options) for log in logs], split)
+    sources = split_recordings([open_recording(log, options) for log in logs], split)
     map_sources(sources, settings, output, notices(quiet), force, vetoes)
 
 
@@ -86,8 +87,8 @@ def map_sources(
 
     A run that appeared at ``output`` meanwhile is replaced only with ``force``.
     """
+    from fcslam import api
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.mission import run_mission
 
     surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
     print_notes(console, (note for survey in surveys for note in survey.notes))
@@ -95,23 +96,13 @@ def map_sources(
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     with ProgressDisplay(console) as display:
-        run = run_mission(sources, settings, _watch(display, sum(survey.scan_count for survey in surveys)), vetoes)
+        progress = _watch(display, sum(survey.scan_count for survey in surveys))
+        run = api.map_recordings(sources, config=settings, vetoes=vetoes, progress=progress)
         display.start("writing")
         run.save(output, force)
     print_faults(console, sources)
     _report(answers(), run, time.perf_counter() - began, output, settings.fleet.join_maps)
     return run
-
-
-def _split(sources: "list[Source]", parts: int) -> "list[Source]":
-    from fcslam.errors import SourceError
-    from fcslam.sources import split
-
-    if parts == 1:
-        return sources
-    if len(sources) != 1:
-        raise SourceError(f"--split cuts one recording, {len(sources)} are given; map them one by one")
-    return split(sources[0], parts)
 
 
 def _watch(display: "ProgressDisplay", total: int) -> "Callable[[Progress], None]":
