@@ -1,4 +1,4 @@
-"""The place index: which stored places are like a new one, in words that follow the places as they arrive."""
+"""The place index: an inverted index over a dynamic vocabulary that retrieves the places most similar to a query."""
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Voc
 from fcslam.records import Codes, FloatArray
 
 _MOST_LEVELS = 16
-"""Of a tree whose leaves split: no limit in practice."""
+"""Depth limit of a tree whose leaves split; no tree reaches it in practice."""
 _MERGED_SHARE = 4
-"""A merged word is at most so much smaller than one that splits, so that it does not split again at once."""
+"""A merged word holds at most 1 / 4 of ``leaf_capacity``, so that it does not split again soon."""
 _ROWS_KEPT = 2
-"""Rows for every stored place at most: those of forgotten ones are closed up then."""
+"""Most rows per stored place. Beyond, the index is compacted: rows of forgotten places go."""
 _NO_CODES = np.empty((0, CODE_WORDS), np.uint64)
 
 
 @dataclass(frozen=True, slots=True)
 class IndexState(Generic[PlaceId]):
-    """All that an index is; postings follow from it."""
+    """The complete state of an index; the postings are computed from it."""
 
     config: VocabularyConfig
     descriptor_version: str
@@ -38,16 +38,16 @@ class IndexState(Generic[PlaceId]):
     counts: NDArray[np.int32]
     """Shape (P,): descriptors of each place."""
     codes: CodeWords
-    """Shape (D, 4), place by place."""
+    """Shape (D, 4): codes of all descriptors, place by place."""
     leaves: NDArray[np.int32]
-    """Shape (D,): vertices of ``tree``."""
+    """Shape (D,): leaf of each descriptor, as a vertex of ``tree``."""
 
 
 class PlaceIndex(Generic[PlaceId]):
-    """Places by the words they contain, and the vocabulary that follows them.
+    """Stored places by the words they contain, with the dynamic vocabulary.
 
-    The strategies differ in when the tree is grown again and whether words split; all else is the same. Places are
-    counted in the order of arrival, from 0, as in Algorithm 1 of FC-SLAM.
+    The strategies differ only in when the tree is trained again and whether words split. Places are counted in the
+    order of arrival, from 0, as in Algorithm 1 of FC-SLAM.
     """
 
     def __init__(self, config: VocabularyConfig, rng: np.random.Generator, descriptor_version: str = "") -> None:
@@ -57,7 +57,7 @@ class PlaceIndex(Generic[PlaceId]):
         self._postings = self._no_postings()
         self._buffers = empty_buffers(0)
         self._ids: list[PlaceId] = []
-        """By row; what stood there once stays after the place was forgotten, until rows are closed up."""
+        """Identifier of each row; that of a forgotten place stays until the index is compacted."""
         self._row_of: dict[PlaceId, int] = {}
         self._places_seen = 0
         self._training: Training | None = None
@@ -70,17 +70,17 @@ class PlaceIndex(Generic[PlaceId]):
 
     @property
     def word_count(self) -> int:
-        """Words of the vocabulary; 0 before the first training."""
+        """Number of words; 0 before the first training."""
         return self._vocabulary.word_count if self._training else 0
 
     @property
     def version(self) -> int:
-        """Counts the changes of the vocabulary; 0 before the first training."""
+        """Number of changes of the vocabulary; 0 before the first training."""
         return self._vocabulary.version
 
     @property
     def training(self) -> Training | None:
-        """What the tree was grown from; None before."""
+        """The data of the latest training; None before the first."""
         return self._training
 
     def add(self, place: PlaceId, descriptors: Codes) -> None:
@@ -105,11 +105,11 @@ class PlaceIndex(Generic[PlaceId]):
     def query(
         self, descriptors: Codes, top_k: int, exclude: Container[PlaceId] = frozenset()
     ) -> list[ScoredPlace[PlaceId]]:
-        """The ``top_k`` stored places most similar to these descriptors (N, 32): the best of ``compare``."""
+        """Return the ``top_k`` stored places most similar to these descriptors (N, 32), the most similar first."""
         return self.compare(descriptors).best(top_k, lambda place: place not in exclude)
 
     def compare(self, descriptors: Codes) -> QueryResult[PlaceId]:
-        """How alike all stored places are to these descriptors (N, 32); nothing before the first training."""
+        """Score all stored places against these descriptors (N, 32); empty before the first training."""
         codes = code_words(descriptors)
         entries, count = self._postings.entries, len(self)
         if not self._training or not count:
@@ -125,20 +125,20 @@ class PlaceIndex(Generic[PlaceId]):
         return QueryResult(self._ids, rows, scores)
 
     def similarity(self, a: Codes, b: Codes) -> float:
-        """Eq. (4) on [0, 1] of two places, each (N, 32), in the present words; 0 before the first training."""
+        """Eq. (4), scaled to [0, 1], of two places with descriptors (N, 32); 0 before the first training."""
         if not self._training:
             return 0.0
         return similarity(self.bag(a), self.bag(b))
 
     def bag(self, descriptors: Codes) -> BagOfWords:
-        """The place with these descriptors (N, 32) in the present words, weighted as stored places are."""
+        """Bag of words of descriptors (N, 32) in the present vocabulary, weighted as stored places are."""
         leaves, weights = self._weigh(code_words(descriptors))
         words = self._vocabulary.words[leaves]
         order = np.argsort(words)
         return BagOfWords(words[order], weights[order], self.version)
 
     def forget(self, place: PlaceId) -> None:
-        """Take a place out.
+        """Remove a place.
 
         Raises:
             KeyError: it is not stored.
@@ -150,11 +150,11 @@ class PlaceIndex(Generic[PlaceId]):
             self._describe_again(self._postings.gather(self._rows()))
 
     def train(self, places: Sequence[Codes]) -> None:
-        """Grow the tree now from the descriptors of these places, each (N, 32), which need not be stored."""
+        """Train the tree now on the descriptors of these places, each (N, 32), which need not be stored."""
         self._train(np.concatenate([_NO_CODES, *map(code_words, places)]), len(places))
 
     def state(self) -> IndexState[PlaceId]:
-        """All that the index is."""
+        """The complete state, from which ``restored`` makes an equal index."""
         rows = self._rows()
         tree, number_of = self._vocabulary.state()
         leaves = np.concatenate([np.empty(0, np.int32), *map(self._postings.leaves, rows.tolist())])
@@ -165,7 +165,7 @@ class PlaceIndex(Generic[PlaceId]):
 
     @classmethod
     def restored(cls, state: IndexState[PlaceId]) -> Self:
-        """The index that had this state; it goes on as that one."""
+        """Restore an index from its state; it behaves exactly like the original."""
         index = cls(state.config, np.random.default_rng(0), state.descriptor_version)
         index._training, index._places_seen = state.training, state.places_seen
         index._vocabulary = Vocabulary.restored(_shape(state.config), state.tree)
@@ -176,7 +176,7 @@ class PlaceIndex(Generic[PlaceId]):
         return index
 
     def _is_due(self, i: int) -> bool:
-        """Algorithm 1, line 4: whether the tree is grown when place i has come."""
+        """Algorithm 1, line 4: whether the tree is trained after place i."""
         since = i - self._config.train_batch - 1
         match self._config.strategy:
             case Strategy.REBUILD:
@@ -187,12 +187,12 @@ class PlaceIndex(Generic[PlaceId]):
                 return since >= 0 and self._training is None
 
     def _train_on_newest(self) -> None:
-        """Lines 5-9, whose two cases are one window here: D_max(0, i - C + 1) ... D_i."""
+        """Algorithm 1, lines 5-9. Its two cases are one window here: D_max(0, i - C + 1) ... D_i."""
         rows = self._rows()[-self._config.capacity :]
         self._train(self._postings.gather(rows), len(rows))
 
     def _train(self, codes: CodeWords, places: int) -> None:
-        """Line 11: V_t, and all stored places in its words."""
+        """Algorithm 1, line 11: train V_t and describe all stored places in its words."""
         stored = self._postings.gather(self._rows())
         self._vocabulary.train(codes)
         self._training = Training(places, len(codes), self._descriptor_version)
@@ -201,7 +201,7 @@ class PlaceIndex(Generic[PlaceId]):
             self._split(np.flatnonzero(self._postings.entries.sizes > self._config.leaf_capacity))
 
     def _describe_again(self, stored: CodeWords) -> None:
-        """Enter all stored places anew, ``stored`` (M, 4) being their codes; rows close up."""
+        """Rebuild the postings from the codes of all stored places, ``stored`` (M, 4), without unused rows."""
         counts = self._postings.entries.counts[self._rows()]
         self._postings = self._no_postings()
         self._postings.fill(stored, self._vocabulary.leaves(stored), counts)
@@ -209,17 +209,17 @@ class PlaceIndex(Generic[PlaceId]):
         self._row_of = {place: row for row, place in enumerate(self._ids)}
 
     def _no_postings(self) -> Postings:
-        """For the leaves of the present tree."""
+        """Empty postings for the leaves of the present tree."""
         return Postings(self._vocabulary.vertex_count, has_norms=self._config.scoring is Scoring.WORDS)
 
     def _rows(self) -> NDArray[np.int64]:
-        """Of the stored places, ascending."""
+        """Rows of the stored places, ascending, shape (P,)."""
         return np.fromiter(self._row_of.values(), np.int64, len(self))
 
     def _overfull(self, entered: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Leaves that have grown over the limit, or over twice, four times ... the limit, by what was just entered.
+        """Leaves that just exceeded 1, 2, 4 ... times their capacity.
 
-        A word of equal descriptors cannot be split; it is not tried again with each one more.
+        A word of equal descriptors cannot be split. Doubling the limit avoids a new attempt at every descriptor.
         """
         capacity, sizes = self._config.leaf_capacity, self._postings.entries.sizes
         leaves, added = np.unique(entered[sizes[entered] > capacity], return_counts=True)
@@ -228,7 +228,7 @@ class PlaceIndex(Generic[PlaceId]):
         return leaves[after - added <= limit]
 
     def _split(self, overfull: NDArray[np.integer[Any]]) -> None:
-        """Split words that hold too many descriptors, and what they split into."""
+        """Split words with too many descriptors until none is too large."""
         waiting = sorted(overfull.tolist(), key=self._word, reverse=True)
         while waiting:
             leaf = waiting.pop()
@@ -242,7 +242,7 @@ class PlaceIndex(Generic[PlaceId]):
             waiting += [child for child in np.unique(targets).tolist() if sizes[child] > self._config.leaf_capacity]
 
     def _merge(self, leaves: NDArray[np.int32]) -> None:
-        """Merge words that have become nearly empty with their siblings, level by level."""
+        """Merge nearly empty words with their siblings, level by level."""
         while len(leaves):
             above = np.unique(self._vocabulary.parents[leaves])
             nearly_empty = [vertex for vertex in above.tolist() if self._is_nearly_empty(vertex)]
@@ -255,7 +255,7 @@ class PlaceIndex(Generic[PlaceId]):
             leaves = np.array(nearly_empty, np.int32)
 
     def _is_nearly_empty(self, vertex: int) -> bool:
-        """Whether the children of a vertex are leaves, and one word can hold all that lies in them."""
+        """Whether the children of a vertex are leaves whose descriptors fit into one word."""
         if vertex < 0:
             return False
         children = self._vocabulary.children(vertex)
@@ -264,11 +264,11 @@ class PlaceIndex(Generic[PlaceId]):
         return bool(self._postings.entries.sizes[children].sum() <= self._config.leaf_capacity // _MERGED_SHARE)
 
     def _word(self, leaf: int) -> int:
-        """Numbers of words, unlike those of vertices, do not depend on where the tree lies in memory."""
+        """Number of a leaf's word; unlike vertex numbers, it does not depend on the layout in memory."""
         return int(self._vocabulary.words[leaf])
 
     def _weigh(self, codes: CodeWords) -> tuple[NDArray[np.int32], FloatArray]:
-        """Leaves, each once, and tf-idf with an L1 norm of 1. Words that all or no places have tell nothing."""
+        """Distinct leaves (K,) and their tf-idf (K,), L1 norm 1. Words of all or of no places have weight 0 and go."""
         leaves, counts = np.unique(self._vocabulary.leaves(codes), return_counts=True)
         documents = self._postings.entries.documents[leaves]
         weights = counts * np.log(max(len(self), 1) / np.maximum(documents, 1))
@@ -278,7 +278,7 @@ class PlaceIndex(Generic[PlaceId]):
 
 
 def _shape(config: VocabularyConfig) -> TreeShape:
-    """A tree whose leaves split has no other limit than their capacity."""
+    """Limits of the tree. The leaf capacity is the only limit of a tree whose leaves split."""
     if config.strategy is not Strategy.INCREMENTAL:
         return config.tree.shape
     return config.tree.shape._replace(depth=_MOST_LEVELS, smallest_split=config.leaf_capacity + 1)

@@ -1,7 +1,7 @@
-"""A place index as a file: numpy's ``.npz``, not compressed, nothing in it that could run.
+"""A place index as a file: uncompressed ``.npz`` without pickled objects.
 
-Written are the tree, the places and their descriptors; postings follow from them. Numbers of words, the state of chance
-and what the tree was trained on are kept, so an index that was read goes on exactly as the one that was written.
+The file holds the tree, the places and their descriptors; the postings are computed from them. It also holds the word
+numbers, the seed and the data of the last training, so a loaded index behaves exactly like the saved one.
 """
 
 import json
@@ -36,7 +36,7 @@ _SHAPES: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
 
 
 def save_index(index: PlaceIndex[Any], path: Path) -> None:
-    """Write an index; what was there is replaced at the end. Identifiers are what JSON can tell: text, numbers, tuples.
+    """Write an index atomically. Identifiers of places must be JSON values: text, numbers or tuples.
 
     Raises:
         OutputError: the file cannot be written.
@@ -70,9 +70,9 @@ def load_index(path: Path, place_id: Callable[[Any], PlaceId], descriptor_versio
     """Read an index.
 
     Args:
-        path: of the file.
-        place_id: an identifier from what JSON makes of it: text, a number, a list.
-        descriptor_version: of the descriptors that it will be asked about; empty if whatever it has will do.
+        path: the file.
+        place_id: converts a JSON value (text, number or list) to an identifier.
+        descriptor_version: version that the descriptors must have; empty accepts any.
 
     Raises:
         InputError: the file cannot be read, is damaged, or holds descriptors of another version.
@@ -83,11 +83,11 @@ def load_index(path: Path, place_id: Callable[[Any], PlaceId], descriptor_versio
         about = json.loads(arrays.pop("about").tobytes())
         state = _state(arrays, about, place_id)
     except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, InputError) as error:
-        raise InputError(f"{path}: no place index that can be read ({_one_line(error)}); make it anew") from error
+        raise InputError(f"{path}: not a readable place index ({_one_line(error)}); build it again") from error
     if descriptor_version not in ("", state.descriptor_version):
         raise InputError(
             f"{path}: descriptors of {state.descriptor_version or 'an unnamed detector'} cannot be compared with those "
-            f"of {descriptor_version}; make the index anew"
+            f"of {descriptor_version}; build the index again"
         )
     return PlaceIndex.restored(state)
 
@@ -95,10 +95,10 @@ def load_index(path: Path, place_id: Callable[[Any], PlaceId], descriptor_versio
 def _state(
     arrays: dict[str, NDArray[Any]], about: dict[str, Any], place_id: Callable[[Any], PlaceId]
 ) -> IndexState[PlaceId]:
-    """What was read, checked: compiled code trusts it.
+    """Check the content of a file, because compiled code does not check indices.
 
     Raises:
-        ValueError, KeyError, TypeError, InputError: it is not what was written.
+        ValueError, KeyError, TypeError, InputError: the content is inconsistent.
     """
     if about["format"] != FORMAT:
         raise ValueError(f"its format is {about['format']!r}, not {FORMAT!r}")
@@ -111,17 +111,17 @@ def _state(
     after = 1 + np.cumsum(child_count)
     is_tree = vertices and child_count.min() >= 0 and after[-1] == vertices and (after > np.arange(vertices)).all()
     if not is_tree or not len(arrays["centres"]) == len(words) == vertices:
-        raise ValueError("the tree does not hold together")
+        raise ValueError("the tree is inconsistent")
     ids = [place_id(value) for value in about["ids"]]
     if len(ids) != len(set(ids)) or len(ids) != len(counts) or (counts < 0).any():
-        raise ValueError("places and their sizes do not fit")
+        raise ValueError("places and their sizes do not agree")
     if not len(leaves) == len(arrays["codes"]) == counts.sum(dtype=np.int64):
-        raise ValueError("places and descriptors do not fit")
+        raise ValueError("places and descriptors do not agree")
     if len(leaves) and (leaves.min() < 0 or leaves.max() >= vertices or child_count[leaves].any()):
-        raise ValueError("descriptors lie in no word")
+        raise ValueError("a descriptor has no word")
     numbers = [int(about[name]) for name in ("seed", "version", "words_given", "places_seen")]
     if min(numbers) < 0 or words.max() >= numbers[2] or ((words >= 0) != (child_count == 0)).any():
-        raise ValueError("numbers of words do not fit")
+        raise ValueError("word numbers are inconsistent")
     tree = TreeState(numbers[0], numbers[1], numbers[2], arrays["centres"], child_count, words)
     training = Training(**about["training"]) if about["training"] is not None else None
     config = parse(VocabularyConfig, about["config"], "config")

@@ -1,7 +1,7 @@
-"""Where every stored descriptor is: by word, in blocks that a query reads in a row, and by place.
+"""The inverted index: all stored descriptors by word, in chains of blocks, and by place.
 
-The codes themselves lie in the blocks, word by word: a query compares some hundred codes of one word, and codes that
-lie place by place would cost a cache miss each. For the same reason a block holds all that is known of its entries.
+The blocks hold the codes themselves. A query compares some hundred codes of one word, and codes stored by place would
+cost a cache miss each. For the same reason a block holds everything about its entries.
 """
 
 from collections.abc import Sequence
@@ -16,45 +16,44 @@ from fcslam.places.prefetch import prefetch
 from fcslam.records import FloatArray, Scalar
 
 BLOCK = 8
-"""Entries of a block: more waste memory in words of few descriptors, fewer cost jumps."""
+"""Entries of a block. More waste memory in small words, fewer cost more jumps between blocks."""
 
 GROWTH_FACTOR = 1.06
-"""Of arrays that run out of room."""
+"""Factor by which arrays grow when they are full."""
 
 ROWS = 2 * CODE_WORDS * BLOCK
-"""Where in the numbers of a block it is told whose descriptors they are, for each entry."""
+"""Offset in a block's ``numbers``: row of the place of each entry."""
 OLDER = ROWS + BLOCK
-"""The number of the block before it in its chain, -1 for none."""
+"""Offset in a block's ``numbers``: the previous block of the chain, -1 for none."""
 _INDICES = OLDER + 2
-"""Which ones of their places they are, for each entry."""
+"""Offset in a block's ``numbers``: index of each entry among the descriptors of its place."""
 _BLOCK_WORDS = (_INDICES + BLOCK) // 2
 _LINE = 16
-"""Numbers to a line of the cache."""
+"""32-bit numbers in a cache line."""
 
 
 class Entries(NamedTuple):
-    """Postings as compiled code sees them. Words go by the number of their leaf in the tree, places by row."""
+    """The arrays of the postings for compiled code. A leaf's vertex number stands for a word, a row for a place."""
 
     heads: NDArray[np.int32]
-    """Shape (V, 2): the block of each leaf that is being filled, -1 for none, all others of its chain being full; how
-    many descriptors the leaf has."""
+    """Shape (V, 2): newest block of each leaf, -1 for none (older blocks of the chain are full); descriptors of it."""
     documents: NDArray[np.int32]
-    """Shape (V,): places that have a descriptor in the leaf."""
+    """Shape (V,): places with a descriptor in the leaf (document frequency)."""
     blocks: NDArray[np.uint64]
     """Shape (B, _BLOCK_WORDS): first the codes, entry by entry."""
     numbers: NDArray[np.int32]
-    """Shape (B, 2 * _BLOCK_WORDS), the same memory: ``ROWS``, ``OLDER``, ``_INDICES``."""
+    """Shape (B, 2 * _BLOCK_WORDS): the same memory as 32-bit numbers, at ``ROWS``, ``OLDER`` and ``_INDICES``."""
     free: NDArray[np.int64]
-    """Shape (2,): the first of the chain of unused blocks, -1 for none; from where on no block was ever used."""
+    """Shape (2,): first block of the chain of free blocks, -1 for none; first block that was never used."""
     starts: NDArray[np.int64]
-    """Shape (R,): where the place's descriptors begin in ``leaves``."""
+    """Shape (R,): first descriptor of the place in ``leaves``."""
     counts: NDArray[np.int32]
-    """Shape (R,): how many they are; -1 for a place that was forgotten."""
+    """Shape (R,): descriptors of the place; -1 if it was forgotten."""
     leaves: NDArray[np.int32]
     """Shape (D,): the leaf of every descriptor, place by place."""
     log_documents: FloatArray
-    """Shape (R,): sum of ln(documents) over a place's descriptors. Its L1 norm is n ln(N) minus this, whatever N is.
-    Shape (0,) where nobody asks for norms."""
+    """Shape (R,): sum of ln(documents) over a place's descriptors. A place of n descriptors has the L1 norm n ln(N)
+    minus this sum, for any N. Shape (0,) if no norms are kept."""
 
     @property
     def sizes(self) -> NDArray[np.int32]:
@@ -63,7 +62,7 @@ class Entries(NamedTuple):
 
 
 class Content(NamedTuple):
-    """Descriptors that lie in some leaves, in the order of places."""
+    """The descriptors of some leaves, in the order of places."""
 
     rows: NDArray[np.int32]
     """Shape (K,)."""
@@ -74,10 +73,10 @@ class Content(NamedTuple):
 
 
 class Postings:
-    """Entries with room for more."""
+    """Owner of the entries; its arrays grow on demand."""
 
     def __init__(self, vertices: int, has_norms: bool) -> None:
-        """``has_norms``: whether the L1 norms of the places are kept up, which every place that comes changes."""
+        """``has_norms``: whether to maintain the L1 norms of the places, which every new place changes."""
         self._has_norms = has_norms
         self.entries = Entries(
             _heads(vertices),
@@ -92,10 +91,10 @@ class Postings:
         )
         self.row_count = 0
         self.descriptor_count = 0
-        """Of all rows, those of forgotten places included."""
+        """Descriptors of all rows, including those of forgotten places."""
 
     def add(self, codes: CodeWords, leaves: NDArray[np.int32]) -> int:
-        """Enter a place with its codes (N, 4) in these leaves (N,); returns its row."""
+        """Add a place with its codes (N, 4) in these leaves (N,); returns its row."""
         row, begin = self.row_count, self.descriptor_count
         self._make_room(blocks=len(codes), rows=1, descriptors=len(codes))
         entries = self.entries
@@ -105,7 +104,7 @@ class Postings:
         return row
 
     def fill(self, codes: CodeWords, leaves: NDArray[np.int32], counts: NDArray[np.int32]) -> None:
-        """Enter many places where there are none: codes (M, 4), leaves (M,) place by place, ``counts`` of each."""
+        """Add many places to empty postings: codes (M, 4) and leaves (M,) place by place, ``counts`` (P,) of each."""
         sizes = np.bincount(leaves, minlength=len(self.entries.heads))
         blocks = -(-sizes // BLOCK)
         ends = np.cumsum(blocks)
@@ -121,19 +120,19 @@ class Postings:
         _fill(entries, len(counts), codes, (ends - blocks) * BLOCK)
 
     def forget(self, row: int) -> NDArray[np.int32]:
-        """Take a place out; returns the leaves that it was in."""
+        """Remove a place; returns its distinct leaves."""
         leaves = np.unique(self.leaves(row))
         _remove(self.entries, leaves, row)
         self.entries.counts[row] = -1
         return leaves
 
     def leaves(self, row: int) -> NDArray[np.int32]:
-        """The leaf of every descriptor of a place."""
+        """The leaf of every descriptor of a place, shape (N,)."""
         begin = self.entries.starts[row]
         return self.entries.leaves[begin : begin + self.entries.counts[row]]
 
     def content(self, leaves: Sequence[int]) -> Content:
-        """What lies in some leaves."""
+        """The descriptors of some leaves."""
         numbers = np.array(leaves, np.int32)
         size = int(self.entries.sizes[numbers].sum())
         content = Content(np.empty(size, np.int32), np.empty(size, np.int32), np.empty((size, CODE_WORDS), np.uint64))
@@ -142,13 +141,13 @@ class Postings:
         return Content(content.rows[order], content.indices[order], content.codes[order])
 
     def move(self, leaves: Sequence[int], content: Content, targets: NDArray[np.int32]) -> None:
-        """Empty ``leaves``, whose ``content`` this is, into other ones: ``targets`` (K,), one for each entry."""
+        """Move the ``content`` of ``leaves`` to other leaves: ``targets`` (K,), one for each entry."""
         receiving = np.unique(targets)
         self._make_room(blocks=len(targets) // BLOCK + len(receiving))
         _move(self.entries, np.array(leaves, np.int32), content, targets, receiving)
 
     def grow_vertices(self, vertices: int) -> None:
-        """Make room for so many vertices of the tree."""
+        """Make room for ``vertices`` vertices of the tree."""
         entries = self.entries
         before = len(entries.heads)
         if vertices > before:
@@ -158,7 +157,7 @@ class Postings:
             self.entries = entries._replace(heads=heads, documents=documents)
 
     def gather(self, rows: NDArray[np.int64]) -> CodeWords:
-        """Codes (M, 4) of these places, in ascending order of rows, place by place."""
+        """Codes (M, 4) of the places ``rows`` (P,), in ascending order of rows, place by place."""
         begins = np.full(self.row_count, -1, np.int64)
         counts = self.entries.counts[rows]
         begins[rows] = np.cumsum(counts) - counts
@@ -184,10 +183,10 @@ class Postings:
 
 
 def grown_rows(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
-    """``array`` with room for ``length`` rows, those it had being kept; the array given is not to be used any more.
+    """Return ``array`` with room for ``length`` rows; the caller must not use the old array or a view of it.
 
-    Large arrays grow in place: the system maps their pages anew instead of copying them, so that no place that comes
-    has to wait for gigabytes to move. Nothing may hold a view of the array.
+    Large arrays grow in place: the system remaps their pages (mremap) instead of copying them, so that no new place
+    waits for a copy of gigabytes.
     """
     if not (array.flags.owndata and array.flags.writeable):
         array = array.copy()
@@ -196,19 +195,19 @@ def grown_rows(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
 
 
 def _heads(vertices: int) -> NDArray[np.int32]:
-    """Of leaves that hold nothing."""
+    """``Entries.heads`` of empty leaves."""
     return np.tile(np.array([-1, 0], np.int32), (vertices, 1))
 
 
 @njit(cache=True)
 def newest_block(entries: Entries, leaf: int) -> tuple[int, int]:
-    """The block of a leaf that is being filled, -1 for none, and how many entries are in it."""
+    """The newest block of a leaf, -1 for none, and the number of its entries."""
     return entries.heads[leaf, 0], (entries.heads[leaf, 1] - 1) % BLOCK + 1
 
 
 @njit(cache=True)
 def prefetch_block(entries: Entries, block: int) -> None:
-    """Announce what a query reads of a block, which begins anywhere in a line."""
+    """Prefetch the part of a block that a query reads; blocks are not aligned to cache lines."""
     for number in range(0, OLDER, _LINE):
         prefetch(entries.numbers, block, number)
     prefetch(entries.numbers, block, OLDER)
@@ -216,7 +215,7 @@ def prefetch_block(entries: Entries, block: int) -> None:
 
 @njit(cache=True)
 def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int32]) -> None:
-    """A new place's descriptors, and what it changes in the norms of others."""
+    """Append a new place's descriptors and update the norms of the other places."""
     for leaf in leaves:
         prefetch(entries.heads, leaf, 0)
     for leaf in leaves:
@@ -235,7 +234,7 @@ def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int3
 
 @njit(cache=True)
 def _fill(entries: Entries, places: int, codes: CodeWords, first: NDArray[np.int64]) -> None:
-    """``first`` (V,): where in the blocks, entry by entry, each leaf's descriptors begin; it moves on."""
+    """Write all entries. ``first`` (V,): position of each leaf's next entry, in entries; it is advanced."""
     latest = np.full(first.shape[0], -1, np.int32)
     k = 0
     for row in range(places):
@@ -255,7 +254,7 @@ def _fill(entries: Entries, places: int, codes: CodeWords, first: NDArray[np.int
 
 @njit(cache=True)
 def _put(entries: Entries, block: int, place: int, row: int, index: int, codes: CodeWords, k: int) -> None:
-    """Write an entry: descriptor ``index`` of a row, whose code is number k of these."""
+    """Write an entry: descriptor ``index`` of a row, with code k of ``codes``."""
     entries.numbers[block, ROWS + place], entries.numbers[block, _INDICES + place] = row, index
     for word in range(CODE_WORDS):
         entries.blocks[block, CODE_WORDS * place + word] = codes[k, word]
@@ -263,7 +262,7 @@ def _put(entries: Entries, block: int, place: int, row: int, index: int, codes: 
 
 @njit(cache=True)
 def _append(entries: Entries, leaf: int, row: int, index: int, codes: CodeWords, k: int) -> Any:
-    """Tells whether the place is new in the leaf: its descriptors come one after the other."""
+    """Append an entry; returns whether it is the first of its place in the leaf. A place's entries come in a row."""
     block, filled = newest_block(entries, leaf)
     is_new = block < 0 or entries.numbers[block, ROWS + filled - 1] != row
     if block < 0 or filled == BLOCK:
@@ -284,7 +283,7 @@ def _append(entries: Entries, leaf: int, row: int, index: int, codes: CodeWords,
 
 @njit(cache=True)
 def _shift(entries: Entries, leaf: int, change: float, but: int) -> None:
-    """Add to the ``log_documents`` of every descriptor in a leaf but those of one place."""
+    """Add ``change`` to ``log_documents`` for every descriptor in a leaf, except those of row ``but``."""
     if not len(entries.log_documents):
         return
     block, filled = newest_block(entries, leaf)
@@ -297,7 +296,7 @@ def _shift(entries: Entries, leaf: int, change: float, but: int) -> None:
 
 @njit(cache=True)
 def _remove(entries: Entries, leaves: NDArray[np.int32], row: int) -> None:
-    """From the end to the beginning: the last entry, which fills each gap, is one that stays."""
+    """Remove the entries of a row, from the end, so that the last entry, which fills each gap, is one that stays."""
     for leaf in leaves:
         block, filled = newest_block(entries, leaf)
         while block >= 0:

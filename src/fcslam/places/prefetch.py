@@ -1,4 +1,4 @@
-"""Telling the processor what will be read: cache misses that are announced together are waited for together."""
+"""Software prefetch for compiled code, so that cache misses overlap."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 _READ, _KEEP, _DATA = 0, 3, 1
-"""As llvm.prefetch has them: not to be written, worth a place in every cache, no instructions."""
+"""Arguments of llvm.prefetch: for reading, high temporal locality, data cache."""
 
 
 @intrinsic
 def prefetch(_context: Any, array: Any, row: Any, column: Any) -> Any:
-    """Announce ``array[row, column]``, both in range; for use in compiled code only. It changes nothing but time."""
+    """Prefetch ``array[row, column]``, both in range; for compiled code only. Has no effect on results."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = signature.args[0]

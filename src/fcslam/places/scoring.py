@@ -1,4 +1,7 @@
-"""How alike a query and stored places are, without touching a place that has nothing in common with it; compiled."""
+"""Similarity of a query to the stored places by the inverted index: places without a common word cost nothing.
+
+Compiled.
+"""
 
 from typing import Any, NamedTuple
 
@@ -13,29 +16,29 @@ from fcslam.places.prefetch import prefetch
 from fcslam.records import FloatArray
 
 _CODES_AT_ONCE = 32
-"""Codes of a query whose words are read together: so many that cache misses overlap, so few that all stays there."""
+"""Codes of a query whose words are prefetched together: enough to overlap cache misses, few enough for the cache."""
 TINY = 1e-300
-"""In the place of a sum that may be zero."""
+"""Smallest divisor, in place of a sum that may be zero."""
 
 
 class ScoreBuffers(NamedTuple):
-    """What is known of every row while a query is answered.
+    """Work buffers of a query, one entry for each row.
 
-    Zeros between queries: to clear what was touched costs less than as many zeros as there are places.
+    They are zero between queries. A query clears only the entries that it used, which is cheaper than new arrays.
     """
 
     scores: FloatArray
     """Shape (R,)."""
     marks: NDArray[np.int32]
-    """Shape (R,): of the word or code that is looked at."""
+    """Shape (R,): counts or closeness for the present word or code of the query."""
     touched: NDArray[np.int32]
-    """Shape (R,): rows that have a score, in the order in which they were met."""
+    """Shape (R,): rows with a score, in the order in which they were found."""
     here: NDArray[np.int32]
-    """Shape (R,): rows that have a mark."""
+    """Shape (R,): rows with a mark."""
 
 
 def empty_buffers(rows: int) -> ScoreBuffers:
-    """For so many rows."""
+    """Zeroed buffers for ``rows`` rows."""
     return ScoreBuffers(np.zeros(rows), np.zeros(rows, np.int32), np.empty(rows, np.int32), np.empty(rows, np.int32))
 
 
@@ -43,14 +46,17 @@ def empty_buffers(rows: int) -> ScoreBuffers:
 def score_words(
     entries: Entries, buffers: ScoreBuffers, place_count: int, leaves: NDArray[np.int32], weights: FloatArray
 ) -> tuple[NDArray[np.int32], FloatArray]:
-    """Sum of min(query, place) over the common words: rows that have one, and their scores.
+    """Sum of min(query, place) over the common words, the L1 score of DBoW2.
 
     Args:
         entries: the stored places, with their norms.
-        buffers: blank, for all rows; it is left so.
+        buffers: zero for all rows; zero again at the end.
         place_count: N of the inverse document frequencies.
         leaves: shape (K,), the query's words, each once.
         weights: shape (K,), tf-idf of the query, L1 norm 1.
+
+    Returns:
+        Rows (M,) with a common word and their scores (M,), in [0, 1].
     """
     scores, counts, touched, here = buffers
     total = 0
@@ -82,23 +88,26 @@ def score_words(
 def score_matches(
     entries: Entries, tree: Tree, buffers: ScoreBuffers, place_count: int, codes: CodeWords, beam: int, near_bits: int
 ) -> tuple[NDArray[np.int32], FloatArray]:
-    """Share of the query's descriptors that a place has, too, in [0, 1]; a place is wholly like itself.
+    """Weighted share of the query's descriptors that match a descriptor of a place; 1 for the query itself.
 
-    A descriptor of the query gives each place 1 - (d / (near_bits + 1))^2 for the nearest one of its own, d bits away:
-    Epanechnikov's kernel. It counts ln((N + 1) / n), where n is the sum of what it gives to all places: what many
-    places have tells little. A place of m times as many descriptors as the query has, m > 1, has more chances to be
-    near and 1 / sqrt(m) of the share: the geometric mean of the shares of both.
+    Each descriptor of the query votes for a place with the Epanechnikov kernel 1 - (d / (near_bits + 1))^2 of the
+    distance d to its nearest descriptor there. Its weight is ln((N + 1) / n), where n is the sum of its votes: a
+    descriptor that many places have says little (idf). A place with m > 1 times as many descriptors as the query has
+    more chances to match, so its score is divided by sqrt(m): the geometric mean of the shares of both.
 
     Args:
         entries: the stored places.
-        tree: the words.
-        buffers: blank, for all rows; it is left so.
-        place_count: N, the places that are stored.
+        tree: the vocabulary.
+        buffers: zero for all rows; zero again at the end.
+        place_count: N, number of stored places.
         codes: shape (K, 4), of the query.
-        beam: words that are looked through for each code.
-        near_bits: codes that differ in no more bits are of the same thing.
+        beam: words that are searched for each code.
+        near_bits: largest Hamming distance of matching codes.
+
+    Returns:
+        Rows (M,) with a match and their scores (M,), in [0, 1].
     """
-    scores, closeness, touched, here = buffers  # closeness: bits that are missing to one more than near_bits
+    scores, closeness, touched, here = buffers  # closeness: near_bits + 1 - distance
     gives = 1.0 - ((near_bits + 1.0 - np.arange(near_bits + 2)) / (near_bits + 1.0)) ** 2
     total, whole = 0, 0.0
     leaves = near_leaves(tree, codes, beam)
@@ -139,7 +148,7 @@ def score_matches(
 
 @njit(cache=True)
 def _taken(buffers: ScoreBuffers, total: int) -> tuple[NDArray[np.int32], FloatArray]:
-    """The rows that were touched and their scores, which are cleared."""
+    """The touched rows (M,) and their scores (M,); clears the scores."""
     rows = buffers.touched[:total].copy()
     scores = buffers.scores[rows]
     buffers.scores[rows] = 0.0
@@ -148,7 +157,7 @@ def _taken(buffers: ScoreBuffers, total: int) -> tuple[NDArray[np.int32], FloatA
 
 @njit(cache=True)
 def _distance(codes: CodeWords, k: int, blocks: NDArray[np.uint64], block: int, place: int) -> Any:
-    """Bits between code k and the code of an entry."""
+    """Hamming distance of code k and the code of an entry."""
     bits = popcount(codes[k, 0] ^ blocks[block, 4 * place]) + popcount(codes[k, 1] ^ blocks[block, 4 * place + 1])
     bits += popcount(codes[k, 2] ^ blocks[block, 4 * place + 2]) + popcount(codes[k, 3] ^ blocks[block, 4 * place + 3])
     return np.int32(bits)
@@ -156,9 +165,9 @@ def _distance(codes: CodeWords, k: int, blocks: NDArray[np.uint64], block: int, 
 
 @njit(cache=True)
 def _prefetch_leaves(entries: Entries, leaves: NDArray[np.int32]) -> None:
-    """Announce the blocks of these leaves, -1 for none.
+    """Prefetch the blocks of these leaves (-1: none).
 
-    A chain is read block after block, each a cache miss in a large index. Abreast, the misses of all chains overlap.
+    Reading a chain block by block costs one cache miss each in a large index. All chains together overlap them.
     """
     for leaf in leaves:
         if leaf >= 0:

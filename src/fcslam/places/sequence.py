@@ -1,8 +1,7 @@
-"""What the order of places tells about matches: which places are too recent to be asked for, how alike neighbours are,
-and whether neighbours match neighbours.
+"""Temporal information for place recognition: excludes recent places, normalises scores, checks sequences.
 
-All of it is about streams, places 0, 1, 2 ... of one robot in the order of time, each asked before it is stored. Of
-similarities (Q, G) the rows are queries, the columns stored places; a similarity of 0 retrieves nothing.
+The functions work on the stream of one robot: places 0, 1, 2 ... in the order of time, each queried before it is
+stored. In similarities (Q, G), rows are queries and columns are stored places; a similarity of 0 retrieves nothing.
 """
 
 import numpy as np
@@ -11,13 +10,14 @@ from numpy.typing import NDArray
 from fcslam.records import FloatArray, Scalar
 
 LEAST_TO_PREVIOUS = 0.005
-"""A query less like the place before it, as after a quick turn or a covered lens, has nothing to be measured by."""
+"""Smallest similarity to the previous place that can normalise a query. It is smaller after a quick turn or with a
+covered lens."""
 
 
 def excluding_recent(stamps: NDArray[np.int64] | FloatArray, gap: float) -> NDArray[np.bool_]:
-    """Which places (columns) a query (row) may be answered by: those that came ``gap`` or more before it.
+    """Mask of the places (columns) that a query (row) may retrieve: those at least ``gap`` before it, shape (N, N).
 
-    Every place is like the ones just before it, and to find these again says nothing.
+    A place is always similar to those just before it, so retrieving them is no loop.
 
     Args:
         stamps: shape (N,), ascending; times, or numbers of places.
@@ -29,31 +29,34 @@ def excluding_recent(stamps: NDArray[np.int64] | FloatArray, gap: float) -> NDAr
 def normalised_by_previous(
     similarity: FloatArray, to_previous: FloatArray, least: float = LEAST_TO_PREVIOUS
 ) -> FloatArray:
-    """s(t, j) / s(t, t - 1), shape (Q, G): about 1 where a place is as like the query as the one just before it.
+    """Normalised similarity score s(t, j) / s(t, t - 1), shape (Q, G) (Galvez-Lopez and Tardos 2012, eq. 2).
 
-    How alike two views can be depends on how much there is to see and on how common it is, and the robot's own
-    previous place tells (Galvez-Lopez and Tardos 2012, eq. 2). All answers to a query change by one factor: their
-    order stays, and only a threshold over several queries is another one.
+    The score that a true match can reach depends on the scene; the robot's previous place measures it. The order of
+    the places of one query does not change. Only thresholds over several queries do.
 
     Args:
         similarity: shape (Q, G), not negative.
-        to_previous: shape (Q,), of each query with the place before it.
-        least: a query that is less like it retrieves nothing.
+        to_previous: shape (Q,), similarity of each query to the place before it.
+        least: a query with a smaller ``to_previous`` retrieves nothing.
     """
     known = to_previous >= max(least, float(np.finfo(np.float64).tiny))
     return np.divide(similarity, to_previous[:, None], out=np.zeros(similarity.shape), where=known[:, None])
 
 
 def temporally_consistent(similarity: FloatArray, hits: int, reach: int) -> FloatArray:
-    """The similarities of those pairs that end a run of ``hits`` queries whose matches lie side by side, else 0.
+    """Keep the similarities of pairs that end ``hits`` consecutive queries with neighbouring matches; others are 0.
 
-    Each query before the last one matches what is most similar to it, equals included; the next match of a run lies at
-    most ``reach`` stored places away, in either direction: a robot may drive its way back.
+    This is the temporal consistency check of DLoopDetector. Each earlier query of the run matches its most similar
+    place, ties included. The next match lies at most ``reach`` stored places away, in either direction, because a
+    robot may drive a route backwards.
 
     Args:
-        similarity: shape (Q, G), queries and stored places in the order of the robot's way.
-        hits: queries in a row; 1 keeps everything.
-        reach: 0 for the same stored place.
+        similarity: shape (Q, G), queries and stored places in the order in which the robot passed them.
+        hits: length of the run; 1 keeps everything.
+        reach: largest step between successive matches, in stored places; 0 for the same place.
+
+    Returns:
+        Shape (Q, G).
     """
     most = similarity.max(axis=1, initial=0.0)
     matches = (similarity == most[:, None]) & (similarity > 0.0)
@@ -66,16 +69,19 @@ def temporally_consistent(similarity: FloatArray, hits: int, reach: int) -> Floa
 
 
 def sequence_similarity(similarity: FloatArray, places: int, reach: int) -> FloatArray:
-    """Mean similarity of the last ``places`` queries with what lies side by side in the same order, or in the opposite.
+    """Mean similarity of the last ``places`` queries to a sequence of stored places, forwards or backwards.
 
-    Where the query and a stored place are t and j, query t - k takes part with the most similar place at most
-    ``reach`` away from j - k, or from j + k on the way back, whichever mean is higher (after SeqSLAM, Milford and Wyeth
-    2012). What is not there counts 0, and what is not similar at all stays so.
+    For query t and stored place j, query t - k contributes its most similar place within ``reach`` of j - k (same
+    direction) or of j + k (opposite direction); the higher mean counts (after SeqSLAM, Milford and Wyeth 2012).
+    Missing places count 0, and a similarity of 0 stays 0.
 
     Args:
-        similarity: shape (Q, G), queries and stored places in the order of the robot's way.
-        places: 1 keeps everything as it is.
-        reach: how unevenly places may lie on both ways; the last query itself is not shifted.
+        similarity: shape (Q, G), queries and stored places in the order in which the robot passed them.
+        places: length of the sequence; 1 changes nothing.
+        reach: largest offset of a place in the sequence, in stored places; the last query is not shifted.
+
+    Returns:
+        Shape (Q, G).
     """
     rows, columns = similarity.shape
     near = _most_nearby(np.pad(similarity, ((places, 0), (places, places))), reach)
@@ -89,7 +95,7 @@ def sequence_similarity(similarity: FloatArray, places: int, reach: int) -> Floa
 
 
 def _most_nearby(values: NDArray[Scalar], reach: int) -> NDArray[Scalar]:
-    """The largest within ``reach`` places along the last axis; nothing in ``values`` is negative."""
+    """Sliding maximum over ``reach`` places on both sides along the last axis; ``values`` must not be negative."""
     width = values.shape[-1]
     padded = np.pad(values, [*[(0, 0)] * (values.ndim - 1), (reach, reach)])
     return np.asarray(np.max([padded[..., first : first + width] for first in range(2 * reach + 1)], axis=0))

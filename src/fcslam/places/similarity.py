@@ -1,7 +1,7 @@
-"""Bags of words and how alike two of them are.
+"""Bags of words and their similarity (eq. (4) of FC-SLAM).
 
-The place seen at time k is Z_k = {z_1 ... z_N}, z_i the tf-idf of word i (FC-SLAM, III.B). Here it is divided by its
-L1 norm, without which no threshold on the similarity would have a meaning.
+The place at time k is Z_k = {z_1 ... z_N}, z_i the tf-idf of word i (FC-SLAM, III.B). fcslam divides it by its L1 norm;
+without that, a threshold on the similarity would have no meaning.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ PAPER_SCALE = 4.0
 
 @dataclass(frozen=True, slots=True)
 class BagOfWords:
-    """tf-idf of one place, L1 norm 1; empty if the place has no word that tells anything."""
+    """tf-idf vector of one place, sparse, L1 norm 1; empty if no word has a positive weight."""
 
     words: NDArray[np.int64]
     """Shape (K,), ascending."""
@@ -27,12 +27,12 @@ class BagOfWords:
 
 
 def bag_of_words(words: NDArray[np.int64], idf: FloatArray, vocabulary_version: int) -> BagOfWords:
-    """Weigh the words of a place.
+    """Compute the tf-idf vector of a place.
 
     Args:
         words: shape (N,), the word of every descriptor.
         idf: shape (word_count,), inverse document frequency of every word of the vocabulary.
-        vocabulary_version: of the vocabulary that gave the words.
+        vocabulary_version: version of the vocabulary that the words belong to.
     """
     present, counts = np.unique(words, return_counts=True)
     weights = counts * idf[present]
@@ -43,7 +43,7 @@ def bag_of_words(words: NDArray[np.int64], idf: FloatArray, vocabulary_version: 
 
 
 def similarity(x: BagOfWords, y: BagOfWords) -> float:
-    """L1 score 1 - |x - y|_1 / 2 = sum of min(x_i, y_i), in [0, 1]; the order is that of ``paper_similarity``.
+    """L1 score 1 - |x - y|_1 / 2 = sum of min(x_i, y_i), in [0, 1]: a quarter of ``paper_similarity``.
 
     Raises:
         ValueError: the bags come from different versions of the vocabulary.
@@ -53,9 +53,9 @@ def similarity(x: BagOfWords, y: BagOfWords) -> float:
 
 
 def paper_similarity(x: BagOfWords, y: BagOfWords) -> float:
-    """Equation (4) to the letter, in [0, 4]: four times ``similarity``.
+    """Equation (4) of FC-SLAM as printed, in [0, 4]: four times ``similarity``.
 
-    The sum runs over the common words: any other word adds |z| + 0 - |z| = 0.
+    The sum runs over the common words, because any other word adds |z| + 0 - |z| = 0.
 
     Raises:
         ValueError: the bags come from different versions of the vocabulary.

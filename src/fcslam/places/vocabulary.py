@@ -1,7 +1,7 @@
-"""Visual vocabulary: a k-means tree over binary descriptors that can go on growing where descriptors arrive.
+"""Visual vocabulary: a k-means tree over binary descriptors whose leaves can split and merge as descriptors arrive.
 
-A word is a leaf; finding it takes branching x depth comparisons. Leaves may split and merge, all other centres stay as
-they are: then every other descriptor's word stays as well. Numbers of words are never given twice.
+A word is a leaf; finding it takes branching x depth comparisons. A split or merge leaves all other centres unchanged,
+so every other descriptor keeps its word. A word's number is never used again.
 """
 
 from dataclasses import dataclass
@@ -28,59 +28,76 @@ class Strategy(StrEnum):
 
 
 class Scoring(StrEnum):
-    """What a query counts."""
+    """The similarity measure of a query."""
 
     WORDS = "words"
     MATCHES = "matches"
 
 
 class TreeConfig(Settings):
-    """Shape of the k-means tree where it is trained."""
+    """Shape of the k-means tree when it is trained."""
 
     branching: int = Field(default=8, ge=2, le=64, description="children of a tree vertex")
-    depth: int = Field(default=4, ge=1, le=8, description="levels below the root; at most branching ** depth words")
-    smallest_split: int = Field(default=20, ge=2, description="a cluster of fewer descriptors stays one word")
-    iterations: int = Field(default=8, ge=1, le=100, description="rounds of k-means per cluster, at most")
+    depth: int = Field(
+        default=4, ge=1, le=8, description="levels of the tree below the root; at most branching ** depth words"
+    )
+    smallest_split: int = Field(
+        default=20, ge=2, description="smallest cluster that training splits further [descriptors]"
+    )
+    iterations: int = Field(default=8, ge=1, le=100, description="most rounds of k-means for one cluster")
 
     @property
     def shape(self) -> TreeShape:
-        """As compiled code has it."""
+        """The same limits for compiled code."""
         return TreeShape(self.branching, self.depth, self.smallest_split, self.iterations)
 
 
 class VocabularyConfig(Settings):
-    """The vocabulary of places, and how it follows them. ``rebuild`` is Algorithm 1 to the letter."""
+    """The dynamic vocabulary. The strategy ``rebuild`` is Algorithm 1 of FC-SLAM exactly."""
 
     strategy: Strategy = Field(
         default=Strategy.INCREMENTAL,
-        description="static: trained once; rebuild: at every place; windowed: at every rebuild_every-th; incremental: "
-        "words split as they fill",
+        description="when the vocabulary is trained. static: once; rebuild: at every place; windowed: at every "
+        "rebuild_every-th place; incremental: once, then words split as they fill",
     )
-    train_batch: int = Field(default=20, ge=0, description="Algorithm 1's L: places before the first training")
-    capacity: int = Field(default=300, ge=1, description="Algorithm 1's C: the newest places that are trained on")
-    rebuild_every: int = Field(default=20, ge=1, description="windowed: places between two trainings")
-    tree: TreeConfig = Field(default=TreeConfig(), description="shape of the tree where it is trained")
-    leaf_capacity: int = Field(default=128, ge=2, description="incremental: a word of more descriptors splits")
+    train_batch: int = Field(
+        default=20, ge=0, description="places before the first training of the vocabulary (L of Algorithm 1)"
+    )
+    capacity: int = Field(
+        default=300, ge=1, description="newest places that the vocabulary is trained on (C of Algorithm 1)"
+    )
+    rebuild_every: int = Field(
+        default=20, ge=1, description="places between two trainings of the vocabulary, strategy windowed"
+    )
+    tree: TreeConfig = Field(default=TreeConfig(), description="shape of the vocabulary tree when it is trained")
+    leaf_capacity: int = Field(
+        default=128, ge=2, description="most descriptors of a word before it splits, strategy incremental"
+    )
     scoring: Scoring = Field(
         default=Scoring.MATCHES,
-        description="words: eq. (4) on [0, 1]; matches: words propose descriptors, their bits decide",
+        description="similarity of two places. words: eq. (4) of FC-SLAM scaled to [0, 1]; matches: weighted share of "
+        "matching descriptors, which the words only preselect",
     )
-    beam: int = Field(default=4, ge=1, le=64, description="matches: words looked through for a descriptor")
-    near_bits: int = Field(default=56, ge=0, le=256, description="matches: descriptors of no more differing bits match")
+    beam: int = Field(
+        default=4, ge=1, le=64, description="words that are searched for each descriptor of a query, scoring matches"
+    )
+    near_bits: int = Field(
+        default=56, ge=0, le=256, description="largest Hamming distance of matching descriptors, scoring matches [bits]"
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """What a vocabulary was trained on."""
+    """The data that a vocabulary was trained on."""
 
     places: int
     descriptors: int
     descriptor_version: str
-    """Of the detector; empty if not told."""
+    """Version of the detector; empty if unknown."""
 
 
 class TreeState(NamedTuple):
-    """A tree whose vertices are numbered level by level, so that the numbers of children say where they are."""
+    """A tree in storage order: vertices are numbered level by level, so the child counts determine all children."""
 
     seed: int
     version: int
@@ -94,7 +111,7 @@ class TreeState(NamedTuple):
 
 
 class Vocabulary:
-    """The living tree. Leaves are numbered as vertices while they live, as words for ever."""
+    """The tree and its words. A vertex number is reused after a merge; a word number never is."""
 
     def __init__(self, shape: TreeShape, seed: int) -> None:
         self._shape, self._seed = shape, seed
@@ -105,10 +122,10 @@ class Vocabulary:
         """Shape (V,): the vertex above; -1 for the root."""
         self.vertex_count = 1
         self.version = 0
-        """Counts the changes: words of different versions must not be compared."""
+        """Number of changes so far. Words of different versions must not be compared."""
         self._words_given = 1
         self._free: dict[int, list[int]] = {}
-        """First vertices of families that merged, by their size."""
+        """First vertices of unused families of children, by the family's size."""
 
     @property
     def word_count(self) -> int:
@@ -116,7 +133,7 @@ class Vocabulary:
         return int((self.words >= 0).sum())
 
     def train(self, codes: CodeWords) -> None:
-        """Grow a new tree from codes (N, 4)."""
+        """Train a new tree on codes (N, 4)."""
         self.version += 1
         self.tree = grow_tree(codes, self._shape, self._state(self.version)[0])
         self.vertex_count = len(self.tree.centres)
@@ -128,7 +145,7 @@ class Vocabulary:
         self._free.clear()
 
     def state(self) -> tuple[TreeState, NDArray[np.int32]]:
-        """The tree without gaps, and the new number of every vertex (V,)."""
+        """The tree in storage order, and the number there of every present vertex (V,), -1 for unused ones."""
         order = level = np.zeros(1, np.int64)
         while len(level):
             counts = self.tree.child_count[level]
@@ -143,7 +160,7 @@ class Vocabulary:
 
     @classmethod
     def restored(cls, shape: TreeShape, state: TreeState) -> Self:
-        """The vocabulary that had this state."""
+        """Restore a vocabulary from its state."""
         vocabulary = cls(shape, state.seed)
         counts = state.child_count
         first_child = np.where(counts > 0, 1 + np.cumsum(counts) - counts, 0).astype(np.int32)
@@ -155,14 +172,14 @@ class Vocabulary:
         return vocabulary
 
     def leaves(self, codes: CodeWords) -> NDArray[np.int32]:
-        """The vertex of the leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
+        """Find the leaf of every code (N, 4) as a vertex number, shape (N,); ties take the first child."""
         leaves: NDArray[np.int32] = find_leaves(self.tree, codes)
         return leaves
 
     def split(self, leaf: int, codes: CodeWords) -> NDArray[np.int32] | None:
-        """Split a leaf by the codes (N, 4) that lie in it; returns the new leaf of each, None if all are equal.
+        """Split a leaf by its codes (N, 4). Returns the new leaf of each, shape (N,), or None if all codes are equal.
 
-        The same word splits the same codes in the same way, whatever else has happened.
+        The result depends only on the word's number and the codes, not on earlier splits elsewhere.
         """
         centres, labels = k_means(codes, self._shape, self._state(int(self.words[leaf])))
         if len(centres) < 2:
@@ -178,7 +195,7 @@ class Vocabulary:
         return leaves
 
     def merge(self, parent: int) -> None:
-        """Make a vertex whose children are leaves one new word."""
+        """Merge the children of a vertex, all of them leaves, into one new word."""
         children = self.children(parent)
         self._free.setdefault(children.stop - children.start, []).append(children.start)
         self.words[children] = -1
@@ -187,12 +204,12 @@ class Vocabulary:
         self.version += 1
 
     def children(self, vertex: int) -> slice:
-        """Of a vertex, in arrays of vertices."""
+        """Slice of a vertex's children in arrays over vertices."""
         first, count = self.tree.families[vertex].tolist()
         return slice(first, first + count)
 
     def _family(self, size: int) -> int:
-        """The first of so many vertices in a row that are free."""
+        """Allocate ``size`` consecutive vertices; returns the first."""
         if self._free.get(size):
             return self._free[size].pop()
         first = self.vertex_count
@@ -205,10 +222,10 @@ class Vocabulary:
         return first
 
     def _state(self, number: int) -> NDArray[np.uint64]:
-        """Random numbers of their own for each training and each word."""
+        """State of the random generator of one training or one word, shape (1,)."""
         return np.random.SeedSequence((self._seed, number)).generate_state(1, np.uint64).astype(np.uint64)
 
 
 def _parents(child_count: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The vertex above each one of a tree that is numbered level by level."""
+    """Parent of every vertex, shape (V,), of a tree that is numbered level by level; -1 for the root."""
     return np.concatenate([[-1], np.repeat(np.arange(len(child_count)), child_count)]).astype(np.int32)
