@@ -1,10 +1,10 @@
-"""Binary features on the bird's-eye picture of a local submap.
+"""Binary features on the bird's-eye picture of a LiDAR submap.
 
-The picture is a likelihood field: a wall is a smooth ridge of one width however densely it was sampled. Keypoints are
-its corners (Shi and Tomasi 1994). A descriptor compares the picture at 256 pairs of points around the keypoint (as
-BRIEF, Calonder et al. 2010), turned to the direction of the patch's centroid (as ORB, Rublee et al. 2011), so the
-heading of the submap does not matter; the scale is known. OpenCV's ORB itself sees 1.5 m on this picture and finds
-its corners by FAST, which on smooth ridges answers to the sampling: it aligned far fewer true pairs of submaps.
+The picture is a likelihood field: a wall is a smooth ridge of constant width, however densely it was sampled. Keypoints
+are its corners (Shi and Tomasi 1994). A descriptor compares the picture at 256 pairs of points around the keypoint
+(BRIEF, Calonder et al. 2010), rotated by the direction of the patch's intensity centroid (ORB, Rublee et al. 2011).
+So it does not depend on the heading of the submap; the scale is known. OpenCV's own ORB aligned far fewer true pairs
+of submaps: its patch covers only 1.5 m here, and FAST corners on smooth ridges depend on the sampling.
 
 Column and row of the picture grow with x and y of the submap's coordinate frame.
 """
@@ -26,10 +26,11 @@ DETECTOR_VERSION = "birdseye-brief-1"
 """Changes whenever the same points would give other descriptors."""
 
 _FIELD_REACH = 3.6
-"""The field counts as zero beyond this many standard deviations: there it is below half a grey level."""
+"""Standard deviations beyond which the field is zero, because it is below half a grey level there."""
 _SUBCELLS = 4
-"""A point is placed to a quarter of a cell."""
+"""Positions of a point are rounded to 1 / 4 of a cell."""
 _CORNER_BLOCK_CELLS = 3
+"""Side of the window of the corner detector, in cells."""
 _PAIR_LENGTHS = (0.15, 0.75)
 """Shortest and longest distance of two compared points, in radii of the patch."""
 
@@ -37,15 +38,27 @@ Picture = NDArray[np.uint8]
 
 
 class BirdseyeConfig(Settings):
-    """Bird's-eye features of LiDAR submaps. A change makes old and new places incomparable."""
+    """Bird's-eye features of LiDAR submaps. Places from different settings cannot be compared."""
 
-    side_m: float = Field(default=30.0, gt=4.0, le=200.0, description="side of the picture around the keyscan [m]")
-    cell_m: float = Field(default=0.1, ge=0.02, le=1.0, description="cell of the picture [m]")
-    field_sigma_m: float = Field(default=0.35, gt=0.0, le=5.0, description="standard deviation of the field [m]")
-    most_features: int = Field(default=400, ge=1, le=5000, description="features kept, strongest first")
-    corner_quality: float = Field(default=0.003, gt=0.0, lt=1.0, description="weakest corner as share of the strongest")
-    patch_radius_m: float = Field(default=1.5, gt=0.0, le=20.0, description="how far a descriptor sees [m]")
-    orientation_radius_m: float = Field(default=0.8, gt=0.0, le=20.0, description="disc that gives its direction [m]")
+    side_m: float = Field(
+        default=30.0, gt=4.0, le=200.0, description="side of the bird's-eye picture around the keyscan [m]"
+    )
+    cell_m: float = Field(default=0.1, ge=0.02, le=1.0, description="side of a cell of the bird's-eye picture [m]")
+    field_sigma_m: float = Field(
+        default=0.35, gt=0.0, le=5.0, description="standard deviation of the likelihood field around a wall [m]"
+    )
+    most_features: int = Field(
+        default=400, ge=1, le=5000, description="most features of a submap, the strongest corners first"
+    )
+    corner_quality: float = Field(
+        default=0.003, gt=0.0, lt=1.0, description="weakest corner response, as a share of the strongest one"
+    )
+    patch_radius_m: float = Field(
+        default=1.5, gt=0.0, le=20.0, description="radius of the patch that a descriptor describes [m]"
+    )
+    orientation_radius_m: float = Field(
+        default=0.8, gt=0.0, le=20.0, description="radius of the disc whose centroid orients a descriptor [m]"
+    )
 
     @property
     def side_cells(self) -> int:
@@ -64,13 +77,13 @@ class BirdseyeFeatures:
 
 
 def describe(points: FloatArray, config: BirdseyeConfig) -> BirdseyeFeatures:
-    """Features of a submap; none (K = 0) where there is nothing to see.
+    """Detect and describe the features of a submap; K = 0 if the picture has no corner.
 
-    OpenCV's thread count is left alone, as it belongs to the whole process; the features do not depend on it.
+    OpenCV's thread count is not changed, because it belongs to the whole process. The features do not depend on it.
 
     Args:
         points: shape (N, 2), metres in the submap's coordinate frame, one point per 5-10 cm of wall. Points that are
-            not finite or beyond the picture are left out.
+            not finite or outside the picture are ignored.
         config: the picture and the detector.
     """
     picture = likelihood_picture(points, config)
@@ -87,7 +100,11 @@ def describe(points: FloatArray, config: BirdseyeConfig) -> BirdseyeFeatures:
 
 
 def likelihood_picture(points: FloatArray, config: BirdseyeConfig) -> Picture:
-    """``255 exp(-d^2 / (2 sigma^2))`` with d the distance to the nearest point, shape (rows, columns)."""
+    """Draw the likelihood field of points (N, 2), metres in the submap's coordinate frame.
+
+    Returns:
+        ``255 exp(-d^2 / (2 sigma^2))`` with d the distance to the nearest point, shape (rows, columns).
+    """
     side = config.side_cells
     cells = points / config.cell_m + 0.5 * side
     inside = cells[((cells >= 0.0) & (cells < side)).all(axis=1)]
@@ -96,14 +113,17 @@ def likelihood_picture(points: FloatArray, config: BirdseyeConfig) -> Picture:
 
 
 def pixels_to_metres(pixels: FloatArray | NDArray[np.int64], config: BirdseyeConfig) -> FloatArray:
-    """Picture coordinates (K, 2), where (0, 0) is the centre of the first cell, in the submap's coordinate frame."""
+    """Convert picture coordinates (K, 2) to metres in the submap's coordinate frame.
+
+    Pixel (0, 0) is the centre of the first cell.
+    """
     metres: FloatArray = (pixels.astype(np.float64) + 0.5 - 0.5 * config.side_cells) * config.cell_m
     return metres
 
 
 @lru_cache(maxsize=8)
 def _likelihood_discs(sigma_cells: float) -> NDArray[np.uint8]:
-    """The field around a point, for every place of the point in its cell: shape (S, S, width, width), y before x."""
+    """The field around a point for every subcell position of the point: shape (S, S, width, width), y before x."""
     reach = int(_FIELD_REACH * sigma_cells) + 1
     places = (np.arange(_SUBCELLS) + 0.5) / _SUBCELLS - 0.5
     squares = (np.arange(-reach, reach + 1) - places[:, None]) ** 2
@@ -115,8 +135,8 @@ def _likelihood_discs(sigma_cells: float) -> NDArray[np.uint8]:
 def _comparison_pattern(radius_cells: float) -> FloatArray:
     """Pairs of points in the patch, shape (256, 4): x, y, x', y' in cells.
 
-    They follow the additive recurrence of the generalised golden ratio in four dimensions, which fills the patch
-    evenly and is the same on every machine for ever; pairs that leave the patch are skipped.
+    They follow the R-sequence of the generalised golden ratio in four dimensions (a low-discrepancy sequence), which
+    covers the patch evenly and needs no random generator. Pairs that leave the patch are skipped.
     """
     golden = 1.0
     for _ in range(64):
@@ -132,10 +152,11 @@ def _comparison_pattern(radius_cells: float) -> FloatArray:
 
 @njit(cache=True)
 def _stamp(cells: FloatArray, discs: NDArray[np.uint8], side: int) -> Picture:
-    """The largest of the discs around ``cells`` (N, 2: column, row, the whole numbers at the corners of cells).
+    """Pixelwise maximum of the discs around ``cells`` (N, 2: column, row; whole numbers are corners of cells).
 
-    The nearest point has the largest likelihood, so this is the field of the distance transform, but finer than a
-    cell, and in a tenth of its time as few cells are occupied. A margin saves the inner loop the borders.
+    The nearest point has the largest likelihood, so the result is the field of the distance transform, but with
+    subcell resolution. It takes a tenth of the time, because few cells are occupied. A margin around the picture saves
+    bound checks in the inner loop.
     """
     width = discs.shape[2]
     reach = width // 2
@@ -152,7 +173,7 @@ def _stamp(cells: FloatArray, discs: NDArray[np.uint8], side: int) -> Picture:
 
 @njit(cache=True)
 def _directions(picture: Picture, pixels: NDArray[np.int64], radius: int) -> FloatArray:
-    """Direction from each pixel to the centroid of the grey levels in a disc around it [rad]."""
+    """Direction [rad] from each pixel (K, 2) to the intensity centroid of a disc around it, shape (K,)."""
     directions = np.empty(pixels.shape[0])
     for index in range(pixels.shape[0]):
         column, row = pixels[index]
@@ -171,7 +192,7 @@ def _directions(picture: Picture, pixels: NDArray[np.int64], radius: int) -> Flo
 def _compare(
     picture: Picture, pixels: NDArray[np.int64], directions: FloatArray, pattern: FloatArray
 ) -> NDArray[np.bool_]:
-    """Whether the first point of each turned pair is darker, shape (K, 256)."""
+    """Whether the first point of each rotated pair is darker, shape (K, 256)."""
     darker = np.empty((pixels.shape[0], pattern.shape[0]), np.bool_)
     for index in range(pixels.shape[0]):
         column, row = pixels[index, 0] + 0.5, pixels[index, 1] + 0.5
@@ -186,7 +207,7 @@ def _compare(
 
 @njit(cache=True)
 def _level(picture: Picture, column: float, row: float) -> int:
-    """Grey level of the cell that holds a point (whole numbers at the corners of cells); 0 beyond the picture."""
+    """Grey level of the cell that contains a point (whole numbers are corners of cells); 0 outside the picture."""
     if 0.0 <= row < picture.shape[0] and 0.0 <= column < picture.shape[1]:
         return int(picture[int(row), int(column)])
     return 0

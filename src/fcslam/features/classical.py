@@ -1,7 +1,7 @@
-"""Detectors without learning, from OpenCV.
+"""Classical detectors from OpenCV.
 
-ORB describes by bits and can take a network's place on a robot. The others are there to be compared with: FAST, Harris
-and Shi-Tomasi find corners, SIFT describes by 128 numbers.
+ORB has binary descriptors and can replace the network on a robot. The others are baselines of the evaluation: FAST,
+Harris and Shi-Tomasi only detect, SIFT has descriptors of 128 floats.
 """
 
 from collections.abc import Sequence
@@ -21,18 +21,28 @@ ORB_VERSION = "orb-1"
 """Changes whenever the same image would give other descriptors."""
 
 _CORNERS: Final = 600
-"""Corners kept of an image, as in the evaluation of SuperPoint."""
+"""Most corners of an image, as in the evaluation of SuperPoint (DeTone et al. 2018)."""
 _SIFT_NUMBERS: Final = 128
+"""Dimension of a SIFT descriptor."""
 _PYRAMID_STEP: Final = 1.2
-"""Of ORB, from one scale to the next."""
+"""Scale factor between two levels of ORB's pyramid, OpenCV's default."""
 
 
 class OrbConfig(Settings):
-    """ORB. A change makes old and new places incomparable."""
+    """The ORB detector. Places from different settings cannot be compared."""
 
-    most_features: int = Field(default=300, ge=1, le=2000, description="features kept of an image, strongest first")
-    fast_threshold: int = Field(default=7, ge=1, le=100, description="least contrast of a corner; low for dim light")
-    pyramid_levels: int = Field(default=8, ge=1, le=16, description="scales, each 1.2 times coarser than the last")
+    most_features: int = Field(
+        default=300, ge=1, le=2000, description="most ORB features of an image, the strongest first"
+    )
+    fast_threshold: int = Field(
+        default=7,
+        ge=1,
+        le=100,
+        description="smallest contrast of a FAST corner, low for dim light [grey levels of 255]",
+    )
+    pyramid_levels: int = Field(
+        default=8, ge=1, le=16, description="levels of ORB's image pyramid, each 1.2 times coarser than the one before"
+    )
 
 
 class Orb:
@@ -52,25 +62,25 @@ class Orb:
         return ORB_VERSION
 
     def detect(self, image: GreyImage) -> ImageFeatures:
-        """Features of an image, its corners ranked by Harris's measure."""
+        """Features of an image (H, W), ranked by the Harris response."""
         keypoints, descriptors = self._orb.detectAndCompute(image, None)
         if descriptors is None:
             return NO_FEATURES
         positions, responses = _positions_and_responses(keypoints)
-        # OpenCV multiplies by the scale of the level; the centre of a coarse pixel lies half of the difference further.
+        # OpenCV multiplies positions by the scale of the level, which shifts pixel centres by half the difference.
         scales = _PYRAMID_STEP ** np.array([keypoint.octave for keypoint in keypoints])
         found, order = _ranked(positions + 0.5 * (scales[:, None] - 1.0), responses)
         return ImageFeatures(found.keypoints_px, found.scores, frozen(descriptors[order], np.uint8))
 
 
 class Sift:
-    """Blobs of the difference of Gaussians with histograms of gradients (Lowe 2004)."""
+    """SIFT: difference-of-Gaussians blobs with gradient histograms (Lowe 2004)."""
 
     def __init__(self, most_features: int) -> None:
         self._sift = cv2.SIFT.create(nfeatures=most_features)
 
     def detect(self, image: GreyImage) -> FloatFeatures:
-        """Features of an image, ranked by contrast."""
+        """Features of an image (H, W), ranked by contrast."""
         keypoints, descriptors = self._sift.detectAndCompute(image, None)
         if descriptors is None:
             descriptors = np.empty((0, _SIFT_NUMBERS))
@@ -79,7 +89,7 @@ class Sift:
 
 
 class Fast:
-    """Corners by the segment test (Rosten and Drummond 2006)."""
+    """FAST corners (segment test, Rosten and Drummond 2006)."""
 
     def __init__(self, threshold: int = 10, nms_px: float = 4.0) -> None:
         self._fast = cv2.FastFeatureDetector.create(threshold)
@@ -91,7 +101,7 @@ class Fast:
 
 
 class Harris:
-    """Corners by Harris and Stephens (1988): every pixel with a positive response, thinned out."""
+    """Harris corners (Harris and Stephens 1988): every pixel with a positive response, then non-maximum suppression."""
 
     def __init__(self, nms_px: float = 4.0) -> None:
         self._nms_px = nms_px
@@ -104,7 +114,7 @@ class Harris:
 
 
 class ShiTomasi:
-    """Good features to track (Shi and Tomasi 1994)."""
+    """Shi-Tomasi corners, "good features to track" (Shi and Tomasi 1994)."""
 
     def __init__(self, nms_px: float = 4.0) -> None:
         self._nms_px = nms_px
@@ -118,13 +128,13 @@ class ShiTomasi:
 
 
 def _positions_and_responses(keypoints: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
-    """Of OpenCV's keypoints: shapes (K, 2) and (K,)."""
+    """Positions (K, 2) in pixels and responses (K,) of OpenCV's keypoints."""
     positions = np.array([keypoint.pt for keypoint in keypoints], np.float64).reshape(-1, 2)
     return positions, np.array([keypoint.response for keypoint in keypoints], np.float64)
 
 
 def _ranked(positions: FloatArray, responses: FloatArray) -> tuple[Keypoints, NDArray[np.int64]]:
-    """The strongest first, and which rows they were."""
+    """Keypoints by descending response, and their rows in the input, shape (K,)."""
     order = np.argsort(-responses, kind="stable")
     return Keypoints(frozen(positions[order], np.float32), frozen(responses[order], np.float32)), order
 

@@ -1,7 +1,6 @@
 """Packed 256-bit codes: Hamming distances and mutual nearest neighbours.
 
-A set of codes has shape (N, 32), uint8. Kernels see it as (N, 4) uint64 and count bits with the processor's own
-instruction.
+A set of codes has shape (N, 32), uint8. Compiled code sees it as (N, 4) uint64 and uses the popcount instruction.
 """
 
 from typing import Any, NamedTuple
@@ -15,16 +14,20 @@ from fcslam.records import CODE_BYTES, Codes
 
 CODE_BITS = 8 * CODE_BYTES
 CODE_WORDS = CODE_BYTES // 8
+"""64-bit words of a code."""
 
 CodeWords = NDArray[np.uint64]
+"""Shape (N, 4)."""
 
 _INDEX_BITS = 22
+"""Bits of a match key that hold the index; the 10 bits above hold the distance."""
 _MOST_CODES = 1 << _INDEX_BITS
 _UNMATCHED = np.uint32(0xFFFFFFFF)
+"""Match key of a code without a neighbour."""
 
 
 class Matches(NamedTuple):
-    """Codes of two sets that belong together."""
+    """Matched codes of two sets."""
 
     pairs: NDArray[np.int64]
     """Shape (M, 2): index into the first set, index into the second; ascending in the first."""
@@ -43,7 +46,7 @@ def popcount(_context: Any, word: Any) -> Any:
 
 
 def code_words(codes: Codes) -> CodeWords:
-    """Codes (N, 32) as a read-only, aligned (N, 4) uint64 view, or a copy where a view is impossible.
+    """View codes (N, 32) as read-only, aligned uint64 (N, 4); a copy if a view is impossible.
 
     Raises:
         ValueError: ``codes`` is not (N, 32) uint8.
@@ -64,12 +67,12 @@ def hamming_matrix(a: Codes, b: Codes) -> NDArray[np.uint16]:
 
 
 def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches:
-    """Pairs that are each other's nearest neighbour, at most ``max_distance`` bits apart.
+    """Match codes of ``a`` (N, 32) and ``b`` (M, 32) that are each other's nearest neighbour.
 
-    Of neighbours at the same distance the one with the lowest index counts as the nearest.
+    Pairs are at most ``max_distance`` bits apart. Of equally near neighbours, the one with the lowest index counts.
 
     Raises:
-        ValueError: a set is not (N, 32) uint8, or has more codes than a key can number.
+        ValueError: a set is not (N, 32) uint8, or has more than 2 ** 22 codes.
     """
     if max(len(a), len(b)) > _MOST_CODES:
         raise ValueError(f"at most {_MOST_CODES} codes a set, not {max(len(a), len(b))}")
@@ -99,10 +102,10 @@ def _hamming_matrix(a: CodeWords, b: CodeWords) -> NDArray[np.uint16]:
 
 @njit(cache=True)
 def _nearest_keys(a: CodeWords, b: CodeWords) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Nearest neighbours of rows and columns in one pass.
+    """Nearest neighbours of ``a`` (N, 4) in ``b`` (M, 4) and back in one pass, as keys (N,) and (M,).
 
-    A key is distance << 22 | index, so that one minimum finds the nearest and breaks ties by the index. The columns
-    are transposed first: only then does the inner loop run in vector registers.
+    A key is distance << 22 | index, so that one minimum finds the nearest and breaks ties by the index. ``b`` is
+    transposed first, so that the compiler vectorises the inner loop.
     """
     columns = b.T.copy()
     row_keys = np.full(a.shape[0], _UNMATCHED, np.uint32)

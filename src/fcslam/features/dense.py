@@ -1,8 +1,8 @@
-"""From what a network says of every pixel and every cell to keypoints and 256-bit codes.
+"""From a network's dense output to keypoints and 256-bit codes.
 
-The contract of a network's output: keypoint probabilities for every pixel, and logits of the code's bits for cells of
-``CELL_PX`` pixels, whose centres lie at pixel ``CELL_PX * index + (CELL_PX - 1) / 2``. Logits are interpolated before
-they become bits, bit = 1 where the logit is not negative (FC-SLAM, eq. (1)).
+The output is a keypoint probability for every pixel, and logits of the code's bits for cells of ``CELL_PX`` pixels. The
+centre of a cell is at pixel ``CELL_PX * index + (CELL_PX - 1) / 2``. Logits are interpolated first and thresholded
+then: a bit is 1 if the logit is not negative (FC-SLAM, eq. (1)).
 """
 
 import cv2
@@ -14,6 +14,7 @@ from fcslam.features.nms import box_nms
 from fcslam.records import Codes
 
 CELL_PX = 8
+"""Side of a cell of logits in pixels, as in SuperPoint."""
 
 Probabilities = NDArray[np.float32]
 """Shape (height, width), in [0, 1]."""
@@ -24,13 +25,16 @@ Logits = NDArray[np.float32]
 def find_peaks(
     scores: Probabilities, least_score: float, nms_px: float, most: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Local maxima, the strongest first: positions (K, 2) in pixels, finer than a pixel, and their scores (K,).
+    """Find local maxima of the keypoint probability with subpixel positions, the strongest first.
 
     Args:
-        scores: keypoint probabilities.
-        least_score: what is not above this is no keypoint.
-        nms_px: side of the boxes that may hardly overlap (``nms.box_nms``).
-        most: K at most.
+        scores: keypoint probabilities, shape (H, W).
+        least_score: a keypoint's score is above this.
+        nms_px: side of the boxes of non-maximum suppression (``nms.box_nms``), pixels.
+        most: most keypoints.
+
+    Returns:
+        Positions (K, 2), x and y in pixels, and scores (K,).
     """
     if not scores.size:
         return np.empty((0, 2), np.float32), np.empty(0, np.float32)
@@ -45,13 +49,13 @@ def find_peaks(
 
 
 def sample_codes(logits: Logits, positions_px: NDArray[np.float32]) -> Codes:
-    """Codes at ``positions_px`` (K, 2), shape (K, bits / 8): the first bit is the highest of the first byte."""
+    """Sample codes at ``positions_px`` (K, 2): shape (K, bits / 8), the first bit is the highest of the first byte."""
     bits: NDArray[np.bool_] = sample_logits(logits, positions_px) >= 0.0
     return np.packbits(bits, axis=1)
 
 
 def sample_logits(logits: Logits, positions_px: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Logits interpolated bilinearly at ``positions_px`` (K, 2), beyond the outer centres the nearest: (K, bits)."""
+    """Sample logits (bits, rows, columns) bilinearly at ``positions_px`` (K, 2), clamped at the border: (K, bits)."""
     bits, rows, columns = logits.shape
     cells = np.asarray(cv2.transpose(np.ascontiguousarray(logits).reshape(bits, -1)), np.float32)
     place = (positions_px.astype(np.float64) - 0.5 * (CELL_PX - 1)) / CELL_PX
@@ -68,7 +72,7 @@ def sample_logits(logits: Logits, positions_px: NDArray[np.float32]) -> NDArray[
 def _interpolate(
     cells: NDArray[np.float32], corners: NDArray[np.int64], u: NDArray[np.float32], v: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Between the cells (C, bits) at four corners (K, 4), u (K,) of the way to the right, v (K,) downwards."""
+    """Bilinear interpolation of the cells (C, bits) at four corners (K, 4) with weights u (K,) in x and v (K,) in y."""
     sampled = np.empty((len(corners), cells.shape[1]), np.float32)
     one = np.float32(1.0)
     for k in range(len(corners)):
@@ -81,7 +85,7 @@ def _interpolate(
 
 
 def _offsets(scores: Probabilities, pixels: NDArray[np.int64]) -> NDArray[np.float32]:
-    """From each peak's pixel to the top of the parabolas through it and its neighbours in x and y, shape (K, 2)."""
+    """Subpixel offsets of peaks, shape (K, 2): vertices of the parabolas through each peak and its neighbours."""
     padded = np.pad(scores, 1, mode="edge")
     x, y = pixels[:, 0] + 1, pixels[:, 1] + 1
     middle = padded[y, x]
@@ -91,7 +95,7 @@ def _offsets(scores: Probabilities, pixels: NDArray[np.int64]) -> NDArray[np.flo
         bend = 2.0 * middle - before - behind
         slope = 0.5 * (behind - before)
         offsets[:, axis] = np.divide(slope, bend, out=np.zeros_like(slope), where=bend > 0.0)
-    # beside the image's edge a neighbour is missing, so nothing is known about the top there
+    # at the image's border a neighbour is missing, so there is no parabola
     height, width = scores.shape
     offsets[(pixels[:, 0] == 0) | (pixels[:, 0] == width - 1), 0] = 0.0
     offsets[(pixels[:, 1] == 0) | (pixels[:, 1] == height - 1), 1] = 0.0

@@ -1,11 +1,11 @@
-"""What a detector of keypoints in camera images gives, whichever it is, and the one that is a network.
+"""Interface of keypoint detectors in camera images, and the detector that runs a network.
 
-A network is an ONNX file, run by ONNX Runtime on the processor. Its contract, ``fcslam_format`` 1:
+A network is an ONNX file, run by ONNX Runtime on the CPU. Its format, ``fcslam_format`` 1:
 
 - input ``image``, float32 (1, 1, H, W): grey levels in [0, 1]; H and W are any multiples of 8;
-- output ``scores``, float32 (1, H, W): the probability that there is a keypoint, for every pixel;
-- output ``logits``, float32 (1, 256, H / 8, W / 8): of the descriptor's bits, for cells as ``dense`` places them;
-- metadata ``fcslam_format``, and ``fcslam_version``: the version that stamps every descriptor.
+- output ``scores``, float32 (1, H, W): the probability of a keypoint, for every pixel;
+- output ``logits``, float32 (1, 256, H / 8, W / 8): logits of the descriptor's bits, for the cells of ``dense``;
+- metadata ``fcslam_format`` and ``fcslam_version``: the version that all its descriptors carry.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -25,8 +25,9 @@ from fcslam.features.onnx_runtime import load_onnx_runtime
 from fcslam.records import CODE_BYTES, NAME, Codes, frozen
 
 NETWORK_FORMAT: Final = "1"
+"""Format of networks that this version of fcslam reads."""
 BUNDLED_NETWORK: Final = Path(__file__).parent / "networks" / "detector.onnx"
-"""Network weights that come with the package, where they do."""
+"""The bundled network; a package may be built without it."""
 
 GreyImage = NDArray[np.uint8]
 """Shape (height, width)."""
@@ -39,17 +40,17 @@ class Keypoints:
     keypoints_px: NDArray[np.float32]
     """Shape (K, 2): x to the right, y down; (0, 0) is the centre of the first pixel."""
     scores: NDArray[np.float32]
-    """Shape (K,), on the detector's own scale."""
+    """Shape (K,), comparable only within one detector."""
 
     def take(self, rows: NDArray[np.int64] | slice) -> Self:
-        """Those keypoints, in that order, with all that is known of them."""
+        """Select keypoints with all their attributes, in the order of ``rows`` (M,)."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         return replace(self, **{name: frozen(array[rows], array.dtype.type) for name, array in arrays.items()})
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFeatures(Keypoints):
-    """Keypoints with what the image shows around them, in 256 bits each."""
+    """Keypoints with binary descriptors of 256 bits."""
 
     descriptors: Codes
     """Shape (K, 32)."""
@@ -57,7 +58,7 @@ class ImageFeatures(Keypoints):
 
 @dataclass(frozen=True, slots=True)
 class FloatFeatures(Keypoints):
-    """Keypoints that are described by numbers, compared by Euclidean distance."""
+    """Keypoints with float descriptors, compared by Euclidean distance."""
 
     descriptors: NDArray[np.float32]
     """Shape (K, D)."""
@@ -72,7 +73,7 @@ class KeypointDetector(Protocol):
     """Finds keypoints."""
 
     def detect(self, image: GreyImage) -> Keypoints:
-        """Keypoints of an image; none where there is nothing to see."""
+        """Keypoints of an image (H, W), the strongest first; K = 0 without any."""
 
 
 class FeatureDetector(KeypointDetector, Protocol):
@@ -80,36 +81,40 @@ class FeatureDetector(KeypointDetector, Protocol):
 
     @property
     def version(self) -> str:
-        """Changes whenever the same image would give other descriptors; words of different ones are not compared."""
+        """Changes whenever the same image gives other descriptors; descriptors of two versions are never compared."""
 
     def detect(self, image: GreyImage) -> ImageFeatures:
-        """Features of an image; none where there is nothing to see."""
+        """Features of an image (H, W), the strongest first; K = 0 without any."""
 
 
 class OnnxConfig(Settings):
-    """A network. Other weights make old and new places incomparable."""
+    """The network detector. Places from different weights cannot be compared."""
 
-    weights: Path | None = Field(default=None, description="network weights, .onnx; null: those that come with fcslam")
-    most_features: int = Field(default=300, ge=1, le=2000, description="features kept of an image, strongest first")
-    nms_px: float = Field(
-        default=4.0, ge=0.0, le=64.0, description="side of boxes around keypoints, hardly overlapping"
+    weights: Path | None = Field(
+        default=None, description="ONNX file with the network weights; null: the bundled network"
     )
-    least_score: float = Field(default=0.005, ge=0.0, lt=1.0, description="weakest keypoint, as a probability")
-    threads: int = Field(default=1, ge=1, le=64, description="threads of the network")
+    most_features: int = Field(
+        default=300, ge=1, le=2000, description="most network features of an image, the strongest first"
+    )
+    nms_px: float = Field(
+        default=4.0, ge=0.0, le=64.0, description="side of the boxes of non-maximum suppression around keypoints [px]"
+    )
+    least_score: float = Field(default=0.005, ge=0.0, lt=1.0, description="smallest probability of a keypoint")
+    threads: int = Field(default=1, ge=1, le=64, description="CPU threads of the network")
 
 
 class OnnxDetector:
     """Keypoints and codes by a network."""
 
     def __init__(self, config: OnnxConfig) -> None:
-        """Load the network.
+        """Load and try the network.
 
         Raises:
-            FeatureError: there is no such file, or it is no network of this contract.
+            FeatureError: the file is missing, or is not a network of this format.
         """
         self._config = config
         if config.weights is None and not BUNDLED_NETWORK.is_file():
-            raise FeatureError("no network weights come with this version of fcslam; name an .onnx file, or take orb")
+            raise FeatureError("no network weights come with this version of fcslam; name an .onnx file, or choose orb")
         path = BUNDLED_NETWORK if config.weights is None else config.weights
         self._session, metadata = _load(path, config.threads)
         if metadata.get("fcslam_format") != NETWORK_FORMAT:
@@ -128,21 +133,27 @@ class OnnxDetector:
         return self._version
 
     def detect(self, image: GreyImage) -> ImageFeatures:
-        """Features of an image of any size, ranked by keypoint probability."""
+        """Features of an image (H, W) of any size, ranked by keypoint probability."""
         found, logits = self._find(image)
         codes = sample_codes(logits, found.keypoints_px)
         return ImageFeatures(found.keypoints_px, found.scores, frozen(codes, np.uint8))
 
     def detect_floats(self, image: GreyImage) -> FloatFeatures:
-        """The same keypoints with the logits of their bits, scaled to unit length: beside ``detect`` it shows what
-        is lost by the bits."""
+        """The keypoints of ``detect`` with their logits, scaled to unit length, as descriptors.
+
+        A comparison with ``detect`` measures the loss by quantisation to bits.
+        """
         found, logits = self._find(image)
         sampled = sample_logits(logits, found.keypoints_px)
         lengths = np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), np.finfo(np.float32).tiny)
         return FloatFeatures(found.keypoints_px, found.scores, frozen(sampled / lengths, np.float32))
 
     def infer(self, image: GreyImage) -> tuple[Probabilities, Logits]:
-        """What the network says: a probability for every pixel (H, W), logits of the cells that cover the image."""
+        """Run the network on an image (H, W).
+
+        Returns:
+            Keypoint probabilities (H, W), and logits (256, rows, columns) of the cells that cover the image.
+        """
         height, width = image.shape
         if not image.size:
             return np.empty(image.shape, np.float32), np.zeros((CODE_BITS, 1, 1), np.float32)
@@ -161,7 +172,7 @@ class OnnxDetector:
         return scores[0], logits[0]
 
     def _check(self, path: Path) -> None:
-        """Try the network on a small image: whatever else its file says, this is what it gives."""
+        """Run the network on a small image and check its output, because its metadata may be wrong."""
         rows, columns = 3, 5
         try:
             scores, logits = self._run(np.full((rows * CELL_PX, columns * CELL_PX), 128, np.uint8))
@@ -178,19 +189,19 @@ class OnnxDetector:
 
 
 def decode_grey(encoded: bytes) -> GreyImage | None:
-    """The picture in an image file in grey levels, 8 bits each, as its pixels are stored; None if it is broken.
+    """Decode an image file to 8-bit grey levels (H, W), ignoring its EXIF orientation; None if it is broken.
 
-    Colours are weighed as in ITU-R BT.601, transparency is left out, and of 16 bits the upper 8 count.
+    Colours are weighted as in ITU-R BT.601, transparency is ignored, and 16-bit values keep their upper 8 bits.
     """
     try:
         decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:  # of no bytes at all, for one
+    except cv2.error:  # for example, no bytes at all
         return None
     return None if decoded is None else np.asarray(decoded, np.uint8)
 
 
 def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
-    """An ONNX Runtime session and the file's own metadata."""
+    """An ONNX Runtime session and the metadata of the file."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -199,7 +210,7 @@ def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
     onnxruntime = load_onnx_runtime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 4  # what is wrong is raised
+    options.log_severity_level = 4  # only fatal messages: errors are raised
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime has no common exception
@@ -208,7 +219,7 @@ def _load(path: Path, threads: int) -> tuple[Any, dict[str, str]]:
 
 
 def _padded(image: GreyImage) -> GreyImage:
-    """Mirrored at the lower and right edge to whole cells."""
+    """Pad an image (H, W) by reflection at the lower and right edge to whole cells."""
     height, width = image.shape
     padded = cv2.copyMakeBorder(image, 0, -height % CELL_PX, 0, -width % CELL_PX, cv2.BORDER_REFLECT_101)
     return np.asarray(padded, np.uint8)

@@ -1,4 +1,4 @@
-"""A detector's file on its way to robots: what is announced of it, and whether what arrived is that."""
+"""Network files that the cloud distributes to robots: their description, and the check of a downloaded file."""
 
 import hashlib
 from pathlib import Path
@@ -9,10 +9,10 @@ from fcslam.records import Channel, DetectorFile
 
 
 def describe_detector_file(path: Path) -> DetectorFile:
-    """What a fleet is told of a network for its cameras.
+    """Describe a network file (version, format, size, SHA-256) for the announcement to a fleet.
 
     Raises:
-        FeatureError: the file is no such network.
+        FeatureError: the file is not a usable network.
     """
     version = OnnxDetector(OnnxConfig(weights=path)).version
     content = _read(path)
@@ -21,10 +21,10 @@ def describe_detector_file(path: Path) -> DetectorFile:
 
 
 def open_detector_file(file: DetectorFile, path: Path, config: OnnxConfig) -> FeatureDetector:
-    """The detector in a file that was fetched, run as ``config`` says.
+    """Load a downloaded network after a check against its announcement ``file``.
 
     Raises:
-        FeatureError: it is another file than announced, or no network that this fcslam runs.
+        FeatureError: the file differs from the announcement, or this fcslam cannot run the network.
     """
     if file.format != int(NETWORK_FORMAT):
         raise FeatureError(f"{file.version}: its format is {file.format}, not {NETWORK_FORMAT}; update fcslam")

@@ -1,21 +1,21 @@
-"""Names of detectors, for the command line and the configuration."""
+"""Names of detectors for the command line and the settings. Imports no library, so that help is fast."""
 
 from enum import StrEnum
 
 
 class DetectorKind(StrEnum):
-    """Detectors that describe places."""
+    """Detectors of camera places on a robot."""
 
     ORB = "orb"
     ONNX = "onnx"
 
 
 class EvaluatedDetectorKind(StrEnum):
-    """Detectors that can be compared."""
+    """Detectors of the homography evaluation."""
 
     ONNX = "onnx"
     LOGITS = "logits"
-    """The same network, compared before its logits become bits."""
+    """The same network, its descriptors compared by logits instead of bits."""
     ORB = "orb"
     SIFT = "sift"
     FAST = "fast"

@@ -1,4 +1,4 @@
-"""Features of every image in a folder, one file each."""
+"""Extracts the features of every image in a folder, one file for each image."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from fcslam.records import frozen
 
 @dataclass(frozen=True, slots=True)
 class Extraction:
-    """What became of one file."""
+    """Result of one file."""
 
     path: Path
     keypoints: int
@@ -25,10 +25,10 @@ class Extraction:
 
 
 def find_files(images: Path) -> list[Path]:
-    """The file itself, or every file in the folder and those below it, in order.
+    """Return the file itself, or all files in the folder and its subfolders, sorted.
 
     Raises:
-        FeatureError: there is nothing.
+        FeatureError: there is no file.
     """
     files = [images] if images.is_file() else sorted(path for path in images.rglob("*") if path.is_file())
     if not files:
@@ -39,9 +39,9 @@ def find_files(images: Path) -> list[Path]:
 def extract_all(
     files: list[Path], root: Path, output: Path, detector: FeatureDetector, longest_side_px: int, nms_px: float
 ) -> Iterator[Extraction]:
-    """Write the features of each image to the same place below ``output`` as it has below ``root``.
+    """Write the features of each image below ``output``, at the image's path relative to ``root``.
 
-    What cannot be read is passed over.
+    Files that cannot be read are skipped and reported.
 
     Raises:
         OutputError: features cannot be written.
@@ -68,7 +68,10 @@ def extract_all(
 
 
 def extract(image: GreyImage, detector: FeatureDetector, longest_side_px: int) -> ImageFeatures:
-    """Features of an image; one that is larger is shrunk for the detector, its keypoints are in its own pixels."""
+    """Detect the features of an image (H, W), downscaled if its longer side exceeds ``longest_side_px``.
+
+    Keypoints are in pixels of the original image.
+    """
     height, width = image.shape
     share = longest_side_px / max(height, width)
     if share >= 1.0:

@@ -1,4 +1,4 @@
-"""The detector that describes camera images."""
+"""Makes the detector of camera images that the settings name."""
 
 from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.detector import FeatureDetector, OnnxConfig, OnnxDetector
@@ -6,9 +6,9 @@ from fcslam.features.detector_kinds import DetectorKind
 
 
 def make_detector(kind: DetectorKind, orb: OrbConfig, onnx: OnnxConfig) -> FeatureDetector:
-    """The detector of that kind.
+    """Make a detector of the given kind; only its own settings are used.
 
     Raises:
-        FeatureError: it is a network whose weights cannot be used.
+        FeatureError: the weights of the network cannot be used.
     """
     return OnnxDetector(onnx) if kind is DetectorKind.ONNX else Orb(orb)

@@ -1,4 +1,4 @@
-"""Image files in; extracted features out and in again, one ``.npz`` an image.
+"""Reads image files, and writes and reads extracted features, one ``.npz`` for each image.
 
 Arrays: ``keypoints`` (N, 2) float32, x y in pixels of the image, (0, 0) the centre of its first pixel; ``scores`` (N,)
 float32; ``descriptors`` (N, 32) uint8, the bits packed; ``image_size`` (2,), width and height.
@@ -17,13 +17,14 @@ from fcslam.sources.images import MAX_SIDE_PX, image_size
 _ARRAYS = ("keypoints", "scores", "descriptors", "image_size")
 
 MOST_IMAGE_BYTES = 1 << 28
+"""Largest image file that is read."""
 
 
 def read_grey(path: Path) -> GreyImage:
-    """The grey levels of an image file.
+    """Read the grey levels (H, W) of an image file.
 
     Raises:
-        FeatureError: it cannot be read, is no image, or is larger than any camera's.
+        FeatureError: the file cannot be read, is not an image, or is too large.
     """
     try:
         encoded = path.read_bytes() if path.stat().st_size <= MOST_IMAGE_BYTES else None
@@ -38,7 +39,7 @@ def read_grey(path: Path) -> GreyImage:
 
 
 def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, int]) -> None:
-    """Write the features of an image of ``image_size`` (width, height).
+    """Write the features of an image of ``image_size`` (width, height), pixels.
 
     Raises:
         OutputError: the file cannot be written.
@@ -56,7 +57,7 @@ def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, i
 
 
 def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
-    """The features in a file, the strongest first, and width and height of their image.
+    """Read features, the strongest first, and the width and height of their image in pixels.
 
     Raises:
         FeatureError: the file cannot be read, or is not of this format.
@@ -83,7 +84,7 @@ def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
 
 
 def _longer_side(encoded: bytes) -> int:
-    """In pixels, told by the header before anything is decoded; 0 where this is neither JPEG nor PNG."""
+    """Longer side in pixels, read from the header without decoding; 0 if the file is neither JPEG nor PNG."""
     try:
         return max(image_size(encoded))
     except ValueError:

@@ -1,10 +1,10 @@
-"""Where the keypoints of a camera image are: their bearings from the camera, how far from the LiDAR.
+"""Metric positions of image keypoints: bearing from the camera, depth from the LiDAR.
 
-Walls, cupboards and door frames stand upright, so what the camera sees above or below the scan plane is taken to lie
-where the LiDAR's returns in that direction do, seen from above. A ray that would be under the floor or above
-``ceiling_m`` there met the floor or the ceiling on its way, and is left out; so is one in whose direction nothing
-returned. Wrong remains what sticks out over or under the scan plane (a table top): RANSAC and the comparison of the
-submaps have to bear it.
+Walls, cupboards and door frames are vertical. So a point above or below the scan plane is assumed to lie, seen from
+above, where the LiDAR measures a surface in its direction. Keypoints are dropped if the ray would be below the floor
+or above ``ceiling_m`` there, because it hit the floor or the ceiling first, or if the LiDAR has no return in its
+direction. Objects that overhang the scan plane, such as a table top, get a wrong depth. RANSAC and the verification of
+the submaps reject them.
 """
 
 from typing import Final, NamedTuple
@@ -17,38 +17,42 @@ from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraModel, FloatArray
 
 FLOOR_MARGIN_M: Final = 0.03
-"""Keypoints so near the floor may lie on it."""
+"""Keypoints at most this high are dropped, because they may lie on the floor."""
 SAME_SURFACE_M: Final = 0.20
-"""Returns next to each other and closer than this lie on one surface ..."""
+"""Neighbouring returns closer than this lie on one surface."""
 SLANT: Final = 4.0
-"""... or than so many times what their beams are apart there: surfaces seen at a grazing angle."""
+"""Neighbouring returns also lie on one surface if they are closer than this many times the spacing of their beams at
+that range: a surface at a grazing angle."""
 WIDEST_GAP: Final = 2.5
-"""Between returns that are more beams apart, nothing is known: one beam in a row may fail."""
+"""Largest gap between the returns of a surface, in beam spacings: one beam in between may fail."""
 EDGE_M: Final = 0.08
-"""A ray that passes an edge this closely ends there: what stands out in an image is often an edge."""
+"""A ray that passes the edge of a surface this closely ends there, because keypoints often lie on edges."""
 
 
 class LidarView(NamedTuple):
-    """One scan as the camera's ``base`` sees it."""
+    """One scan in the coordinate frame ``base`` at the image's stamp."""
 
     returns: FloatArray
     """Shape (N, 2), metres, in the order of their beams."""
     origin: FloatArray
-    """Where the LiDAR is, shape (2,)."""
+    """Position of the LiDAR, shape (2,), metres."""
     spacing_rad: float
-    """Between neighbouring beams."""
+    """Angle between neighbouring beams."""
 
 
 def locate_keypoints(
     keypoints_px: NDArray[np.float32], camera: CameraModel, lidar: LidarView, ceiling_m: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Positions of keypoints in ``base``, shape (K, 3) in metres, and for which of them there is one, shape (K,).
+    """Compute metric positions of image keypoints from the LiDAR's range in their direction.
 
     Args:
-        keypoints_px: shape (K, 2), pixels.
-        camera: its geometry; ``base`` lies on the floor.
-        lidar: what the LiDAR saw at that moment.
-        ceiling_m: height that no wall exceeds.
+        keypoints_px: shape (K, 2), x and y in pixels.
+        camera: intrinsics and mounting; ``base`` lies on the floor.
+        lidar: the scan at the image's stamp.
+        ceiling_m: largest height of a keypoint.
+
+    Returns:
+        Positions (K, 3) in ``base``, metres, 0 without a position; and which keypoints have a position, shape (K,).
     """
     rays = _rays(keypoints_px.astype(np.float64), camera)
     level = np.hypot(rays[:, 0], rays[:, 1])
@@ -62,7 +66,7 @@ def locate_keypoints(
 
 
 def _rays(keypoints_px: FloatArray, camera: CameraModel) -> FloatArray:
-    """Viewing rays in ``base``, shape (K, 3)."""
+    """Directions of the viewing rays in ``base``, shape (K, 3)."""
     x = (keypoints_px[:, 0] - camera.cx) / camera.fx
     y = (keypoints_px[:, 1] - camera.cy) / camera.fy
     return np.column_stack((x, y, np.ones(len(x)))) @ rotation_matrix(camera.T_base_camera.rotation).T
@@ -72,7 +76,7 @@ def _rays(keypoints_px: FloatArray, camera: CameraModel) -> FloatArray:
 def _distances(
     eye: FloatArray, directions: FloatArray, returns: FloatArray, origin: FloatArray, widest_gap_rad: float
 ) -> FloatArray:
-    """How far each ray from ``eye`` goes until it meets a surface between neighbouring returns; NaN if none."""
+    """Distance (K,) along each ray from ``eye`` to the first surface between neighbouring returns; NaN without one."""
     nearest = np.full(len(directions), np.inf)
     count = len(returns)
     for k in range(count if count > 1 else 0):
@@ -101,7 +105,7 @@ def _distances(
 
 @njit(cache=True)
 def _crossing(eye: FloatArray, direction: FloatArray, side: tuple[float, float, float, float]) -> float:
-    """Distance along the ray to a side (start x, y and vector x, y); infinite where they do not cross."""
+    """Distance along the ray to a segment (start x, y and vector x, y); infinite if they do not intersect."""
     x, y, dx, dy = side
     determinant = direction[1] * dx - direction[0] * dy
     if abs(determinant) < 1e-12:

@@ -1,4 +1,4 @@
-"""Nearest neighbours among descriptors of two images, whatever these are made of."""
+"""Nearest neighbours among descriptors of two images, binary or float."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +11,22 @@ Rows = NDArray[np.int64]
 
 
 def nearest_neighbours(a: Descriptors, b: Descriptors) -> tuple[Rows, Rows]:
-    """Row in ``b`` (M, D) of the nearest to each of ``a`` (N, D), shape (N,), and the other way round, shape (M,).
+    """Find the nearest neighbour in ``b`` (M, D) of each of ``a`` (N, D), shape (N,), and vice versa, shape (M,).
 
-    Of equally near ones the first counts. Both sets hold at least one descriptor.
+    Ties take the first one. Both sets hold at least one descriptor.
     """
     distances = _distances(a, b)
     return distances.argmin(axis=1), distances.argmin(axis=0)
 
 
 def mutual_pairs(to_b: Rows, to_a: Rows) -> Rows:
-    """Rows of those that are each other's nearest neighbours, shape (K, 2), from what ``nearest_neighbours`` gives."""
+    """Pairs of mutual nearest neighbours (K, 2) from both results of ``nearest_neighbours``, (N,) and (M,)."""
     rows = np.flatnonzero(to_a[to_b] == np.arange(len(to_b)))
     return np.column_stack((rows, to_b[rows]))
 
 
 def _distances(a: Descriptors, b: Descriptors) -> NDArray[np.uint16] | NDArray[np.float64]:
-    """Hamming distances, or squares of Euclidean ones, shape (N, M)."""
+    """Hamming distances or squared Euclidean distances, shape (N, M)."""
     if a.dtype == np.uint8:
         return hamming_matrix(a, b)  # type: ignore[arg-type]
     first, second = a.astype(np.float64), b.astype(np.float64)

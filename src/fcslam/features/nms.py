@@ -1,23 +1,23 @@
-"""Non-maximum suppression as benchmarks of detectors do it: boxes around keypoints may hardly overlap."""
+"""Non-maximum suppression by boxes around keypoints, as in SuperPoint's evaluation."""
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 MOST_OVERLAP = 0.1
-"""Share of the union of two boxes that their intersection may be. For whole pixels and boxes of side 4, keypoints 4 px
-apart along an axis stay, and so do those 3 px apart along one and 2 px along the other."""
+"""Largest intersection over union of two boxes. With integer pixels and boxes of side 4, keypoints 4 px apart along an
+axis stay, and so do keypoints 3 px apart along one axis and 2 px along the other."""
 
 
 def box_nms(positions_px: ArrayLike, side_px: float) -> NDArray[np.int64]:
-    """Rows of the keypoints that stay, ascending.
-
-    From the strongest to the weakest, a keypoint goes if its box overlaps that of one that stays by more than
-    ``MOST_OVERLAP``.
+    """Suppress keypoints whose box overlaps that of a stronger remaining keypoint by more than ``MOST_OVERLAP``.
 
     Args:
         positions_px: shape (N, 2), the strongest first; finite.
         side_px: side of the boxes; 0 keeps everything.
+
+    Returns:
+        Rows of the remaining keypoints, shape (K,), ascending.
     """
     points = np.asarray(positions_px, np.float64).reshape(-1, 2)
     if side_px <= 0.0 or not len(points):
@@ -29,7 +29,7 @@ def box_nms(positions_px: ArrayLike, side_px: float) -> NDArray[np.int64]:
 
 @njit(cache=True)
 def _keep(points: NDArray[np.float64], cells: NDArray[np.int64], side: float) -> NDArray[np.bool_]:
-    """Only boxes in neighbouring cells can overlap; each cell chains the keypoints in it that stay."""
+    """Mask of the remaining keypoints. Only boxes in neighbouring cells can overlap; each cell chains its keypoints."""
     columns, rows = cells[:, 0].max() + 3, cells[:, 1].max() + 3
     newest = np.full((rows, columns), -1)
     before = np.full(len(points), -1)

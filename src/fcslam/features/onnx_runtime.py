@@ -1,8 +1,8 @@
-"""ONNX Runtime as this project uses it: it tells nobody of its use.
+"""Loads ONNX Runtime without telemetry.
 
-On Linux its official builds report use to their maker, and keep an identifier and a database for it in
-``~/.cache/Microsoft/DeveloperTools`` (since 1.29; https://github.com/microsoft/onnxruntime/pull/27379). Reports can be
-stopped later by ``disable_telemetry_events``; files are made as soon as it is loaded, unless the environment says no.
+On Linux, the official builds since 1.29 send telemetry and keep an identifier and a database in
+``~/.cache/Microsoft/DeveloperTools`` (https://github.com/microsoft/onnxruntime/pull/27379).
+``disable_telemetry_events`` stops the events, but only the environment variable prevents the files.
 """
 
 import os
@@ -10,9 +10,9 @@ from typing import Any
 
 
 def load_onnx_runtime() -> Any:
-    """The module ``onnxruntime``; what is imported of it by others has to be imported after this."""
+    """Import ``onnxruntime``; call this before any other import of it."""
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime
 
-    onnxruntime.disable_telemetry_events()  # had somebody else loaded it before
+    onnxruntime.disable_telemetry_events()  # in case another module imported it before
     return onnxruntime
