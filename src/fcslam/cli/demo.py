@@ -144,8 +144,9 @@ def _evaluate(output: Path, console: "Console") -> None:
 
 def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.evaluation.fleet.charts import Outline, fleet_charts
-    from fcslam.evaluation.fleet.figure import write_figure
+    from fcslam.evaluation.fleet.charts import fleet_charts
+    from fcslam.maps.charts import Outline
+    from fcslam.maps.fleet_figure import write_figure
     from fcslam.simulation.floorplan import PieceKind
 
     _announce(console, 5, "draw")

@@ -13,6 +13,7 @@ from fcslam.errors import FeatureError, OutputError
 from fcslam.features.detector import GreyImage, ImageFeatures, decode_grey
 from fcslam.records import CODE_BYTES, frozen
 from fcslam.sources.images import MAX_SIDE_PX, image_size
+from fcslam.storage.files import replacing
 
 _ARRAYS = ("keypoints", "scores", "descriptors", "image_size")
 
@@ -45,13 +46,14 @@ def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, i
         OutputError: the file cannot be written.
     """
     try:
-        np.savez(
-            path,
-            keypoints=features.keypoints_px,
-            scores=features.scores,
-            descriptors=features.descriptors,
-            image_size=np.array(image_size, np.int32),
-        )
+        with replacing(path) as unfinished, unfinished.open("wb") as file:
+            np.savez(
+                file,
+                keypoints=features.keypoints_px,
+                scores=features.scores,
+                descriptors=features.descriptors,
+                image_size=np.array(image_size, np.int32),
+            )
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error}); make room or choose another folder") from error
 

@@ -1,12 +1,10 @@
-"""Squares of a map, for viewers that show parts of it."""
+"""Square tiles of a map as pictures, for viewers that show parts of it."""
 
 from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-from fastapi import HTTPException
-from fastapi.responses import Response
 from numpy.typing import NDArray
 
 from fcslam.runs.map_files import PIXELS, Occupancy, parse_map, pixels_of
@@ -17,13 +15,12 @@ TILE_PX = 256
 DEEPEST_ZOOM = 8
 
 
-def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> Response:
-    """The tile whose lower left corner lies at (column, row) * side; unknown where the map ends.
+def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes:
+    """PNG of the tile whose lower left corner is (column, row) times its side; unknown beyond the map.
 
-    Refuses (HTTPException 404): there is no such map.
+    Raises:
+        FileNotFoundError: the folder has no map ``stem``.
     """
-    if not (folder / f"{stem}.pgm").is_file():
-        raise HTTPException(404, f"there is no {stem}")
     pixels, resolution_m, origin = _grid(folder, stem)
     side_m = WORLD_M / 2**zoom
     canvas = np.full((TILE_PX, TILE_PX), PIXELS[Occupancy.UNKNOWN], np.uint8)
@@ -45,12 +42,12 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> Respo
         canvas[inside] = drawn[
             inside[0].start - bottom : inside[0].stop - bottom, inside[1].start - left : inside[1].stop - left
         ]
-    return Response(bytes(cv2.imencode(".png", canvas[::-1])[1]), media_type="image/png")
+    return bytes(cv2.imencode(".png", canvas[::-1])[1])
 
 
 @lru_cache(maxsize=8)
 def _grid(folder: Path, stem: str) -> tuple[NDArray[np.uint8], float, NDArray[np.float64]]:
-    """Pixels with row 0 at the lowest y, side of a cell, lower left corner (2,). A snapshot never changes."""
+    """Pixels (H, W) with row 0 at the lowest y, resolution in metres, lower left corner (2,). Files never change."""
     pgm, description = (folder / f"{stem}.pgm").read_bytes(), (folder / f"{stem}.yaml").read_text(encoding="utf-8")
     occupancy = parse_map(stem, pgm, description)
     return pixels_of(occupancy.cells), occupancy.resolution_m, np.array(occupancy.origin_xy)

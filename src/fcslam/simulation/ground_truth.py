@@ -13,6 +13,7 @@ from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, map_yaml, pgm_
 from fcslam.simulation.scene import bare_model
 from fcslam.simulation.sensors import RayCaster
 from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot
+from fcslam.storage.files import write_file
 
 RESOLUTION_M = 0.05
 
@@ -50,8 +51,8 @@ def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Gener
     place.mkdir(parents=True, exist_ok=True)
     write_relations(place / "relations", true_relations(fleet.robots, rng))
     seen = true_map(fleet)
-    (place / "map.pgm").write_bytes(pgm_bytes(seen))
-    (place / "map.yaml").write_text(map_yaml(seen, "map.pgm"), encoding="utf-8")
+    write_file(place / "map.pgm", pgm_bytes(seen))
+    write_file(place / "map.yaml", map_yaml(seen, "map.pgm"))
 
 
 def true_relations(

@@ -57,7 +57,7 @@ def fleet(
         write_metrics(fleet_metrics(report), csv)
     if figure is not None:
         from fcslam.evaluation.fleet.charts import fleet_charts
-        from fcslam.evaluation.fleet.figure import write_figure
+        from fcslam.maps.fleet_figure import write_figure
 
         with ProgressDisplay(notices(quiet)) as display:
             display.start("drawing")

@@ -125,7 +125,11 @@ def map_router(state: ServiceState) -> APIRouter:
     )
     def get_tile(k: Index, z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)], x: Square, y: Square) -> Response:
         """A square of a map: at zoom z it has 256 m / 2^z; x and y count squares from the origin, y upwards."""
-        return tile_png(_live_folder(state), _stem(k), z, x, y)
+        try:
+            tile = tile_png(_live_folder(state), _stem(k), z, x, y)
+        except FileNotFoundError as error:
+            raise HTTPException(404, f"there is no {_stem(k)}") from error
+        return Response(tile, media_type=MEDIA["png"])
 
     @router.get("/pose_graph.g2o", response_class=Response, responses={**refusals(404), 200: content(TEXT)})
     def get_pose_graph() -> FileResponse:

@@ -1,6 +1,6 @@
-"""The picture of a fleet's run, as figure 5 of FC-SLAM: local maps, matched places, the fused map, the building.
+"""The figure of a fleet's run, as figure 5 of FC-SLAM: local maps, matched places, the fused map, the building.
 
-All charts stand on one sheet that is measured in pixels, y upwards, so that lines can lead from one to another.
+All charts share one axes in pixels, y upwards, so that lines can connect them.
 """
 
 import io
@@ -15,8 +15,8 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from fcslam.errors import OutputError
-from fcslam.evaluation.fleet.charts import Chart, FleetCharts, Match, spread
 from fcslam.geometry import se2
+from fcslam.maps.charts import Chart, FleetCharts, MatchedPlaces, spread
 from fcslam.maps.drawing import round_length
 from fcslam.maps.palette import CLOSURES, FLOOR, FURNITURE, INK, PAPER, ROBOTS, WALL
 from fcslam.metrics.grid import LabelledGrid
@@ -36,39 +36,39 @@ NAME_PX: Final = 70
 LEGEND_PX: Final = 120
 SCALE_PX: Final = 60
 HIGHEST_PX: Final = 850
-"""No chart is drawn higher."""
+"""Largest height of a chart."""
 SHADES: Final = 128
-"""Colours of the PNG: with so few it is a quarter of the size, and nobody sees the difference."""
+"""Colours of the PNG. The file is a quarter of the size without a visible difference."""
 FINE_PX: Final = 2.5
 """Walls of cells smaller than this are drawn one cell thicker."""
 MATCHES_DRAWN: Final = 15
-"""Of one channel, if each two robots have their share of them; at least one between two robots."""
+"""Most matches of one channel, shared by all pairs of robots; at least one for each pair."""
 BOW: Final = 0.15
-"""A line over a chart rises by this share of its length."""
+"""Rise of a line that crosses a chart, as a share of its length."""
 TITLE_PT, TEXT_PT = 12.0, 9.5
 SENSORS: Final = {Channel.LIDAR: "LiDAR", Channel.CAMERA: "camera"}
 
 
 @dataclass(frozen=True, slots=True)
 class _Panel:
-    """A chart at its place on the sheet."""
+    """A chart at its position on the sheet."""
 
     chart: Chart
     low: FloatArray
-    """Lower left corner of what is shown, metres on the chart."""
+    """Lower left corner of the shown area, metres on the chart, shape (2,)."""
     size_m: FloatArray
     corner_px: FloatArray
-    """Where that corner lies on the sheet."""
+    """The same corner on the sheet, pixels, shape (2,)."""
     scale: float
     """Pixels per metre."""
 
     def pixels(self, points: FloatArray) -> FloatArray:
-        """Points (N, 2+) of the map on the sheet, shape (N, 2)."""
+        """Transform points (N, 2+) of the map to pixels on the sheet, shape (N, 2)."""
         return np.asarray(self.corner_px + self.scale * (self.chart.place(points) - self.low))
 
     @property
     def head_px(self) -> FloatArray:
-        """The middle of its upper edge."""
+        """Middle of the upper edge, pixels, shape (2,)."""
         return np.asarray(self.corner_px + self.scale * self.size_m * (0.5, 1.0))
 
 
@@ -89,7 +89,7 @@ def write_figure(charts: FleetCharts, path: Path) -> None:
 
 
 def draw_figure(charts: FleetCharts) -> "Figure":
-    """The figure; each line between matched places has the gid ``match``."""
+    """Draw the figure; each line between matched places has the gid ``match``."""
     lower = _row((charts.fused, charts.building), MARGIN_PX + SCALE_PX)
     legend_px = _top(lower) + TITLE_PX
     upper = _row(tuple(charts.local.values()), legend_px + LEGEND_PX + NAME_PX)
@@ -114,13 +114,13 @@ def draw_figure(charts: FleetCharts) -> "Figure":
     return figure
 
 
-def _chosen(charts: FleetCharts) -> list[Match]:
+def _chosen(charts: FleetCharts) -> list[MatchedPlaces]:
     pairs = math.comb(len(charts.local), 2)
     return spread(charts.matches, max(1, MATCHES_DRAWN // max(1, pairs)))
 
 
-def _line(match: Match, local: Mapping[str, _Panel]) -> FloatArray:
-    """From where one robot was to where the other was, shape (N, 2); it rises where other charts lie between."""
+def _line(match: MatchedPlaces, local: Mapping[str, _Panel]) -> FloatArray:
+    """Line between the two ends, pixels, shape (N, 2); it is an arc if other charts lie between."""
     order = list(local)
     start, end = (local[robot].pixels(xy[None])[0] for robot, xy in (match[:2], match[2:4]))
     share = np.linspace(0.0, 1.0, 40)[:, None]
@@ -131,7 +131,7 @@ def _line(match: Match, local: Mapping[str, _Panel]) -> FloatArray:
 
 
 def _row(charts: Sequence[Chart], bottom_px: float) -> list[_Panel]:
-    """Charts side by side on one scale, spread over the sheet's width."""
+    """Place charts side by side at one scale over the sheet's width."""
     boxes = [chart.bounds() for chart in charts]
     sizes = np.array([high - low for low, high in boxes])
     width_m, height_m = sizes[:, 0].sum(), sizes[:, 1].max()
@@ -151,7 +151,7 @@ def _top(row: Sequence[_Panel]) -> float:
 
 
 def _sheet(height_px: float) -> "tuple[Figure, Axes]":
-    """A figure, and an axes in pixels that fills it."""
+    """A figure and its only axes, in pixels."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDTH_PX / DPI, height_px / DPI), dpi=DPI, facecolor=_hex(PAPER))
@@ -162,20 +162,20 @@ def _sheet(height_px: float) -> "tuple[Figure, Axes]":
 
 
 def _draw_chart(axes: "Axes", panel: _Panel, colors: Mapping[str, str]) -> None:
-    """The map, what stands in the building, and every way from a dot at its start."""
+    """Draw the map, the outlines, and every trajectory with a dot at its start."""
     _draw_grid(axes, panel)
     for corners, furniture in panel.chart.outlines:
         axes.fill(*panel.pixels(corners).T, color=_hex(FURNITURE if furniture else WALL), linewidth=0)
-    ways = [(panel.pixels(way), colors[robot]) for robot, way in panel.chart.ways.items()]
-    for pixels, color in ways:
+    lines = [(panel.pixels(poses), colors[robot]) for robot, poses in panel.chart.trajectories.items()]
+    for pixels, color in lines:
         axes.plot(*pixels.T, color=_hex(FLOOR), linewidth=2.2)
         axes.plot(*pixels.T, color=color, linewidth=1.2)
-    for pixels, color in ways:
+    for pixels, color in lines:
         axes.plot(*pixels[:1].T, "o", color=color, markersize=6.0, markeredgecolor=_hex(FLOOR), markeredgewidth=1.2)
 
 
 def _draw_grid(axes: "Axes", panel: _Panel) -> None:
-    """The grid turned as it lies, cut where the chart ends; unknown cells leave the paper as it is."""
+    """Draw the grid at its pose, clipped to the panel; unknown cells are transparent."""
     from matplotlib.patches import Rectangle
     from matplotlib.transforms import Affine2D
 
@@ -196,7 +196,7 @@ def _colored(grid: LabelledGrid, scale: float) -> "NDArray[np.uint8]":
     """RGBA of every cell, shape (H, W, 4)."""
     fine = scale * grid.resolution_m < FINE_PX
     image = np.empty((*grid.free.shape, 4), np.uint8)
-    # not transparent black: where cells are blended, walls would have a dark edge
+    # transparent paper, not black: interpolation would draw a dark edge around walls
     image[:] = (*_rgb(PAPER), 0)
     image[grid.free] = (*_rgb(FLOOR), 255)
     image[binary_dilation(grid.occupied, np.ones((2, 2), np.bool_)) if fine else grid.occupied] = (*_rgb(WALL), 255)
@@ -205,7 +205,7 @@ def _colored(grid: LabelledGrid, scale: float) -> "NDArray[np.uint8]":
 
 def _draw_titles(axes: "Axes", upper_px: float, lower: Sequence[_Panel], robots: int) -> None:
     fused, building = lower
-    joined = f"{len(fused.chart.ways)} of {robots} robots in one coordinate frame"
+    joined = f"{len(fused.chart.trajectories)} of {robots} robots in one coordinate frame"
     above = "no robot knows where the others are; a line is a place that two of them saw"
     _draw_title(axes, 0.5 * WIDTH_PX, upper_px, "Each robot's own map", above)
     _draw_title(axes, fused.head_px[0], _top(lower), "The fused map", joined)
@@ -217,8 +217,8 @@ def _draw_title(axes: "Axes", x: float, bottom_px: float, title: str, words: str
     _write(axes, x, bottom_px + 0.30 * TITLE_PX, words, ha="center")
 
 
-def _draw_legend(axes: "Axes", y: float, matches: Sequence[Match]) -> None:
-    """At the left: each channel's colour, and how many closures there are."""
+def _draw_legend(axes: "Axes", y: float, matches: Sequence[MatchedPlaces]) -> None:
+    """At the left: the colour and the number of closures of each channel."""
     left = float(MARGIN_PX)
     for channel, sensor in SENSORS.items():
         if count := sum(match.channel is channel for match in matches):
@@ -228,7 +228,7 @@ def _draw_legend(axes: "Axes", y: float, matches: Sequence[Match]) -> None:
 
 
 def _draw_scale(axes: "Axes", y: float, scale: float) -> None:
-    """At the right, as long as it says."""
+    """Draw a scale bar at the right."""
     length_m = round_length(0.15 * WIDTH_PX / scale)
     right = WIDTH_PX - MARGIN_PX
     left = right - length_m * scale

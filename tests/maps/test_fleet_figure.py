@@ -9,10 +9,11 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import EvaluationError, OutputError
-from fcslam.evaluation.fleet.charts import RAY_M, Chart, FleetCharts, Match, Outline, fleet_charts, spread
-from fcslam.evaluation.fleet.figure import MATCHES_DRAWN, WIDTH_PX, draw_figure, write_figure
+from fcslam.evaluation.fleet.charts import fleet_charts
 from fcslam.geometry import se2
 from fcslam.maps import palette
+from fcslam.maps.charts import RAY_M, Chart, FleetCharts, MatchedPlaces, Outline, spread
+from fcslam.maps.fleet_figure import MATCHES_DRAWN, WIDTH_PX, draw_figure, write_figure
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import ClosureRow, LocalMap, RobotTrajectory, Run, write_tum
@@ -36,17 +37,17 @@ def way(k=0):
 
 
 def match(i, j, channel=Channel.LIDAR, x=1.0):
-    return Match(ROBOTS[i], np.array((x, 1.0)), ROBOTS[j], np.array((x + 1.0, 2.0)), channel)
+    return MatchedPlaces(ROBOTS[i], np.array((x, 1.0)), ROBOTS[j], np.array((x + 1.0, 2.0)), channel)
 
 
 @pytest.fixture
 def charts():
-    ways = {robot: way(k) for k, robot in enumerate(ROBOTS)}
+    trajectories = {robot: way(k) for k, robot in enumerate(ROBOTS)}
     cabinet = Outline(np.array(((2, 2), (3, 2), (3, 3), (2, 3))), True)
     return FleetCharts(
         {robot: Chart(hall(), {robot: way()}) for robot in ROBOTS},
-        Chart(hall(), ways, (1.0, 2.0, 0.7)),
-        Chart(hall(), ways, outlines=(cabinet,)),
+        Chart(hall(), trajectories, (1.0, 2.0, 0.7)),
+        Chart(hall(), trajectories, outlines=(cabinet,)),
         [match(0, 1), match(1, 2), match(0, 2), match(0, 1, Channel.CAMERA)],
     )
 
@@ -151,10 +152,10 @@ def test_lines_do_not_crowd_and_stay_under_the_titles(robots):
     names = [f"robot_{k}" for k in range(robots)]
     pairs = list(combinations(names, 2))
     xy = [np.array((x, 3.9)) for x in np.linspace(0.5, 5.5, 30)]
-    matches = [Match(i, at, j, at, Channel.LIDAR) for i, j in pairs for at in xy]
-    ways = {name: way() for name in names}
+    matches = [MatchedPlaces(i, at, j, at, Channel.LIDAR) for i, j in pairs for at in xy]
+    trajectories = {name: way() for name in names}
     local = {name: Chart(hall(), {name: way()}) for name in names}
-    charts = FleetCharts(local, Chart(hall(), ways), Chart(hall(), ways), matches)
+    charts = FleetCharts(local, Chart(hall(), trajectories), Chart(hall(), trajectories), matches)
     lines = match_lines(charts)
     assert len(pairs) <= len(lines) <= max(MATCHES_DRAWN, len(pairs))
     title = next(text for text in sheet(charts).texts if text.get_text().startswith("no robot knows"))
@@ -223,10 +224,12 @@ def run_folder(tmp_path):
 
 def test_charts_of_a_run_folder(run_folder):
     charts = fleet_charts(run_folder)
-    assert list(charts.local) == list(charts.building.ways) == list(ROBOTS)
-    assert list(charts.fused.ways) == ["a", "b"]
+    assert list(charts.local) == list(charts.building.trajectories) == list(ROBOTS)
+    assert list(charts.fused.trajectories) == ["a", "b"]
     np.testing.assert_allclose(charts.fused.T_chart_map, T_BUILDING_MAP, atol=1e-6)
-    np.testing.assert_allclose(charts.fused.place(charts.fused.ways["b"]), charts.building.ways["b"][:, :2], atol=1e-6)
+    np.testing.assert_allclose(
+        charts.fused.place(charts.fused.trajectories["b"]), charts.building.trajectories["b"][:, :2], atol=1e-6
+    )
     ((robot_i, xy_i, robot_j, xy_j, channel),) = charts.matches
     assert (robot_i, robot_j, channel) == ("a", "b", Channel.CAMERA)
     np.testing.assert_allclose((xy_i, xy_j), [(2.0, 0.0), (1.0, 0.0)])
