@@ -51,6 +51,7 @@ def test_the_docstring_names_the_command(path):
     assert f"python benchmarks/{path.name}" in docstring
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 @pytest.mark.usefixtures("common")
 def test_imports_without_running(path, capsys):
@@ -111,6 +112,7 @@ def test_a_picture_lies_beside_the_report(common, tmp_path, monkeypatch, capsys)
     assert "![A line](sample.png)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_command_is_measured_and_its_failure_ends_the_script(common):
     cost = common.run_fcslam("--version")
     assert cost.cpu_s > 0.0

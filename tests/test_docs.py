@@ -105,6 +105,7 @@ def test_every_symbol_is_in_its_file(page):
     assert missing_symbols(page.read_text(encoding="utf-8")) == []
 
 
+@pytest.mark.slow
 @pages
 def test_every_command_parses(page):
     found = [complaint(line, complete) for line, complete in commands(page.read_text(encoding="utf-8"))]

@@ -166,6 +166,7 @@ def probe(statement: str, folder: Path) -> dict[str, object]:
     return answer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("statement", ["import fcslam", "import fcslam.cli"])
 def test_import_is_light_and_writes_nothing(statement, tmp_path):
     answers = [probe(statement, tmp_path) for _ in range(3)]

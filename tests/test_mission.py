@@ -15,8 +15,15 @@ from tests.robot.kidnapping import kidnapping
 
 
 @pytest.fixture(scope="module")
-def run(logs):
-    return run_mission([open_source(log) for log in logs], MissionConfig(seed=3))
+def watched(logs):
+    """A run, and the progress that was reported during it."""
+    seen = []
+    return run_mission([open_source(log) for log in logs], MissionConfig(seed=3), seen.append), seen
+
+
+@pytest.fixture(scope="module")
+def run(watched):
+    return watched[0]
 
 
 def files(folder):
@@ -44,6 +51,7 @@ class Kidnapped:
         return iter(kidnapping()[0])
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_lost_is_two_sessions_that_a_veto_may_name():
     settings = MissionConfig()
     robot = settings.robot.model_copy(update={"channels": (Channel.LIDAR,)})
@@ -58,14 +66,14 @@ def test_a_robot_that_was_lost_is_two_sessions_that_a_veto_may_name():
     assert first.map_index != second.map_index
 
 
-def test_the_watcher_sees_all_scans_and_then_that_the_cloud_fuses(logs):
-    seen = []
-    run = run_mission([open_source(log) for log in logs], MissionConfig(seed=3), seen.append)
+def test_the_watcher_sees_all_scans_and_then_that_the_cloud_fuses(watched):
+    run, seen = watched
     assert [now.fusing for now in seen] == [False] * (len(seen) - 1) + [True]
     assert [now.scans for now in seen] == sorted(now.scans for now in seen)
     assert seen[-1].scans == sum(len(trajectory.stamps) for trajectory in run.trajectories.values())
 
 
+@pytest.mark.slow
 def test_the_order_of_the_recordings_does_not_matter(run, logs):
     turned = run_mission([open_source(log) for log in reversed(logs)], MissionConfig(seed=3))
     assert turned.closures
@@ -83,6 +91,7 @@ def test_trajectories_have_every_scan_of_the_recording(run, drawn):
         assert trajectory.T_map_base.shape == (len(robot.stamps), 3)
 
 
+@pytest.mark.slow
 def test_a_robots_own_map_is_what_it_would_have_mapped_alone(run, logs):
     """To the last bit: no other robot has a say in it, and its trajectory starts at the origin."""
     for log, local in zip(logs, run.local_maps.values(), strict=True):
@@ -136,9 +145,8 @@ def test_the_run_carries_its_configuration(run):
     assert MissionConfig.model_validate(yaml.safe_load(run.config_yaml)) == MissionConfig(seed=3)
 
 
-def test_progress_goes_forward_to_the_end(logs, drawn):
-    seen = []
-    run_mission([open_source(log) for log in logs], MissionConfig(), seen.append)
+def test_progress_goes_forward_to_the_end(watched, drawn):
+    _, seen = watched
     scans = [progress.scans for progress in seen]
     assert scans == sorted(scans)
     assert scans[-1] > 0.9 * sum(len(robot.stamps) for robot in drawn.robots)
@@ -147,6 +155,7 @@ def test_progress_goes_forward_to_the_end(logs, drawn):
     json.dumps(seen[-1].closures)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "error"),
     [("a b.clf", None), ("_robot.clf", None), ("(1).log", None), ("Ä.log", None), ("x" * 90 + ".log", SourceError)],

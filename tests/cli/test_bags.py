@@ -50,6 +50,7 @@ def from_log(logs, tmp_path_factory):
     return read_tum(output / "trajectories" / "robot.tum")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run.db3", "run"])
 def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path, name):
     assert run("convert", logs[0], tmp_path / name) == 0
@@ -59,6 +60,7 @@ def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path,
     assert np.hypot(*(poses - from_log[1])[:, :2].T).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_recording_made_of_a_log_gives_the_same_trajectory_to_the_bit(logs, from_log, tmp_path):
     assert run("convert", logs[0], tmp_path / "robot.fcslam") == 0
     assert run("map", tmp_path / "robot.fcslam", "-o", tmp_path / "out") == 0

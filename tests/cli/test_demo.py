@@ -39,6 +39,7 @@ def shown(tmp_path_factory):
     return output
 
 
+@pytest.mark.slow
 def test_it_ends_with_a_run_a_figure_and_a_table(shown):
     run = open_run(shown / "run")
     assert [trajectory.robot for trajectory in run.trajectories.values()] == ["robot_1", "robot_2"]
@@ -51,12 +52,14 @@ def test_it_ends_with_a_run_a_figure_and_a_table(shown):
     assert figures["map_f1"] > 0.9
 
 
+@pytest.mark.slow
 def test_it_replaces_itself_and_nothing_else(shown):
     assert (shown / "notes").read_text() == "mine"
     assert not (shown / "recordings" / "stale").exists()
     assert "path_length_m: 30.0" in (shown / "recordings" / "simulation.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_it_says_where_everything_is(tmp_path, capsys):
     assert run_demo(tmp_path / "demo", *TINIEST) == 0
     said = capsys.readouterr()
@@ -84,6 +87,7 @@ def test_what_is_no_demo_is_left_alone(tmp_path, capsys):
     assert "cannot be used as the output folder" in refused(tmp_path / "run" / "notes", capsys, "--no-camera")
 
 
+@pytest.mark.slow
 def test_without_a_gl_library_one_line_says_what_to_install_and_an_earlier_demo_stays(shown, capsys, monkeypatch):
     monkeypatch.setattr(engine, "_BACKENDS", ("none",))
     monkeypatch.delenv("MUJOCO_GL", raising=False)

@@ -59,6 +59,7 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_a_run_folder_holds_everything(run, fleet):
     for name in ("config.yaml", "rounds.csv", "checkpoint.npz", "rounds.png", "card.md"):
         assert (run / name).stat().st_size > 100
@@ -69,6 +70,7 @@ def test_a_run_folder_holds_everything(run, fleet):
     assert yaml.safe_load((run / "config.yaml").read_text())["rounds"] == 2
 
 
+@pytest.mark.slow
 def test_the_delivered_detectors_run(run, fleet, tmp_path):
     for name in ("detector.onnx", "detector-int8.onnx"):
         arguments = ["extract", str(fleet / "one"), "--output", str(tmp_path / name), "--detector", "onnx"]
@@ -76,12 +78,14 @@ def test_the_delivered_detectors_run(run, fleet, tmp_path):
         assert len(list((tmp_path / name).rglob("*.npz"))) == 3
 
 
+@pytest.mark.slow
 def test_labels_are_all_that_is_kept_of_images(run):
     suffixes = {file.suffix for file in run.rglob("*") if file.is_file()}
     assert suffixes <= {".yaml", ".csv", ".npz", ".onnx", ".png", ".md"}
     assert {file.name for file in run.rglob("*.png")} == {"rounds.png"}
 
 
+@pytest.mark.slow
 def test_the_same_command_with_more_rounds_goes_on(fleet, tmp_path, capsys):
     assert federate(fleet, tmp_path / "run", "--rounds", "1", robots=("one", "two")) == 0
     assert federate(fleet, tmp_path / "run", "--rounds", "2", robots=("one", "two")) == 0

@@ -106,6 +106,7 @@ def test_the_truths_relations_agree(run, logs, capsys):
     assert mean < 0.05
 
 
+@pytest.mark.slow
 def test_what_came_out_is_said(logs, tmp_path, capsys):
     assert run_map(logs[0], "--output", tmp_path / "a[bold]" / "run") == 0
     out, err = capsys.readouterr()
@@ -115,6 +116,7 @@ def test_what_came_out_is_said(logs, tmp_path, capsys):
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_one_recording_split_into_robots(logs, tmp_path, drawn):
     assert run_map(logs[0], "--split", 2, "--output", tmp_path / "run") == 0
     rows = rows_of(tmp_path / "run" / "robots.csv")
@@ -124,6 +126,7 @@ def test_one_recording_split_into_robots(logs, tmp_path, drawn):
     assert max(counts) - min(counts) <= 1
 
 
+@pytest.mark.slow
 def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsys):
     run = tmp_path / "run"
     assert run_map(*logs, "--no-fuse", "--output", run) == 0
@@ -135,6 +138,7 @@ def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsy
     assert yaml.safe_load((run / "config.yaml").read_text())["fleet"]["join_maps"] is False
 
 
+@pytest.mark.slow
 def test_the_configuration_goes_round(logs, run, tmp_path, capsys):
     """A dumped configuration is a valid one, and the run's own gives the run again, byte for byte."""
     assert main(["config", "dump"]) == 0
@@ -189,6 +193,7 @@ TOLERATED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lines", "reports"), TOLERATED.values(), ids=TOLERATED)
 def test_little_damage_is_tolerated_and_reported(tmp_path, capsys, lines, reports):
     log = save(tmp_path / "healthy.log", lines)
@@ -298,6 +303,7 @@ def test_a_missing_configuration_is_refused(tmp_path, log, capsys):
     assert "cannot read the configuration" in refused(capsys, tmp_path, *arguments)
 
 
+@pytest.mark.slow
 def test_a_veto_parts_the_maps(run, logs, tmp_path, capsys):
     """A user looks at the run, does not believe two robots' closures, and maps again without them."""
     names = [path.stem.split(".")[0] for path in logs]

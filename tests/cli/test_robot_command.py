@@ -35,6 +35,7 @@ def cloud():
         yield cloud
 
 
+@pytest.mark.slow
 def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     state = tmp_path / "state"
     assert main(["robot", str(log), "--server", cloud.url, "--state", str(state)]) == 0
@@ -92,6 +93,7 @@ def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, cap
     assert f"fcslam: {cloud.url}: no token (401)" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_robot_says_what_is_left_and_goes_on_later(log, cloud, tmp_path, number):
     # What runs in the background of a shell ignores SIGINT.

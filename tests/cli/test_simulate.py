@@ -43,6 +43,7 @@ def test_bags_hold_the_same_scans(simulated):
     )
 
 
+@pytest.mark.slow
 def test_a_simulated_fleet_is_mapped(simulated, tmp_path):
     recordings = [str(simulated / name) for name in ("robot_1", "robot_2")]
     assert main(["map", *recordings, "--output", str(tmp_path / "run")]) == 0

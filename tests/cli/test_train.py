@@ -28,6 +28,7 @@ def complaint(capsys, *arguments):
     return line
 
 
+@pytest.mark.slow
 def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, capsys):
     pytest.importorskip("torch", reason="needs fcslam[train]")
     settings = tmp_path / "settings.yaml"

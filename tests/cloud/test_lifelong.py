@@ -23,6 +23,8 @@ from tests import small_fleet
 from tests.cloud.test_sessions import started_again
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 
+pytestmark = pytest.mark.slow
+
 SESSIONS, BETWEEN_S = 4, 1000.0
 ONE_A_SQUARE = FleetConfig(matcher=MatcherConfig(most_nearby=1, nearby_m=6.0))
 FEW_ENOUGH_TO_MEET = FleetConfig(matcher=MatcherConfig(most_nearby=1, nearby_m=4.0))

@@ -62,6 +62,7 @@ def next_packet(body):
     return Packet(robot, 0, KNOWN if robot == "a" else 0, NOW, body)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("body", "reason"), HOSTILE.values(), ids=HOSTILE)
 def test_what_does_not_fit_is_refused_and_leaves_no_trace(scripted, reference, body, reason):
     fleet = scripted(SCRIPT)
@@ -77,6 +78,7 @@ def test_what_does_not_fit_is_refused_and_leaves_no_trace(scripted, reference, b
     assert fingerprint(feed(fleet, PACKETS[HALF:]).finalize()) == reference
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("body", "reason"), HOSTILE.values(), ids=HOSTILE)
 def test_what_comes_early_and_does_not_fit_does_no_harm_either(scripted, reference, body, reason):
     """It waits for the packets before it; the packet that lets it speak is not blamed."""
@@ -147,6 +149,7 @@ def test_a_duplicate_is_acknowledged_again(scripted):
     assert decode(reply).body == Acknowledgement(PACKETS[0].robot, 0, PACKETS[0].sequence)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", [{"keypoints": 0.0}, {"keypoints": 300.0}])
 def test_places_made_to_confuse_are_matched_without_harm(packets, changed):
     """Through the real matcher: all keypoints in one spot or far away, descriptors all alike."""

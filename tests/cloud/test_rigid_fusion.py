@@ -164,6 +164,7 @@ def test_a_veto_takes_a_match_away(scripted, strategy):
     assert revoked.reason == "vetoed by hand"
 
 
+@pytest.mark.slow
 @rigid
 def test_looking_at_the_result_does_not_change_it(scripted, strategy):
     packets = in_order([*stream(*A, start_s=0.0), *stream(*B, start_s=5.5)])

@@ -106,6 +106,7 @@ def test_the_estimate_on_the_way_is_the_result_where_nothing_is_in_doubt(scripte
         assert np.allclose(live.T_local_base, final.T_local_base, atol=1e-6)
 
 
+@pytest.mark.slow
 @given(st.from_regex(NAME, fullmatch=True).filter(lambda name: robot_of(name) == name), st.integers(0, 10**6))
 def test_a_sessions_name_tells_robot_and_epoch(robot, epoch):
     assert robot_and_epoch(session_name(robot, epoch)) == (robot, epoch)

@@ -83,6 +83,7 @@ def test_differences_are_those_of_the_pairs(report):
     assert gain.low <= gain.mean <= gain.high
 
 
+@pytest.mark.slow
 def test_each_network_is_compared_by_its_bits_and_by_its_logits(scenes, tmp_path):
     paths = [tmp_path / f"{name}.onnx" for name in ("first", "second")]
     for seed, path in enumerate(paths):
@@ -190,6 +191,7 @@ def test_nothing_found_scores_nothing(scenes, tmp_path):
     assert [len(points) for points in matched_points(none, none)] == [0, 0]
 
 
+@pytest.mark.slow
 def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     arguments = ["evaluate", "homography", str(scenes), "--detector", "orb", "--detector", "fast"]

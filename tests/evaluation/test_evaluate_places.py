@@ -103,6 +103,7 @@ def test_extracted_features_are_those_of_the_detector(folders, tmp_path):
     assert recall_at(brute_force(found), truth, 1).tolist() == [1.0] * 5
 
 
+@pytest.mark.slow
 def test_the_command_writes_matrices_curves_and_a_table(folders, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     arguments = [*map(str, folders), "--train-on", str(folders[1]), "--strategy", "incremental", "--verify"]
@@ -123,6 +124,7 @@ def test_the_command_writes_matrices_curves_and_a_table(folders, tmp_path, capsy
     assert (tmp_path / "precision_recall.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_order_of_a_stream_is_used_where_there_is_one(folders, tmp_path):
     arguments = [*map(str, folders), "--strategy", "incremental", "--sequence", "-o", str(tmp_path)]
     assert main(["evaluate", "places", *arguments]) == 0

@@ -83,6 +83,7 @@ def with_shapes(finished, folder):
     return folder
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_path):
     whole = finished[1]
 
@@ -115,6 +116,7 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
             run_study(study(robots, tmp_path / "torn", **changed))
 
 
+@pytest.mark.slow
 def test_arms_and_seeds_may_be_added_to_a_study(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     run_study(study(robots, tmp_path, seeds=1, arms={"averaged": {"seeds": 1}}))
@@ -149,6 +151,7 @@ def test_nobody_reads_what_a_study_is_while_another_begins_it(robots, tmp_path, 
     assert (tmp_path / "study.yaml").read_bytes() == content
 
 
+@pytest.mark.slow
 def test_robots_own_networks_may_have_fewer_seeds_and_images(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     settings = {"local_seeds": 1, "trained": 3, "arms": {}}
@@ -167,6 +170,7 @@ def test_robots_own_networks_may_have_fewer_seeds_and_images(finished, robots, t
     assert all(np.isnan([row.closed, row.closed_alone]).all() for row in rows)
 
 
+@pytest.mark.slow
 def test_two_at_one_study_share_the_work_out(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     told, found = [], []
@@ -190,6 +194,7 @@ def test_two_at_one_study_share_the_work_out(finished, robots, tmp_path):
         assert np.array_equal(values, found[1].measured[name], equal_nan=True)
 
 
+@pytest.mark.slow
 def test_robots_own_networks_share_the_pairs_out(finished):
     local = finished[1].measured["local"]
     shown = np.isfinite(local[..., 0])
@@ -197,6 +202,7 @@ def test_robots_own_networks_share_the_pairs_out(finished):
     assert (shown.sum(axis=0) == 1).all()  # over two seeds each of both networks sees each pair once
 
 
+@pytest.mark.slow
 def test_all_begin_from_the_start_that_is_named(finished, robots, tmp_path):
     folder, first = finished
     seen = set()
@@ -210,6 +216,7 @@ def test_all_begin_from_the_start_that_is_named(finished, robots, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_every_network_sees_as_many_samples(finished, robots, tmp_path):
     with_shapes(finished, tmp_path)
     steps = {}

@@ -9,6 +9,7 @@ from fcslam.evaluation.places.scoring import PlaceFeatures
 from fcslam.geometry import se2
 
 
+@pytest.mark.slow
 def test_places_of_a_recording_are_asked_for_long_after(logs):
     found = describe_recording(logs[0])
     (truth,) = found.place_set.questions.values()

@@ -69,6 +69,7 @@ def camera_over_a_wall(shift_m):
 PLAIN = DepthCamera(np.array([80.0, 80.0, 79.5, 59.5]), np.zeros(5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift_m", "share"), [(0.0, 1.0), (0.5, 0.75), (1.0, 0.5), (3.0, 0.0)])
 def test_overlap_of_a_wall_is_what_stays_in_view(shift_m, share):
     overlap = view_overlap(np.ones((2, 120, 160)), camera_over_a_wall(shift_m), PLAIN)

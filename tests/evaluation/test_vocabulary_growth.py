@@ -98,6 +98,7 @@ def test_what_is_fixed_stays(world):
         assert tuple(difference) == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_the_command_draws_and_writes(tour, tmp_path, capsys):
     assert main(["evaluate", "vocabulary", str(tour), "--groups", "5", "-o", str(tmp_path)]) == 0
     assert "5 groups" in " ".join(capsys.readouterr().out.split())

@@ -136,6 +136,7 @@ def test_the_kind_chooses(weights):
     assert isinstance(make_detector(DetectorKind.ORB, OrbConfig(), onnx), Orb)
 
 
+@pytest.mark.slow
 def test_the_library_is_loaded_late():
     import subprocess
 

@@ -19,6 +19,7 @@ OnnxDetector(OnnxConfig(weights=Path(sys.argv[1]))).detect(np.zeros((64, 64), np
 """
 
 
+@pytest.mark.slow
 def test_a_detector_leaves_no_file_at_home(tmp_path):
     tiny_network(network := tmp_path / "tiny.onnx")
     (home := tmp_path / "home").mkdir()

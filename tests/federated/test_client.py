@@ -77,6 +77,7 @@ def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
     assert {file: file.read_bytes() for file in labels_in(tmp_path)} == labels
 
 
+@pytest.mark.slow
 def test_the_optimiser_goes_on_from_the_robots_last_round(folder, start, tmp_path):
     def learn(cache, round_number, run="run"):
         return robot(folder, tmp_path / cache).learn(start, round_number, run, settings(rounds=9)).weights
@@ -97,6 +98,7 @@ def test_the_optimiser_goes_on_from_the_robots_last_round(folder, start, tmp_pat
     assert same(learn("a", 3), second), "a run that begins anew does not know what came later"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
     robot(folder, tmp_path).learn(start, 0, "run", settings())
     (moments,) = tmp_path.glob("moments-*.npz")
@@ -119,6 +121,7 @@ def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
         robot(folder, tmp_path).learn(start, 0, "run", settings())
 
 
+@pytest.mark.slow
 def test_the_pull_holds_updates_back(folder, start, tmp_path):
     def length(**given):
         learned = robot(folder, tmp_path).learn(start, 0, "run", settings(local_steps=12, rounds=1, **given))
@@ -128,6 +131,7 @@ def test_the_pull_holds_updates_back(folder, start, tmp_path):
     assert 0.0 < held < free
 
 
+@pytest.mark.slow
 def test_codes_are_kept_to_those_of_the_run_s_first_weights(folder, start, tmp_path):
     chosen = settings(compatible=100.0)
     torch.manual_seed(4)

@@ -309,6 +309,7 @@ def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
     assert same(state.weights, shifted(START, 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
 def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
     """The others end where they would have ended without it."""

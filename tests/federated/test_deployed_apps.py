@@ -69,6 +69,7 @@ def line_of(capsys):
     return line
 
 
+@pytest.mark.slow
 def test_certificates_that_do_not_fit_end_in_one_line(tmp_path, capsys):
     """Another machine's, on the server and on a robot, before anything of Flower starts."""
     ours, theirs = certificates(tmp_path / "ours"), certificates(tmp_path / "theirs")

@@ -69,6 +69,7 @@ def test_its_normalisations_begin_as_none(tmp_path):
         assert np.allclose(weights[name], 0.0 if name.endswith("mean") else 1.0, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_what_no_normalisation_had_become_is_another_function_as_soon_as_it_is_trained():
     """Normalised anew it stays what it was, the more so the more alike the images are."""
     released = read_detector_weights(BUNDLED_NETWORK, "light")
@@ -98,6 +99,7 @@ def test_a_channel_that_says_the_same_everywhere_is_normalised_as_well():
     assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4 * float(theirs.abs().max()))
 
 
+@pytest.mark.slow
 def test_a_fleet_goes_on_from_the_start_it_had_whatever_public_images_there_are_now(tmp_path):
     export_onnx(lived_in("light"), tmp_path / "detector.onnx")
     pictures = np.random.default_rng(1).integers(0, 256, (2, 96, 96), np.uint8)

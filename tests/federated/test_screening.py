@@ -98,6 +98,7 @@ def test_bounds_that_are_off_let_everything_finite_pass():
     assert screen(answers, BEFORE, off) == {}
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_an_update_taken_apart_and_added_again_is_the_same(seed, frozen):
     rng = np.random.default_rng(seed)

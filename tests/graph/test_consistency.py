@@ -283,6 +283,7 @@ def test_clique_is_the_largest_of_brute_force(seed: int, density: float) -> None
     assert adjacent[np.ix_(clique.members, clique.members)].sum() == largest * (largest - 1)
 
 
+@pytest.mark.slow
 def test_a_planted_clique_among_hundreds() -> None:
     generator = np.random.default_rng(0)
     upper = np.triu(generator.random((400, 400)) < 0.1, 1)

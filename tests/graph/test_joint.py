@@ -103,6 +103,7 @@ def lying_world(seed: int, share: float) -> World:
     return world
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("share", [0.1, 0.7])
 def test_false_closures_are_found_out_and_true_ones_kept(seed: int, share: float) -> None:

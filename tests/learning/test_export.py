@@ -24,6 +24,7 @@ def answers(path, image):
     return session.run(["scores", "logits"], {"image": image[None, None]}), session.get_modelmeta().custom_metadata_map
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["light", "vgg"])
 def test_the_file_says_what_torch_says_at_any_size(encoder, tmp_path):
     net = network(encoder)
@@ -42,6 +43,7 @@ def test_the_file_says_what_torch_says_at_any_size(encoder, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["detector.onnx"]
 
 
+@pytest.mark.slow
 def test_int8_is_smaller_and_nearly_the_same(tmp_path):
     net = network("light")
     export_onnx(net, tmp_path / "detector.onnx")

@@ -21,6 +21,7 @@ def batch(seed):
     return collate([draw_pair(example, SIZE, 32, 8, np.random.default_rng([seed, index])) for index in range(4)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_a_linear_map_is_read_where_the_homography_says(seed):
     """Bilinear sampling is exact on a map that is linear in x and y."""

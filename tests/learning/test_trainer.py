@@ -41,6 +41,7 @@ def weights(network):
     return torch.cat([value.flatten().double() for value in network.state_dict().values()])
 
 
+@pytest.mark.slow
 def test_a_run_learns(examples, tmp_path):
     longer = SMALL.model_copy(update={"steps": 40, "pairs": 2})
     figures = []
@@ -52,6 +53,7 @@ def test_a_run_learns(examples, tmp_path):
     assert (np.array(last) < 0.85 * np.array(first)).all()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_gives_the_network_that_the_run_handed_over(examples, tmp_path):
     run = TrainingRun(SMALL, "joint", tmp_path, PACE)
     delivered = run.train(examples, examples[:1])
@@ -69,6 +71,7 @@ def test_a_checkpoint_of_another_network_is_refused(tmp_path):
             trained_network(tmp_path / "c.npz")
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):
     bits = teacher_bits(torch.from_numpy(examples[0].teacher.descriptors.astype(np.float32)), 1)
     whole = TrainingRun(SMALL, "joint", tmp_path / "whole", PACE)
@@ -88,6 +91,7 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):
     assert torch.equal(weights(whole.train(examples, examples[:1], bits)), weights(torn))
 
 
+@pytest.mark.slow
 def test_another_seed_trains_another_network(examples, tmp_path):
     networks = []
     for seed in (1, 2):
@@ -98,6 +102,7 @@ def test_another_seed_trains_another_network(examples, tmp_path):
     assert not torch.equal(*networks)
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeypatch):
     TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
     before = (tmp_path / CHECKPOINT_FILE).read_bytes()
@@ -121,6 +126,7 @@ def test_a_foreign_checkpoint_is_said(examples, tmp_path, content):
         TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_other_settings_is_refused_but_more_steps_are_not(examples, tmp_path):
     TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
     with pytest.raises(TrainingError, match="other settings"):
@@ -130,6 +136,7 @@ def test_a_checkpoint_of_other_settings_is_refused_but_more_steps_are_not(exampl
     assert more.step == 7
 
 
+@pytest.mark.slow
 def test_collapsed_codes_sound_the_alarm(examples):
     network = KeypointNetwork("light").eval()
     head = network.body.code_head[-1]
@@ -153,6 +160,7 @@ def test_a_perfect_detector_of_unmoved_pictures_scores_one():
     assert figures["mma_3px"] > 0.95
 
 
+@pytest.mark.slow
 def test_a_network_that_finds_nothing_has_no_figures_and_no_alarm(examples):
     network = KeypointNetwork("light").eval()
     for layer in (network.body.point_head[-1], network.body.refine[-1]):

@@ -151,6 +151,7 @@ def visit(x):
     return [(x, 0.0), (x, 2.6), (x - 1.0, 3.2), (x + 0.2, 3.8), (x, 2.4), (x, 0.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", [0.03, 1.0])
 def test_rooms_that_look_alike_stay_apart(drift):
     """With the default drift, and with so much allowed for that every twin lies inside the search."""

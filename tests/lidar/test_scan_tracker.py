@@ -48,6 +48,7 @@ def odometry(truth):
     return drifting(truth, np.random.default_rng(1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.3, 0.1, 0.4)])
 def test_a_drive_of_fifty_metres_is_tracked(truth, odometry, mount):
     laser = replace(LASER, T_base_laser=mount)
@@ -58,6 +59,7 @@ def test_a_drive_of_fifty_metres_is_tracked(truth, odometry, mount):
     assert np.rad2deg(turn.max()) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slip", [(0.5, 0.0, np.deg2rad(15)), (-0.35, 0.35, np.deg2rad(-15)), (0.0, -0.5, 0.0)])
 def test_a_slip_is_recovered(truth, odometry, slip):
     scans = recording(truth, slipped(odometry, 200, slip), ring())[:260]
@@ -116,6 +118,7 @@ def test_somebody_who_walks_by_does_not_take_the_robot_along(truth, odometry):
     assert shift.max() < 0.10
 
 
+@pytest.mark.slow
 def test_the_buffer_does_not_grow_with_the_drive(truth):
     """Twice round the ring needs no more than once: at most two fields, each as large as the stretch it holds."""
 

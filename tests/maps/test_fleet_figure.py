@@ -179,6 +179,7 @@ def test_maps_of_nothing_are_still_a_figure(tmp_path):
     assert cv2.imread(str(tmp_path / "figure.png")).shape[1] == WIDTH_PX
 
 
+@pytest.mark.slow
 def test_the_same_charts_make_the_same_file(charts, tmp_path):
     for name in ("one.png", "two.png"):
         write_figure(charts, tmp_path / name)

@@ -45,6 +45,7 @@ def path(tmp_path):
     return tmp_path / "index.npz"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", list(Strategy))
 @pytest.mark.parametrize("scoring", list(Scoring))
 def test_what_was_read_goes_on_as_what_was_written(strategy, scoring, tmp_path):

@@ -52,6 +52,7 @@ def beam_oracle(tree, code, beam):
     return kept
 
 
+@pytest.mark.slow
 def test_leaves_are_those_of_a_walk_down_the_tree():
     rng = np.random.default_rng(0)
     tree = grow_tree(clustered_codes(rng, 600), SMALL, np.uint64(1))
@@ -95,6 +96,7 @@ def test_clear_clusters_become_words_and_centres_are_bit_majorities():
         np.testing.assert_array_equal(np.unpackbits(tree.centres[leaf].view(np.uint8)), majority)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**16), count=st.integers(1, 90), clusters=st.integers(1, 5))
 def test_majorities_of_bits_are_those_of_counting_them(seed, count, clusters):

@@ -104,6 +104,7 @@ def test_an_outage_leaves_no_trace(scans, alone, tmp_path):
     assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [1, 40])
 def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_path, stop):
     cloud = FakeCloud()
@@ -180,6 +181,7 @@ def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
     outbox.close()
 
 
+@pytest.mark.slow
 def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tmp_path):
     tiny_network(tmp_path / "tiny.onnx", version="tiny-2")
     file = describe_detector_file(tmp_path / "tiny.onnx")
@@ -201,6 +203,7 @@ def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tm
     assert agent.progress().notices == ("detector tiny-2 from now on",)
 
 
+@pytest.mark.slow
 def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     """Put down elsewhere and, after another while, stopped and resumed: each part travels in an epoch of its own."""
     scans, moment = kidnapping()

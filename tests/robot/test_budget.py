@@ -35,6 +35,7 @@ def drive():
     return [said(k, body, time) for k, (body, time) in enumerate(zip(bodies, times, strict=True))]
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(st.sampled_from([KEYSCAN, CLOSURE, *PLACES.values()]), st.floats(0.0, 4.0)), max_size=30),
     st.floats(10.0, 20000.0),
@@ -59,6 +60,7 @@ def test_places_never_spend_more_than_there_is(steps, rate):
             assert replace(kept[0], body=body) == packet
 
 
+@pytest.mark.slow
 def test_what_is_allowed_is_used(drive):
     """Within a descriptor or two of the whole budget, whatever it is, between the chain alone and everything."""
     sizes = {rate: sum(len(encode(p)) for p in Budget(rate).fit(drive)) for rate in (2000.0, 4000.0, 6000.0)}
@@ -74,6 +76,7 @@ def test_the_chain_travels_whatever_it_costs(drive):
     assert budget.left_out == len(drive) - len(kept)
 
 
+@pytest.mark.slow
 def test_the_same_recording_sends_the_same(drive):
     in_one = Budget(3000.0).fit(drive)
     budget = Budget(3000.0)

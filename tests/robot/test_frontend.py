@@ -130,6 +130,7 @@ def test_time_on_packets_never_goes_back(scans):
         encode(packet)  # no keyscan is later than its packet
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blind", [slice(0, 1), slice(0, 5), slice(20, 24), slice(0, None)])
 def test_scans_that_see_nothing_do_not_stop_a_robot(scans, blind):
     """Covered at the start, dazzled on the way, or blind for all time."""

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from fcslam.lidar.lost import LostConfig
 from fcslam.records import Channel, Constraint, Keyscan, frozen
@@ -40,6 +41,7 @@ def test_a_kidnapped_robot_begins_anew_where_it_was_put_down():
     assert [pose.stamp for track in robot.tracks for pose in track] == [scan.stamp for scan in scans]
 
 
+@pytest.mark.slow
 def test_both_sessions_are_what_two_robots_would_have_said():
     scans, moment = kidnapping()
     _, packets = driven(scans)
@@ -62,6 +64,7 @@ def test_who_cannot_be_lost_ties_the_two_places_together():
     assert any(stamps[motion.i] <= moment < stamps[motion.j] for motion in motions)
 
 
+@pytest.mark.slow
 def test_a_drive_without_surprises_says_the_same_whether_it_is_watched_or_not():
     for scans in drives():
         robot, watched = driven(scans)
@@ -69,6 +72,7 @@ def test_a_drive_without_surprises_says_the_same_whether_it_is_watched_or_not():
         assert [encode(packet) for packet in watched] == [encode(packet) for packet in driven(scans, BLIND)[1]]
 
 
+@pytest.mark.slow
 def test_doubt_that_passes_leaves_no_trace():
     """Somebody stands before the laser for three scans."""
     scans = list(drives()[0])

@@ -41,6 +41,7 @@ def desk(tmp_path):
     desk.store.close()
 
 
+@pytest.mark.slow
 @given(data=st.data())
 def test_what_is_acknowledged_is_stored_without_a_gap(data, tmp_path_factory):
     desk = Desk(tmp_path_factory.mktemp("intake") / "mission.sqlite")

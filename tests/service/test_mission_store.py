@@ -35,6 +35,7 @@ def correction(robot, x, epoch=0, y=0.0, theta=0.0, map_index=0, quality=0.25):
     return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, map_index, frozen((x, y, theta)), quality))
 
 
+@pytest.mark.slow
 @given(batches=BATCHES)
 def test_any_order_and_any_repetition_give_the_same_set_and_the_same_acknowledgement(batches, tmp_path_factory):
     path = tmp_path_factory.mktemp("store") / "mission.sqlite"

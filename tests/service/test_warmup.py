@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from fcslam.wire.packets import encode
 
 SCRIPT = """
@@ -51,6 +53,7 @@ print(json.dumps([sum(map(len, cold.values())), sum(map(len, warm.values())), of
 """
 
 
+@pytest.mark.slow
 def test_after_the_warm_up_a_fleet_finds_all_its_code_compiled(tmp_path, packets):
     stream = tmp_path / "stream.json"
     stream.write_text(json.dumps([encode(packet).hex() for packet in packets]))

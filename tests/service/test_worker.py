@@ -86,6 +86,7 @@ def two_robots():
     return in_order([*stream("a", POSES, start_s=0.0), *stream("b", POSES, start_s=500.0)])
 
 
+@pytest.mark.slow
 def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_path, logs, rng_order):
     config = MissionConfig(seed=3)
     packets = in_order(packet for log in logs for packet in sent(open_source(log), config.robot))
@@ -221,6 +222,7 @@ def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch)
     assert len(cloud.finalize().trajectories["a"].stamps) == len(POSES)
 
 
+@pytest.mark.slow
 def test_a_worker_waits_until_the_one_before_is_gone(cloud):
     command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
     cloud.put(stream("a", POSES, start_s=0.0))
@@ -236,6 +238,7 @@ def test_a_worker_waits_until_the_one_before_is_gone(cloud):
             assert process.wait(60) == 0
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cloud):
     command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -248,6 +251,7 @@ def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cl
         assert process.wait(60) == 0
 
 
+@pytest.mark.slow
 def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
     cloud.put(two_robots())
     assert {t.map_index for t in cloud.finalize().trajectories.values()} == {0}
@@ -301,6 +305,7 @@ def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):
     assert sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories.values()) == 2 * len(POSES)
 
 
+@pytest.mark.slow
 def test_more_robots_join_a_mission_that_was_finished(cloud, tmp_path):
     packets = two_robots()
     half = [p for p in packets if p.robot == "a"]
@@ -328,6 +333,7 @@ def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scr
     assert {"map.pgm", "map.yaml", "map.png"} == set(run.map_files)
 
 
+@pytest.mark.slow
 def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
     """What is replayed in the end is read from the store again."""
 
@@ -343,6 +349,7 @@ def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
     assert in_memory() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("step_m", "kept"), [(1e6, 1), (1e5, 3)])
 def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same(cloud, step_m, kept):
     far = np.cumsum(np.full((13, 3), (step_m, 0.0, 0.0)), axis=0)
@@ -353,6 +360,7 @@ def test_motions_out_of_all_bounds_are_refused_and_the_map_is_drawn_all_the_same
     assert cloud.folder.live.exists()
 
 
+@pytest.mark.slow
 def test_corrections_number_maps_as_the_live_run_does(cloud):
     alone = stream("c", POSES, start_s=-500.0)
     cloud.put(in_order([*alone, *two_robots()]))

@@ -117,6 +117,7 @@ def test_the_command_goes_on(tmp_path, monkeypatch):
     assert files(cut) == files(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -37,6 +37,7 @@ def route_of(seed, building=Building.DEFAULT, length_m=60.0):
     return route(draw_floor_plan(rng, building), length_m, rng)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("building", Building)
 @pytest.mark.parametrize("seed", range(3))
 def test_robots_touch_nothing_wherever_furniture_stands(building, seed):
@@ -101,11 +102,13 @@ def test_short_and_long_routes(length_m):
     assert length(route_of(3, length_m=length_m)) == pytest.approx(length_m)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_route_and_another_another():
     np.testing.assert_array_equal(route_of(5), route_of(5))
     assert not np.array_equal(route_of(5), route_of(6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_further_robot_changes_no_goals(seed):
     plan = draw_floor_plan(np.random.default_rng(seed))
@@ -114,6 +117,7 @@ def test_a_further_robot_changes_no_goals(seed):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("building", Building)
 @pytest.mark.parametrize("seed", range(3))
 def test_neighbours_share_ground_and_return_to_their_own(building, seed):

@@ -114,6 +114,7 @@ def as_raw(encoding, pixels, padding=0):
     return change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("padding", [0, 5])
 @pytest.mark.parametrize(
     ("encoding", "pixels", "expected_bgr"),

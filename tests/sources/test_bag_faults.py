@@ -329,6 +329,7 @@ def test_a_database_that_is_no_bag(tmp_path):
 fuzz = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 @fuzz
 @given(data=st.data())

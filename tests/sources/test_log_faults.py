@@ -54,6 +54,7 @@ def test_what_is_no_file_is_refused(tmp_path):
     assert "cannot be read" in refusal(save(tmp_path / "run.log", drive(2)) / "inside.log")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compress", [gzip.compress, lzma.compress])
 @pytest.mark.parametrize("kept", [0.2, 0.9, 0.999])
 def test_a_truncated_archive_is_refused_wherever_it_ends(tmp_path, compress, kept):
@@ -252,6 +253,7 @@ def test_a_count_of_ranges_that_cannot_be_is_a_broken_line(tmp_path, count):
     survives(save(tmp_path / "run.log", ["ODOM 0 0 0 0 0 0 0 h 0", line]))
 
 
+@pytest.mark.slow
 @fuzz
 @given(
     st.sampled_from(["ODOM 0 0 0 0 0 0 0 h 0", "Odometry 0 0 0", " ".join(["0"] * 707)]),

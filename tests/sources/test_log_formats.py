@@ -204,6 +204,7 @@ def test_two_ranges_make_the_whole(tmp_path, cut):
     ]
 
 
+@pytest.mark.slow
 def test_memory_does_not_depend_on_the_length(tmp_path):
     def peak_bytes(scans):
         source = open_source(save(tmp_path / f"{scans}.log", drive(scans, beams=90)))

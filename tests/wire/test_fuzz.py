@@ -1,5 +1,6 @@
 """Whatever arrives is a valid packet or a PacketError."""
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,6 +34,7 @@ def test_random_bytes(data):
     receive(data)
 
 
+@pytest.mark.slow
 @settings(max_examples=500)
 @given(
     st.sampled_from(VALID),
@@ -51,6 +53,7 @@ def test_spliced_packets(data, more):
     receive(data[: more.draw(st.integers(0, len(data)))] + other[more.draw(st.integers(0, len(other))) :])
 
 
+@pytest.mark.slow
 def test_every_flip_of_one_bit():
     for data in VALID:
         for bit in range(8 * len(data)):
@@ -88,6 +91,7 @@ def values(field):
     }[field.type]
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(messages(pb.Packet.DESCRIPTOR), st.booleans())
 def test_any_protobuf_message(message, known_version):

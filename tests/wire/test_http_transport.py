@@ -148,6 +148,7 @@ def test_a_token_is_not_shown_to_the_network():
     HttpTransport("http://cloud.example", "r", "ab" * 16).close()
 
 
+@pytest.mark.slow
 def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_path):
     ours, others = certificates(tmp_path / "ours"), certificates(tmp_path / "others")
     with serving(tls=ours) as cloud:

@@ -56,6 +56,7 @@ def test_the_routes_are_all_there(routes):
     assert {path for _, path, route in routes if not isinstance(route.route, APIRoute)} <= OPEN
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("who", [None, "nobody", "a", "b", "eye", "boss"])
 def test_who_has_no_right_gets_nothing_and_changes_nothing(desk, routes, who):
     desk.told(desk.send("a", A[:9]))
@@ -157,6 +158,7 @@ def fuzzed(tmp_path_factory):
         yield desk
 
 
+@pytest.mark.slow
 @given(
     path=st.sampled_from(["robots/a/packets", "detectors", "missions/import?name=new", "vetoes", "missions"]),
     body=st.one_of(st.binary(min_size=1, max_size=300), st.sampled_from([b"{}", b"[]", b'{"name": 3}', b"\0" * 4])),

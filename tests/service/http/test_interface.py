@@ -21,6 +21,7 @@ ITSELF = '[parameters]\n"path.robot" = "a"\n'
 """What is added to the configuration: a robot's token is good for that robot alone."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tokens", "options", "more"),
     [(ENTRIES, AS_BOSS, ""), (ENTRIES, AS_ROBOT, ITSELF), (None, AS_ANYBODY, "")],

@@ -22,6 +22,7 @@ def place():
     return replace(LIDAR_PLACE, keypoints=keypoints, descriptors=frozen(np.zeros((MAXIMUM_KEYPOINTS, 32)), np.uint8))
 
 
+@pytest.mark.slow
 def test_a_batch_that_unpacks_to_too_much_is_sent_in_parts(tmp_path, scripted, place):
     scripted()
     outbox = Outbox(tmp_path / "outbox", "alice", 10**9)

@@ -287,6 +287,7 @@ def test_measures_say_what_came_in(mapped):
     assert lines["fcslam_packets_queued"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_once", [1, 7, 10_000])
 def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, scripted, monkeypatch, at_once):
     monkeypatch.setattr(measures, "_AT_ONCE", at_once)
