@@ -174,7 +174,7 @@ def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
     place = next(packet for packet in alone if isinstance(packet.body, Place))
     cloud = FakeCloud(unwanted={content(encode(place))})
     (tmp_path / "refused").touch()
-    with pytest.raises(StateError, match="refused: a refused packet cannot be kept there"):
+    with pytest.raises(StateError, match="refused: cannot store a refused packet"):
         drive(tmp_path, Network(cloud), scans)
     outbox = Outbox(tmp_path / "outbox", "alice", 10**9)
     assert content(outbox.packet(*next(iter(cloud.refused)))) == content(encode(place))

@@ -94,7 +94,7 @@ def test_one_that_cannot_be_used_is_said_and_nothing_stops(start):
 def test_one_that_cannot_be_kept_is_one_line(start, tmp_path):
     updates, frontend = start()
     (tmp_path / "detectors").touch()
-    with pytest.raises(StateError, match=f"detectors: detector {FIRST.version} cannot be kept there"):
+    with pytest.raises(StateError, match=f"detectors: cannot store detector {FIRST.version}"):
         updates.store(FIRST, b"network")
     assert drive(updates, frontend, range(3)) == {}
 

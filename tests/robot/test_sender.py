@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fcslam.errors import CloudError, OversizeError, StateError, UnavailableError
 from fcslam.robot.outbox import Outbox
-from fcslam.robot.sender import ASK_AFTER_S, EVERY_S, LONGEST_RETRY_S, Sender, retry_delay_s
+from fcslam.robot.sender import ASK_AFTER_S, LONGEST_RETRY_S, SEND_INTERVAL_S, Sender, retry_delay_s
 from fcslam.wire.http_transport import HttpResponse
 from fcslam.wire.packets import decode, encode
 from tests.robot.fake_cloud import FakeCloud, Network, content, said
@@ -126,7 +126,7 @@ def test_what_collects_goes_together_and_what_is_too_much_goes_at_once(robot):
     large = [said(k, LIDAR_PLACE) for k in range(1500)]
     robot.outbox.put(large)
     assert robot.step() == 0.0, "more than a batch holds"
-    assert robot.step() == EVERY_S
+    assert robot.step() == SEND_INTERVAL_S
     assert robot.sender._transport.requests == 3, "the state, and two batches"
 
 
@@ -136,7 +136,7 @@ def test_a_robot_at_rest_asks_now_and_then_and_hears_of_corrections_once(robot):
     robot.step()
     network.cloud.correction = 3
     steps = [robot.step() for _ in range(4 * int(ASK_AFTER_S))]
-    assert set(steps) == {EVERY_S}
+    assert set(steps) == {SEND_INTERVAL_S}
     assert [correction.version for correction in robot.corrections] == [3]
     assert 4 <= network.requests - 2 <= 5
     network.cloud.correction = 2
@@ -253,7 +253,7 @@ def test_a_cloud_that_confirms_nothing_is_not_asked_in_a_hurry(robot):
     robot.sender._transport = deaf
     robot.outbox.put([said(0)])
     delays = [robot.step() for _ in range(8)]
-    assert "confirms nothing" in robot.sender.trouble
+    assert "confirms no packet" in robot.sender.trouble
     assert sum(delays) > 2.0
     assert robot.outbox.waiting.packets == 1
 
@@ -276,7 +276,7 @@ def test_a_cloud_that_opens_another_mission_is_found_out_and_gets_the_next_start
     assert list(network.cloud.stored) == [(0, 2), (0, 3), (1, 0), (1, 1)], "it was sent before it was found out"
     assert [data for data, _ in anew.refused] == [content(encode(said(k))) for k in (2, 3)]
     assert "another mission" in anew.refused[0][1]
-    assert anew.sender.notice.startswith("2 packets of earlier starts are of another mission")
+    assert anew.sender.notice.startswith("2 packets of earlier starts belong to another mission")
     assert (anew.sender.confirmed, anew.sender.refusals) == (2, 2)
     assert anew.outbox.waiting == (0, 0)
     anew.outbox.close()

@@ -1,7 +1,7 @@
-"""A robot that takes part in a mission over a network that fails: it maps as if there were none.
+"""A robot in a mission over an unreliable network: mapping never depends on the network.
 
-The front end runs where ``run`` is called and hands its packets to the outbox, which is on disk. A thread of its own
-brings them to the cloud; the front end never waits for it, unless the outbox is full.
+The front end runs in the thread that calls ``run`` and puts its packets into the outbox, which is on disk. A second
+thread sends them to the cloud. The front end waits for it only if the outbox is full.
 """
 
 import threading
@@ -24,56 +24,55 @@ from fcslam.robot.sender import Sender
 from fcslam.wire.http_transport import BatchTransport
 from fcslam.wire.messages import Packet
 
-LOOK_EVERY_S = 0.1
-"""How often what waits for the sender looks after it."""
-FAREWELL_S = 2.0
-"""How long a request under way may take when the robot stops; what it brought is sent again next time."""
+POLL_INTERVAL_S = 0.1
+"""Interval at which the main thread checks the sender while it waits for it."""
+STOP_TIMEOUT_S = 2.0
+"""Time that a running request may take when the robot stops; its packets are sent again at the next start."""
 
 
 class LocalizationState(StrEnum):
-    """Whether a robot knows where it is."""
+    """Whether a robot knows its pose in the fleet's map."""
 
     MAPPING = "mapping"
-    """It has not been lost."""
+    """It was never lost."""
     LOST = "lost"
-    """It maps, but how that lies to the fleet's map, and to what it mapped before, nobody knows yet."""
+    """It maps in a new session, whose transform to the fleet's map and to its earlier sessions is not known yet."""
     RELOCALISED = "relocalised"
-    """It was lost, and the cloud has found it."""
+    """It was lost, and the cloud has joined its new session to the map."""
 
 
 @dataclass(frozen=True, slots=True)
 class AgentProgress:
-    """How far a robot is."""
+    """Progress of a robot."""
 
     scans: int
     keyscans: int
     waiting: WaitingPackets
     """Packets that the cloud has not confirmed."""
     confirmed: int
-    """Packets that it has."""
+    """Packets that the cloud has confirmed."""
     sent_bytes: int
     left_out: int
-    """Places that are not sent: too much waits, or the budget does not allow for them."""
+    """Places that are not sent, because the outbox or the budget has no room for them."""
     refused: int
     """Packets that the cloud will never store."""
     map_index: int | None
-    """Which of the fleet's maps the robot is in; None: the cloud has not said."""
+    """Index of the robot's map; None before the first correction."""
     correction_age_s: float | None
     quality: float
-    """How well the newest correction is borne out, in [0, 1], as in ``Correction``."""
+    """Quality of the newest correction, in [0, 1], as in ``Correction``."""
     times_lost: int
-    """How often it was lost since it started."""
+    """Number of times the robot was lost since it started."""
     trouble: str | None
-    """Why nothing gets through; None: it does."""
+    """Why packets do not arrive; None if they do."""
     catching_up: bool
-    """Whether the recording is still where it was when the robot was stopped."""
+    """Whether a resumed recording has not yet reached the point of interruption."""
     notices: tuple[str, ...]
-    """What became of packets for another mission, what the cloud refused, and what became of the last detector that was
-    announced, if there were any."""
+    """Messages about packets of another mission, refused packets, and the last detector update, if there were any."""
 
     @property
     def localization(self) -> LocalizationState:
-        """Whether the robot knows where it is, as far as it needed to find out."""
+        """Whether the robot knows its pose."""
         if not self.times_lost:
             return LocalizationState.MAPPING
         return LocalizationState.RELOCALISED if self.quality > 0.0 else LocalizationState.LOST
@@ -83,18 +82,18 @@ AgentWatch = Callable[[AgentProgress], None]
 
 
 class PlaybackPace:
-    """Plays a recording by its own clock."""
+    """Paces a recording by its own clock."""
 
     def __init__(self, speed: float | None, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
-        """``speed`` times as fast as it was recorded; None: as fast as it can be mapped."""
+        """``speed``: factor of the recorded speed; None: as fast as the robot can map."""
         self._speed = speed
         self._clock = clock
         self._sleep = sleep
         self._origin: tuple[float, float] | None = None
-        """A stamp, and the time that it stands for."""
+        """The first stamp, and the time of the clock at which it was due."""
 
     def wait(self, stamp: float) -> None:
-        """Until ``stamp`` is due; the first one is at once."""
+        """Sleep until ``stamp`` is due; the first stamp is due at once."""
         if self._speed is None:
             return
         if self._origin is None:
@@ -104,14 +103,14 @@ class PlaybackPace:
 
 
 class Agent:
-    """One robot: front end, outbox, sender, and where it is in the fleet's map."""
+    """One robot: front end, outbox, sender, and its pose in the fleet's map."""
 
     def __init__(
         self, frontend: RobotFrontend, outbox: Outbox, transport: BatchTransport, folder: Path,
         rng: np.random.Generator, clock: Callable[[], float], sleep: Callable[[float], None],
         budget: Budget | None = None,
     ) -> None:  # fmt: skip
-        """``folder``: for packets that the cloud will never take, and for detectors; without ``budget`` all is sent."""
+        """``folder`` holds refused packets and detectors; without ``budget`` every packet is sent."""
         self._frontend = frontend
         self._outbox = outbox
         self._refused = folder / "refused"
@@ -120,19 +119,21 @@ class Agent:
         self._detector_updates = DetectorUpdates(folder / "detectors", outbox, frontend)
         self._clock = clock
         self._localizers: dict[int, Localizer] = {}
-        """Of every part of this start: each has a frame of its own."""
+        """By part of this start: each part has its own ``odom`` frame."""
         self._sender = Sender(
             outbox, transport, rng, clock, self._correct, self._detector_updates.store, self._keep_refused
         )
-        self._kept: int | None = None
-        """Files of refused packets, once they were counted: there may be many."""
-        self._known = self._said = self._keyscans = self._crowded_out = 0
+        self._refused_files: int | None = None
+        """Number of files of refused packets; None until they are counted, as there may be many."""
+        self._known = self._put = self._keyscans = self._crowded_out = 0
 
     def run(self, records: Iterable[SensorRecord], known: int, pace: PlaybackPace, watch: AgentWatch) -> None:
-        """Map a whole recording and send all of it; ``known`` packets of it were said before, and hurry by.
+        """Map a whole recording and send all packets.
+
+        The outbox knows the first ``known`` packets from before an interruption; up to them nothing is paced.
 
         Raises:
-            CloudError: the cloud turns the robot away; what it does not have stays in the outbox.
+            CloudError: the cloud rejects the robot; unconfirmed packets stay in the outbox.
             StateError: the outbox or its folder cannot be used.
             SourceError: the recording cannot be read.
         """
@@ -140,36 +141,39 @@ class Agent:
         self._detector_updates.resume()
         with self._sending():
             for number, record in enumerate(records):
-                self._detector_updates.apply_due(number, self._said < known)
-                if isinstance(record, LaserScan) and self._said >= known:
+                self._detector_updates.apply_due(number, self._put < known)
+                if isinstance(record, LaserScan) and self._put >= known:
                     pace.wait(record.stamp)
-                self._say(self._frontend.process(record))
+                self._queue(self._frontend.process(record))  # map one record
                 self._wait_while(lambda: self._outbox.is_full, watch)
                 watch(self.progress())
-            self._say(self._frontend.finish())
-            self._wait_while(lambda: self._outbox.waiting.packets > 0, watch)
+            self._queue(self._frontend.finish())
+            self._wait_while(lambda: self._outbox.waiting.packets > 0, watch)  # until the cloud has everything
 
     def progress(self) -> AgentProgress:
-        """Where the robot is now."""
+        """The progress now."""
         sender = self._sender
         notices = tuple(filter(None, (sender.notice, sender.refused_notice, self._detector_updates.notice)))
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
             sum(map(len, self._frontend.tracks)), self._keyscans, self._outbox.waiting, sender.confirmed,
             sender.sent_bytes, left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s,
-            self.localizer.quality, len(self._frontend.tracks) - 1, sender.trouble, self._said < self._known, notices,
+            self.localizer.quality, len(self._frontend.tracks) - 1, sender.trouble, self._put < self._known, notices,
         )  # fmt: skip
 
     @property
     def localizer(self) -> Localizer:
-        """Where the robot is, in the frame of the part that runs."""
+        """Pose of the robot, for the part of this start that is running."""
         return self._localizer(len(self._frontend.tracks) - 1)
 
     def trajectory(self) -> tuple[FloatArray, FloatArray] | None:
-        """Stamps (N,) and poses (N, 3) of ``base`` in the fleet's map at every scan, by the newest correction.
+        """The trajectory in the fleet's map by the newest correction, since the robot was last lost.
 
-        Since the robot was last lost: of what was before, corrections are as old as that, and maps are numbered anew as
-        they join. None: the cloud has not said where the map is.
+        Corrections of earlier parts are out of date, because maps are renumbered when they join.
+
+        Returns:
+            Stamps (N,) in seconds of the recording's clock, and poses (N, 3) of ``base`` in ``map``, metres and
+            radians; None before the first correction.
         """
         localizer, track = self.localizer, self._frontend.tracks[-1]
         poses = [localizer.T_map_base(pose) for pose in track]
@@ -184,7 +188,7 @@ class Agent:
         if part is not None:
             self._localizer(part).correct(correction)
 
-    def _say(self, packets: list[Packet]) -> None:
+    def _queue(self, packets: list[Packet]) -> None:
         for packet in packets:
             body = packet.body
             if isinstance(body, Constraint) and body.kind is ConstraintKind.ODOMETRY:
@@ -193,14 +197,14 @@ class Agent:
         chosen = packets if self._budget is None else self._budget.fit(packets)
         if chosen:
             self._crowded_out += self._outbox.put(chosen)
-            self._said += len(chosen)
+            self._put += len(chosen)
 
     def _wait_while(self, condition: Callable[[], bool], watch: AgentWatch) -> None:
-        """Until the sender has changed that."""
+        """Wait while the sender works on ``condition``."""
         self._require_sender()
         while condition():
             watch(self.progress())
-            self._sleep(LOOK_EVERY_S)
+            self._sleep(POLL_INTERVAL_S)
             self._require_sender()
 
     def _require_sender(self) -> None:
@@ -209,7 +213,7 @@ class Agent:
 
     @contextmanager
     def _sending(self) -> Iterator[None]:
-        """A thread that sends meanwhile."""
+        """Run the sender in a second thread."""
         stop = threading.Event()
         thread = threading.Thread(target=self._sender.run, args=(stop,), name="sender", daemon=True)
         thread.start()
@@ -217,18 +221,18 @@ class Agent:
             yield
         finally:
             stop.set()
-            thread.join(FAREWELL_S)
+            thread.join(STOP_TIMEOUT_S)
 
     def _keep_refused(self, data: bytes, reason: str) -> None:
         try:
             self._refused.mkdir(parents=True, exist_ok=True)
-            if self._kept is None:
-                self._kept = len(list(self._refused.glob("*.bin")))
-            stem = f"{self._kept:06d}"
+            if self._refused_files is None:
+                self._refused_files = len(list(self._refused.glob("*.bin")))
+            stem = f"{self._refused_files:06d}"
             (self._refused / f"{stem}.bin").write_bytes(data)
             (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
         except OSError as error:
             raise StateError(
-                f"{self._refused}: a refused packet cannot be kept there ({error}); make room, and --resume"
+                f"{self._refused}: cannot store a refused packet ({error}); free some space, then use --resume"
             ) from error
-        self._kept += 1
+        self._refused_files += 1

@@ -1,4 +1,4 @@
-"""Fewer bytes than a robot would like to send: the chain first, then as many of each place's descriptors as fit."""
+"""A limit of bytes per second: keyscans and constraints first, then as many descriptors of each place as fit."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -9,18 +9,18 @@ from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
 BURST_S = 10.0
-"""Seconds of the budget that may be spent ahead: places come in one piece."""
+"""Seconds of the budget that may be spent in advance: a place is sent in one packet."""
 ENVELOPE_BYTES = 100
-"""At most so much of a place is neither keypoint nor descriptor."""
+"""Largest part of a place's packet besides its keypoints and descriptors."""
 FEWEST_DESCRIPTORS = 50
-"""A place with less is rarely known again; its bytes serve the next one."""
+"""A place with fewer descriptors is rarely recognised, so it is dropped."""
 
 
 class Budget:
-    """Bytes per second of the recording's own time, so the same recording always sends the same.
+    """A limit of bytes per second of the recording's own clock, so the same recording always sends the same packets.
 
-    Hello, keyscans and constraints always travel: without them there is no map. They count, and places get what they
-    leave: all of their descriptors, the strongest of them, or nothing.
+    Hello, keyscans and constraints are always sent: without them there is no map. Places get the rest of the budget:
+    they are sent with all their descriptors, with the strongest ones, or not at all.
     """
 
     def __init__(self, bytes_per_s: float) -> None:
@@ -28,10 +28,10 @@ class Budget:
         self._began: float | None = None
         self._spent = 0
         self.left_out = 0
-        """Places that were not sent at all."""
+        """Number of places that were not sent."""
 
     def fit(self, packets: Iterable[Packet]) -> list[Packet]:
-        """What may be sent of the front end's next packets; descriptors are the strongest first."""
+        """Select what to send of the next packets of the front end; descriptors are sorted, strongest first."""
         kept = []
         for packet in packets:
             if self._began is None:

@@ -1,6 +1,6 @@
-"""Detectors that the cloud has announced: fetched by the sender, taken by the front end between two records.
+"""Detector updates: downloaded by the sender, used by the front end from the next record on.
 
-A recording that is resumed takes each where it took it before, so that it says the same again.
+A resumed recording switches at the same records again, so that it produces the same packets.
 """
 
 import queue
@@ -14,47 +14,47 @@ from fcslam.storage.files import write_file
 
 
 class DetectorUpdates:
-    """From the thread that hears of a detector to the one that uses it."""
+    """Passes new detectors from the thread that downloads them to the one that uses them."""
 
     def __init__(self, folder: Path, outbox: Outbox, frontend: RobotFrontend) -> None:
-        """``folder``: for the files; the outbox keeps when each was taken."""
+        """``folder`` holds the files; the outbox records when each was applied."""
         self._folder = folder
         self._outbox = outbox
         self._frontend = frontend
         self._fetched: queue.SimpleQueue[DetectorFile] = queue.SimpleQueue()
-        self._taken: dict[int, DetectorFile] = {}
+        self._applied: dict[int, DetectorFile] = {}
         self.notice: str | None = None
-        """What came of the last one."""
+        """Outcome of the last update."""
 
     def resume(self) -> None:
-        """Look up what the session, once begun, took before it was stopped."""
-        self._taken = self._outbox.detector_updates()
+        """Load the updates that this recording applied before it was interrupted."""
+        self._applied = self._outbox.detector_updates()
 
     def store(self, file: DetectorFile, content: bytes) -> None:
-        """Called by the sender: here is what was announced.
+        """Store a downloaded detector. Called by the sender.
 
         Raises:
-            StateError: it cannot be written.
+            StateError: the file cannot be written.
         """
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            write_file(self._path(file), content)  # a recording that is resumed may need the old one
+            write_file(self._path(file), content)  # a resumed recording may need the old one
         except OSError as error:
             raise StateError(
-                f"{self._folder}: detector {file.version} cannot be kept there ({error}); make room, and --resume"
+                f"{self._folder}: cannot store detector {file.version} ({error}); free some space, then use --resume"
             ) from error
         self._fetched.put(file)
 
     def apply_due(self, record: int, catching_up: bool) -> None:
-        """Called before each record, which are counted from 0: let the front end have what is due."""
-        file = self._taken.get(record)
-        is_news = not catching_up and record > max(self._taken, default=-1)
-        if file is None and is_news and not self._fetched.empty():
+        """Give the front end the detector that is due before this record, counted from 0."""
+        file = self._applied.get(record)
+        is_new = not catching_up and record > max(self._applied, default=-1)
+        if file is None and is_new and not self._fetched.empty():
             file = self._fetched.get()
-            if file in self._taken.values():
+            if file in self._applied.values():
                 return
             self._outbox.record_detector_update(record, file)
-            self._taken[record] = file
+            self._applied[record] = file
         if file is None:
             return
         try:

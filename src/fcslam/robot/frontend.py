@@ -1,8 +1,8 @@
-"""One robot: sensor records in, packets out. It knows no network and no other robot.
+"""The front end of one robot: sensor records in, packets out. It knows no network and no other robot.
 
-While what the robot sees is doubtful (``fcslam.lidar.lost``), records are put by. Either they turn out to belong to
-what came before, and are processed as if nothing had been; or the robot is lost: its session ends where it last knew
-where it was, and a new one begins with them, as after a restart. So no motion that nobody measured enters a map.
+While scans are doubtful (``fcslam.lidar.lost``), records are deferred. If they show the same place as before, they are
+processed normally. If they show another place, the robot is lost: its session ends before the doubtful scans, and a new
+one begins with them, as after a restart. So no unmeasured motion enters a map.
 """
 
 from dataclasses import replace
@@ -21,55 +21,56 @@ from fcslam.wire.quantisation import dequantise, quantise
 
 
 class RobotConfig(SessionConfig):
-    """What runs on a robot."""
+    """Settings of one robot."""
 
-    lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost, and begins anew")
+    lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost and starts a new session")
 
 
 class RobotFrontend:
-    """Turns a robot's sensor records into the packets that leave it; keeps every raw scan's pose for itself.
+    """Turns the sensor records of a robot into packets; the poses of all scans stay on the robot.
 
-    Packets bear the number of their session, from 0, as their epoch.
+    The epoch of a packet is the number of its session, from 0.
     """
 
     def __init__(self, robot: str, config: RobotConfig) -> None:
         self.robot = robot
         self.tracks: list[list[ScanPose]] = []
-        """Poses of the scans of every session."""
+        """Poses of the scans, by session."""
         self._config = config
         self._view_extractor = ViewExtractor(config.views)
-        self._put_by: list[LaserScan | CameraImage] = []
-        """From the first scan on that is doubtful."""
-        self._T_local_doubted: FloatArray | None = None
-        """Where that seems to have been taken."""
+        self._deferred: list[LaserScan | CameraImage] = []
+        """Records since the first doubtful scan."""
+        self._T_local_deferred: FloatArray | None = None
+        """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
         self._session = self._begin(float("-inf"))
 
     @property
     def scan_poses(self) -> list[ScanPose]:
-        """Poses of the scans of the session that runs."""
+        """Poses of the scans of the present session."""
         return self.tracks[-1]
 
     def process(self, record: SensorRecord) -> list[Packet]:
-        """The packets that the next record of the recording causes."""
+        """Process the next record of the recording; returns its packets."""
         match record:
             case LaserScan():
-                # The robot works with the ranges that the cloud will see, to the last bit.
+                # The robot maps with the quantised ranges, so robot and cloud see the same numbers.
                 return self._process_scan(replace(record, ranges_m=dequantise(quantise(record.ranges_m))))
-            case CameraImage() if Channel.CAMERA in self._config.channels and self._put_by:
-                self._put_by.append(record)
+            case CameraImage() if Channel.CAMERA in self._config.channels and self._deferred:
+                self._deferred.append(record)
             case CameraImage() if Channel.CAMERA in self._config.channels:
                 self._session.process_image(record)
-        return []  # a scan brings its own odometry; images never leave the robot
+        return []  # scans carry their odometry; images never leave the robot
 
     def set_detector(self, file: DetectorFile, path: Path) -> None:
-        """Describe camera images by another network from now on, and, with the next scan, those that are still here.
+        """Use another network for camera images from now on; the next scan describes buffered images again.
 
         Args:
-            file: as the cloud announced it.
-            path: where it was fetched to.
+            file: the detector as the cloud announced it.
+            path: the downloaded file.
 
         Raises:
-            FeatureError: it is not that file, cannot be used, or this robot has no use for it; nothing has changed.
+            FeatureError: the file is not the announced one, cannot be used, or describes a channel that this robot does
+                not use; nothing has changed.
         """
         if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
             raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
@@ -77,37 +78,40 @@ class RobotFrontend:
             self._view_extractor.set_detector(file, path)
 
     def finish(self) -> list[Packet]:
-        """The packets of what was still open when the recording ended."""
-        return [*self._go_on(), *self._session.finish()]
+        """End the recording; returns the packets of open submaps."""
+        return [*self._process_deferred(), *self._session.finish()]
 
     def _process_scan(self, scan: LaserScan) -> list[Packet]:
         mapper, config = self._session.mapper, self._config.lost
+        # 1. Localize the scan; unless it is doubtful, process it.
         tracking = mapper.localize(scan)
         if not is_doubtful(tracking, mapper, config):
-            if self._put_by:
-                return [*self._go_on(), *self._session.process_scan(scan)]
+            if self._deferred:
+                return [*self._process_deferred(), *self._session.process_scan(scan)]
             return self._session.process_scan(scan, tracking)
-        if self._T_local_doubted is None:
-            self._T_local_doubted = tracking.tracked.T_local_base
-        self._put_by.append(scan)
-        scans = [record for record in self._put_by if isinstance(record, LaserScan)]
+        # 2. Defer a doubtful scan until there are enough of them for a decision.
+        if self._T_local_deferred is None:
+            self._T_local_deferred = tracking.tracked.T_local_base
+        self._deferred.append(scan)
+        scans = [record for record in self._deferred if isinstance(record, LaserScan)]
         if not can_decide(scans, config):
             return []
-        if not is_lost(scans, self._T_local_doubted, mapper, config):
-            return self._go_on()
+        # 3. Same place: process them. Another place: the robot is lost, and a new session begins with them.
+        if not is_lost(scans, self._T_local_deferred, mapper, config):
+            return self._process_deferred()
         rest = self._session.finish()
         self._view_extractor.reset()
         self._session = self._begin(self._session.time)
-        return [*rest, *self._go_on()]
+        return [*rest, *self._process_deferred()]
 
     def _begin(self, time: float) -> RobotSession:
         session = RobotSession(self.robot, len(self.tracks), time, self._view_extractor, self._config)
         self.tracks.append(session.scan_poses)
         return session
 
-    def _go_on(self) -> list[Packet]:
-        """With what was put by."""
-        records, self._put_by, self._T_local_doubted = self._put_by, [], None
+    def _process_deferred(self) -> list[Packet]:
+        """Process the deferred records normally."""
+        records, self._deferred, self._T_local_deferred = self._deferred, [], None
         packets: list[Packet] = []
         for record in records:
             if isinstance(record, LaserScan):

@@ -1,4 +1,4 @@
-"""Keyframe images that a robot keeps for itself, to describe them again when it gets another detector."""
+"""Buffer of keyframe images on the robot, so that a new detector can describe them again."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,27 +11,27 @@ from fcslam.records import CameraModel, FloatArray
 
 
 class ImageBufferConfig(Settings):
-    """How much is kept, in memory; the oldest go first."""
+    """Size of the buffer, which is in memory; the oldest images are dropped first."""
 
-    most_images: int = Field(default=500, ge=0, description="images that a new detector describes again; 0 for none")
-    most_megabytes: float = Field(default=32.0, ge=0.0, description="and their size as they came from the camera [MB]")
+    most_images: int = Field(default=500, ge=0, description="largest number of images; 0 for none")
+    most_megabytes: float = Field(default=32.0, ge=0.0, description="largest total size of the encoded images [MB]")
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeImage:
-    """A keyframe's image with all that places its keypoints."""
+    """An encoded image with all that is needed to find the positions of its keypoints."""
 
     keyscan: int
     encoded: bytes
     camera: CameraModel
     surroundings: LidarView
-    """What the LiDAR saw, from the base at the moment of the image."""
+    """LiDAR returns in the base at the time of the image."""
     T_keyscan_image: FloatArray
-    """Pose of the base at that moment, in the keyscan's."""
+    """Pose of the base at the time of the image in the keyscan's base, shape (3,), metres and radians."""
 
 
 class ImageBuffer:
-    """The newest shots, one a keyscan."""
+    """The newest images, one a keyscan."""
 
     def __init__(self, config: ImageBufferConfig) -> None:
         self._config = config
@@ -41,10 +41,10 @@ class ImageBuffer:
     def __iter__(self) -> Iterator[KeyframeImage]:
         return iter(self._images.values())
 
-    def add(self, shot: KeyframeImage) -> None:
-        """Keep a shot of a keyscan that has none, and let go of the oldest where there is no room."""
-        self._images[shot.keyscan] = shot
-        self._bytes += len(shot.encoded)
+    def add(self, image: KeyframeImage) -> None:
+        """Add the image of a keyscan that has none; drop the oldest images if the buffer is full."""
+        self._images[image.keyscan] = image
+        self._bytes += len(image.encoded)
         while len(self._images) > self._config.most_images or self._bytes > 1e6 * self._config.most_megabytes:
             oldest = self._images.pop(next(iter(self._images)))
             self._bytes -= len(oldest.encoded)

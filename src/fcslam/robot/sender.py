@@ -1,4 +1,4 @@
-"""Brings what waits in the outbox to the cloud, however long that takes, and what the cloud says back."""
+"""Sends the packets of the outbox to the cloud, with retries, and reads the replies."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -14,32 +14,31 @@ from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate
 from fcslam.wire.packets import decode
 
-EVERY_S = 1.0
-"""Between two batches, if one took all that waited: a request costs some hundred bytes whatever is in it."""
+SEND_INTERVAL_S = 1.0
+"""Time between two batches if the first took all waiting packets: a request itself costs some hundred bytes."""
 ASK_AFTER_S = 5.0
-"""A robot that has nothing to say asks for its correction, and shows that it is there."""
+"""A robot without waiting packets asks for its correction after this time, which also shows that it is alive."""
 FIRST_RETRY_S, LONGEST_RETRY_S = 0.5, 30.0
 
 
 def retry_delay_s(failures: int, rng: np.random.Generator) -> float:
-    """How long to wait after so many failures in a row: exponential backoff with full jitter.
+    """Delay after a number of consecutive failures: exponential backoff with full jitter.
 
-    Robots that lost one cloud at one instant do not come back at one instant.
+    The jitter keeps robots that lost the cloud at the same moment from returning at the same moment.
     """
     return float(rng.uniform(0.0, min(LONGEST_RETRY_S, FIRST_RETRY_S * 2.0 ** min(failures, 16))))
 
 
 class Sender:
-    """One request at a time, the oldest packets first; each is sent until the cloud has confirmed it."""
+    """Sends one request at a time, the oldest packets first, each packet until the cloud has confirmed it."""
 
     def __init__(
         self, outbox: Outbox, transport: BatchTransport, rng: np.random.Generator, clock: Callable[[], float],
         correct: Callable[[int, Correction], None], keep: Callable[[DetectorFile, bytes], None],
         refused: Callable[[bytes, str], None],
     ) -> None:  # fmt: skip
-        """Whom to tell, from where ``step`` is called: ``correct`` of the newest session's corrections and its
-        epoch, ``keep`` of detectors that were announced and fetched, ``refused`` of packets that the cloud will never
-        take, and why."""
+        """Callbacks run in the thread of ``step``: ``correct`` gets the epoch and correction of the newest session,
+        ``keep`` a downloaded detector, ``refused`` a refused packet and the reason."""
         self._outbox = outbox
         self._transport = transport
         self._rng = rng
@@ -48,31 +47,31 @@ class Sender:
         self._keep = keep
         self._refused = refused
         self._is_synchronized = False
-        self._most = MAXIMUM_BATCH_PACKETS
-        """In a batch."""
-        self._refused_there = 0
-        """How many packets the cloud has refused as far as this robot has heard."""
+        self._batch_packets = MAXIMUM_BATCH_PACKETS
+        """Largest number of packets in a batch; halved when the cloud refuses the size."""
+        self._known_refusals = 0
+        """Number of refused packets that the cloud has reported and this robot has read."""
         self._known: set[DetectorFile] = set()
-        """Detectors that were fetched, or cannot be."""
+        """Detectors that were downloaded, or cannot be."""
         self._correction = -1
         self._failures = 0
-        self._last_answer_s = -np.inf
+        self._last_reply_s = -np.inf
         self.sent_bytes = 0
-        """Of packets, those that were sent more than once included."""
+        """Bytes of packets, counted as often as they were sent."""
         self.confirmed = 0
         """Packets that the cloud has stored."""
         self.refusals = 0
         self.trouble: str | None = "connecting"
-        """Why nothing gets through; None: it does."""
+        """Why packets do not arrive; None if they do."""
         self.notice: str | None = None
-        """What became of packets of earlier starts that the cloud can no longer take; None: there were none."""
+        """Message about packets of earlier starts that belong to another mission; None if there were none."""
         self.refused_notice: str | None = None
-        """What the cloud says that it refused, some of it after it had confirmed it; None: nothing."""
+        """Message about refused packets, some of them refused after confirmation; None if there were none."""
         self.failure: Exception | None = None
-        """What ended ``run``."""
+        """The error that ended ``run``."""
 
     def run(self, stop: threading.Event) -> None:
-        """Work until ``stop`` is set or something ends it, as the cloud that turns the robot away: see ``failure``."""
+        """Send until ``stop`` is set or an error occurs, as a cloud that rejects the robot; see ``failure``."""
         try:
             while not stop.is_set():
                 stop.wait(self.step())
@@ -80,16 +79,16 @@ class Sender:
             self.failure = error
 
     def step(self) -> float:
-        """At most one batch and its answer; returns how many seconds the next step may wait.
+        """Send at most one batch and read the reply; returns the time until the next step, seconds.
 
         Raises:
-            CloudError: the cloud turns the robot away.
+            CloudError: the cloud rejects the robot.
             StateError: the outbox or its folder cannot be used, or the cloud lacks the beginning of this epoch.
         """
         try:
             return self._step()
         except UnavailableError as error:
-            self._is_synchronized = False  # its mission may be another one
+            self._is_synchronized = False  # the cloud may have opened another mission
             self.trouble = str(error)
             self._failures += 1
             return error.retry_after_s + retry_delay_s(self._failures, self._rng)
@@ -99,61 +98,63 @@ class Sender:
             self._synchronize()
             self._is_synchronized = True
             self.trouble = None
-        batch = self._outbox.batch(MAXIMUM_BATCH_BYTES, self._most)
+        batch = self._outbox.batch(MAXIMUM_BATCH_BYTES, self._batch_packets)
         if batch is None:
-            if self._clock() - self._last_answer_s >= ASK_AFTER_S:
+            if self._clock() - self._last_reply_s >= ASK_AFTER_S:
                 self._exchange((), None)
-            return EVERY_S
+            return SEND_INTERVAL_S
         is_all = len(batch.packets) >= self._outbox.waiting.packets
         try:
             self._exchange(batch.packets, batch)
         except OversizeError:
             if len(batch.packets) == 1:
                 raise
-            self._most = len(batch.packets) // 2
+            self._batch_packets = len(batch.packets) // 2
             return 0.0
-        return EVERY_S if is_all else 0.0
+        return SEND_INTERVAL_S if is_all else 0.0
 
     def _synchronize(self) -> None:
         state = self._transport.state()
-        in_vain = self._outbox.synchronize(state.expected)
-        for epoch, sequence in in_vain:
-            self._set_aside(epoch, sequence, f"epoch {epoch} is of another mission: the cloud lacks its beginning")
-        if in_vain:
-            self.notice = f"{len(in_vain)} packets of earlier starts are of another mission: set aside in refused"
-        self._hear(state)
+        orphans = self._outbox.synchronize(state.expected)
+        for epoch, sequence in orphans:
+            self._set_aside(
+                epoch, sequence, f"epoch {epoch} belongs to another mission: the cloud does not have its first packets"
+            )
+        if orphans:
+            self.notice = f"{len(orphans)} packets of earlier starts belong to another mission: moved to refused"
+        self._read_refusals(state)
         for epoch, sequence in state.expected.items():
             self.confirmed += self._outbox.acknowledge(epoch, sequence - 1)
 
-    def _hear(self, state: CloudState) -> None:
-        """Of refusals: one whose answer was lost, and what was found out after it was confirmed, is heard of here."""
+    def _read_refusals(self, state: CloudState) -> None:
+        """Set refused packets aside: those whose reply was lost, and those refused after they were confirmed."""
         for (epoch, sequence), reason in state.refused.items():
             self._set_aside(epoch, sequence, reason)
             self.refused_notice = (
                 f"packets of this robot that the cloud refused: {len(state.refused)}; the last is packet {sequence} of "
                 f"start {epoch}: {reason}"
             )
-        self._refused_there = len(state.refused)
+        self._known_refusals = len(state.refused)
 
     def _exchange(self, packets: Sequence[bytes], batch: PacketBatch | None) -> None:
         before = self.confirmed + self.refusals
         self.sent_bytes += sum(map(len, packets))
-        answer = self._transport.send(packets, self._correction)
-        self._last_answer_s = self._clock()
-        self._read(answer)
-        if batch is not None and answer.refusal is not None:
-            sequence = batch.first + answer.refusal.index
+        reply = self._transport.send(packets, self._correction)
+        self._last_reply_s = self._clock()
+        self._read(reply)
+        if batch is not None and reply.refusal is not None:
+            sequence = batch.first + reply.refusal.index
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)
-            self._set_aside(batch.epoch, sequence, answer.refusal.reason)
-            self._refused_there += 1  # heard of here: the whole list need not be asked for because of it
-        if answer.refusal is None and answer.refused != self._refused_there:
-            self._hear(self._transport.state())
+            self._set_aside(batch.epoch, sequence, reply.refusal.reason)
+            self._known_refusals += 1  # read here, so the whole list need not be requested
+        if reply.refusal is None and reply.refused != self._known_refusals:
+            self._read_refusals(self._transport.state())
         if batch is not None and self.confirmed + self.refusals == before:
-            raise UnavailableError("the cloud answers, but confirms nothing")
+            raise UnavailableError("the cloud replies, but confirms no packet")
         self._failures, self.trouble = 0, None
 
     def _set_aside(self, epoch: int, sequence: int, reason: str) -> None:
-        """One that waits is forgotten only once it is kept elsewhere: whatever comes between, it is not lost."""
+        """Store a waiting packet elsewhere before the outbox drops it, so that no interruption loses it."""
         data = self._outbox.packet(epoch, sequence)
         if data is None:
             return
@@ -161,24 +162,24 @@ class Sender:
         self._outbox.drop(epoch, sequence)
         self.refusals += 1
 
-    def _read(self, answer: HttpResponse) -> None:
+    def _read(self, reply: HttpResponse) -> None:
         try:
-            packets = [decode(data) for data in answer.packets]
+            packets = [decode(data) for data in reply.packets]
         except PacketError as error:
-            raise UnavailableError(f"the cloud's answer is broken: {error}") from error
+            raise UnavailableError(f"the cloud's reply is broken: {error}") from error
         for packet in packets:
             match packet.body:
                 case Acknowledgement(epoch=epoch, sequence=sequence):
                     self.confirmed += self._outbox.acknowledge(epoch, sequence)
-                # That of an earlier session, whose packets go first, is about another odometry.
-                case Correction() as news if packet.epoch == self._outbox.epoch and news.version > self._correction:
-                    self._correction = news.version
-                    self._correct(packet.epoch, news)
+                # A correction of an earlier session, whose packets are sent first, is about another odometry.
+                case Correction() as newest if packet.epoch == self._outbox.epoch and newest.version > self._correction:
+                    self._correction = newest.version
+                    self._correct(packet.epoch, newest)
                 case DetectorUpdate(file=file) if file not in self._known:
                     self._fetch(file)
 
     def _fetch(self, file: DetectorFile) -> None:
-        """The robot goes on with its old detector if there is no such file."""
+        """Download a detector; without the file the robot keeps its present one."""
         with suppress(CloudError):
             self._keep(file, self._transport.detector(file.channel, file.version))
         self._known.add(file)

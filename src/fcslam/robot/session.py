@@ -1,4 +1,4 @@
-"""One session of a robot: from a start with odometry at zero to its end, or to where the robot was lost."""
+"""One session of a robot: from a start with odometry at zero until it stops or is lost."""
 
 from collections.abc import Iterable
 
@@ -14,23 +14,23 @@ from fcslam.wire.messages import Body, Hello, Packet
 
 
 class SessionConfig(Settings):
-    """What turns sensor records into packets."""
+    """Settings of everything that turns sensor records into packets."""
 
-    lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM")
+    lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM of one robot")
     channels: tuple[Channel, ...] = Field(
-        default=tuple(Channel), min_length=1, description="what places are described by: lidar, camera"
+        default=tuple(Channel), min_length=1, description="sensors that describe places: lidar, camera"
     )
-    birdseye: BirdseyeConfig = Field(default=BirdseyeConfig(), description="binary features of LiDAR submaps")
-    views: ViewsConfig = Field(default=ViewsConfig(), description="binary features of camera images")
+    birdseye: BirdseyeConfig = Field(default=BirdseyeConfig(), description="binary descriptors of LiDAR submaps")
+    views: ViewsConfig = Field(default=ViewsConfig(), description="binary descriptors of camera images")
 
 
 class RobotSession:
-    """Turns sensor records into numbered packets; keeps every raw scan's pose for itself."""
+    """Turns sensor records into numbered packets; the poses of all scans stay on the robot."""
 
     def __init__(
         self, robot: str, epoch: int, time: float, view_extractor: ViewExtractor, config: SessionConfig
     ) -> None:
-        """``epoch`` counts the robot's sessions; packets bear no ``time`` before this."""
+        """``epoch`` counts the robot's sessions; no packet has a ``time`` before ``time``."""
         self.robot = robot
         self.epoch = epoch
         self.time = time
@@ -40,38 +40,38 @@ class RobotSession:
         self._config = config
         self._view_extractor = view_extractor
         self._views: list[CameraView] = []
-        """Those that wait for the submap around them."""
+        """Views that wait until the submap around them is complete."""
         self._submaps: dict[int, tuple[int, int]] = {}
-        """First and last keyscan of the submap that each camera place was sent with."""
+        """By keyscan of a camera place: first and last keyscan of the submap that it was sent with."""
         self._described: set[tuple[int, str]] = set()
-        """Keyscans of camera places that were sent, with the version of the detector."""
+        """Keyscan and detector version of every camera place that was sent."""
         self._laser: LaserModel | None = None
-        self._told: str | None = None
+        self._announced: str | None = None
         """Version of the camera's detector in the last hello."""
         self._sequence = 0
 
     def process_scan(self, scan: LaserScan, tracking: TrackingResult | None = None) -> list[Packet]:
-        """The packets that the next scan causes; ``tracking``: as the mapper saw it, if it has looked already."""
+        """Process the next scan, with its result of ``Mapper.localize`` if that was called; returns its packets."""
         self.time = max(self.time, scan.stamp)
         self._laser = scan.laser
-        news = self._news()
+        announcement = self._detector_announcement()
         step = self.mapper.process(scan, tracking)
         self.scan_poses.append(step.pose)
         self._view_extractor.set_scan(scan, step.pose)
-        return self._packets([*news, *self._bodies(step)])
+        return self._packets([*announcement, *self._bodies(step)])
 
     def process_image(self, image: CameraImage) -> None:
-        """Keep what an image shows until the submap around it is complete."""
+        """Describe an image and keep the view until the submap around it is complete."""
         view = self._view_extractor.describe(image)
         if view is not None:
             self._views.append(view)
 
     def finish(self) -> list[Packet]:
-        """The packets of what is still open."""
-        news, rest = self._news(), self.mapper.finish()
+        """End the session; returns the packets of open submaps."""
+        announcement, rest = self._detector_announcement(), self.mapper.finish()
         last = rest[-1:]
         bodies = [body for submap in rest for body in self._submap_bodies(submap, submap in last)]
-        return self._packets([*news, *bodies])
+        return self._packets([*announcement, *bodies])
 
     def _bodies(self, step: Step) -> list[Body]:
         bodies: list[Body] = []
@@ -84,22 +84,22 @@ class RobotSession:
         return bodies
 
     def _submap_bodies(self, submap: FinishedSubmap, at_end: bool = False) -> list[Body]:
-        """The robot's own closures to a submap, its LiDAR place, and the camera places on the way to its anchor."""
+        """Closures of a submap within this robot, its LiDAR place, and the camera places up to its anchor."""
         bodies: list[Body] = list(submap.closures)
         if Channel.LIDAR in self._config.channels:
             bodies.append(self._lidar_place(submap))
-        ripe = [view for view in self._views if at_end or view.keyscan <= submap.anchor]
-        self._views = self._views[len(ripe) :]
-        # Between two scans a robot may jump: a view whose surroundings no submap shows is no place.
-        shown = [view for view in ripe if submap.first <= view.keyscan <= submap.last]
+        complete = [view for view in self._views if at_end or view.keyscan <= submap.anchor]
+        self._views = self._views[len(complete) :]
+        # A view outside of every submap is no place: the robot may have jumped between two scans.
+        shown = [view for view in complete if submap.first <= view.keyscan <= submap.last]
         self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
         return [*bodies, *(self._camera_place(view) for view in shown)]
 
-    def _news(self) -> list[Body]:
-        """A hello, first of all and with another detector; then the camera places that this had not described yet."""
-        if self._laser is None or self._told == self._view_extractor.detector_version:
+    def _detector_announcement(self) -> list[Body]:
+        """A hello at the start and after a change of the detector, then the camera places that it describes again."""
+        if self._laser is None or self._announced == self._view_extractor.detector_version:
             return []
-        self._told = self._view_extractor.detector_version
+        self._announced = self._view_extractor.detector_version
         views = {view.keyscan: view for view in self._view_extractor.describe_again()} if self._submaps else {}
         self._views = [views.get(view.keyscan, view) for view in self._views]
         sent = [view for view in views.values() if view.keyscan in self._submaps]

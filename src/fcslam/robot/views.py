@@ -1,4 +1,4 @@
-"""Keyframe images: what the camera shows of a place, as descriptors with metric positions. The images stay here."""
+"""Camera views: descriptors of keyframe images with metric positions. The images stay on the robot."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,21 +22,33 @@ from fcslam.robot.image_buffer import ImageBuffer, ImageBufferConfig, KeyframeIm
 
 
 class ViewsConfig(Settings):
-    """Which images become places, and what is kept of them."""
+    """Which images become places, and which are kept."""
 
-    every_m: float = Field(default=1.0, gt=0.0, description="travel between two camera places [m]")
-    every_rad: float = Field(default=0.5, gt=0.0, description="or turn: half of what a camera sees is new [rad]")
-    fewest_keypoints: int = Field(default=20, ge=1, description="an image of a bare wall is no place")
-    ceiling_m: float = Field(default=3.0, gt=0.0, description="keypoints above this lie on no wall [m]")
-    detector: DetectorKind = Field(default=DetectorKind.ONNX, description="what describes images: a network or orb")
-    orb: OrbConfig = Field(default=OrbConfig(), description="settings of detector orb")
-    onnx: OnnxConfig = Field(default=OnnxConfig(), description="settings of detector onnx")
-    image_buffer: ImageBufferConfig = Field(default=ImageBufferConfig(), description="images kept for another detector")
+    every_m: float = Field(default=1.0, gt=0.0, description="travel after which an image becomes a camera place [m]")
+    every_rad: float = Field(
+        default=0.5,
+        gt=0.0,
+        description="turn after which an image becomes a camera place; at 0.5 rad about half of the view is new [rad]",
+    )
+    fewest_keypoints: int = Field(
+        default=20, ge=1, description="least number of keypoints with a position; an image with fewer is no place"
+    )
+    ceiling_m: float = Field(
+        default=3.0, gt=0.0, description="height of the ceiling above the floor; keypoints above it are dropped [m]"
+    )
+    detector: DetectorKind = Field(
+        default=DetectorKind.ONNX, description="detector of camera images: onnx (a network) or orb"
+    )
+    orb: OrbConfig = Field(default=OrbConfig(), description="settings of the detector orb")
+    onnx: OnnxConfig = Field(default=OnnxConfig(), description="settings of the detector onnx")
+    image_buffer: ImageBufferConfig = Field(
+        default=ImageBufferConfig(), description="images that a new detector describes again"
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """One keyframe image, as far as it leaves the robot."""
+    """The part of one keyframe image that leaves the robot."""
 
     keyscan: int
     keypoints: NDArray[np.float32]
@@ -47,13 +59,13 @@ class CameraView:
 
 
 class ViewExtractor:
-    """Picks images that show something new and turns them into views."""
+    """Picks images that show something new and describes them."""
 
     def __init__(self, config: ViewsConfig) -> None:
         """Load the detector.
 
         Raises:
-            FeatureError: it is a network whose weights cannot be used.
+            FeatureError: the detector is a network whose weights cannot be used.
         """
         self._config = config
         self._detector = make_detector(config.detector, config.orb, config.onnx)
@@ -65,17 +77,20 @@ class ViewExtractor:
 
     @property
     def detector_version(self) -> str:
-        """Of the descriptors."""
+        """Version of the detector."""
         return self._detector.version
 
     def set_scan(self, scan: LaserScan, pose: ScanPose) -> None:
-        """The robot has seen this scan from this pose."""
+        """Set the newest scan and its pose."""
         self._scan, self._pose = scan, pose
 
     def describe(self, image: CameraImage) -> CameraView | None:
-        """The view in the next image; None if it shows little, or little that is new.
+        """Describe the next image.
 
-        Between the last scan and the image the robot moved as its odometry says, or not at all if that is not known.
+        The motion between the last scan and the image is that of the odometry, or zero if the image has none.
+
+        Returns:
+            The view, or None if the image has too few keypoints, cannot be decoded, or shows little that is new.
         """
         if self._scan is None or self._pose is None:
             return None
@@ -92,44 +107,44 @@ class ViewExtractor:
         ends = se2.transform(se2.inverse(T_scan_image), np.vstack((returns.origin, returns.points)))
         T_keyscan_image = se2.compose(self._pose.T_keyscan_base, T_scan_image)
         surroundings = LidarView(ends[1:], ends[0], spacing_rad)
-        shot = KeyframeImage(self._pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
-        view = self._describe(shot, picture)
+        keyframe = KeyframeImage(self._pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
+        view = self._describe(keyframe, picture)
         if view is not None:
-            self._image_buffer.add(shot)
+            self._image_buffer.add(keyframe)
         return view
 
     def set_detector(self, file: DetectorFile, path: Path) -> None:
-        """Look with a network that was announced and fetched from now on.
+        """Use a downloaded network from now on.
 
         Raises:
-            FeatureError: it is another file, or cannot be used; nothing has changed.
+            FeatureError: the file is not the announced one, or cannot be used; nothing has changed.
         """
         self._detector = open_detector_file(file, path, self._config.onnx)
 
     def reset(self) -> None:
-        """What was seen is of a session that has ended."""
+        """Start a new session: forget all scans and images."""
         self._image_buffer = ImageBuffer(self._config.image_buffer)
         self._scan = self._pose = self._last = None
 
     def describe_again(self) -> list[CameraView]:
-        """The views in the images that are still here, oldest first, as the detector sees them now."""
-        pictures = ((shot, decode_grey(shot.encoded)) for shot in self._image_buffer)
-        views = (self._describe(shot, picture) for shot, picture in pictures if picture is not None)
+        """Describe all buffered images with the present detector, oldest first."""
+        pictures = ((image, decode_grey(image.encoded)) for image in self._image_buffer)
+        views = (self._describe(image, picture) for image, picture in pictures if picture is not None)
         return [view for view in views if view is not None]
 
-    def _describe(self, shot: KeyframeImage, picture: GreyImage) -> CameraView | None:
+    def _describe(self, image: KeyframeImage, picture: GreyImage) -> CameraView | None:
         features = self._detector.detect(picture)
         positions, placed = locate_keypoints(
-            features.keypoints_px, shot.camera, shot.surroundings, self._config.ceiling_m
+            features.keypoints_px, image.camera, image.surroundings, self._config.ceiling_m
         )
         if placed.sum() < self._config.fewest_keypoints:
             return None
-        positions[:, :2] = se2.transform(shot.T_keyscan_image, positions[:, :2])
+        positions[:, :2] = se2.transform(image.T_keyscan_image, positions[:, :2])
         keypoints, codes = frozen(positions[placed], np.float32), frozen(features.descriptors[placed], np.uint8)
-        return CameraView(shot.keyscan, keypoints, codes, self._detector.version)
+        return CameraView(image.keyscan, keypoints, codes, self._detector.version)
 
     def _is_new(self, keyscan: int, T_odom_base: FloatArray) -> bool:
-        """A keyscan has one view at most, which names its place."""
+        """Whether the robot moved enough since the last view; a keyscan has one view at most."""
         if self._last is None:
             return True
         seen_from, T_odom_last = self._last
