@@ -26,7 +26,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-IGNORED = ("config.yaml", "settings.yaml", "mission.json", "*.log")
+IGNORED = ("config.yaml", "settings.yaml", "simulation.yaml", "mission.json", "*.log")
 """Configuration with its comments, and files that hold times of the clock."""
 DOWNLINK = re.compile(r"downlink|acknowledgement|correction|release|detector_update")
 

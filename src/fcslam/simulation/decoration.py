@@ -1,4 +1,4 @@
-"""What a building looks like: materials, heights of furniture, pictures on walls. The same for all robots in it."""
+"""Appearance of a building: materials, heights of furniture, pictures on walls. It is the same for all robots."""
 
 from dataclasses import dataclass
 
@@ -12,47 +12,48 @@ from fcslam.simulation.textures import Image
 WALL_HEIGHT_M = 2.5
 DOOR_HEIGHT_M = 2.05
 _LOW_M, _HIGH_M = 0.6, 1.9
-"""Furniture is between these heights: always taller than a laser is mounted."""
+"""Lowest and highest furniture, always taller than the mounting height of a laser."""
 
 _WALLS, _FLOORS, _FRONTS = 8, 6, 10
-"""Kinds of wall, floor and furniture; every picture is its own."""
+"""Number of different walls, floors and furniture fronts. Every picture is unique."""
 _PICTURE_OFF_M = WALL_M / 2.0 + 0.01
 _SIGN_M = 0.24
 
 
 @dataclass(frozen=True, slots=True)
 class WallPicture:
-    """Something flat on a wall."""
+    """A picture or a sign on a wall."""
 
     image: Image
     centre: tuple[float, float, float]
+    """In ``building``, metres."""
     size: tuple[float, float]
     """Width and height, metres."""
     heading_rad: float
-    """Of its width."""
+    """Direction of its width."""
 
 
 @dataclass(frozen=True, slots=True)
 class Decoration:
-    """All that a camera sees of a building and a laser does not."""
+    """The appearance of a building, which only cameras see."""
 
     walls: tuple[Image, ...]
     floors: tuple[Image, ...]
     fronts: tuple[Image, ...]
-    """Of furniture."""
+    """Fronts of furniture."""
     corridor_floor: Image
     ceiling: Image
     looks: tuple[int, ...]
-    """For each piece of the floor plan which of ``walls`` or ``fronts`` it has."""
+    """Index into ``walls`` or ``fronts`` for each piece of the floor plan."""
     heights_m: tuple[float, ...]
-    """For each piece of the floor plan."""
+    """Height of each piece of the floor plan."""
     room_floors: tuple[int, ...]
-    """For each room which of ``floors`` it has."""
+    """Index into ``floors`` for each room."""
     pictures: tuple[WallPicture, ...]
 
 
 def decorate(plan: FloorPlan, rng: np.random.Generator) -> Decoration:
-    """Choose how everything looks; pieces keep their looks when furniture moves."""
+    """Draw the appearance of everything; a piece keeps its appearance when furniture moves."""
     floors = [(textures.planks, textures.tiles, textures.carpet)[k % 3](rng) for k in range(_FLOORS)]
     looks = [int(rng.integers(_WALLS if _is_wall(piece) else _FRONTS)) for piece in plan.pieces]
     heights = [_height_m(piece, rng) for piece in plan.pieces]
@@ -81,7 +82,7 @@ def _height_m(piece: Piece, rng: np.random.Generator) -> float:
 
 
 def _pictures(room: Room, rng: np.random.Generator) -> list[WallPicture]:
-    """On the walls inside a room, and outside beside its door."""
+    """Pictures on the walls inside a room, and outside beside its door."""
     inward = float(np.sign(room.inside[1] - room.doorway[1]))
     front, back = (room.low[1], room.high[1]) if inward > 0 else (room.high[1], room.low[1])
     (west, _), (east, _) = room.low, room.high
@@ -106,7 +107,7 @@ def _pictures(room: Room, rng: np.random.Generator) -> list[WallPicture]:
 
 
 def _between(low: float, high: float, width: float, rng: np.random.Generator) -> float:
-    """Where a picture's middle may be on a wall."""
+    """Draw the coordinate of a picture's centre on a wall from ``low`` to ``high``."""
     margin = 0.5 * width + 0.1
     return float(rng.uniform(low + margin, high - margin))
 

@@ -1,7 +1,7 @@
-"""The free space of a floor plan, and shortest paths on it that keep away from what stands around.
+"""The drivable space of a floor plan, and shortest paths in it that keep clear of obstacles.
 
-The clearance of a point is its distance from the nearest wall or piece of furniture. It is known on a fine grid; paths
-are searched for on a coarser one, whose points are numbered, and then straightened.
+The clearance of a point is its distance to the nearest wall or piece of furniture, computed on a fine grid. Paths are
+searched on a coarser grid, whose points are numbered, and then straightened.
 """
 
 from functools import cached_property
@@ -19,31 +19,33 @@ from fcslam.simulation.floorplan import FloorPlan, PieceKind
 
 ROBOT_RADIUS_M = 0.25
 _CLEARANCE_M = ROBOT_RADIUS_M + 0.05
-"""Robots plan with this distance; the margin is more than what the grid rounds away."""
+"""Smallest clearance of a path; the margin exceeds the rounding of the grid."""
 _COMFORT_M = 0.8
-"""From this clearance on a metre costs what it is long."""
+"""Clearance above which a metre has its plain cost of 1."""
 _NARROW = 2.0
-"""What a metre costs on top at the smallest clearance."""
+"""Additional cost of a metre at the smallest clearance."""
 _CELL_M = 0.05
+"""Side of a cell of the fine grid."""
 _STEP = 2
-"""Cells between points of the search."""
+"""Cells between two points of the search grid."""
 _LOOK_AHEAD_M = 20.0
-"""Straight legs are no longer than a path of this length."""
+"""Longest piece of path that a straight leg replaces."""
 _DETOUR = 1.05
-"""A straight leg may cost so much more than the path it replaces, and _CORNER_M: robots that turn lose time."""
+"""A straight leg may cost this factor more than the path it replaces, plus _CORNER_M, because turns take time."""
 _CORNER_M = 0.2
+"""Cost of a corner, in metres."""
 
 Cells = NDArray[np.bool_]
 
 
 class DrivableSpace:
-    """Where the middle of a robot may be: the largest connected part of what has enough clearance."""
+    """Positions of a robot's centre: the largest connected area with enough clearance."""
 
     def __init__(self, plan: FloorPlan) -> None:
-        """Of ``plan``, with the furniture as it stands there.
+        """Compute the drivable space of ``plan`` with its furniture.
 
         Raises:
-            SimulationError: there is none.
+            SimulationError: the plan has no drivable space.
         """
         self._clearance_m = _CELL_M * distance_transform_edt(~_obstacles(plan))
         parts, count = label(self._clearance_m[::_STEP, ::_STEP] >= _CLEARANCE_M, np.ones((3, 3)))
@@ -54,19 +56,19 @@ class DrivableSpace:
         self._inside: Cells = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
         rows, columns = np.nonzero(self._inside)
         self.points: FloatArray = frozen((np.column_stack((columns, rows)) * _STEP + 0.5) * _CELL_M)
-        """Points (N, 2) of the free space, 0.1 m apart."""
+        """Points (N, 2) of the search grid, 0.1 m apart, metres in ``building``."""
         self._nearby = KDTree(self.points)
 
     def nearest(self, point: FloatArray) -> int:
-        """The number of the free point next to ``point`` (2,)."""
+        """Number of the grid point nearest to ``point`` (2,)."""
         return int(self._nearby.query(point)[1])
 
     def costs(self, start: int) -> FloatArray:
-        """What driving from free point ``start`` to each costs, shape (N,): metres, more of them in narrow places."""
+        """Costs (N,) of the cheapest paths from grid point ``start`` to all points: metres, more in narrow places."""
         return np.asarray(dijkstra(self._graph, indices=np.array(start)))
 
     def path(self, start: int, end: int) -> FloatArray:
-        """Corners (K, 2) of a cheap path of straight legs between two free points, both included."""
+        """Corners (K, 2) of a cheap path of straight legs between two grid points, both included."""
         _, before = dijkstra(self._graph, indices=np.array(start), return_predecessors=True)
         numbers = [end]
         while numbers[-1] != start:
@@ -74,7 +76,7 @@ class DrivableSpace:
         return self._straightened(self.points[numbers[::-1]])
 
     def leg_costs(self, start: FloatArray, ends: FloatArray) -> FloatArray:
-        """What straight legs (M,) from ``start`` (2,) to ``ends`` (M, 2) cost; infinite where a robot would touch."""
+        """Costs (M,) of straight legs from ``start`` (2,) to ``ends`` (M, 2); infinite if a robot would collide."""
         lengths = np.linalg.norm(ends - start, axis=1)
         shares = np.linspace(0.0, 1.0, 2 + int(lengths.max(initial=0.0) / _CELL_M))
         samples = start + shares[:, None, None] * (ends - start)
@@ -85,7 +87,7 @@ class DrivableSpace:
         return np.where(np.min(clearance_m, axis=0) >= _CLEARANCE_M, costs, np.inf)
 
     def _straightened(self, path: FloatArray) -> FloatArray:
-        """The path (K, 2) with as few corners as cost little: the clearance counts as it did in the search."""
+        """Remove corners from a path (K, 2) as long as the cost hardly grows; clearance counts as in the search."""
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
         clearance_m = map_coordinates(self._clearance_m, (path / _CELL_M - 0.5).T[::-1], order=1, mode="nearest")
         price = _price(clearance_m)
@@ -102,7 +104,7 @@ class DrivableSpace:
 
     @cached_property
     def _graph(self) -> csr_array:
-        """Costs (N, N) of the steps between neighbouring free points, diagonal ones included."""
+        """Costs (N, N) of the steps between neighbouring grid points, diagonal steps included."""
         inside = self._inside
         numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
         price = _price(self._clearance_m[::_STEP, ::_STEP])
@@ -120,13 +122,13 @@ class DrivableSpace:
 
 
 def _price(clearance_m: FloatArray) -> FloatArray:
-    """What a metre costs."""
+    """Cost of a metre at the given clearances, same shape."""
     tightness = np.clip((_COMFORT_M - clearance_m) / (_COMFORT_M - _CLEARANCE_M), 0.0, 1.0)
     return np.asarray(1.0 + _NARROW * tightness**2)
 
 
 def _obstacles(plan: FloorPlan) -> Cells:
-    """Cells that something stands in, shape (H, W), row 0 in the south."""
+    """Occupied cells, shape (H, W), row 0 in the south."""
     width, height = (int(np.ceil(size / _CELL_M)) for size in plan.size_m)
     occupied = np.zeros((height, width), dtype=bool)
     reach = _CELL_M * np.sqrt(0.5)
@@ -143,7 +145,7 @@ def _obstacles(plan: FloorPlan) -> Cells:
 
 
 def _outside_m(points: FloatArray, outline: FloatArray) -> FloatArray:
-    """How far points (..., 2) lie outside of each side of a counter-clockwise outline (K, 2), shape (..., K)."""
+    """Signed distances (..., K) of points (..., 2) to the sides of an outline (K, 2), positive outside."""
     along = np.roll(outline, -1, axis=0) - outline
     normals = np.column_stack((along[:, 1], -along[:, 0])) / np.linalg.norm(along, axis=1)[:, None]
     return np.asarray(points @ normals.T - np.sum(normals * outline, axis=1))

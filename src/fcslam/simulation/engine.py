@@ -1,4 +1,4 @@
-"""MuJoCo and software GL, loaded when they are needed. Rays need MuJoCo alone, pictures a GL library as well."""
+"""Loads MuJoCo and software GL on demand. Ray casting needs MuJoCo only; rendering also needs a GL library."""
 
 import importlib
 import os
@@ -12,14 +12,14 @@ from fcslam.errors import SimulationError
 _GL = "MUJOCO_GL"
 _BACKENDS = ("egl", "osmesa")
 GL_LOCK = RLock()
-"""Robots are simulated side by side in threads. Whoever loads a library or calls GL does so alone: Mesa's software
-renderer looks through what all contexts of the process are drawing, without asking whether one of them is at it."""
+"""Serialises library loading and GL calls of the robots' threads. Mesa's software renderer reads the state of all
+contexts of the process without a lock."""
 
 _PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
 
 
 def mujoco() -> Any:
-    """The module; it is imported without GL, which it would otherwise look for at once.
+    """Import ``mujoco`` without GL, which it would otherwise load at import.
 
     Raises:
         SimulationError: it is not installed.
@@ -40,7 +40,7 @@ def mujoco() -> Any:
 
 
 def gl_context(width: int, height: int) -> Any:
-    """A current off-screen GL context: EGL, or OSMesa where there is no EGL; MUJOCO_GL asks for one of them.
+    """Make an off-screen GL context current: EGL, or OSMesa without EGL. MUJOCO_GL selects one of them.
 
     Raises:
         SimulationError: there is no GL library.
@@ -48,7 +48,7 @@ def gl_context(width: int, height: int) -> Any:
     mujoco()
     wanted = os.environ.get(_GL, "").lower()
     for backend in (wanted,) if wanted in _BACKENDS else _BACKENDS:
-        # Without their library these modules fail in ways of their own: ImportError, AttributeError, GL's errors.
+        # Without their library these modules raise ImportError, AttributeError or errors of GL.
         with suppress(Exception):
             context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             context.make_current()

@@ -1,7 +1,7 @@
-"""A floor plan: walls with doors, and furniture, as outlines of what stands there.
+"""A floor plan: outlines of walls, doors and furniture.
 
-Its sizes are drawn by a random generator, so that no two corridors are alike, but the doors repeat as in any building.
-Coordinates are metres in the coordinate frame ``building``, whose origin is the south-west corner.
+A random generator draws the sizes, so that corridors differ, but doors repeat as in real buildings. Coordinates are
+metres in the coordinate frame ``building``, whose origin is the south-west corner.
 """
 
 from collections.abc import Sequence
@@ -16,42 +16,44 @@ from fcslam.simulation.layouts import Lane, Layout, Row, draw_layout
 from fcslam.simulation.options import Building
 
 WALL_M = 0.12
+"""Thickness of a wall."""
 DOOR_M = 1.0
+"""Width of a door."""
 CLEARANCE_M = 0.5
-"""Furniture keeps this far from the corridors' centre lines and the ways into rooms."""
+"""Distance of furniture from the centre lines of corridors and the entrances of rooms."""
 
 _ATTEMPTS = 20
-"""Tries to place a piece of furniture before it is left out."""
+"""Attempts to place a piece of furniture before it is omitted."""
 _SHIFT_M, _TURN_RAD = 0.4, 0.3
-"""Standard deviations of what moving does to a piece of furniture."""
+"""Standard deviations of the shift and the turn of a moved piece of furniture."""
 
 
 class PieceKind(StrEnum):
-    """What a piece is."""
+    """Kinds of pieces."""
 
     WALL = "wall"
     CABINET = "cabinet"
     COLUMN = "column"
     LINTEL = "lintel"
-    """The wall above a door: robots drive and look under it."""
+    """The wall above a door; robots and LiDAR beams pass under it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Something that stands in the building, seen from above."""
+    """A wall or a piece of furniture, seen from above."""
 
     kind: PieceKind
     outline: FloatArray
-    """Corners counter-clockwise: (4, 2) of a rectangle, (8, 2) of a column."""
+    """Corners counter-clockwise, metres: (4, 2) of a rectangle, (8, 2) of a column."""
 
     @property
     def centre(self) -> FloatArray:
-        """Its middle, shape (2,)."""
+        """Centre, shape (2,)."""
         return np.asarray(self.outline.mean(axis=0))
 
     @property
     def size(self) -> tuple[float, float]:
-        """Length along its first side and across; a column's diameter twice."""
+        """Length and width, metres; for a column the diameter twice."""
         if self.kind is PieceKind.COLUMN:
             diameter = float(np.linalg.norm(self.outline[4] - self.outline[0]))
             return diameter, diameter
@@ -60,19 +62,19 @@ class Piece:
 
     @property
     def heading_rad(self) -> float:
-        """Of its first side."""
+        """Direction of the first side."""
         along = self.outline[1] - self.outline[0]
         return float(np.arctan2(along[1], along[0]))
 
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A room with one door, and a straight way in that furniture keeps clear of."""
+    """A room with one door and a straight entrance path that furniture keeps clear of."""
 
     doorway: FloatArray
-    """The point on the corridor's centre line in front of the door, shape (2,)."""
+    """Start of the entrance path, on the corridor's centre line in front of the door, shape (2,)."""
     inside: FloatArray
-    """The other end of this way, shape (2,)."""
+    """End of the entrance path, shape (2,)."""
     low: FloatArray
     """The south-west corner, shape (2,)."""
     high: FloatArray
@@ -81,30 +83,30 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
-    """What reflects a laser beam, and where robots can drive."""
+    """Obstacles, corridors and rooms of one floor."""
 
     size_m: tuple[float, float]
     """From west to east and from south to north."""
     pieces: tuple[Piece, ...]
     segments: FloatArray
-    """Ends x1 y1 x2 y2 of every side of a wall or a piece of furniture, shape (S, 4)."""
+    """Sides of walls and furniture at the laser's height: x1 y1 x2 y2, shape (S, 4)."""
     lanes: tuple[Lane, ...]
     """Centre lines of the corridors."""
     rooms: tuple[Room, ...]
 
     @property
     def floor_m2(self) -> float:
-        """Floor area, that under the walls included."""
+        """Floor area, including the area under walls."""
         return self.size_m[0] * self.size_m[1]
 
 
 def draw_floor_plan(rng: np.random.Generator, building: Building = Building.DEFAULT) -> FloorPlan:
-    """A building, by default of about 22 m by 17 m; the same generator state gives the same one."""
+    """Draw a building, by default about 22 m by 17 m; the same generator state gives the same one."""
     return build(draw_layout(building, rng), rng)
 
 
 def build(layout: Layout, rng: np.random.Generator) -> FloorPlan:
-    """Walls, doors and furniture for a layout, one's own for instance."""
+    """Build walls, doors and furniture for a layout."""
     walls = [_wall(0, 0, layout.width, 0), _wall(0, layout.height, layout.width, layout.height)]
     walls += [_wall(x, 0, x, layout.height) for x in (0.0, layout.width)]
     pieces = [Piece(PieceKind.WALL, outline) for outline in walls]
@@ -119,9 +121,9 @@ def build(layout: Layout, rng: np.random.Generator) -> FloorPlan:
 
 
 def move_furniture(plan: FloorPlan, share: float, rng: np.random.Generator) -> FloorPlan:
-    """The same building after ``share`` of its rooms' furniture was shifted and turned a little.
+    """Shift and turn a ``share`` of the furniture in rooms a little.
 
-    Every piece stays in its room and clear of the way in; what finds no such place stays where it was.
+    Every piece stays in its room and clear of the entrance; a piece without such a position stays where it was.
     """
     moved = [
         _moved(piece, room, rng) if (room := _room_of(piece, plan)) and rng.random() < share else piece
@@ -142,7 +144,7 @@ def _moved(piece: Piece, room: Room, rng: np.random.Generator) -> Piece:
 
 
 def _room_of(piece: Piece, plan: FloorPlan) -> Room | None:
-    """The room in which a piece of furniture stands; None for walls and for what stands in a corridor."""
+    """The room of a piece of furniture; None for walls and for furniture in corridors."""
     if piece.kind not in (PieceKind.CABINET, PieceKind.COLUMN):
         return None
     centre = piece.centre
@@ -175,7 +177,7 @@ def _build_row(row: Row, layout: Layout, rng: np.random.Generator) -> tuple[list
 
 
 def _furniture(room: Room, rng: np.random.Generator) -> list[Piece]:
-    """A few tables, cabinets and columns that leave the way through the door free."""
+    """A few tables, cabinets and columns that leave the entrance free."""
     path = (room.doorway, room.inside)
     pieces = []
     for _ in range(rng.integers(2, 5)):
@@ -192,7 +194,7 @@ def _furniture(room: Room, rng: np.random.Generator) -> list[Piece]:
 
 
 def _corridor_cabinets(layout: Layout, paths: list[Lane], rng: np.random.Generator) -> list[Piece]:
-    """Cabinets along the corridors' walls: without them a corridor would not tell how far along it a robot is."""
+    """Cabinets along the walls of corridors. Without them, a corridor would not constrain the position along it."""
     pieces = []
     for _ in range(layout.cabinets):
         lane = rng.integers(len(layout.lanes))
@@ -209,7 +211,7 @@ def _corridor_cabinets(layout: Layout, paths: list[Lane], rng: np.random.Generat
 
 
 def _segments(pieces: Sequence[Piece]) -> FloatArray:
-    """The sides of everything that a beam at the laser's height meets, shape (S, 4)."""
+    """Sides of all pieces at the laser's height, shape (S, 4)."""
     return frozen(np.concatenate([_sides(piece.outline) for piece in pieces if piece.kind is not PieceKind.LINTEL]))
 
 
@@ -233,7 +235,7 @@ def _rectangle(size: Sequence[float] | FloatArray, heading_rad: float) -> FloatA
 
 
 def _rotation(heading_rad: float) -> FloatArray:
-    """What points (N, 2) are multiplied by from the right to turn them."""
+    """Rotation matrix (2, 2) to multiply points (N, 2) by from the right."""
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     return np.array([[cos, sin], [-sin, cos]])
 

@@ -1,4 +1,4 @@
-"""What a fleet could have known without any error: relations between its scans, and the map of what its beams met."""
+"""Ground truth of a simulated fleet: relations between scans, and the map of all surfaces that its beams hit."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,13 +18,13 @@ from fcslam.storage.files import write_file
 RESOLUTION_M = 0.05
 
 _STEP_M, _TURN_RAD = 0.2, 0.2
-"""Scans closer together add next to nothing to the map."""
+"""Distance and turn between the scans that are drawn; closer scans add almost nothing to the map."""
 _INTO_M = 1e-3
-"""A beam ends on a surface; the cell is that of the wall behind it."""
+"""A beam is extended by this, so that its end falls into the cell of the wall, not of the free space before it."""
 _MARGIN = 2
-"""Cells around the building."""
+"""Unknown cells around the building."""
 _FRACTION_BITS = 8
-"""Of cells, when beams are drawn."""
+"""Fractional bits of OpenCV's fixed-point coordinates, when beams are drawn."""
 
 
 class HasTruePoses(Protocol):
@@ -32,17 +32,17 @@ class HasTruePoses(Protocol):
 
     @property
     def stamps(self) -> FloatArray:
-        """Of its scans, shape (N,)."""
+        """Stamps of its scans, shape (N,), seconds."""
 
     @property
     def T_building_base(self) -> FloatArray:
-        """The truth at these stamps, shape (N, 3)."""
+        """True poses at these stamps, shape (N, 3)."""
 
 
 def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -> None:
     """Write ``ground_truth/relations``, ``map.pgm`` and ``map.yaml`` into ``folder``.
 
-    Where each robot was stands in its recording. The relations let a map be measured without a common frame.
+    True poses are in each robot's recording. The relations measure a map without a common coordinate frame.
 
     Raises:
         SimulationError: MuJoCo is missing.
@@ -58,7 +58,7 @@ def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Gener
 def true_relations(
     robots: Sequence[HasTruePoses], rng: np.random.Generator, count: int = 2000, reach_m: float = 5.0
 ) -> Relations:
-    """Up to ``count`` true relations between scans of any robots less than ``reach_m`` and more than 20 s apart."""
+    """Draw up to ``count`` true relations between scans of any robots, within ``reach_m`` and more than 20 s apart."""
     stamps = np.concatenate([robot.stamps for robot in robots])
     poses = np.concatenate([robot.T_building_base for robot in robots])
     first, second = rng.integers(0, len(stamps), (2, 50 * count))
@@ -105,14 +105,14 @@ def _draw_beams(robot: SimulatedRobot, passed: Cells, hit: Cells) -> None:
 
 
 def _spaced(poses: FloatArray) -> FloatArray:
-    """Those of the poses (N, 3) at which the robot had gone or turned a step further."""
+    """Select poses (N, 3) with at least a step of distance or turn between them."""
     x, y, turn = se2.relative(poses).T
     steps = np.insert(np.cumsum(np.hypot(x, y) / _STEP_M + np.abs(turn) / _TURN_RAD), 0, 0.0)
     return poses[np.unique(np.floor(steps), return_index=True)[1]]
 
 
 def _beams(ranges_m: FloatArray, laser: LaserModel, T_building_base: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the beams that hit something start (2,) and end (N, 2), in cells."""
+    """Start (2,) and ends (N, 2) of the beams that hit a surface, in cells."""
     x, y, heading = se2.compose(T_building_base, np.array(laser.T_base_laser))
     returned = ranges_m < laser.max_range_m
     angles = heading + laser.angles_rad()[returned]

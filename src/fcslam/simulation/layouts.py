@@ -1,4 +1,4 @@
-"""Where corridors and rooms of a building lie: four kinds of building, each drawn anew from every seed.
+"""Layouts of corridors and rooms for four kinds of building, drawn from a random generator.
 
     default
     +--------+------+----------+------+      north rooms
@@ -25,7 +25,7 @@ from fcslam.records import FloatArray
 from fcslam.simulation.options import Building
 
 Lane = tuple[FloatArray, FloatArray]
-"""Ends (2,) of a corridor's centre line."""
+"""Both ends (2,) of a corridor's centre line, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +33,19 @@ class Row:
     """Rooms side by side whose doors open to one corridor."""
 
     x: tuple[float, float]
+    """West and east end."""
     back: float
+    """y of the wall away from the corridor."""
     front: float
+    """y of the wall with the doors."""
     lane: float
+    """y of the corridor's centre line."""
     rooms: int
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What a floor plan is built from."""
+    """Corridors and rows of rooms of a building; lengths in metres."""
 
     width: float
     height: float
@@ -50,15 +54,15 @@ class Layout:
     rows: tuple[Row, ...]
     lanes: tuple[Lane, ...]
     door_limits: tuple[float, float]
-    """Where doors may be, between the west and the east corridor."""
+    """Lowest and highest x of a door."""
     cabinets: int
-    """Tries to place a cabinet in a corridor."""
+    """Attempts to place a cabinet in a corridor."""
     alike: bool = False
-    """Rooms of one size, every door in the middle of its room."""
+    """Whether all rooms have one size and a door in the middle."""
 
 
 def draw_layout(building: Building, rng: np.random.Generator) -> Layout:
-    """A layout; the same generator state gives the same one."""
+    """Draw a layout; the same generator state gives the same one."""
     if building is Building.DEFAULT:
         return _two_loops(rng)
     if building is Building.OFFICE:

@@ -1,4 +1,4 @@
-"""Light in the building: where lamps hang, which of them burn, and how bright it is without them."""
+"""Light in the building: positions of lamps, failed lamps, and ambient light."""
 
 from dataclasses import dataclass
 
@@ -10,22 +10,23 @@ from fcslam.simulation.options import Lighting
 
 LAMP_HEIGHT_M = 2.4
 _LAMP_SPACING_M = 6.0
-"""Along a corridor."""
+"""Distance of lamps along a corridor, about."""
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """All light of one robot's world."""
+    """The light during one robot's recording."""
 
     lamps: FloatArray
-    """Where those hang that burn, shape (L, 3)."""
+    """Positions of the working lamps in ``building``, shape (L, 3), metres."""
     lamp_rgb: tuple[float, float, float]
+    """Intensity of a lamp, each colour in [0, 1]."""
     ambient_rgb: tuple[float, float, float]
-    """What comes from everywhere."""
+    """Intensity of the ambient light, each colour in [0, 1]."""
 
 
 def light_of(plan: FloorPlan, lighting: Lighting, rng: np.random.Generator) -> Light:
-    """The lamps of a building under one kind of lighting; the generator says which of them fail."""
+    """Light a building; the generator chooses the lamps that fail."""
     lamps = _lamps(plan)
     if lighting is Lighting.EVENING:
         return Light(lamps, (0.52, 0.40, 0.24), (0.14, 0.11, 0.09))
@@ -36,7 +37,7 @@ def light_of(plan: FloorPlan, lighting: Lighting, rng: np.random.Generator) -> L
 
 
 def _lamps(plan: FloorPlan) -> FloatArray:
-    """One in the middle of every room, and some along each corridor, shape (L, 3)."""
+    """Positions of lamps, one in the middle of every room and some along each corridor, shape (L, 3)."""
     points = [(room.low + room.high) / 2.0 for room in plan.rooms]
     for start, end in plan.lanes:
         count = max(2, round(float(np.linalg.norm(end - start)) / _LAMP_SPACING_M) + 1)

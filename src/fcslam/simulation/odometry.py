@@ -1,4 +1,4 @@
-"""How wheel odometry goes wrong."""
+"""Errors of simulated wheel odometry."""
 
 import numpy as np
 from pydantic import Field
@@ -9,27 +9,41 @@ from fcslam.records import FloatArray
 
 
 class OdometryNoiseSettings(Settings):
-    """How wheel odometry goes wrong: chance along the way, and a bias drawn once for each robot."""
+    """Errors of wheel odometry: noise along the path, and biases drawn once for each robot."""
 
     travel_noise_m: float = Field(
-        default=0.01, ge=0.0, description="standard deviation after 1 m; grows with the square root"
+        default=0.01,
+        ge=0.0,
+        description="standard deviation of the measured distance after 1 m, grows with the root of the distance [m]",
     )
-    heading_noise_rad: float = Field(default=0.01, ge=0.0, description="standard deviation of the heading after 1 m")
+    heading_noise_rad: float = Field(
+        default=0.01,
+        ge=0.0,
+        description="standard deviation of the heading after 1 m, grows with the root of the distance [rad]",
+    )
     turn_noise_rad: float = Field(
-        default=0.02, ge=0.0, description="standard deviation of the heading after turning 1 rad"
+        default=0.02,
+        ge=0.0,
+        description="standard deviation of the heading after a turn of 1 rad, grows with the root of the turn [rad]",
     )
     scale_bias: float = Field(
-        default=0.01, ge=0.0, description="standard deviation of the wrong scale of travel and of turns"
+        default=0.01, ge=0.0, description="standard deviation of the relative scale error of distances and of turns"
     )
-    veer_bias_rad_m: float = Field(default=0.003, ge=0.0, description="standard deviation of the constant veer a metre")
-    slips_per_m: float = Field(default=0.0, ge=0.0, description="how often wheels turn without moving the robot")
-    slip_m: float = Field(default=0.05, ge=0.0, description="mean travel that a slip makes up")
+    veer_bias_rad_m: float = Field(
+        default=0.003, ge=0.0, description="standard deviation of a robot's constant heading drift [rad/m]"
+    )
+    slips_per_m: float = Field(default=0.0, ge=0.0, description="mean number of wheel slips per distance [1/m]")
+    slip_m: float = Field(default=0.05, ge=0.0, description="mean distance that a wheel slip adds to the odometry [m]")
 
 
 def simulate_odometry(
     T_building_base: FloatArray, settings: OdometryNoiseSettings, rng: np.random.Generator
 ) -> FloatArray:
-    """Odometry (N, 3) of a robot that drove the true poses (N, 3): zero at first, then ever more wrong."""
+    """Simulate the odometry of a robot along true poses (N, 3), metres and radians.
+
+    Returns:
+        ``T_odom_base``, shape (N, 3); the first is zero.
+    """
     twists = se2.log(se2.relative(T_building_base))
     travel, turn = np.abs(twists[:, 0]), np.abs(twists[:, 2])
     scale_travel, scale_turn = 1.0 + rng.normal(0.0, settings.scale_bias, 2)
@@ -52,7 +66,7 @@ def simulate_odometry(
 
 
 def _chain(motions: FloatArray) -> FloatArray:
-    """Poses (N + 1, 3) that start at zero and follow ``motions`` (N, 3)."""
+    """Accumulate ``motions`` (N, 3) to poses (N + 1, 3) that start at zero."""
     headings = np.insert(np.cumsum(motions[:, 2]), 0, 0.0)
     steps = np.column_stack((motions[:, :2], np.zeros(len(motions))))
     turned = se2.compose(np.column_stack((np.zeros((len(motions), 2)), headings[:-1])), steps)

@@ -1,10 +1,10 @@
-"""What can be chosen by name: kinds of building and of lighting. Loads nothing, for the command line's help."""
+"""Kinds of building and of lighting, for the command line. Imports no library, so that help is fast."""
 
 from enum import StrEnum
 
 
 class Building(StrEnum):
-    """The kinds of building."""
+    """Kinds of building."""
 
     FLAT = "flat"
     DEFAULT = "default"
@@ -13,9 +13,9 @@ class Building(StrEnum):
 
 
 class Lighting(StrEnum):
-    """What a robot sees by."""
+    """Kinds of lighting."""
 
     DAY = "day"
     EVENING = "evening"
     LAMP_OFF = "lamp-off"
-    """By day, and one lamp in three has failed."""
+    """Daylight, with one lamp in three failed."""

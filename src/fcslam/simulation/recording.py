@@ -1,4 +1,4 @@
-"""A fleet's recordings on disk. What was interrupted goes on to the bytes that it would have had without."""
+"""Writes the recordings of a simulated fleet. A resumed simulation gives the same bytes as an uninterrupted one."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -18,13 +18,13 @@ from fcslam.sources.recording.layout import META
 from fcslam.storage.files import write_file
 
 SETTINGS = "simulation.yaml"
-"""What a folder's fleet is simulated from; everything in it follows from this."""
+"""File with the settings of the fleet in a folder, which determine all its recordings."""
 
 Watch = Callable[[Iterator[RecordedItem]], Iterator[RecordedItem]]
 
 
 def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int, resume: bool) -> None:
-    """A folder for the fleet with its settings in it; with ``resume`` it may hold an interrupted one of the same.
+    """Make the fleet's folder and write its settings; with ``resume`` it may hold an interrupted simulation of them.
 
     Raises:
         OutputError: the folder holds something else, or cannot be written.
@@ -44,9 +44,9 @@ def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int, 
 
 
 def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter, resume: bool = False) -> None:
-    """Write the robot's recording at ``folder``; with ``resume`` what is there already stays and is not made again.
+    """Write the robot's recording to ``folder``; with ``resume``, continue after the records that it holds already.
 
-    ``watch`` is given the records and hands them on; where it ends, the recording ends.
+    ``watch`` receives the records and passes them on; the recording ends when it ends.
 
     Raises:
         SimulationError: MuJoCo or, with a camera, a GL library is missing.
@@ -69,7 +69,7 @@ def _writer(robot: SimulatedRobot, folder: Path, resume: bool) -> RecordingWrite
         writer = RecordingWriter.resume(folder)
         if writer.is_gapless:
             return writer
-        # A power cut may have taken records before others that are there: their order is lost.
+        # After a power cut, records before existing ones may be missing, so the order cannot be restored.
         writer.close()
     if resume and folder.exists():
         shutil.rmtree(folder)

@@ -1,4 +1,4 @@
-"""Where a robot drives in a floor plan, and when it is where."""
+"""Routes of robots in a floor plan, and their poses over time."""
 
 from dataclasses import dataclass
 from itertools import cycle
@@ -15,22 +15,30 @@ from fcslam.simulation.floorplan import FloorPlan
 SPEED_M_S = 0.5
 TURN_RATE_RAD_S = 0.9
 _STRETCH, _SHIFT = 0.85, 0.55
-"""How long a robot's stretch of the walk is, and how much later its neighbour's begins, as shares of its path."""
+"""Length of a robot's part of the common walk, and offset of the next robot's part, as shares of the path length."""
 _NEXT = 2
-"""A walk goes on to one of so many nearest spots."""
+"""The walk continues to one of this many nearest spots."""
 _LANE_SPOTS_M = 15.0
+"""Distance of spots along a corridor, about."""
 _SWAY_M = 0.2
-"""No two passes follow the same line."""
+"""Largest random shift of a corner in x and y, so that no two passes follow the same line."""
 _LEAST_SPREAD_M = 1.0
+"""Smallest extent of a robot's goals."""
 
 
 def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:
-    """Goals (G, 2) of each robot that is to drive ``length_m``: stretches of one walk through rooms and corridors.
+    """Draw goals (G, 2) for each robot: overlapping parts of one walk through rooms and corridors.
 
-    Neighbours' stretches overlap. A further robot changes nothing for those before it.
+    Another robot changes nothing for those before it.
+
+    Args:
+        plan: the building.
+        robots: number of robots.
+        length_m: path length of each robot.
+        rng: random generator.
 
     Raises:
-        SimulationError: the building has no free space, or too little to drive about in.
+        SimulationError: the building has no drivable space, or too little of it.
     """
     space = DrivableSpace(plan)
     spots = _draw_spots(plan, space, rng)
@@ -51,12 +59,12 @@ def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Gen
 
 
 def plan_route(plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
-    """Waypoints (K, 2) of a robot that drives from goal to goal (G, 2), then from the first again: ``length_m`` in all.
+    """Plan waypoints (K, 2) of a path of ``length_m`` metres that visits goals (G, 2) in a cycle.
 
-    It begins with any of them and goes either way round. Goals where furniture stands in ``plan`` move aside.
+    The start and the direction are random. Goals that furniture occupies move to the nearest drivable point.
 
     Raises:
-        SimulationError: there is no free space, or too little to drive about in.
+        SimulationError: the building has no drivable space, or too little of it.
     """
     space = DrivableSpace(plan)
     goals = space.points[[space.nearest(goal) for goal in goals]]
@@ -77,27 +85,27 @@ def plan_route(plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.rand
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Where a robot is when: it turns at each waypoint and drives straight to the next."""
+    """Poses over time of a robot that turns at each waypoint and drives straight to the next."""
 
     times_s: FloatArray
-    """Shape (K,), from zero; twice the same while nothing happens."""
+    """Shape (K,), from zero; a time may repeat."""
     poses: FloatArray
-    """Shape (K, 3) at these times; headings are unwrapped, in between everything changes evenly."""
+    """Poses in ``building`` at these times, shape (K, 3), linear in between; headings are unwrapped."""
 
     @property
     def duration_s(self) -> float:
-        """How long the whole drive takes."""
+        """Duration of the drive."""
         return float(self.times_s[-1])
 
     def at(self, times_s: FloatArray) -> FloatArray:
-        """Poses (N, 3) at times (N,)."""
+        """Poses (N, 3) in ``building`` at times (N,)."""
         poses = np.column_stack([np.interp(times_s, self.times_s, column) for column in self.poses.T])
         poses[:, 2] = se2.wrap_angle(poses[:, 2])
         return poses
 
 
 def schedule(waypoints: FloatArray) -> Schedule:
-    """The drive along waypoints (K, 2)."""
+    """Schedule a drive along waypoints (K, 2), metres in ``building``."""
     legs = np.diff(waypoints, axis=0)
     legs = legs[np.linalg.norm(legs, axis=1) > 1e-9]
     headings = np.unwrap(np.arctan2(legs[:, 1], legs[:, 0]))
@@ -111,14 +119,14 @@ def schedule(waypoints: FloatArray) -> Schedule:
 
 
 def drive(waypoints: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:
-    """Times (N,) from zero and poses (N, 3) of a drive along waypoints, every ``period_s``."""
+    """Sample a drive along waypoints (K, 2) every ``period_s``: times (N,) from zero and poses (N, 3)."""
     plan = schedule(waypoints)
     stamps = np.arange(0.0, plan.duration_s, period_s)
     return stamps, plan.at(stamps)
 
 
 def _draw_spots(plan: FloorPlan, space: DrivableSpace, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Numbers (S,) of free points worth going to: one in each room, and some along each corridor."""
+    """Numbers (S,) of grid points to visit: one in each room, and some along each corridor."""
     spots = []
     for room in plan.rooms:
         inside = np.flatnonzero(np.all((space.points > room.low) & (space.points < room.high), axis=1))
@@ -132,13 +140,13 @@ def _draw_spots(plan: FloorPlan, space: DrivableSpace, rng: np.random.Generator)
 
 
 def _check_spread(points: FloatArray) -> None:
-    """Refuse points (N, 2) between which a robot would not drive."""
+    """Refuse points (N, 2) that are too close together for a drive."""
     if not len(points) or np.ptp(points, axis=0).max() < _LEAST_SPREAD_M:
         raise SimulationError("the building's free space is too small or too divided to drive in; take a larger one")
 
 
 def _swayed(leg: FloatArray, space: DrivableSpace, rng: np.random.Generator) -> FloatArray:
-    """The leg (K, 2) with its corners moved a little, where that keeps it free."""
+    """Move the corners of a leg (K, 2) a little, if the leg stays free of collisions."""
     swayed = leg.copy()
     for k in range(1, len(leg) - 1):
         corner = leg[k] + rng.uniform(-_SWAY_M, _SWAY_M, 2)

@@ -1,4 +1,4 @@
-"""The building as a MuJoCo model: what a laser meets is solid (group 0), what only a camera sees is not (group 1)."""
+"""The building as a MuJoCo model. Group 0 is visible to lasers and cameras, group 1 only to cameras."""
 
 import math
 from collections.abc import Iterator
@@ -17,19 +17,19 @@ from fcslam.simulation.textures import Image
 SOLID, SEEN = 0, 1
 CAMERA = "camera"
 LIGHTS = 5
-"""Software GL lights by eight at most; these follow the robot to the nearest lamps."""
+"""Number of lights, which move to the lamps nearest to the robot; software GL supports eight at most."""
 
 _SEAM_M = 0.001
-"""Walls end this much earlier than drawn: faces in one plane would flicker."""
+"""Walls are shortened by this, because coplanar faces would flicker."""
 _TEXTURE_M = 2.5
-"""What one repeat of a wall or a floor spans."""
+"""Size of one repeat of a wall or floor texture."""
 _NEAR_M, _FAR_M = 0.05, 100.0
 _UPRIGHT = (1, -1, 2, 0, 0, 0)
-"""Quarter turns that make an image stand upright on each face of a cube texture."""
+"""Quarter turns of the image on each face of a cube texture, so that it is upright."""
 
 
 def bare_model(plan: FloorPlan) -> Any:
-    """The model of a building for lasers alone: walls and furniture without looks.
+    """Model of a building for lasers: walls and furniture without textures.
 
     Raises:
         SimulationError: MuJoCo is not installed.
@@ -43,7 +43,7 @@ def bare_model(plan: FloorPlan) -> Any:
 def furnished_model(
     plan: FloorPlan, decoration: Decoration, light: Light, image_size: tuple[int, int], fov_y_rad: float
 ) -> Any:
-    """The model of a building for cameras, with one camera called ``CAMERA``.
+    """Model of a building for cameras, with one camera called ``CAMERA``.
 
     Raises:
         SimulationError: MuJoCo is not installed.
@@ -74,14 +74,14 @@ def furnished_model(
 
 
 def _squares(size_m: tuple[float, float]) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Corners of what covers a floor: light is computed at the corners of faces, so large ones would stay dark."""
+    """Corners of squares that cover the floor. Light is computed at the corners of faces, so large faces stay dark."""
     edges = [np.append(np.arange(0.0, size, 2.0 * _TEXTURE_M), size) for size in size_m]
     for (west, east), (south, north) in product(*map(pairwise, edges)):
         yield np.array([west, south]), np.array([east, north])
 
 
 def _standing(plan: FloorPlan) -> Iterator[tuple[int, Piece]]:
-    """Pieces with their numbers, without walls that lie within others: two faces in one place would flicker."""
+    """Pieces with their numbers, without walls inside other walls, because coincident faces would flicker."""
     boxes = [(piece.outline.min(axis=0), piece.outline.max(axis=0)) for piece in plan.pieces]
     kept: list[int] = []
     walls = [k for k, piece in enumerate(plan.pieces) if piece.kind is PieceKind.WALL]
@@ -94,7 +94,7 @@ def _standing(plan: FloorPlan) -> Iterator[tuple[int, Piece]]:
 
 
 class _Builder:
-    """Puts geoms into a MuJoCo specification."""
+    """Builds a MuJoCo specification."""
 
     def __init__(self) -> None:
         self._mujoco = mujoco()
@@ -105,12 +105,12 @@ class _Builder:
         return self._spec.compile()
 
     def view(self, light: Light, image_size: tuple[int, int], fov_y_rad: float) -> None:
-        """The camera, what lights it, and how far it sees."""
+        """Add the camera and the lights, and set the clipping planes."""
         visual = self._spec.visual
         self._spec.stat.extent = 1.0
         visual.map.znear, visual.map.zfar = _NEAR_M, _FAR_M
         visual.global_.offwidth, visual.global_.offheight = image_size
-        # Smoother edges and finer shading cost more than all the rest.
+        # Antialiasing and finer shading would cost more than everything else.
         visual.quality.offsamples, visual.quality.numquads = 0, 2
         visual.headlight.ambient = light.ambient_rgb
         visual.headlight.diffuse, visual.headlight.specular = (0.08,) * 3, (0.0,) * 3
@@ -129,7 +129,7 @@ class _Builder:
             )
 
     def material(self, name: str, image: Image, repeats_per_m: float | None = None, cube: bool = False) -> None:
-        """A material that shows an image: repeated, once on each face, or once."""
+        """Add a material that shows an image: repeated, once on each face of a cube, or once."""
         kinds = self._mujoco.mjtTexture
         height, width = image.shape[:2]
         faces = [np.rot90(image, turns) for turns in _UPRIGHT] if cube else [image]
@@ -144,11 +144,11 @@ class _Builder:
         material = self._spec.add_material(name=name, specular=0.1, shininess=0.1)
         material.textures[self._mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
         if repeats_per_m is not None:
-            # MuJoCo counts them over half a metre on either side of the middle.
+            # MuJoCo counts the repeats per half metre.
             material.texuniform, material.texrepeat = True, (2.0 * repeats_per_m,) * 2
 
     def piece(self, piece: Piece, height_m: float, material: str) -> None:
-        """A wall, a lintel, or a piece of furniture that stands on the floor."""
+        """Add a wall, a lintel, or a piece of furniture."""
         x, y = piece.centre
         if piece.kind is PieceKind.COLUMN:
             kinds = self._mujoco.mjtGeom
@@ -175,17 +175,17 @@ class _Builder:
         material: str,
         group: int,
     ) -> None:
-        """A box whose x lies along ``heading_rad`` and whose y points up, so that its image does."""
+        """Add a box with x along ``heading_rad`` and y up, so that its image is upright."""
         cos, sin = (math.sqrt(0.5) * f(heading_rad / 2.0) for f in (math.cos, math.sin))
         self._box(half, centre, (cos, cos, sin, sin), material, group)
 
     def slab(self, low: FloatArray, high: FloatArray, top_m: float, material: str) -> None:
-        """A floor or ceiling between two corners."""
+        """Add a floor or ceiling between two corners (2,)."""
         (x, y), (half_x, half_y) = (low + high) / 2.0, (high - low) / 2.0
         self._box((half_x, half_y, 0.01), (x, y, top_m - 0.01), (1.0, 0.0, 0.0, 0.0), material, SEEN)
 
     def lamps(self, light: Light) -> None:
-        """What shines, as panels under the ceiling."""
+        """Add the lamps as panels under the ceiling."""
         self._spec.add_material(name="lamp", emission=1.0, rgba=(1.0, 0.98, 0.9, 1.0))
         for x, y, _ in light.lamps:
             half = (0.3, 0.15, (WALL_HEIGHT_M - LAMP_HEIGHT_M) / 4.0)

@@ -16,7 +16,7 @@ from fcslam.simulation.textures import Image
 
 LASER_HEIGHT_M = 0.25
 _UNSEEN = 5
-"""A group that no geom of the building is in."""
+"""Group of geoms that are not drawn."""
 
 
 class RayCaster:
@@ -33,7 +33,7 @@ class RayCaster:
         self._distances = np.empty(laser.beam_count)
 
     def cast(self, T_building_base: FloatArray) -> FloatArray:
-        """Ranges (beam_count,) without noise; ``max_range_m`` where nothing is hit."""
+        """Ranges (beam_count,) in metres without noise, from pose (3,); ``max_range_m`` without a hit."""
         x, y, heading = se2.compose(T_building_base, np.array(self._laser.T_base_laser))
         angles = heading + self._laser.angles_rad()
         directions = np.column_stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)))
@@ -46,7 +46,7 @@ class RayCaster:
 
 
 class Camera:
-    """Takes pictures with the model's one camera; to be closed, or used in a ``with``.
+    """Renders images of the model's camera; close it, or use it in a ``with``.
 
     Raises:
         SimulationError: there is no GL library.
@@ -73,7 +73,7 @@ class Camera:
         self._sides = _sides(camera)
 
     def take(self, T_building_base: FloatArray) -> Image:
-        """The picture (height, width, 3) from where the robot stands."""
+        """Render the image (height, width, 3), RGB, at the robot's pose (3,)."""
         x, y, heading = T_building_base
         cos, sin = math.cos(heading), math.sin(heading)
         turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -96,13 +96,13 @@ class Camera:
         return np.ascontiguousarray(pixels[::-1])
 
     def _leave_out_unseen(self, position: FloatArray, rotation: FloatArray) -> None:
-        """Take what lies outside the field of view out of the groups that are drawn: MuJoCo would draw it all."""
+        """Exclude geoms outside the field of view from rendering, because MuJoCo has no frustum culling."""
         offsets = (self._data.geom_xpos - position) @ rotation
         seen = np.all(offsets @ self._sides.T > -self._model.geom_rbound[:, None], axis=1)
         self._model.geom_group[:] = np.where(seen, SEEN, _UNSEEN)
 
     def close(self) -> None:
-        """Free what GL holds."""
+        """Free the GL resources."""
         with GL_LOCK:
             self._gl.make_current()
             self._context.free()
@@ -126,7 +126,7 @@ def _matrix(camera: CameraModel) -> FloatArray:
 
 
 def _sides(camera: CameraModel) -> FloatArray:
-    """Unit vectors (4, 3) in the optical frame that point from the sides of the field of view to its inside."""
+    """Inward normals (4, 3) of the sides of the view frustum, in the optical frame."""
     right, down = math.atan(0.5 * camera.width / camera.fx), math.atan(0.5 * camera.height / camera.fy)
     sideways = [(sign * math.cos(right), 0.0, math.sin(right)) for sign in (-1.0, 1.0)]
     upwards = [(0.0, sign * math.cos(down), math.sin(down)) for sign in (-1.0, 1.0)]

@@ -1,8 +1,8 @@
-"""A fleet with LiDARs and cameras in one furnished building: who drives where, sees what, and where it really was.
+"""A simulated fleet with LiDARs and cameras in one furnished building: routes, sensor records and true poses.
 
-One seed decides everything. The building, its looks, the furniture and the fleet's goals come from the seed alone,
-each robot's route, odometry, noise and the furniture that moved before it came from the seed and its number: a further
-robot changes nothing for the others, and cameras change nothing for the LiDARs.
+One seed decides everything. The building, its appearance, the furniture and the goals of the fleet depend on the seed
+alone. The route, odometry and noise of a robot, and the furniture that moved before it, depend on the seed and the
+robot's number. So another robot changes nothing for the others, and cameras change nothing for the LiDARs.
 """
 
 import math
@@ -40,28 +40,28 @@ from fcslam.simulation.sensors import Camera, RayCaster
 
 FIRST_STAMP = 1000.0
 STAMP_SHIFT_S = 0.001
-"""Between robots, so that a stamp tells which robot it belongs to."""
+"""Offset between the stamps of two robots, so that a stamp identifies its robot."""
 LANE_PER_ROBOT_M = 2.0
-"""Robots do not see each other, but a corridor full of them would be no fleet."""
+"""Least length of corridor for each robot. Robots do not see each other, but a crowded corridor is not realistic."""
 IMAGE_DELAY_S = 0.03
-"""Of the first image after the first scan; cameras and LiDARs are not triggered together."""
+"""Time from the first scan to the first image; cameras and LiDARs are not triggered together."""
 
 _T_BASE_LASER = (0.05, 0.0, 0.0)
 _AHEAD = (-0.5, 0.5, -0.5, 0.5)
-"""The rotation of an optical frame that looks along x of the base."""
+"""Quaternion (x, y, z, w) of an optical frame that looks along x of the base."""
 
 
 class CameraSettings(Settings):
-    """The simulated camera: it looks straight ahead."""
+    """The simulated camera, which looks straight ahead."""
 
-    width: int = Field(default=320, ge=16, le=2048, description="pixels")
-    height: int = Field(default=240, ge=16, le=2048, description="pixels")
-    field_of_view_rad: float = Field(default=1.35, gt=0.1, lt=2.8, description="from left to right")
-    rate_hz: float = Field(default=5.0, gt=0.0, description="images a second")
-    ahead_m: float = Field(default=0.1, description="how far ahead of the base it sits")
-    above_m: float = Field(default=0.6, gt=0.0, lt=2.0, description="how far above the floor")
-    noise: float = Field(default=2.0, ge=0.0, description="standard deviation of a pixel's brightness, of 255")
-    jpeg_quality: int = Field(default=90, ge=1, le=100, description="of the encoded images")
+    width: int = Field(default=320, ge=16, le=2048, description="width of an image [px]")
+    height: int = Field(default=240, ge=16, le=2048, description="height of an image [px]")
+    field_of_view_rad: float = Field(default=1.35, gt=0.1, lt=2.8, description="horizontal field of view [rad]")
+    rate_hz: float = Field(default=5.0, gt=0.0, description="image rate [Hz]")
+    ahead_m: float = Field(default=0.1, description="position of the camera ahead of the robot's base [m]")
+    above_m: float = Field(default=0.6, gt=0.0, lt=2.0, description="height of the camera above the floor [m]")
+    noise: float = Field(default=2.0, ge=0.0, description="standard deviation of the pixel noise [grey levels of 255]")
+    jpeg_quality: int = Field(default=90, ge=1, le=100, description="JPEG quality of the images, as in OpenCV")
 
     def model(self) -> CameraModel:
         """Intrinsics and mounting."""
@@ -74,14 +74,19 @@ class CameraSettings(Settings):
 class SimulationSettings(Settings):
     """A simulated fleet."""
 
-    building: Building = Field(default=Building.DEFAULT, description="flat, default, office or corridor")
+    building: Building = Field(
+        default=Building.DEFAULT, description="kind of building: flat, default, office or corridor"
+    )
     robots: int = Field(default=3, ge=1, description="number of robots")
-    path_length_m: float = Field(default=60.0, gt=0.0, description="how far each drives")
+    path_length_m: float = Field(default=60.0, gt=0.0, description="length of each robot's path [m]")
     lighting: tuple[Lighting, ...] = Field(
-        default=(Lighting.DAY,), min_length=1, description="day, evening or lamp-off of each robot in turn"
+        default=(Lighting.DAY,), min_length=1, description="lighting of each robot in turn: day, evening or lamp-off"
     )
     moved_furniture: float = Field(
-        default=0.0, ge=0.0, le=1.0, description="share of the rooms' furniture that moved before each further robot"
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the furniture in rooms that moves before the second and each further robot",
     )
     lidar: LidarSettings = LidarSettings(rate_hz=10.0)
     drift: OdometryNoiseSettings = OdometryNoiseSettings(slips_per_m=0.05)
@@ -90,21 +95,21 @@ class SimulationSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class SimulatedRobot:
-    """One robot with its route; what it senses is computed when it is asked for."""
+    """One robot with its route. Its sensor records are computed on demand."""
 
     name: str
     laser: LaserModel
     camera: CameraModel | None
     stamps: FloatArray
-    """Of its scans, shape (N,)."""
+    """Stamps of its scans, shape (N,), seconds."""
     T_building_base: FloatArray
-    """The truth at these stamps, shape (N, 3)."""
+    """True poses at these stamps, shape (N, 3)."""
     T_odom_base: FloatArray
-    """What the wheels say, shape (N, 3), from zero."""
+    """Wheel odometry at these stamps, shape (N, 3); the first is zero."""
     image_stamps: FloatArray
-    """Shape (M,); none without a camera."""
+    """Stamps of its images, shape (M,), seconds; empty without a camera."""
     plan: FloorPlan
-    """The building as this robot met it."""
+    """The building with the furniture at the time of this robot."""
     lighting: Lighting
     settings: SimulationSettings
     decoration: Decoration | None
@@ -116,13 +121,13 @@ class SimulatedRobot:
 
     @property
     def duration_s(self) -> float:
-        """From the first scan to the last."""
+        """Time from the first scan to the last."""
         return float(self.stamps[-1] - self.stamps[0])
 
     def items(self, first_scan: int = 0, first_image: int = 0) -> Generator[RecordedItem, None, None]:
-        """Scans, images and the truth at the stamp of each, as they come.
+        """Scans and images in the order of time, each followed by the true pose at its stamp.
 
-        Scans before number ``first_scan`` and images before ``first_image`` are not made, the truth at their stamps is.
+        Scans before number ``first_scan`` and images before ``first_image`` are skipped; their true poses are not.
 
         Raises:
             SimulationError: MuJoCo or, with a camera, a GL library is missing.
@@ -141,7 +146,7 @@ class SimulatedRobot:
         return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
 
     def scans(self, first: int = 0) -> Iterator[LaserScan]:
-        """Scans from number ``first`` on; each time the same.
+        """Scans from number ``first`` on; every call yields the same.
 
         Raises:
             SimulationError: MuJoCo is missing.
@@ -169,18 +174,18 @@ class SimulatedRobot:
                 yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, frozen(odometry[k]))
 
     def _generator(self, purpose: "_RandomStream", record: int = 0) -> np.random.Generator:
-        """Each record has its own, so that a recording can go on anywhere."""
+        """A generator for each record, so that a recording can be resumed at any record."""
         return _generator(self.seed, purpose, self.number, record)
 
 
 class _RandomStream(IntEnum):
-    """What chance decides: each with a generator of its own, so that none moves another."""
+    """Purposes of random numbers. Each has its own generator, so that none affects another."""
 
     BUILDING = 0
     LOOKS = 1
     GOALS = 2
     ROBOTS = 3
-    """Furniture that moved before a robot came, its route, its odometry."""
+    """Moved furniture, route and odometry of a robot."""
     LAMPS = 4
     SCANS = 5
     IMAGES = 6
@@ -199,10 +204,10 @@ class SimulatedFleet:
 
 
 def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
-    """Draw a building and plan what each robot does; the same seed gives the same fleet.
+    """Draw a building and plan the route of each robot; the same seed gives the same fleet.
 
     Raises:
-        SimulationError: the building is too small for so many robots, or to drive in.
+        SimulationError: the building is too small for this many robots, or has too little free space.
     """
     plan = draw_floor_plan(_generator(seed, _RandomStream.BUILDING), settings.building)
     _check_room(plan, settings)
@@ -258,7 +263,7 @@ def _robot(
 
 
 def _between(stamps: FloatArray, known: FloatArray, poses: FloatArray) -> FloatArray:
-    """Poses (N, 3) at ``stamps``, each on the way between two known ones."""
+    """Interpolate ``poses`` (M, 3) at the stamps ``known`` (M,) to ``stamps`` (N,), along SE(2) twists: (N, 3)."""
     before = np.clip(np.searchsorted(known, stamps) - 1, 0, len(known) - 2)
     share = (stamps - known[before]) / (known[before + 1] - known[before])
     step = se2.log(se2.between(poses[before], poses[before + 1]))

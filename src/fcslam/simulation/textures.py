@@ -1,4 +1,4 @@
-"""Pictures and surfaces for the simulated building: images (height, width, 3) of uint8, drawn from a generator."""
+"""Procedural textures of the simulated building: RGB images (height, width, 3), uint8, from a random generator."""
 
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ _WOOD = np.array([[150, 104, 62], [112, 76, 48], [186, 146, 98], [92, 84, 78], [
 
 
 def noise(shape: tuple[int, int], cells: int, rng: np.random.Generator) -> FloatArray:
-    """Smooth noise of mean 0 and deviation about 0.3 that repeats at the edges; ``cells`` bumps across."""
+    """Tileable value noise of the given shape with mean 0 and standard deviation about 0.3; ``cells`` bumps across."""
     grid = rng.normal(0.0, 0.5, (cells, cells))
     columns = _blend(np.arange(shape[1]) * cells / shape[1], grid)
     return _blend(np.arange(shape[0]) * cells / shape[0], columns.T).T
@@ -44,7 +44,7 @@ def plaster(rng: np.random.Generator, size: int = 512) -> Image:
 
 
 def planks(rng: np.random.Generator, size: int = 512) -> Image:
-    """A wooden floor or the side of a cupboard."""
+    """Wooden planks, for floors and sides of cupboards."""
     colour = _WOOD[rng.integers(len(_WOOD))]
     boards = int(rng.integers(5, 9))
     image = np.empty((size, size, 3))
@@ -59,7 +59,7 @@ def planks(rng: np.random.Generator, size: int = 512) -> Image:
 
 
 def tiles(rng: np.random.Generator, size: int = 512) -> Image:
-    """A tiled floor whose tiles differ a little."""
+    """A tiled floor with slightly different tiles."""
     count = int(rng.integers(5, 9))
     base = rng.uniform(110.0, 200.0) + rng.normal(0.0, 8.0, 3)
     tone = 14.0 * rng.normal(size=(count, count))
@@ -73,13 +73,13 @@ def tiles(rng: np.random.Generator, size: int = 512) -> Image:
 
 
 def carpet(rng: np.random.Generator, size: int = 512) -> Image:
-    """A carpet: fine noise, large stains."""
+    """A carpet: fine noise and large stains."""
     stains = 22.0 * noise((size, size), 7, rng) + 14.0 * rng.normal(size=(size, size))
     return _image(0.5 * _ink(rng) + 50.0 + stains[..., None])
 
 
 def cupboard(rng: np.random.Generator, size: int = 256) -> Image:
-    """The face of a piece of furniture: boards, drawers or shelves with things on them."""
+    """The front of a piece of furniture: boards, drawers or filled shelves."""
     image = planks(rng, size).astype(np.float64).transpose(1, 0, 2)
     rows, columns = int(rng.integers(2, 5)), int(rng.integers(1, 4))
     filled = rng.random() < 0.5
@@ -98,7 +98,7 @@ def cupboard(rng: np.random.Generator, size: int = 256) -> Image:
 
 
 def picture(rng: np.random.Generator, height: int = 192, width: int = 256) -> Image:
-    """A framed picture, a poster with lines of writing, or a painting of shapes: no two are alike."""
+    """A framed picture of random shapes, perhaps with lines of text."""
     image = np.tile(0.75 * _ink(rng) + 0.25 * _ink(rng), (height, width, 1))
     image += 18.0 * noise((height, width), 6, rng)[..., None]
     y, x = np.mgrid[:height, :width]
@@ -139,7 +139,7 @@ def _books(shelf: FloatArray, rng: np.random.Generator) -> None:
 
 
 def _writing(image: FloatArray, rng: np.random.Generator) -> None:
-    """Lines of dark blocks as of words, on a light field."""
+    """Draw lines of dark blocks, like words, on a light field."""
     height, width = image.shape[:2]
     top, left = int(rng.uniform(0.1, 0.5) * height), int(rng.uniform(0.08, 0.3) * width)
     field = image[top : int(0.92 * height), left : int(0.92 * width)]
@@ -157,7 +157,7 @@ def _ink(rng: np.random.Generator) -> FloatArray:
 
 
 def _blend(positions: FloatArray, grid: FloatArray) -> FloatArray:
-    """Values between the columns of ``grid`` at ``positions``, smoothly, the last column before the first."""
+    """Interpolate the columns of ``grid`` smoothly and periodically at ``positions`` (N,)."""
     left = np.floor(positions).astype(int)
     share = positions - left
     share = share * share * (3.0 - 2.0 * share)
