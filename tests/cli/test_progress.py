@@ -61,6 +61,7 @@ def test_a_stage_of_unknown_length_shows_its_count_and_the_time_it_took():
     pipe = console()
     with ProgressDisplay(pipe, interval_s=0.02) as display:
         display.start("reading", 1)()
+        display.start("sorting")
         advance = display.start("describing")
         advance()
         advance()

@@ -77,7 +77,10 @@ class ProgressDisplay:
             self._bars.stop()
 
     def start(self, stage: str, total: int | None = None) -> Callable[[], None]:
-        """Begin a stage of ``total`` items, None if unknown; returns the function to call after each item."""
+        """Begin a stage of ``total`` items, None if unknown; returns the function to call after each item.
+
+        A stage of unknown length ends when the next one begins.
+        """
         task = self._begin(stage, total)
         return lambda: self._bars.advance(task)
 
@@ -86,13 +89,13 @@ class ProgressDisplay:
         task = self._tasks[stage] if stage in self._tasks else self._begin(stage, total)
         if done < total and self._bars.tasks[self._bars.task_ids.index(task)].finished:
             self._bars.reset(task)  # the same stage of another round
-        self._bars.update(task, completed=done, total=total, details=details)
+        self._bars.update(task, completed=done, total=total, details=details, visible=True)
 
     def _begin(self, stage: str, total: int | None) -> TaskID:
         if not self._tasks:
             self._start_display()
         for task in self._bars.tasks:
-            if task.finished:
+            if task.finished or task.total is None:
                 self._bars.update(task.id, visible=False)
         self._tasks[stage] = self._bars.add_task(stage, total=total, details="")
         return self._tasks[stage]
@@ -110,7 +113,7 @@ class ProgressDisplay:
         began = monotonic()
         interval_s = self._interval_s
         while not self._ended.wait(interval_s):
-            line = "; ".join(_line(task) for task in self._bars.tasks if not task.finished)
+            line = "; ".join(_line(task) for task in self._bars.tasks if task.visible and not task.finished)
             if line:
                 print_line(self._console, line)
             interval_s = max(self._interval_s, min((monotonic() - began) / 20.0, LONGEST_INTERVAL_S))

@@ -93,7 +93,7 @@ def record_fleet(
     began = time.perf_counter()
     recordings = [output / robot.name for robot in fleet.robots]
     total = sum(len(robot.stamps) + len(robot.image_stamps) for robot in fleet.robots)
-    with ProgressDisplay(console, f"output: {output}") as display:
+    with ProgressDisplay(console) as display:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             watch = _Watch(display.start("simulating", total))
             jobs = [
