@@ -1,4 +1,4 @@
-"""Typed configuration: load, check, dump. Each room owns its model; units stand in the field names."""
+"""Typed settings: load, check and dump. Each package owns its model; field names contain the unit."""
 
 import difflib
 import math
@@ -12,7 +12,7 @@ from fcslam.errors import ConfigError
 
 
 class Settings(BaseModel):
-    """Base of every room's settings: frozen, no unknown keys, finite numbers only."""
+    """Base class of all settings: frozen, no unknown keys, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -24,7 +24,7 @@ def load(kind: type[SettingsType], path: Path) -> SettingsType:
     """Read a YAML file over the defaults of ``kind``.
 
     Raises:
-        ConfigError: the file cannot be read, is no mapping, or has a key or value that does not belong.
+        ConfigError: the file cannot be read, is not a mapping, or has an unknown key or a wrong value.
     """
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -43,7 +43,7 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
     """Check ``content`` against ``kind``; ``where`` names its origin in messages.
 
     Raises:
-        ConfigError: a key or a value does not belong; an unknown key is answered with the nearest known one.
+        ConfigError: a key is unknown (the message names the most similar key), or a value is wrong.
     """
     try:
         return kind.model_validate(content)
@@ -56,7 +56,7 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
 
 
 def dump(settings: Settings) -> str:
-    """Complete YAML of ``settings``, each key under the comment that describes it."""
+    """Complete YAML of ``settings``, with the description of each key as a comment above it."""
     return "\n".join(_lines(settings, indent=0)) + "\n"
 
 
@@ -82,7 +82,7 @@ def _flow(value: Any) -> str:
 
 
 def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:
-    """A hint that names the known key nearest to the unknown one at ``loc``."""
+    """A hint with the known key that is most similar to the unknown key at ``loc``."""
     model: Any = kind
     for part in loc[:-1]:
         model = model.model_fields[str(part)].annotation

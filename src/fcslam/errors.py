@@ -1,31 +1,31 @@
 """The exception tree.
 
 FcslamError
-├── InputError            something the user gave is wrong: one line says what, where, what to do (exit code 2)
+├── InputError            an input of the user is wrong; the message says what, where and what to do (exit code 2)
 │   ├── SourceError       a recording cannot be read
-│   ├── ConfigError       a configuration file, a key of it or a veto is wrong
+│   ├── ConfigError       a settings file, one of its keys or a veto is wrong
 │   ├── OutputError       the output folder cannot be used
 │   ├── SimulationError   a fleet cannot be simulated
 │   ├── FeatureError      network weights, images or extracted features cannot be used
 │   ├── TrainingError     a detector cannot be trained: images, settings or a checkpoint are unusable
 │   ├── EvaluationError   a reference file or a run folder cannot be evaluated
-│   ├── ServiceError      the cloud service cannot do as it is told: tokens, certificates, address, folder, mission
-│   ├── StoreError        a mission cannot be kept or read: the disk is full, the file is broken or something else
+│   ├── ServiceError      the service cannot run: tokens, certificates, address, folder or mission are unusable
+│   ├── StoreError        a mission cannot be stored or read: the disk is full, or the file is damaged
 │   ├── StateError        a robot's state folder cannot be used
-│   └── CloudError        the cloud turns a robot away: its token, its name or what it sends
-│       └── OversizeError     it takes nothing so large at once
-├── PacketError           bytes received are not a packet that may be trusted
-│   └── PacketConflictError   two different packets have one number
-└── UnavailableError      the cloud cannot be reached or is busy: try again
+│   └── CloudError        the cloud rejects a robot: its token, its name or its packets
+│       └── OversizeError     a request is too large
+├── PacketError           received bytes are not a valid packet
+│   └── PacketConflictError   two different packets have the same number
+└── UnavailableError      the cloud is unreachable or busy; retry later
 """
 
 
 class FcslamError(Exception):
-    """Everything that fcslam raises on purpose."""
+    """Base class of all exceptions of fcslam."""
 
 
 class InputError(FcslamError):
-    """Something the user gave is wrong; the message says what, where and what to do."""
+    """An input of the user is wrong; the message says what, where and what to do."""
 
 
 class SourceError(InputError):
@@ -33,7 +33,7 @@ class SourceError(InputError):
 
 
 class ConfigError(InputError):
-    """A configuration file, one of its keys or a veto is wrong."""
+    """A settings file, one of its keys or a veto is wrong."""
 
 
 class OutputError(InputError):
@@ -41,7 +41,7 @@ class OutputError(InputError):
 
 
 class SimulationError(InputError):
-    """A fleet cannot be simulated: the building is too small for it, or a library is missing."""
+    """A fleet cannot be simulated: the building is too small, or a library is missing."""
 
 
 class FeatureError(InputError):
@@ -49,7 +49,7 @@ class FeatureError(InputError):
 
 
 class TrainingError(InputError):
-    """A detector cannot be trained: images, a teacher's points or a checkpoint do not serve, or torch is missing."""
+    """A detector cannot be trained: images, teacher points or a checkpoint are unusable, or torch is missing."""
 
 
 class EvaluationError(InputError):
@@ -57,42 +57,42 @@ class EvaluationError(InputError):
 
 
 class StateError(InputError):
-    """A robot's state folder is another robot's, in use, damaged, or not what the recording says."""
+    """A robot's state folder belongs to another robot or recording, is in use, or is damaged."""
 
 
 class CloudError(InputError):
-    """The cloud turns a robot away, and will again: its token, its name, its certificate, or what it sends."""
+    """The cloud permanently rejects a robot: its token, its name, its certificate or its packets."""
 
 
 class OversizeError(CloudError):
-    """The cloud, or what stands before it, takes no request of this size; a smaller one may pass."""
+    """The cloud or a proxy rejects a request of this size; a smaller one may be accepted."""
 
 
 class UnavailableError(FcslamError):
-    """The cloud cannot be reached or has no time; the same request may succeed later."""
+    """The cloud is unreachable or busy; the same request may succeed later."""
 
     def __init__(self, message: str, retry_after_s: float = 0.0) -> None:
         super().__init__(message)
         self.retry_after_s = retry_after_s
-        """The cloud asks not to be asked before; 0: it says nothing."""
+        """Time to wait before the next attempt, as the cloud asks; 0 if it does not."""
 
 
 class ServiceError(InputError):
-    """The cloud service cannot do as it is told: tokens, certificates, address, folder or mission do not serve."""
+    """The service cannot run: tokens, certificates, address, folder or mission are unusable."""
 
 
 class StoreError(InputError):
-    """A mission cannot be kept or read: the disk is full, or the file is broken or no mission."""
+    """A mission cannot be stored or read: the disk is full, or the file is damaged or not a mission."""
 
 
 class PacketError(FcslamError):
-    """Bytes received are not a packet that may be trusted; the message says why."""
+    """Received bytes are not a valid packet; the message says why."""
 
 
 class PacketConflictError(PacketError):
-    """A packet has the number of another one that is stored already."""
+    """A packet has the number of a different packet that is already stored."""
 
     def __init__(self, message: str, index: int) -> None:
         super().__init__(message)
         self.index = index
-        """Of the packet among those that were given."""
+        """Index of the packet in its batch."""

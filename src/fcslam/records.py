@@ -1,4 +1,4 @@
-"""Frozen records that cross the borders between rooms. Arrays in them are read-only.
+"""Frozen records that packages exchange. Their arrays are read-only.
 
 Poses are (x, y, theta) in metres and radians; ``T_a_b`` takes coordinates in b to a. Coordinate frames as in ROS
 REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recording's own clock.
@@ -22,14 +22,14 @@ CODE_BYTES = 32
 """A binary descriptor is 256 bits, packed."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,63}", re.ASCII)
-"""Names of robots and detector versions: also safe as file names."""
+"""Names of robots and detector versions; they are also safe file names."""
 
 SAME_STAMP_S = 1e-6
-"""Stamps that differ by less are one: files print them with so many digits."""
+"""Largest difference of equal stamps: files print stamps with microseconds."""
 
 
 def frozen(array: ArrayLike, dtype: type[Scalar] = np.float64) -> NDArray[Scalar]:  # type: ignore[assignment]
-    """A read-only array of ``dtype``; copied only if it has to be."""
+    """Return a read-only array of ``dtype`` with the same shape; copies only a writeable array."""
     result: NDArray[Scalar] = np.asarray(array, dtype=dtype)
     if result.flags.writeable:
         result = result.copy()
@@ -45,11 +45,12 @@ class LaserModel:
     angle_min_rad: float
     angle_increment_rad: float
     max_range_m: float
-    """A range at or above it means that nothing was hit."""
+    """A range at or above it means no return."""
     T_base_laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Mounting pose, metres and radians."""
 
     def angles_rad(self) -> FloatArray:
-        """Beam directions in ``laser``, shape (beam_count,)."""
+        """Directions of the beams in ``laser``, shape (beam_count,), radians."""
         return self.angle_min_rad + self.angle_increment_rad * np.arange(self.beam_count, dtype=np.float64)
 
 
@@ -59,6 +60,7 @@ class Odometry:
 
     stamp: float
     T_odom_base: FloatArray
+    """Shape (3,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,22 +69,23 @@ class LaserScan:
 
     stamp: float
     ranges_m: Ranges
-    """Shape (beam_count,). NaN: invalid; at or above ``laser.max_range_m`` (or inf): nothing was hit."""
+    """Shape (beam_count,). NaN: invalid; at or above ``laser.max_range_m`` (or inf): no return."""
     laser: LaserModel
     T_odom_base: FloatArray
+    """Shape (3,)."""
 
 
 class Transform(NamedTuple):
-    """``T_a_b`` in three dimensions."""
+    """A rigid transform ``T_a_b`` in three dimensions."""
 
     translation_m: tuple[float, float, float]
     rotation: tuple[float, float, float, float]
-    """Quaternion (x, y, z, w) of length 1."""
+    """Unit quaternion (x, y, z, w)."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """Pinhole geometry of one camera, constant over a recording; its images are free of distortion."""
+    """Pinhole model of one camera, constant over a recording; its images are undistorted."""
 
     width: int
     height: int
@@ -92,7 +95,7 @@ class CameraModel:
     cx: float
     cy: float
     T_base_camera: Transform
-    """Of the optical frame as in ROS REP 103: z ahead, x to the right, y down."""
+    """Mounting of the optical frame (ROS REP 103): z ahead, x to the right, y down."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,27 +107,28 @@ class CameraImage:
     """A JPEG or PNG file of camera.width x camera.height pixels."""
     camera: CameraModel
     T_odom_base: FloatArray | None
-    """The odometry at the stamp; None: not known."""
+    """Odometry at the stamp, shape (3,); None if unknown."""
 
 
 SensorRecord = LaserScan | Odometry | CameraImage
-"""What a robot senses."""
+"""A record of one of a robot's sensors."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """Where the robot really was, in the frame of the building. No robot is ever told."""
+    """The robot's true pose in the frame ``building``, for evaluation only."""
 
     stamp: float
     T_building_base: FloatArray
+    """Shape (3,)."""
 
 
 RecordedItem = SensorRecord | GroundTruth
-"""What a recording can hold."""
+"""An item of a recording."""
 
 
 class KeyscanId(NamedTuple):
-    """A keyscan of the fleet."""
+    """Identifier of a keyscan in the fleet."""
 
     robot: str
     number: int
@@ -138,11 +142,11 @@ class Keyscan:
     id: KeyscanId
     stamp: float
     ranges_m: Ranges
-    """As in LaserScan, but an invalid or missing return is 0."""
+    """Shape (beam_count,), as in LaserScan, but an invalid range or a missing return is 0."""
 
 
 class ConstraintKind(StrEnum):
-    """Where a constraint between two keyscans of one robot comes from."""
+    """Origin of a constraint between two keyscans of one robot."""
 
     ODOMETRY = "odometry"
     CLOSURE = "closure"
@@ -150,7 +154,7 @@ class ConstraintKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Constraint:
-    """A measured motion between two keyscans of one robot."""
+    """A measured relative pose of two keyscans of one robot."""
 
     robot: str
     i: int
@@ -163,7 +167,7 @@ class Constraint:
 
 
 class Channel(StrEnum):
-    """Which sensor a place's descriptors come from; words of different channels are never compared."""
+    """Sensor of a place's descriptors; places of different channels are never compared."""
 
     LIDAR = "lidar"
     CAMERA = "camera"
@@ -171,38 +175,38 @@ class Channel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """One channel of one keyscan: binary descriptors with where each was seen."""
+    """One channel of one keyscan: keypoints with binary descriptors."""
 
     id: KeyscanId
     channel: Channel
     detector_version: str
     first: int
-    """Number of the first keyscan of the submap it was seen in."""
+    """Number of the first keyscan of its submap."""
     last: int
-    """Number of the last one (inclusive)."""
+    """Number of the last keyscan of its submap (inclusive)."""
     keypoints: NDArray[np.float32]
-    """Metres in the keyscan's base: x and y, shape (N, 2), if lidar; with the height z, shape (N, 3), if camera."""
+    """Metres in the keyscan's base: x and y, shape (N, 2), for lidar; x, y and height z, shape (N, 3), for camera."""
     descriptors: Codes
     """Shape (N, 32)."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorFile:
-    """A network that describes places, as a file that is not here yet."""
+    """Description of a network file that robots can download."""
 
     channel: Channel
     version: str
-    """Stamps every descriptor that it makes."""
+    """Detector version, which all its descriptors carry."""
     format: int
-    """Of the network, as its own metadata say."""
+    """Format of the network (``fcslam_format`` in its metadata)."""
     size: int
-    """Bytes of the file."""
+    """Size of the file in bytes."""
     sha256: bytes
-    """Of the file, 32 bytes."""
+    """SHA-256 of the file, 32 bytes."""
 
 
 class ClosureStatus(StrEnum):
-    """How far a closure has come; three different things and two ways to end."""
+    """Status of a closure: three stages, and two ways to be discarded."""
 
     CANDIDATE = "candidate"
     VERIFIED = "verified"
@@ -225,20 +229,20 @@ class LoopClosure:
     status: ClosureStatus
     reason: str
     informative: bool = True
-    """Whether the match fixes the pose in every direction (a bare corridor does not)."""
+    """Whether the match constrains the pose in every direction (a bare corridor does not)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Veto:
-    """Somebody knows that two robots' places (or two places of one robot) are not the same, whatever they look like."""
+    """A user's statement that places of two robots, or two places of one robot, are not the same."""
 
     robot_i: str
     robot_j: str
     stamps: tuple[float, float] | None = None
-    """Of the keyscans of i and j; None: no place of the one is a place of the other."""
+    """Stamps of the keyscans of i and j; None: no place of robot i is a place of robot j."""
 
     def forbids(self, robot_i: str, stamp_i: float, robot_j: str, stamp_j: float) -> bool:
-        """Whether it speaks of this closure, told from either end."""
+        """Whether the veto forbids this closure, in either order of its ends."""
         ends = ((robot_i, stamp_i), (robot_j, stamp_j))
         return any(
             (self.robot_i, self.robot_j) == (i, j) and (self.stamps is None or _same_stamps(self.stamps, (at_i, at_j)))
@@ -252,15 +256,14 @@ def _same_stamps(a: tuple[float, float], b: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """What the cloud tells a robot: where its smooth, drifting frame lies in the fleet's map."""
+    """The cloud's message to a robot: the pose of its smooth, drifting frame ``odom`` in the fleet's map."""
 
     robot: str
     version: int
     map_index: int
-    """Tells apart maps that are not joined yet; it may change when maps join."""
+    """Identifies one of the maps that are not joined yet; it may change when maps join."""
     T_map_odom: FloatArray
-    """``odom`` here is the chain of the robot's own motions between keyscans, from zero at its first."""
+    """Shape (3,). Here, ``odom`` is the chain of the robot's motions between keyscans; its first keyscan is zero."""
     quality: float = 0.0
-    """How well others bear it out, in [0, 1]: of what the session saw at its newest place that others have seen as
-    well, the share that lies where they saw it, times 1 - 2^-n with n closures to others. 0: none holds it in the map.
-    """
+    """Support by other sessions, in [0, 1]: at the session's newest place, the share of the surfaces seen by both that
+    agree, times 1 - 2^-n with n closures to others. 0: no closure connects the session to others."""

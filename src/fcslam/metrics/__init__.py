@@ -1,1 +1,1 @@
-"""Pure measures of results against references."""
+"""Metrics of results against references, as pure functions."""

@@ -1,4 +1,4 @@
-"""How far a mean over few samples can be trusted."""
+"""Confidence intervals by bootstrap."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from fcslam.records import FloatArray
 
 DRAWS = 2000
+"""Bootstrap samples of a mean."""
 FEW_DRAWS = 300
-"""For what takes longer than a mean."""
+"""Bootstrap samples of any other measure, which takes longer."""
 
 
 class Interval(NamedTuple):
-    """A mean and where it would lie in 95 of 100 samples of the same size."""
+    """A mean, or another measure, with its 95 % bootstrap interval."""
 
     mean: float
     low: float
@@ -22,9 +23,9 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: FloatArray, rng: np.random.Generator) -> Interval:
-    """Percentile bootstrap (Efron 1979) of the mean of ``values`` (N,), those that are NaN left out.
+    """Percentile bootstrap (Efron 1979) of the mean of ``values`` (N,), ignoring NaN.
 
-    Of two systems on the same samples, the interval of the mean difference is the paired one.
+    For two systems on the same samples, pass their differences to get the paired interval.
     """
     known = values[np.isfinite(values)]
     if not len(known):
@@ -35,9 +36,15 @@ def mean_interval(values: FloatArray, rng: np.random.Generator) -> Interval:
 
 
 def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator) -> Interval:
-    """The same for any measure of some of ``count`` samples, which is given their numbers; the first value is of all.
+    """Percentile bootstrap of any measure of ``count`` samples.
 
-    Draws for which the measure is NaN are left out.
+    Args:
+        measure: computes the measure of the samples whose indices (N,) it is given; draws with NaN are ignored.
+        count: number of samples.
+        rng: random generator.
+
+    Returns:
+        The measure of all samples and its interval.
     """
     whole = measure(np.arange(count))
     drawn = np.array([measure(rng.integers(count, size=count)) for _ in range(FEW_DRAWS if count else 0)])

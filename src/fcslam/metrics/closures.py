@@ -1,7 +1,7 @@
-"""Loop closures against reference poses: how many are true, and how many revisits they find.
+"""Precision and recall of loop closures against reference poses.
 
-A reference knows motions between some of a run's poses. A closure ends at other poses, a little before or after; that
-gap is bridged by the run's own trajectory, which over so short a time is as good as its odometry.
+A reference has relative poses between some of a run's poses. The ends of a closure are other poses, shortly before or
+after. The run's own trajectory bridges this gap; over such a short time it is as accurate as odometry.
 """
 
 from dataclasses import dataclass
@@ -18,53 +18,55 @@ Rows = NDArray[np.int64]
 """Rows of a run's pose table; -1 for none."""
 
 Mask = NDArray[np.bool_]
+"""Selection, shape (K,) for K closures."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClosureCriteria:
-    """When a closure is covered, when it is wrong, and which revisit it finds."""
+    """Thresholds for covered closures, wrong closures and found revisits."""
 
     bridge_s: float = 1.0
-    """A closure's stamp and the reference's may lie this far apart."""
+    """Largest time between an end of a closure and a reference pose that covers it."""
     wrong_m: float = 0.5
-    """A covered closure that is off by more is wrong."""
+    """A covered closure with a larger translation error is wrong."""
     wrong_deg: float = 10.0
-    """Or turned by more."""
+    """A covered closure with a larger rotation error is wrong."""
     reach_m: float = 2.0
-    """A closure finds a revisit if both ends lie this near along the robots' paths: the usual distance of places."""
+    """A closure finds a revisit if both ends are within this path length of it: the spacing of places."""
     within_gap_s: float = 60.0
-    """What lies nearer in time within one robot is no revisit."""
+    """Shortest time between two passes of one robot that count as a revisit."""
 
 
 class ReferenceMotion(NamedTuple):
-    """What a reference knows of the way between two poses."""
+    """A relative pose of a reference, near two poses of a run."""
 
     a: int
-    """Row of a pose near the first one."""
+    """Row of the reference pose near the first pose."""
     b: int
-    """Row of a pose near the second one."""
+    """Row of the reference pose near the second pose."""
     T_a_b: FloatArray
+    """Shape (3,)."""
 
 
 class Reference(Protocol):
-    """Something that knows motions between some of a run's poses."""
+    """A source of true relative poses between some of a run's poses."""
 
     def motion(self, i: int, j: int) -> ReferenceMotion | None:
-        """The motion whose ends lie nearest in time to rows i and j, if it knows one near enough."""
+        """The relative pose whose ends are nearest in time to rows i and j; None if none is near enough."""
 
 
 @dataclass(frozen=True, slots=True)
 class PoseReference:
-    """Reference poses in components; poses of different components are not placed to each other."""
+    """Reference poses in components; relative poses are only known within a component."""
 
     run: PoseTable
     bridge_s: float
     rows: Rows
-    """Where in the run the poses are, shape (M,)."""
+    """Rows of the reference poses in the run, shape (M,)."""
     T_component_base: FloatArray
-    """Shape (M, 3)."""
+    """Reference poses in the frame of their component, shape (M, 3)."""
     components: NDArray[np.int64]
-    """Shape (M,)."""
+    """Component of each pose, shape (M,)."""
 
     def motion(self, i: int, j: int) -> ReferenceMotion | None:
         """As in Reference."""
@@ -86,10 +88,10 @@ class PoseReference:
 
 
 class RelationReference:
-    """Reference motions each for itself, in both directions: nothing is chained and nothing adjusted."""
+    """Single reference relations, in both directions, neither chained nor optimised."""
 
     def __init__(self, run: PoseTable, bridge_s: float, ends: Rows, T_1_2: FloatArray) -> None:
-        """``ends``, shape (R, 2), are the rows that the motions ``T_1_2``, shape (R, 3), join."""
+        """``ends``, shape (R, 2), are the rows that the relative poses ``T_1_2``, shape (R, 3), connect."""
         self._run, self._bridge_s = run, bridge_s
         self._ends = np.concatenate((ends, ends[:, ::-1]))
         self._T_a_b = np.concatenate((T_1_2, se2.inverse(T_1_2)))
@@ -108,10 +110,10 @@ class RelationReference:
 
 @dataclass(frozen=True, slots=True)
 class ClosureErrors:
-    """How far closures are off, one row each; NaN where no reference covers one."""
+    """Errors of closures, one row each; NaN without a reference."""
 
     ends: Rows
-    """Rows of the reference poses that a closure was compared by, shape (K, 2); -1 where none covers it."""
+    """Rows of the reference poses that a closure was compared with, shape (K, 2); -1 without a reference."""
     translation_m: FloatArray
     """Shape (K,)."""
     rotation_deg: FloatArray
@@ -119,16 +121,16 @@ class ClosureErrors:
 
     @property
     def covered(self) -> Mask:
-        """Which closures the reference can judge, shape (K,)."""
+        """Closures with a reference, shape (K,)."""
         return np.isfinite(self.translation_m)
 
     def correct(self, criteria: ClosureCriteria) -> Mask:
-        """Which of the covered ones are not wrong, shape (K,)."""
+        """Covered closures that are not wrong, shape (K,)."""
         return (self.translation_m <= criteria.wrong_m) & (self.rotation_deg <= criteria.wrong_deg)
 
 
 def closure_errors(pairs: Rows, T_i_j: FloatArray, run: PoseTable, reference: Reference) -> ClosureErrors:
-    """Errors of closures ``T_i_j`` (K, 3) between the rows ``pairs`` (K, 2) of ``run``."""
+    """Errors of closures ``T_i_j`` (K, 3), metres and radians, between rows ``pairs`` (K, 2) of ``run``."""
     ends = np.full((len(pairs), 2), -1, dtype=np.int64)
     true = np.full((len(pairs), 3), np.nan)
     for k, (i, j) in enumerate(pairs.tolist()):
@@ -143,28 +145,29 @@ def closure_errors(pairs: Rows, T_i_j: FloatArray, run: PoseTable, reference: Re
 
 @dataclass(frozen=True, slots=True)
 class Precision:
-    """How many closures of a set are true, as far as the reference can tell."""
+    """Precision of a set of closures, as far as the reference covers it."""
 
     closures: int
     covered: int
     wrong: int
     translation_m: tuple[float, float]
-    """Median and maximum error of the covered ones; NaN for none."""
+    """Median and maximum error of the covered closures; NaN for none."""
     rotation_deg: tuple[float, float]
+    """Median and maximum error of the covered closures; NaN for none."""
 
     @property
     def coverage(self) -> float:
-        """Share of the closures that the reference covers; NaN of none."""
+        """Share of the closures that the reference covers; NaN without closures."""
         return _share(self.covered, self.closures)
 
     @property
     def precision(self) -> float:
-        """Share of the covered closures that are not wrong; NaN of none."""
+        """Share of the covered closures that are not wrong; NaN without covered closures."""
         return _share(self.covered - self.wrong, self.covered)
 
 
 def precision(errors: ClosureErrors, members: Mask, criteria: ClosureCriteria) -> Precision:
-    """Precision of the closures for which ``members``, shape (K,), holds."""
+    """Precision of the closures selected by ``members``, shape (K,)."""
     judged = members & errors.covered
     wrong = judged & ~errors.correct(criteria)
     middle_and_most = [_median_and_maximum(spread[judged]) for spread in (errors.translation_m, errors.rotation_deg)]
@@ -173,21 +176,28 @@ def precision(errors: ClosureErrors, members: Mask, criteria: ClosureCriteria) -
 
 @dataclass(frozen=True, slots=True)
 class Recall:
-    """How many of the revisits that a reference names are found."""
+    """Recall of closures over the revisits of a reference."""
 
     revisits: int
     found: int
 
     @property
     def recall(self) -> float:
-        """Share of the revisits that are found; NaN of none."""
+        """Share of the revisits that are found; NaN without revisits."""
         return _share(self.found, self.revisits)
 
 
 def revisits_found(revisits: Rows, correct: Rows, run: PoseTable, reach_m: float) -> Mask:
-    """Which revisits, pairs of rows (R, 2), a correct closure, one of the pairs (C, 2), finds: shape (R,).
+    """Find which revisits are detected by a correct closure.
 
-    Both ends must lie within ``reach_m`` of path of the same robots; which end comes first does not matter.
+    Args:
+        revisits: pairs of rows of ``run``, shape (R, 2).
+        correct: ends of the correct closures as pairs of rows, shape (C, 2), in either order.
+        run: poses of the run.
+        reach_m: largest path length between the ends of a closure and of a revisit, on the same robots.
+
+    Returns:
+        Shape (R,).
     """
     metres, robots = path_lengths(run), run.robots
     both_ways = np.concatenate((correct, correct[:, ::-1]))
@@ -199,7 +209,7 @@ def revisits_found(revisits: Rows, correct: Rows, run: PoseTable, reach_m: float
 
 
 def path_lengths(run: PoseTable) -> FloatArray:
-    """How far each pose's robot had driven, metres, shape (M,): the polygon through its poses in the stamps' order."""
+    """Path length of each pose's robot up to the pose, metres, shape (M,): polyline in the order of stamps."""
     metres = np.zeros(len(run.stamps))
     for robot in np.unique(run.robots):
         rows = np.flatnonzero(run.robots == robot)

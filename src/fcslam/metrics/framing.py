@@ -1,4 +1,4 @@
-"""Images of one size for every detector, and what that makes of the homography between them."""
+"""Scaling and cropping of images to a common size, and the homography between the resulting images."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,18 +12,18 @@ Size = tuple[int, int]
 
 
 class HomographyGroundTruth(StrEnum):
-    """Which homography counts as true between two scaled and cropped images."""
+    """How to compute the true homography between two scaled and cropped images."""
 
     CORRECTED = "corrected"
-    """The right one."""
+    """With the scale and the crop of both images: the correct one."""
     LEGACY = "legacy"
-    """As in SuperPoint's widely used evaluation until 2019: the crop and the second image's scale are forgotten, so
-    almost nothing holds under a change of viewpoint. Published tables rest on it."""
+    """As in SuperPoint's widely used evaluation until 2019, which ignores the crop and the scale of the second image.
+    Almost no match is then correct under a change of viewpoint, but published tables use it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """How an image was brought to a size: scaled, keeping its proportions, and cropped around its middle."""
+    """Scaling with constant aspect ratio and cropping around the centre, to a given size."""
 
     scale: float
     crop_px: tuple[int, int]
@@ -31,19 +31,19 @@ class Framing:
 
     @classmethod
     def of(cls, image: Size, target: Size) -> "Framing":
-        """The smallest scale at which the image covers the target."""
+        """Framing with the smallest scale at which the image covers the target."""
         scale = max(target[0] / image[0], target[1] / image[1])
         cut = [int(0.5 * (side * scale - wanted)) for side, wanted in zip(image, target, strict=True)]
         return cls(scale, (cut[0], cut[1]))
 
     @property
     def matrix(self) -> FloatArray:
-        """Takes pixels of the image to pixels of the framed one, shape (3, 3)."""
+        """Homography from pixels of the image to pixels of the framed image, shape (3, 3)."""
         return np.array([[self.scale, 0.0, -self.crop_px[0]], [0.0, self.scale, -self.crop_px[1]], [0.0, 0.0, 1.0]])
 
 
 def framed_homography(H: FloatArray, first: Framing, second: Framing, truth: HomographyGroundTruth) -> FloatArray:
-    """H between the framed images, shape (3, 3)."""
+    """Homography (3, 3) between two framed images from H (3, 3) between the original images, in pixels."""
     if truth is HomographyGroundTruth.LEGACY:
         scaling = np.diag([first.scale, first.scale, 1.0])
         return scaling @ H @ np.linalg.inv(scaling)

@@ -1,7 +1,7 @@
-"""How well an occupancy grid agrees with the true one: surfaces within a tolerance, free space cell by cell.
+"""Agreement of an occupancy grid with the true one: surfaces within a tolerance, free space cell by cell.
 
-Every occupied cell of the map must be near a true surface, also where the truth knows nothing: the true grid holds all
-that the robots' beams could reach, so a surface elsewhere is invented.
+Every occupied cell of the map must be near a true surface, even where the true grid is unknown. The true grid has all
+surfaces that the robots' beams can reach, so a surface elsewhere is wrong.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,16 @@ from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
 TOLERANCE_M = 0.10
+"""Largest distance of an occupied cell to its true counterpart: two cells of 0.05 m."""
 _ROUNDING_M = 1e-6
-"""Cells exactly as far apart as the tolerance are near in whatever coordinate frame they are compared."""
+"""Added to the tolerance, so that cells exactly that far apart match in every coordinate frame."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class LabelledGrid:
-    """An occupancy grid that has been decided; cells that are neither occupied nor free are unknown."""
+    """A classified occupancy grid; cells that are neither occupied nor free are unknown."""
 
     occupied: Mask
     """Shape (H, W); row 0 is the lowest y, column 0 the lowest x of ``grid``."""
@@ -30,15 +31,15 @@ class LabelledGrid:
     """Shape (H, W)."""
     resolution_m: float
     T_frame_grid: FloatArray
-    """Where the lower left corner of cell (0, 0) lies, shape (3,)."""
+    """Pose of the lower left corner of cell (0, 0), shape (3,)."""
 
     def centres(self, cells: Mask) -> FloatArray:
-        """Centres (N, 2) of the cells for which ``cells``, shape (H, W), holds, in the grid's frame."""
+        """Centres (N, 2) of the cells selected by ``cells``, shape (H, W), metres in the grid's frame."""
         row, column = np.nonzero(cells)
         return se2.transform(self.T_frame_grid, (np.column_stack((column, row)) + 0.5) * self.resolution_m)
 
     def is_free(self, points: FloatArray) -> Mask:
-        """Whether points (N, 2) in the grid's frame lie in free cells, shape (N,); outside nothing is free."""
+        """Whether points (N, 2), metres in the grid's frame, lie in free cells, shape (N,); False outside the grid."""
         in_grid = se2.transform(se2.inverse(self.T_frame_grid), points)
         column, row = np.floor(in_grid / self.resolution_m).astype(np.int64).T
         height, width = self.free.shape
@@ -50,19 +51,19 @@ class LabelledGrid:
 
 @dataclass(frozen=True, slots=True)
 class GridAgreement:
-    """A map against the true one; NaN where there is nothing to compare."""
+    """Agreement of a map with the true one; NaN if it is undefined."""
 
     precision: float
-    """Share of the map's occupied cells with a truly occupied one within the tolerance."""
+    """Share of the map's occupied cells with a truly occupied cell within the tolerance."""
     recall: float
-    """Share of the truly occupied cells with an occupied one of the map within the tolerance."""
+    """Share of the truly occupied cells with an occupied cell of the map within the tolerance."""
     free_iou: float
-    """Area free in both over the area free in one of them."""
+    """Intersection over union of the free areas."""
 
     @property
     def f1(self) -> float:
         """Harmonic mean of precision and recall."""
-        if self.recall == 0.0:  # then nothing is precise either, and a map without surfaces has no precision
+        if self.recall == 0.0:  # precision is 0 too, or undefined for a map without surfaces
             return 0.0
         return 2.0 * self.precision * self.recall / (self.precision + self.recall)
 
@@ -70,9 +71,15 @@ class GridAgreement:
 def grid_agreement(
     grid: LabelledGrid, truth: LabelledGrid, T_truth_map: FloatArray, tolerance_m: float = TOLERANCE_M
 ) -> GridAgreement:
-    """Agreement of ``grid``, whose frame ``map`` is ``T_truth_map`` (3,) in the true one, with ``truth``.
+    """Compare ``grid`` with ``truth``.
 
-    Nothing is resampled: centres of cells are moved, and free space is looked up at them.
+    Grids are not resampled: cell centres are transformed, and free space is looked up at them.
+
+    Args:
+        grid: the map, in its frame ``map``.
+        truth: the true map, in its own frame.
+        T_truth_map: pose of ``map`` in the frame of the truth, shape (3,); NaN if unknown.
+        tolerance_m: largest distance of matching surfaces.
     """
     if not np.isfinite(T_truth_map).all():
         return GridAgreement(np.nan, np.nan, np.nan)
@@ -86,7 +93,7 @@ def grid_agreement(
 
 
 def _share_near(points: FloatArray, others: FloatArray, tolerance_m: float) -> float:
-    """Share of ``points`` (N, 2) with one of ``others`` (M, 2) within the tolerance; NaN of none."""
+    """Share of ``points`` (N, 2) with one of ``others`` (M, 2) within the tolerance; NaN without points."""
     if not len(points):
         return np.nan
     if not len(others):
@@ -96,7 +103,7 @@ def _share_near(points: FloatArray, others: FloatArray, tolerance_m: float) -> f
 
 
 def _free_iou(grid: LabelledGrid, truth: LabelledGrid, T_truth_map: FloatArray) -> float:
-    """From both sides: what is free in truth is looked up in the map, and what is free in the map in the truth."""
+    """IoU of free space: truly free cells are looked up in the map, and free cells of the map in the truth."""
     T_map_truth = se2.inverse(T_truth_map)
     true_cells = truth.centres(truth.free)
     cells = grid.centres(grid.free)

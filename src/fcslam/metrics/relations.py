@@ -1,7 +1,7 @@
-"""The relations metric: errors of relative poses against hand-checked ones.
+"""The relations metric: errors of relative poses against manually verified ones.
 
 R. Kuemmerle et al., "On Measuring the Accuracy of SLAM Algorithms", Autonomous Robots 27(4), 2009. A relation is the
-pose of the robot (``base``, not the laser) at one stamp seen from its pose at another, so the measure needs no common
+pose of the robot (``base``, not the laser) at one stamp relative to its pose at another, so the metric needs no common
 coordinate frame and no alignment.
 """
 
@@ -20,10 +20,10 @@ from fcslam.geometry import se2
 from fcslam.records import FloatArray, frozen
 
 STAMP_TOLERANCE_S = 5.5e-6
-"""Half a unit of the fifth digit, which is the last one that some relations files print, and float64's own rounding."""
+"""Largest difference of equal stamps: half a unit of the fifth decimal, the last of some files, plus rounding."""
 
 ACROSS_ROBOTS_GAP_S = 20.0
-"""Relations across robots must be further apart in time: across a cut in a log they would only measure odometry."""
+"""Shortest time span of a relation across robots. Shorter ones, across a cut in a log, would measure odometry."""
 
 _COLUMNS = "stamp1 stamp2 x y z roll pitch yaw"
 _OPENERS = {".gz": gzip.open, ".xz": lzma.open}
@@ -42,28 +42,35 @@ class Relations:
         return len(self.stamps)
 
     def where(self, mask: NDArray[np.bool_]) -> "Relations":
-        """Those relations for which ``mask``, shape (N,), holds."""
+        """Relations selected by ``mask``, shape (N,)."""
         return Relations(frozen(self.stamps[mask]), frozen(self.T_1_2[mask]))
 
 
 @dataclass(frozen=True, slots=True)
 class PoseTable:
-    """Estimated poses of a fleet, sorted by stamp so that a stamp is looked up exactly and never interpolated."""
+    """Estimated poses of a fleet, sorted by stamp; stamps are looked up exactly, without interpolation."""
 
     stamps: FloatArray
-    """Shape (M,), ascending."""
+    """Shape (M,), ascending, seconds."""
     T_map_base: FloatArray
     """Shape (M, 3), each in the coordinate frame of its own map."""
     robots: NDArray[np.int64]
-    """Number of the robot that was there, shape (M,)."""
+    """Number of each pose's robot, shape (M,)."""
     maps: NDArray[np.int64]
-    """Number of the map that the pose is given in, shape (M,)."""
+    """Number of each pose's map, shape (M,)."""
 
     @classmethod
     def of(
         cls, stamps: ArrayLike, T_map_base: ArrayLike, robots: ArrayLike | None = None, maps: ArrayLike | None = None
     ) -> "PoseTable":
-        """A table of poses in any order of time (intel's stamps run backwards); one robot, one map if not said."""
+        """Make a table of poses in any order of time (stamps of intel run backwards).
+
+        Args:
+            stamps: shape (M,), seconds.
+            T_map_base: shape (M, 3).
+            robots: number of each pose's robot, shape (M,); None: all of one robot.
+            maps: number of each pose's map, shape (M,); None: all in one map.
+        """
         stamp_column = np.asarray(stamps, dtype=np.float64)
         order = np.argsort(stamp_column, kind="stable")
         zeros = np.zeros(len(stamp_column), dtype=np.int64)
@@ -75,7 +82,7 @@ class PoseTable:
         )
 
     def find(self, stamps: ArrayLike) -> NDArray[np.int64]:
-        """Row of each stamp; -1 where no pose has it, or where two have and it cannot be told which is meant."""
+        """Row of each stamp, same shape; -1 if no pose has the stamp, or if several have it."""
         wanted = np.asarray(stamps, dtype=np.float64)
         if not len(self.stamps):
             return np.full(wanted.shape, -1, dtype=np.int64)
@@ -94,7 +101,7 @@ class PoseTable:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How a set of errors is distributed; all NaN for none."""
+    """Statistics of a set of errors; all NaN without errors."""
 
     mean: float
     std: float
@@ -110,14 +117,14 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class RelationErrors:
-    """Errors over the usable relations of a set."""
+    """Errors of the usable relations of a set."""
 
     translation_m: FloatArray
-    """|translation| of each error, shape (used,)."""
+    """Norm of each translation error, shape (used,)."""
     rotation_deg: FloatArray
-    """|rotation| of each error, shape (used,)."""
+    """Absolute rotation error, shape (used,)."""
     total: int
-    """Relations asked for, the unusable ones included."""
+    """Number of selected relations, including unusable ones."""
 
     @property
     def used(self) -> int:
@@ -138,9 +145,9 @@ class RelationErrors:
 def select(
     relations: Relations, poses: PoseTable, minimum_gap_s: float = 0.0, across_robots: bool = False
 ) -> Relations:
-    """The relations whose stamps lie more than ``minimum_gap_s`` apart and, if asked, belong to different robots.
+    """Select relations whose stamps are more than ``minimum_gap_s`` apart and, if asked, of different robots.
 
-    A relation with a stamp that no robot of ``poses`` has is kept, so that it counts as unusable and is not forgotten.
+    A relation with a stamp that ``poses`` does not have is kept, so that it counts as unusable.
     """
     gap_s = np.abs(relations.stamps[:, 1] - relations.stamps[:, 0])
     keep = (gap_s > minimum_gap_s) | (minimum_gap_s <= 0.0)
@@ -152,10 +159,10 @@ def select(
 
 
 def relation_errors(relations: Relations, poses: PoseTable) -> RelationErrors:
-    """Errors of ``poses`` against ``relations``; a stamp without a pose or two different maps make one unusable.
+    """Compute the errors of ``poses``; a relation is unusable if a stamp has no pose or its poses are in two maps.
 
     Raises:
-        EvaluationError: not one stamp of the relations has a pose.
+        EvaluationError: no stamp of the relations has a pose.
     """
     row = poses.find(relations.stamps)
     if not np.any(row >= 0):
@@ -169,7 +176,11 @@ def relation_errors(relations: Relations, poses: PoseTable) -> RelationErrors:
 
 
 def motion_errors(T_true: FloatArray, T_estimated: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """|translation| in metres and |rotation| in degrees, (N,) each, of what lies between motions (N, 3)."""
+    """Errors of estimated motions (N, 3), metres and radians, against true ones (N, 3).
+
+    Returns:
+        Norm of the translation error in metres and absolute rotation error in degrees, shape (N,) each.
+    """
     error = se2.between(T_true, T_estimated)
     return frozen(np.hypot(error[:, 0], error[:, 1])), frozen(np.degrees(np.abs(error[:, 2])))
 
@@ -178,7 +189,7 @@ def read_relations(path: Path) -> Relations:
     """Read a relations file, plain, ``.gz`` or ``.xz``.
 
     Raises:
-        EvaluationError: the file cannot be read, a line is not eight finite numbers, or there is none at all.
+        EvaluationError: the file cannot be read, has no relation, or a line is not eight finite numbers.
     """
     opener = _OPENERS.get(path.suffix, open)
     try:
@@ -193,7 +204,7 @@ def read_relations(path: Path) -> Relations:
 
 
 def write_relations(path: Path, relations: Relations) -> None:
-    """Write ``relations`` as ``read_relations`` reads them: stamps with six digits, the rest with nine."""
+    """Write ``relations`` in the format of ``read_relations``: stamps with six decimals, other numbers with nine."""
     x, y, theta = relations.T_1_2.T
     zeros = np.zeros(len(relations))
     columns = (*relations.stamps.T, x, y, zeros, zeros, zeros, theta)
@@ -201,7 +212,7 @@ def write_relations(path: Path, relations: Relations) -> None:
 
 
 def _parse(lines: Iterable[str], path: Path) -> list[list[float]]:
-    """Rows of eight numbers; blank lines and comments are passed over."""
+    """Rows of eight numbers; skips blank lines and comments."""
     rows = []
     for number, line in enumerate(lines, start=1):
         fields = line.split()

@@ -1,7 +1,7 @@
-"""Repeatability of a detector: whether what it finds in one image of a plane it finds in another as well.
+"""Repeatability of a detector between two images with a known homography.
 
-As in SuperPoint's evaluation (DeTone et al. 2018): of the points that both images show the strongest, found again if
-the other image has one within ``CORRECT_PX``.
+As in SuperPoint's evaluation (DeTone et al. 2018): the share of the strongest keypoints in common view that have a
+keypoint of the other image within ``CORRECT_PX``.
 """
 
 from dataclasses import dataclass
@@ -14,38 +14,40 @@ from fcslam.metrics.homography import Rows, inside, inverse, warp
 from fcslam.records import FloatArray
 
 CORRECT_PX = 3.0
+"""Largest distance of a repeated keypoint."""
 
 
 @dataclass(frozen=True, slots=True)
 class Repeatability:
-    """Of one pair of images, both directions together."""
+    """Repeatability of one pair of images, both directions together."""
 
     found: int
-    """Points that have one of the other image's near them."""
+    """Repeated keypoints."""
     points: int
+    """Keypoints in common view."""
     distance_px: float
-    """Sum over the points found of the distance to the nearest."""
+    """Sum of the distances of repeated keypoints to their nearest neighbours."""
 
     @property
     def repeatability(self) -> float:
-        """Share of the points that are found again; NaN without points."""
+        """Share of the keypoints that are repeated; NaN without keypoints."""
         return self.found / self.points if self.points else float("nan")
 
     @property
     def localisation_error_px(self) -> float:
-        """Mean distance of the points found to the nearest; NaN without any."""
+        """Mean distance of repeated keypoints; NaN without any."""
         return self.distance_px / self.found if self.found else float("nan")
 
 
 def repeatability(first: FloatArray, second: FloatArray, H: FloatArray, size: Size, most: int) -> Repeatability:
-    """Repeatability of keypoints of image 1, (N, 2), and of image 2, (M, 2), each the strongest first.
+    """Compute the repeatability of keypoints, each set the strongest first.
 
     Args:
-        first: in pixels of image 1.
-        second: in pixels of image 2.
-        H: from image 1 to image 2; distances count in image 2.
-        size: width and height of both images.
-        most: the strongest points of each image that count, of those which the other image shows, too.
+        first: keypoints of image 1, shape (N, 2), pixels.
+        second: keypoints of image 2, shape (M, 2), pixels.
+        H: homography (3, 3) from image 1 to image 2; distances are measured in image 2.
+        size: width and height of both images, pixels.
+        most: number of the strongest keypoints in common view that count in each image.
     """
     here = warp(H, first[in_common_view(first, H, size)][:most])
     there = second[in_common_view(second, inverse(H), size)][:most]
@@ -58,5 +60,5 @@ def repeatability(first: FloatArray, second: FloatArray, H: FloatArray, size: Si
 
 
 def in_common_view(points: FloatArray, H: FloatArray, size: Size) -> Rows:
-    """Rows of those ``points`` (N, 2) that the other image shows, ascending; H takes them there."""
+    """Rows (K,) of the ``points`` (N, 2), pixels, that H (3, 3) maps into the other image, ascending."""
     return np.flatnonzero(inside(warp(H, points), size))

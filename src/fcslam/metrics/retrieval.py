@@ -1,11 +1,11 @@
-"""How well similarities between queries and a gallery find the same place again.
+"""Place retrieval metrics on similarities between queries and a gallery.
 
-The words are those of the tutorial of Schubert et al. 2023 (stschubert/VPR_Tutorial). A similarity matrix has shape
-(Q, G); a similarity of 0 or less retrieves nothing. Of every pair the truth says that it is a match, that it is
-different, or nothing: then it is ignored, whatever its similarity.
+The terms are those of the tutorial of Schubert et al. 2023 (stschubert/VPR_Tutorial). A similarity matrix has shape
+(Q, G); a similarity of 0 or less retrieves nothing. The ground truth labels a pair as a match, as different, or not at
+all; unlabelled pairs are ignored.
 
-Ties are nobody's luck: where equals compete for a rank, a measure is its mean over all orders of them, and a threshold
-takes them all or none.
+Ties do not depend on the order: a ranking measure is the mean over all orders of equal similarities, and a threshold
+accepts all of them or none.
 """
 
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ Pairs = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class PairTruth:
-    """What is known of queries (rows) and gallery (columns)."""
+    """Ground truth of pairs of queries (rows) and gallery places (columns)."""
 
     matches: Pairs
-    """The same place."""
+    """Pairs of the same place, shape (Q, G)."""
     different: Pairs
-    """Another place; what is neither is ignored."""
+    """Pairs of different places, shape (Q, G); pairs that are neither are ignored."""
 
     def __post_init__(self) -> None:
         if self.matches.shape != self.different.shape or self.matches.ndim != 2:
@@ -41,38 +41,46 @@ class PairTruth:
         return np.asarray(self.matches.any(axis=1), np.bool_)
 
     def take(self, queries: NDArray[np.int64] | NDArray[np.bool_]) -> "PairTruth":
-        """The truth of those queries."""
+        """The ground truth of some queries: indices (K,) or a mask (Q,)."""
         return PairTruth(self.matches[queries], self.different[queries])
 
 
 @dataclass(frozen=True, slots=True)
 class PrecisionRecall:
-    """A curve over all thresholds, the strictest first."""
+    """A precision-recall curve, the strictest threshold first."""
 
     thresholds: FloatArray
-    """Shape (T,), falling: what is at least so similar is said to be the same place."""
+    """Shape (T,), descending: similarities from which a pair is accepted."""
     precision: FloatArray
+    """Shape (T,)."""
     recall: FloatArray
+    """Shape (T,); NaN if there is nothing to find."""
 
     @property
     def average_precision(self) -> float:
-        """Area under the steps: the sum of precision times gain of recall; NaN if there is nothing to find."""
+        """Average precision: the sum of precision times gain of recall; NaN if there is nothing to find."""
         if np.isnan(self.recall).any():
             return float("nan")
         return float(np.sum(np.diff(self.recall, prepend=0.0) * self.precision))
 
     @property
     def recall_at_full_precision(self) -> float:
-        """The largest recall before the first wrong answer; NaN if there is nothing to find."""
+        """Maximum recall at 100 % precision; NaN if there is nothing to find."""
         if np.isnan(self.recall).any():
             return float("nan")
         return float(np.max(self.recall[self.precision >= 1.0], initial=0.0))
 
 
 def recall_at(similarity: FloatArray, truth: PairTruth, k: int) -> FloatArray:
-    """Whether a match is among the ``k`` most similar, for every query that has one, shape (answerable,), in [0, 1].
+    """Recall@k of every query that has a match, shape (answerable,), in [0, 1].
 
-    Between 0 and 1 where equals compete for the last of the ``k`` ranks. Queries without a match are left out.
+    It is 1 if a match is among the ``k`` most similar places, and a probability in between if ties decide. Queries
+    without a match are excluded.
+
+    Args:
+        similarity: shape (Q, G).
+        truth: ground truth of the pairs.
+        k: number of retrieved places.
     """
     return np.array(
         [_found_within(similarity[q], truth, int(q), k) for q in np.flatnonzero(truth.answerable)], np.float64
@@ -81,20 +89,20 @@ def recall_at(similarity: FloatArray, truth: PairTruth, k: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class RetrievedPlaces:
-    """What every query says at most once: its most similar place."""
+    """The single best match of every query."""
 
     scores: FloatArray
-    """Shape (Q,); 0 where nothing is retrieved."""
+    """Similarity of the retrieved place, shape (Q,); 0 if none is retrieved."""
     right: FloatArray
-    """Shape (Q,), in [0, 1]: of equally similar places, the share of matches."""
+    """Whether it is a match, shape (Q,); of equally similar places, the share of matches."""
     answerable: NDArray[np.bool_]
-    """Shape (Q,)."""
+    """Whether the query has a match, shape (Q,)."""
 
     def curve(self, queries: NDArray[np.int64] | slice = slice(None)) -> PrecisionRecall:
-        """Over the thresholds, for some of the queries; each may be there several times.
+        """Precision-recall curve of some queries, indices (K,) that may repeat.
 
-        Precision: share of right answers; recall: right answers among the queries that have a match. A query without
-        one can only be wrong.
+        Precision is the share of correct retrievals. Recall is the number of correct retrievals divided by the number
+        of queries that have a match. Any retrieval of a query without a match is wrong.
         """
         scores, right = self.scores[queries], self.right[queries]
         given = scores > 0.0
@@ -102,7 +110,7 @@ class RetrievedPlaces:
 
 
 def single_best(similarity: FloatArray, truth: PairTruth) -> RetrievedPlaces:
-    """The most similar place of every query, ignored pairs left out."""
+    """Retrieve the most similar place of every query from similarities (Q, G), without ignored pairs."""
     best = _best(similarity, truth.matches | truth.different)
     first = (similarity == best[:, None]) & (similarity > 0.0)
     right, wrong = ((first & of).sum(axis=1) for of in (truth.matches, truth.different))
@@ -110,15 +118,15 @@ def single_best(similarity: FloatArray, truth: PairTruth) -> RetrievedPlaces:
 
 
 def multi_match_curve(similarity: FloatArray, truth: PairTruth) -> PrecisionRecall:
-    """Every pair is an answer of its own: all matches are to be found."""
+    """Precision-recall curve over all pairs (multi-match) of similarities (Q, G): all matches are to be found."""
     counted = (truth.matches | truth.different) & (similarity > 0.0)
     return _curve(similarity[counted], truth.matches[counted].astype(np.float64), int(truth.matches.sum()))
 
 
 def significance(similarity: FloatArray, truth: PairTruth) -> FloatArray:
-    """By how much the most similar match is ahead of the most similar wrong place (FC-SLAM, IV.C).
+    """Similarity of the best match minus that of the best wrong place (FC-SLAM, IV.C), from similarities (Q, G).
 
-    Shape (answerable,), of the queries that have a match; negative similarities count as 0.
+    Shape (answerable,), for the queries that have a match; negative similarities count as 0.
     """
     best = _best(similarity, truth.matches) - _best(similarity, truth.different)
     ahead: FloatArray = best[truth.answerable]
@@ -126,9 +134,10 @@ def significance(similarity: FloatArray, truth: PairTruth) -> FloatArray:
 
 
 def relative_significance(similarity: FloatArray, truth: PairTruth) -> FloatArray:
-    """``significance`` as a share of the similarity of the match, shape (answerable,), at most 1.
+    """``significance`` divided by the similarity of the match, shape (answerable,), in [-1, 1].
 
-    The scale of the similarity drops out, which a larger vocabulary lowers. Where the match has no similarity, -1.
+    It does not depend on the scale of similarities (Q, G), which a larger vocabulary lowers. It is -1 if the match has
+    similarity 0.
     """
     right = _best(similarity, truth.matches)[truth.answerable]
     ahead = significance(similarity, truth)
@@ -136,12 +145,12 @@ def relative_significance(similarity: FloatArray, truth: PairTruth) -> FloatArra
 
 
 def mismatches(similarity: FloatArray, truth: PairTruth) -> FloatArray:
-    """1 for each query that has a match but no positive significance, else 0; shape (answerable,)."""
+    """1 for each query whose match has no positive significance, else 0; shape (answerable,), from (Q, G)."""
     return (significance(similarity, truth) <= 0.0).astype(np.float64)
 
 
 def _best(similarity: FloatArray, among: Pairs) -> FloatArray:
-    """The highest similarity of every query, 0 without any, shape (Q,)."""
+    """The highest similarity of every query among some pairs (Q, G), at least 0, shape (Q,)."""
     best: FloatArray = np.max(np.where(among, similarity, 0.0), axis=1, initial=0.0)
     return best
 
@@ -159,7 +168,7 @@ def _found_within(row: FloatArray, truth: PairTruth, query: int, k: int) -> floa
 
 
 def _curve(scores: FloatArray, right: FloatArray, to_find: int) -> PrecisionRecall:
-    """From answers with their scores and how right they are, each in [0, 1]."""
+    """Curve of retrievals with their scores (N,) and correctness (N,) in [0, 1], for ``to_find`` matches."""
     order = np.argsort(-scores, kind="stable")
     scores, right = scores[order], right[order]
     last = np.flatnonzero(np.diff(scores, append=-np.inf))

@@ -1,8 +1,8 @@
-"""Where the truth says that robots came to places again, and how many of these revisits closures find.
+"""Revisits of places according to the ground truth, and the recall of closures over them.
 
-A revisit is asked of positions alone, so that it is the same question to every sensor: at a pose of robot a, had robot
-b been, or will it be, near by? A camera sees the same only if the headings are alike, so revisits can be asked for with
-like headings as well. What walls stand between is not asked.
+A revisit depends on positions only, so that it is the same for every sensor: robot b passes near a pose of robot a,
+before or after. A camera sees the same scene only from similar headings, so revisits can also be limited to those.
+Walls in between are ignored.
 """
 
 from collections.abc import Iterator
@@ -18,35 +18,35 @@ from fcslam.metrics.relations import PoseTable
 
 @dataclass(frozen=True, slots=True)
 class RevisitCriteria:
-    """What counts as a revisit."""
+    """Definition of a revisit."""
 
     every_m: float = 1.0
-    """Poses asked about lie this far apart along the path."""
+    """Path length between the poses that are tested."""
     radius_m: float = 2.0
-    """The other path passes within it."""
+    """Largest distance of the other path."""
     turn_deg: float = 180.0
-    """Headings differ by no more; 180: any."""
+    """Largest difference of the headings; 180: any."""
     within_gap_s: float = 60.0
-    """Within one robot, the other pass is further away in time."""
+    """Shortest time between two passes of one robot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Revisits:
-    """Poses of robots, each with the passes of one robot near it; to find one of several passes is enough."""
+    """Revisits: poses with the passes of one robot near them. A closure to any of the passes finds the revisit."""
 
     passes: Rows
-    """Row of the pose, row of the nearest pose of a pass: shape (P, 2)."""
+    """Row of the pose and row of the nearest pose of a pass, shape (P, 2)."""
     numbers: NDArray[np.int64]
-    """Number of the revisit that the pass belongs to, shape (P,)."""
+    """Number of the pass's revisit, shape (P,)."""
 
     def recall(self, correct: Rows, truth: PoseTable, reach_m: float) -> Recall:
-        """How many revisits the ``correct`` closures (C, 2) find: both ends within ``reach_m`` of path of a pass."""
+        """Recall of the ``correct`` closures (C, 2), with both ends within ``reach_m`` of path length of a pass."""
         found = revisits_found(self.passes, correct, truth, reach_m)
         return Recall(len(np.unique(self.numbers)), len(np.unique(self.numbers[found])))
 
 
 def find_revisits(truth: PoseTable, criteria: RevisitCriteria, between_robots: bool) -> Revisits:
-    """All revisits of other robots' paths, or of the robots' own; ``truth`` is in one frame."""
+    """Find all revisits of other robots' paths, or of the robots' own paths; ``truth`` has one coordinate frame."""
     robots = np.unique(truth.robots).tolist()
     pairs = [(a, b) for a in robots for b in robots if (a != b) == between_robots]
     rows_of = {robot: np.flatnonzero(truth.robots == robot) for robot in robots}
@@ -62,7 +62,7 @@ def find_revisits(truth: PoseTable, criteria: RevisitCriteria, between_robots: b
 
 
 def _sampled(rows: NDArray[np.int64], metres: NDArray[np.float64], every_m: float) -> NDArray[np.int64]:
-    """Rows of one robot about ``every_m`` of path apart, its first among them."""
+    """Select rows of one robot about ``every_m`` of path length apart, starting with the first: shape (S,)."""
     lengths = metres[rows]
     at = np.searchsorted(lengths, np.arange(0.0, lengths[-1] + 1e-9, every_m))
     sampled: NDArray[np.int64] = rows[np.unique(np.minimum(at, len(rows) - 1))]
@@ -70,7 +70,7 @@ def _sampled(rows: NDArray[np.int64], metres: NDArray[np.float64], every_m: floa
 
 
 def _passes(row: int, others: NDArray[np.int64], truth: PoseTable, criteria: RevisitCriteria) -> Iterator[int]:
-    """The nearest pose of each stretch of path, rows ``others``, that passes the pose ``row``."""
+    """Row of the nearest pose of each pass of the path ``others`` (M,) near the pose ``row``."""
     away = truth.T_map_base[others] - truth.T_map_base[row]
     distance = np.hypot(away[:, 0], away[:, 1])
     near = (distance <= criteria.radius_m) & (np.abs(se2.wrap_angle(away[:, 2])) <= np.radians(criteria.turn_deg))

@@ -1,9 +1,9 @@
-"""Estimated trajectories of a fleet against the truth: absolute errors after alignment, errors of relative poses.
+"""Errors of a fleet's trajectories against the ground truth: absolute errors after alignment, relative pose errors.
 
-The truth is in one coordinate frame, ``truth``, the estimate in one ``map`` for each map. ATE (absolute trajectory
-error) is what remains after *one* rigid motion has put a whole map onto the truth, so robots that lie wrongly to each
-other show; J. Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, without scale. An
-alignment has no reflection: a mirrored map stays wrong.
+The truth has one coordinate frame, ``truth``; the estimate has a frame ``map`` for each map. The absolute trajectory
+error (ATE) is computed after aligning a whole map with *one* rigid motion, so it includes errors between robots.
+J. Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, without scale. An alignment contains
+no reflection, so a mirrored map has a large error.
 """
 
 from dataclasses import dataclass
@@ -17,11 +17,12 @@ from fcslam.metrics.relations import PoseTable, RelationErrors, motion_errors
 from fcslam.records import SAME_STAMP_S, FloatArray
 
 _DRAWS_PER_PAIR = 50
+"""Random pairs drawn for each wanted pair, because most are too far apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class PositionErrors:
-    """How far positions lie from the true ones, metres; all NaN for none."""
+    """Statistics of position errors in metres; all NaN without positions."""
 
     rmse_m: float
     mean_m: float
@@ -29,17 +30,23 @@ class PositionErrors:
 
     @classmethod
     def of(cls, errors_m: FloatArray) -> "PositionErrors":
-        """Of the distances ``errors_m``, shape (N,)."""
+        """Statistics of the distances ``errors_m``, shape (N,)."""
         if not len(errors_m):
             return cls(np.nan, np.nan, np.nan)
         return cls(float(np.sqrt(np.mean(errors_m**2))), float(np.mean(errors_m)), float(np.max(errors_m)))
 
 
 def interpolate(stamps: FloatArray, T: FloatArray, wanted: FloatArray, gap_s: float) -> FloatArray:
-    """Poses at the stamps ``wanted`` (K,) from poses ``T`` (N, 3) at ``stamps`` (N,), which may be in any order.
+    """Interpolate poses linearly in position and heading.
 
-    Positions and headings go straight from one pose to the next. NaN at a stamp that lies between poses more than
-    ``gap_s`` apart, and at one before the first or after the last.
+    Args:
+        stamps: stamps of the known poses, shape (N,), seconds, in any order.
+        T: known poses, shape (N, 3).
+        wanted: stamps to interpolate at, shape (K,), seconds.
+        gap_s: largest time between two known poses.
+
+    Returns:
+        Shape (K, 3); NaN in gaps longer than ``gap_s``, before the first and after the last known pose.
     """
     order = np.argsort(stamps, kind="stable")
     known, poses = stamps[order], T[order]
@@ -55,15 +62,26 @@ def interpolate(stamps: FloatArray, T: FloatArray, wanted: FloatArray, gap_s: fl
 
 
 def align(T_truth_base: FloatArray, T_map_base: FloatArray) -> FloatArray:
-    """``T_truth_map`` (3,) with the least squared distances of positions, from poses (N, 3) at the same stamps.
+    """Align estimated to true positions by least squares (Umeyama 1991, without scale).
 
-    NaN if the robots did not move: then positions determine no rotation.
+    Args:
+        T_truth_base: true poses, shape (N, 3).
+        T_map_base: estimated poses at the same stamps, shape (N, 3).
+
+    Returns:
+        ``T_truth_map``, shape (3,); NaN if the robots did not move, because positions then determine no rotation.
     """
     return n_point_alignment(T_truth_base[:, :2], T_map_base[:, :2])
 
 
 def position_errors(T_truth_map: FloatArray, T_truth_base: FloatArray, T_map_base: FloatArray) -> FloatArray:
-    """Distances (N,) between true positions and estimated ones moved into the truth's frame."""
+    """Distances (N,) in metres between true positions and estimated positions after alignment.
+
+    Args:
+        T_truth_map: the alignment, shape (3,).
+        T_truth_base: true poses, shape (N, 3).
+        T_map_base: estimated poses at the same stamps, shape (N, 3).
+    """
     moved = se2.transform(T_truth_map, T_map_base[:, :2])
     distances: FloatArray = np.linalg.norm(moved - T_truth_base[:, :2], axis=-1)
     return distances
@@ -71,25 +89,25 @@ def position_errors(T_truth_map: FloatArray, T_truth_base: FloatArray, T_map_bas
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryPair:
-    """Poses of one robot at the same stamps: where it was and where its map says that it was."""
+    """True and estimated poses of one robot at the same stamps."""
 
     T_truth_base: FloatArray
-    """Shape (N, 3)."""
+    """True poses, shape (N, 3)."""
     T_map_base: FloatArray
-    """Shape (N, 3)."""
+    """Estimated poses, shape (N, 3)."""
 
     def alignment(self) -> FloatArray:
-        """``T_truth_map`` by positions and headings, so that a robot that stands still has one too."""
+        """``T_truth_map`` (3,) from positions and headings, so that it is defined for a robot that stands still."""
         both = (self.T_truth_base, self.T_map_base)
         truth, estimate = (np.concatenate((T[:, :2], se2.compose(T, (1.0, 0.0, 0.0))[:, :2])) for T in both)
         return n_point_alignment(truth, estimate)
 
 
 def placement_error(a: TrajectoryPair, b: TrajectoryPair) -> tuple[float, float]:
-    """How wrongly two robots of one map lie to each other: metres and degrees.
+    """Relative error of two robots in one map: metres and degrees.
 
-    Each robot by itself says where the map lies in the truth. If the robots lie rightly to each other, both say the
-    same; else the difference is what one would have to be moved, measured in the middle of both.
+    The trajectory of each robot alone gives an alignment of the map with the truth. The error is the difference between
+    both alignments, with the translation measured at the centroid of both trajectories.
     """
     off = se2.between(a.alignment(), b.alignment())
     middle = np.concatenate((a.T_map_base, b.T_map_base))[:, :2].mean(axis=0)
@@ -100,9 +118,17 @@ def placement_error(a: TrajectoryPair, b: TrajectoryPair) -> tuple[float, float]
 def near_pairs(
     truth: PoseTable, rng: np.random.Generator, across_robots: bool, count: int = 2000, reach_m: float = 5.0
 ) -> NDArray[np.int64]:
-    """Up to ``count`` pairs of rows (P, 2), drawn evenly from those that truth puts less than ``reach_m`` apart.
+    """Draw up to ``count`` random pairs of rows whose true positions are less than ``reach_m`` apart.
 
-    Pairs of different robots, or of one robot.
+    Args:
+        truth: true poses.
+        rng: random generator.
+        across_robots: whether the pairs are of different robots, or of one robot.
+        count: largest number of pairs.
+        reach_m: largest distance.
+
+    Returns:
+        Shape (P, 2).
     """
     if not len(truth.stamps):
         return np.empty((0, 2), dtype=np.int64)
@@ -115,7 +141,7 @@ def near_pairs(
 
 
 def relative_errors(pairs: NDArray[np.int64], truth: PoseTable, estimate: PoseTable) -> RelationErrors:
-    """Errors of the estimated motions between ``pairs`` of rows (P, 2); pairs in different maps are not usable."""
+    """Errors of estimated relative poses between ``pairs`` of rows (P, 2); pairs in different maps are unusable."""
     i, j = pairs[estimate.maps[pairs[:, 0]] == estimate.maps[pairs[:, 1]]].T
     true = se2.between(truth.T_map_base[i], truth.T_map_base[j])
     estimated = se2.between(estimate.T_map_base[i], estimate.T_map_base[j])

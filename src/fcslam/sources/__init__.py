@@ -1,4 +1,4 @@
-"""Recordings in, sensor records out: ``open_source(path)`` knows every format."""
+"""Reads and writes recordings. ``open_source(path)`` reads every format as a stream of sensor records."""
 
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag

@@ -1,4 +1,4 @@
-"""What was wrong with a recording that could be read all the same."""
+"""Faults of a recording that are tolerated, counted and reported."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 
 class Fault(StrEnum):
-    """A kind of fault that is tolerated, counted and reported."""
+    """Kinds of tolerated faults; the value is the text of the report."""
 
     BROKEN_LINE = "broken lines skipped"
     BROKEN_MESSAGE = "broken messages skipped"
@@ -29,24 +29,22 @@ class Fault(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FaultCount:
-    """How often a kind of fault occurred."""
+    """Number of faults of one kind."""
 
     count: int = 0
     first_line: int = 0
-    """Line of the recording (message of its topic, record of its file), counted from 1, with the first one; 0 when
-    there is none.
-    """
+    """Line (or message of its topic, or record of its file) of the first fault, counted from 1; 0 without faults."""
     largest_s: float = 0.0
-    """Largest step back in time, of the kinds that have one."""
+    """Largest step back in time, for kinds of faults that have one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """The faults of one pass over a recording; false when there are none, its text is one line for people."""
+    """The faults of one pass over a recording; false without faults. ``str`` gives a one-line summary."""
 
     counts: Mapping[Fault, FaultCount]
     unit: str = "line"
-    """What the recording is made of and ``FaultCount.first_line`` counts."""
+    """Unit that ``FaultCount.first_line`` counts."""
 
     def __getitem__(self, kind: Fault) -> FaultCount:
         return self.counts.get(kind, FaultCount())
@@ -71,12 +69,12 @@ class Audit:
         self._counts: dict[Fault, FaultCount] = {}
 
     def add(self, kind: Fault, line: int, count: int = 1, step_s: float = 0.0) -> None:
-        """Count ``count`` faults at ``line``."""
+        """Add ``count`` faults at ``line``."""
         before = self._counts.get(kind, FaultCount(first_line=line))
         self._counts[kind] = FaultCount(before.count + count, before.first_line, max(before.largest_s, step_s))
 
     def clear(self) -> None:
-        """Forget what was counted."""
+        """Reset all counts."""
         self._counts.clear()
 
     def faults(self) -> Faults:

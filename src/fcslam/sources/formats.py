@@ -1,4 +1,4 @@
-"""Which format a recording has."""
+"""The known formats of recordings, and opening a recording by its content."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ from fcslam.sources.source import Source
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A kind of recording."""
+    """A format of recordings."""
 
     name: str
     recognises: Callable[[Path, bytes], bool]
-    """Told by the path and the first bytes (decompressed; none of a folder)."""
+    """Whether a path and its first bytes (decompressed; empty for a folder) have this format."""
     open: Callable[[Path, str, BagOptions | None], Source]
-    """By path, the robot's name, and options, which only bags are given."""
+    """Opens a path with the robot's name, and options, which are for bags only."""
     takes_options: bool = False
 
 
@@ -42,18 +42,22 @@ FORMATS: tuple[Format, ...] = (
     Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
     Format("ROS bag", is_bag, RosBag, takes_options=True),
 )
-"""Asked in this order; a new format is one more entry."""
+"""Tried in this order. To add a format, add an entry."""
 
 
 def open_source(path: Path, options: BagOptions | None = None, name: str | None = None) -> Source:
-    """The recording at ``path``; what it holds decides the format, not its name.
+    """Open the recording at ``path``. Its content decides the format, not its name.
 
-    Reads only the beginning: ``Source.survey`` finds what is wrong further on. ``name`` is the robot's, the file's
-    if not given.
+    Only the beginning is read; ``Source.survey`` checks the rest.
+
+    Args:
+        path: file or folder.
+        options: options of a bag.
+        name: the robot's name; None takes the name of the file.
 
     Raises:
-        SourceError: the file is missing, empty, unreadable, a damaged archive, or of no known format; or it is no
-            bag and ``options`` are given.
+        SourceError: the file is missing, empty, unreadable, a damaged archive or of an unknown format; or ``options``
+            are given for a recording that is not a bag.
     """
     path = Path(path)
     content = b"" if path.is_dir() else head(path)

@@ -1,11 +1,12 @@
-"""Which scans fit the rest of a recording, and when too many do not: one rule for all formats.
+"""Consistency rules for the scans of a recording, the same for all formats.
 
-- Clocks of one robot disagree by up to a second (the Intel log: 631 steps back, largest 0.9 s): scans stay in the
-  recording's order, which is the order that the odometry makes sense in. A scan more than 2 s before both scans
-  before it is misplaced and skipped (both: one of them may carry a damaged stamp, far ahead). When more than 1 % are
-  misplaced, two recordings were put together, which is refused. So is one in which more than half of the steps go back.
-- A scan with another beam count than the rest is skipped; more than 1 % of them are a change of sensor: refused.
-- Equal stamps are kept: some logs were printed with too few digits, or without a clock.
+- Steps back in time. The clocks of one robot disagree by up to a second (the Intel log has 631 steps back, the largest
+  0.9 s). Scans stay in file order, in which the odometry is consistent. A scan more than 2 s before both preceding
+  scans is misplaced and skipped (both, because one of them may have a damaged stamp far ahead). A recording with more
+  than 1 % misplaced scans, or with more than half of its steps back in time, is rejected.
+- Beam count. A scan with a different beam count is skipped. A recording with more than 1 % of them is rejected, because
+  the sensor changed.
+- Equal stamps are kept. Some logs were printed with too few digits or without a clock.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -18,16 +19,17 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.source import ScanRange
 
 MAX_STEP_BACK_S = 2.0
+"""Largest tolerated step back in time."""
 TOLERATED_SHARE = 0.01
-"""Share of a recording's scans that may not fit the rest."""
+"""Largest share of inconsistent scans in a recording."""
 SCANS_THAT_VOTE = 20
-"""So many of the first scans decide what is usual."""
+"""Number of first scans whose majority decides the nominal beam count."""
 
 Entry = TypeVar("Entry")
 
 
 class StampedScan(Protocol):
-    """What the gate looks at."""
+    """The part of a scan that the gate checks."""
 
     @property
     def stamp(self) -> float:
@@ -39,7 +41,7 @@ class StampedScan(Protocol):
 
 
 class ScanGate:
-    """Lets scans pass that fit the recording and counts those that do not; every pass uses the same rule."""
+    """Filters inconsistent scans out and counts them."""
 
     def __init__(self, beam_count: int, audit: Audit) -> None:
         self._beam_count = beam_count
@@ -47,7 +49,7 @@ class ScanGate:
         self._previous = self._before_previous = -inf
 
     def admits(self, number: int, scan: StampedScan) -> bool:
-        """Whether the scan on line (or in message) ``number`` is one of the recording's."""
+        """Whether the scan on line (or in message) ``number`` is consistent; counts its faults."""
         if scan.beam_count != self._beam_count:
             self._audit.add(Fault.BEAM_COUNT, number)
             return False
@@ -66,9 +68,9 @@ class ScanGate:
 def scan_window(
     entries: Iterable[tuple[int, Entry]], scans: ScanRange, is_scan: Callable[[Entry], bool], audit: Audit
 ) -> Iterator[tuple[int, Entry]]:
-    """The entries of a range of scans; odometry goes with the scan before it.
+    """Select the entries of a range of scans; other entries belong to the scan before them.
 
-    In the end ``audit`` holds the faults of this range alone.
+    Afterwards, ``audit`` holds the faults of this range only.
     """
     seen = 0
     for number, entry in entries:
@@ -83,7 +85,7 @@ def scan_window(
 
 
 def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int, beam_count: int) -> None:
-    """Refuse a recording of which too much does not fit the rest.
+    """Reject a recording with too many inconsistent or damaged scans.
 
     Raises:
         SourceError: it is mostly damaged, its beam count changes, or its time jumps or runs back.

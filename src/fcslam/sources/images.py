@@ -1,4 +1,4 @@
-"""Encoded images at the border: what kind of file the bytes are and how large the picture is, without decoding it."""
+"""Checks of encoded images without decoding: file type and size."""
 
 import struct
 from struct import unpack_from
@@ -6,20 +6,26 @@ from struct import unpack_from
 from fcslam.records import CameraModel
 
 MAX_IMAGE_BYTES = 1 << 25
-"""A larger file is no camera's."""
+"""Largest image file of a camera."""
 MAX_SIDE_PX = 1 << 14
+"""Largest width or height of an image."""
 
 _FAR = 1e6
+"""Bound of intrinsics in pixels and of positions in metres."""
 _UNIT = 1e-6
+"""Largest deviation of a quaternion's squared length from 1."""
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _PNG_SIZE = 16
+"""Offset of width and height in a PNG file."""
 _SEGMENT = 0xFF
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""JPEG markers SOF0 to SOF15 (without DHT, JPG and DAC), which hold the size."""
 _BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})
+"""JPEG markers without a length: TEM, RST0 to RST7 and SOI."""
 
 
 def image_suffix(encoded: bytes) -> str:
-    """``jpg`` or ``png``, told by the first bytes; raises ValueError when it is neither."""
+    """``jpg`` or ``png`` by the first bytes; raises ValueError for anything else."""
     if encoded.startswith(_JPEG):
         return "jpg"
     if encoded.startswith(_PNG):
@@ -28,7 +34,7 @@ def image_suffix(encoded: bytes) -> str:
 
 
 def image_size(encoded: bytes) -> tuple[int, int]:
-    """Width and height in pixels that the header states; raises ValueError when there is no sane header."""
+    """Width and height in pixels from the header; raises ValueError for an invalid header."""
     try:
         if image_suffix(encoded) == "png":
             width, height = unpack_from(">II", encoded, _PNG_SIZE)
@@ -40,7 +46,7 @@ def image_size(encoded: bytes) -> tuple[int, int]:
 
 
 def check_image(encoded: bytes, camera: CameraModel) -> None:
-    """Raises ValueError when ``encoded`` is no image of ``camera``."""
+    """Raises ValueError if ``encoded`` is not an image of ``camera``."""
     if len(encoded) > MAX_IMAGE_BYTES:
         raise ValueError(f"an image has at most {MAX_IMAGE_BYTES} bytes")
     width, height = image_size(encoded)
@@ -49,7 +55,7 @@ def check_image(encoded: bytes, camera: CameraModel) -> None:
 
 
 def check_camera(camera: CameraModel) -> None:
-    """Raises ValueError when ``camera`` is no camera's model."""
+    """Raises ValueError if ``camera`` is invalid."""
     if not (0 < camera.width <= MAX_SIDE_PX and 0 < camera.height <= MAX_SIDE_PX):
         raise ValueError(f"width and height must be 1 to {MAX_SIDE_PX} pixels")
     if not (0.0 < camera.fx < _FAR and 0.0 < camera.fy < _FAR):
@@ -64,7 +70,7 @@ def check_camera(camera: CameraModel) -> None:
 
 
 def _jpeg_size(encoded: bytes) -> tuple[int, int]:
-    """From the first frame header; every segment before it says how long it is."""
+    """Width and height from the first frame header, after skipping the segments before it."""
     at = 2
     while True:
         fill, marker = unpack_from(">BB", encoded, at)

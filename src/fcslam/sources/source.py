@@ -1,4 +1,4 @@
-"""What every recording offers, whatever its format."""
+"""The interface of recordings of all formats."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ class ScanRange(NamedTuple):
 
     first: int = 0
     end: int | None = None
-    """None: up to the end of the recording."""
+    """None: to the end of the recording."""
 
 
 WHOLE = ScanRange()
@@ -21,21 +21,21 @@ WHOLE = ScanRange()
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What one pass over a recording tells without reading the ranges."""
+    """Summary of a recording from one pass that does not parse the ranges."""
 
     scan_count: int
-    """Scans that ``records`` yields; it yields fewer only where a range turns out not to be a number."""
+    """Scans that ``records`` yields; it yields fewer only if a range is not a number."""
     duration_s: float
     """Time between the earliest and the latest scan."""
     path_length_m: float
     """Length of the odometry's polyline through the scans, in file order."""
     laser: LaserModel
     faults: Faults
-    """Of this pass, so without those of the ranges."""
+    """Faults of this pass, so without those of the ranges."""
     notes: tuple[str, ...] = ()
-    """What was chosen where the recording leaves a choice, in sentences for people."""
+    """Choices that were made for the user, such as topics, as sentences."""
     camera: CameraModel | None = None
-    """None: ``records`` yields no images."""
+    """None if ``records`` yields no images."""
 
     @property
     def beam_count(self) -> int:
@@ -52,10 +52,10 @@ class Source(Protocol):
 
     @property
     def faults(self) -> Faults:
-        """What the latest pass of ``records`` has tolerated so far; complete once it has ended."""
+        """Faults of the latest pass of ``records`` so far; complete when the pass has ended."""
 
     def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """One quick pass that says what is in ``scans`` and refuses a recording that cannot be mapped.
+        """Summarise ``scans`` in one quick pass, and reject a recording that cannot be mapped.
 
         Raises:
             SourceError: the archive is truncated, there are no laser scans or no odometry, the beam count changes,
@@ -63,9 +63,9 @@ class Source(Protocol):
         """
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """Stream scans, odometry and images in file order; what is no scan goes with the scan before it.
+        """Stream scans, odometry and images in file order; other records belong to the scan before them.
 
-        Memory does not depend on the recording's length. Every call starts a new pass.
+        Memory use does not depend on the recording's length. Every call starts a new pass.
 
         Raises:
             SourceError: as in ``survey``.

@@ -1,4 +1,4 @@
-"""One recording cut into several robots."""
+"""Splits one recording into several robots."""
 
 from collections.abc import Iterator
 from copy import copy
@@ -12,12 +12,12 @@ from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 
 
 def split(source: Source, parts: int) -> list[Source]:
-    """``parts`` disjoint robots ``<name>_1``, ``<name>_2`` ... of equal scan count (to within one), in file order.
+    """Split a recording into robots ``<name>_1``, ``<name>_2`` ... of equal scan count (to within one), in file order.
 
     Each starts with a scan at the identity of its own odometry.
 
     Raises:
-        SourceError: there are not enough scans, or ``source`` cannot be mapped.
+        SourceError: the recording has too few scans, or cannot be mapped.
     """
     count = source.survey().scan_count
     if not 1 <= parts <= count:
@@ -29,11 +29,11 @@ def split(source: Source, parts: int) -> list[Source]:
 
 
 class Part:
-    """Some scans of a recording as a robot of its own."""
+    """A range of scans of a recording as a robot of its own."""
 
     def __init__(self, whole: Source, scans: ScanRange, name: str) -> None:
         self._whole = copy(whole)
-        """A pass of its own: parts are read side by side."""
+        """A copy with its own pass, because parts are read concurrently."""
         self._scans = scans
         self.name = name
 
@@ -47,7 +47,7 @@ class Part:
         return self._whole.survey(self._within(scans))
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """As in Source; the first record is a scan at the identity, what comes before it is left out."""
+        """As in Source; the first record is a scan at the identity, and records before it are dropped."""
         origin: Pose | None = None
         for record in self._whole.records(self._within(scans)):
             pose: Pose | None = None if record.T_odom_base is None else tuple(record.T_odom_base.tolist())

@@ -37,7 +37,7 @@ def head(path: Path) -> bytes:
     Raises:
         SourceError: the file is missing, empty or damaged, or is no file.
     """
-    with _reported(path), _open(path) as stream:
+    with _translate_errors(path), _open(path) as stream:
         content = stream.read(_HEAD_BYTES)
     if not content:
         raise SourceError(f"{path}: the file is empty; give a recording with laser scans")
@@ -50,7 +50,7 @@ def numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
     Raises:
         SourceError: the file cannot be read to its end.
     """
-    with _reported(path), _open(path) as stream:
+    with _translate_errors(path), _open(path) as stream:
         yield from enumerate(iter(partial(stream.readline, MAX_LINE_BYTES), b""), start=1)
 
 
@@ -73,8 +73,8 @@ def _buffered(stream: gzip.GzipFile | lzma.LZMAFile | bz2.BZ2File) -> BinaryIO:
 
 
 @contextmanager
-def _reported(path: Path) -> Iterator[None]:
-    """Turn what the system and the archive modules raise into one clear line."""
+def _translate_errors(path: Path) -> Iterator[None]:
+    """Translate errors of the system and the archive modules to SourceError with a one-line message."""
     try:
         yield
     except FileNotFoundError as error:

@@ -1,1 +1,1 @@
-"""The own recording format, a folder for each robot: writer and reader. docs/recording.md says every byte."""
+"""fcslam's own recording format, a folder for each robot: reader and writer. docs/recording.md specifies it."""

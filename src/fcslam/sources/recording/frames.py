@@ -1,4 +1,4 @@
-"""The frames of a recording's files, in blocks, and merged into the order in which they were written."""
+"""Reads the frames of a recording's files and merges them into the order in which they were written."""
 
 import heapq
 from collections.abc import Iterator, Sequence
@@ -17,15 +17,15 @@ _BLOCK_FRAMES = 256
 
 
 class Frame(NamedTuple):
-    """One record as it lies in its file."""
+    """One record of a file."""
 
     sequence: int
-    """Where it belongs; a frame that cannot be trusted stays with the one before it."""
+    """Position in the recording; a damaged frame has that of the frame before it."""
     file: FrameFile
     number: int
     """Counts the file's frames from 1."""
     content: Any
-    """By the fields of ``file.frame``; None: damaged."""
+    """The fields of ``file.frame``; None if damaged."""
     fault: Fault | None = None
 
     @property
@@ -40,7 +40,7 @@ class Frame(NamedTuple):
 
     @property
     def T_odom_base(self) -> Pose:
-        """The odometry; all NaN when an image has none."""
+        """The odometry; all NaN for an image without odometry."""
         x, y, theta = self.content["T_odom_base"].tolist()
         return x, y, theta
 
@@ -51,16 +51,16 @@ class Frame(NamedTuple):
 
 
 def merged_frames(folder: Path, files: Sequence[FrameFile]) -> Iterator[Frame]:
-    """The frames of all ``files`` of ``folder`` in the order of the recording, the damaged ones among them.
+    """The frames of all ``files`` of ``folder`` in the order of the recording, including damaged ones.
 
     Raises:
-        SourceError: a file is missing, cannot be read, or is of another laser or version than meta.yaml.
+        SourceError: a file is missing, cannot be read, or does not match the laser or version of meta.yaml.
     """
     yield from heapq.merge(*(_frames(folder / file.name, file) for file in files), key=lambda frame: frame.sequence)
 
 
 def frame_count(folder: Path, file: FrameFile) -> int:
-    """Whole frames in ``file``, as far as its length tells; 0 when it is not there."""
+    """Number of whole frames in ``file`` by its length; 0 if the file is missing."""
     path = folder / file.name
     return max(0, path.stat().st_size - HEADER_BYTES) // file.frame_bytes if path.is_file() else 0
 

@@ -1,8 +1,8 @@
-"""What lies in a recording's folder: file names, the layout of frames, and the sensors' geometry in meta.yaml.
+"""Layout of a recording's folder: file names, binary frames, and the sensors' geometry in meta.yaml.
 
-``scans.bin``, ``odometry.bin`` and ``images.bin`` are a header and frames of one size, each with a checksum: what is
-damaged is lost alone, and what a crash cut off is told by the file's length. The frames of all files count on one
-sequence, which is the order of the recording.
+``scans.bin``, ``odometry.bin`` and ``images.bin`` have a header and frames of constant size, each with a checksum. So
+damage affects single frames, and the length of a file shows a frame that a crash cut off. The frames of all files share
+one sequence of numbers, which is the order of the recording.
 """
 
 from dataclasses import dataclass
@@ -70,7 +70,7 @@ class FrameFile:
 
 
 def is_whole(frame: bytes | memoryview) -> bool:
-    """Whether a frame's checksum is right."""
+    """Whether a frame's checksum is correct."""
     return crc32(frame[:-CRC_BYTES]) == int.from_bytes(frame[-CRC_BYTES:], "little")
 
 
@@ -91,7 +91,7 @@ def image_path(folder: Path, index: int, suffix: str) -> Path:
 
 
 class Meta(Settings):
-    """Which sensors the robot carries."""
+    """The sensors of the robot."""
 
     version: Literal[1] = 1
     laser: LaserModel
@@ -113,7 +113,7 @@ class Meta(Settings):
 
 
 def write_meta(folder: Path, meta: Meta) -> None:
-    """Write meta.yaml, which is whole or not there."""
+    """Write meta.yaml atomically."""
     content = meta.model_dump(mode="json", exclude_none=True)
     if meta.camera is not None:
         translation_m, rotation = meta.camera.T_base_camera

@@ -1,8 +1,8 @@
-"""A recording folder as a source.
+"""Reads a recording folder.
 
-What is damaged is skipped and counted: a frame whose checksum is wrong or whose stamp or pose is no sane number, an
-image whose file is missing or is another one, and what a crash cut off at the end of a file. Without the camera's
-calibration its images are left out and the rest is read. Which scans fit the others is decided in ``gate``.
+Damaged records are skipped and counted: frames with a wrong checksum or an implausible stamp or pose, images whose file
+is missing or different, and frames that a crash cut off. Without the camera's calibration, images are ignored and the
+rest is read. ``gate`` decides which scans are consistent.
 """
 
 from collections.abc import Iterator
@@ -57,7 +57,7 @@ def is_recording(path: Path, _: bytes) -> bool:
 
 
 class Recording:
-    """What one robot recorded, in a folder."""
+    """A recording folder of one robot."""
 
     def __init__(self, path: Path, name: str) -> None:
         self.name = name
@@ -99,7 +99,7 @@ class Recording:
                     audit.add(Fault.BROKEN_IMAGE, number)
 
     def ground_truth(self) -> Iterator[GroundTruth]:
-        """Where the robot really was, in the order in which it was written; none if that was not recorded.
+        """True poses in the order in which they were written; empty if they were not recorded.
 
         Raises:
             EvaluationError: ground_truth.tum is damaged.
@@ -115,7 +115,7 @@ class Recording:
 
     @cached_property
     def _survey(self) -> Survey:
-        """From one pass over all of it; refuses what cannot be mapped."""
+        """Summary from one pass over the whole recording; rejects a recording that cannot be mapped."""
         audit, scans, odometry = _audit(), PathSummary(), PathSummary()
         for _, frame in self._checked(audit):
             if frame.is_scan:
@@ -142,7 +142,7 @@ class Recording:
         return scan_window(self._checked(audit), scans, lambda frame: frame.is_scan, audit)
 
     def _checked(self, audit: Audit) -> Iterator[tuple[int, Frame]]:
-        """The frames that can be used, each with its number."""
+        """The usable frames, each with its number."""
         files = [scans_file(self._meta.laser), ODOMETRY_FILE]
         if self._camera_and_notes()[0] is not None:
             files.append(IMAGES_FILE)
@@ -157,7 +157,7 @@ class Recording:
         return frame.file.name == "scans.bin"
 
     def _image(self, frame: Frame, camera: CameraModel) -> CameraImage:
-        """Raises OSError or ValueError when the image's file is missing or is another one."""
+        """Raises OSError or ValueError if the image's file is missing or different."""
         size, suffix = int(frame.content["size"]), bytes(frame.content["suffix"])
         if suffix not in _SUFFIXES or size > MAX_IMAGE_BYTES:
             raise ValueError("no image of this kind")
@@ -180,7 +180,7 @@ def _is_sane(frame: Frame) -> bool:
 
 
 def _ranges(frame: Frame, audit: Audit) -> Ranges:
-    """Ranges in metres; negative ones are made invalid."""
+    """Ranges in metres, shape (beam_count,); negative ones become NaN."""
     ranges: Ranges = frame.content["ranges_m"].astype(np.float32)
     negative = ranges < 0.0
     if negative.any():

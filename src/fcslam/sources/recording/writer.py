@@ -1,4 +1,4 @@
-"""Sensor records written as a recording, one by one: after a crash everything but the last record is there."""
+"""Writes sensor records to a recording folder, one by one. A crash loses the last record at most."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -48,7 +48,7 @@ class RecordingWriter:
     """A recording that grows. Nothing is buffered: what ``write`` has returned from outlives this process."""
 
     def __init__(self, folder: Path, meta: Meta) -> None:
-        """For ``create`` and ``resume`` only."""
+        """Use ``create`` or ``resume`` instead."""
         self._folder = folder
         self._meta = meta
         self._next_sequence = 0
@@ -57,16 +57,16 @@ class RecordingWriter:
 
     @classmethod
     def create(cls, folder: Path, laser: LaserModel, camera: CameraModel | None = None) -> Self:
-        """A new recording at ``folder``, which must not be there or be empty.
+        """Start a new recording at ``folder``, which must be missing or empty.
 
         Raises:
-            OutputError: there is something, it cannot be written, or the models are not sane.
+            OutputError: the folder is not empty or cannot be written, or a sensor model is invalid.
         """
         try:
             meta = Meta(laser=laser, camera=camera)
         except ValidationError as error:
             raise OutputError(f"{folder}: cannot hold these sensors ({error.errors()[0]['msg']})") from error
-        with _reported(folder):
+        with _translate_errors(folder):
             folder.mkdir(exist_ok=True)
             if any(folder.iterdir()):
                 raise OutputError(f"{folder}: is not empty; choose another place")
@@ -75,11 +75,11 @@ class RecordingWriter:
 
     @classmethod
     def resume(cls, folder: Path) -> Self:
-        """Go on with the recording at ``folder`` where it was cut off; last records that are not whole are removed.
+        """Continue the recording at ``folder``; incomplete last records are removed.
 
         Raises:
-            SourceError: there is no recording.
-            OutputError: it cannot be written.
+            SourceError: the folder has no recording.
+            OutputError: the recording cannot be written.
         """
         return cls._opened(folder, read_meta(folder))
 
@@ -87,7 +87,7 @@ class RecordingWriter:
     def _opened(cls, folder: Path, meta: Meta) -> Self:
         writer = cls(folder, meta)
         try:
-            with _reported(folder):
+            with _translate_errors(folder):
                 writer._open_files()
         except BaseException:
             writer.close()
@@ -106,24 +106,24 @@ class RecordingWriter:
 
     @property
     def counts(self) -> RecordCounts:
-        """What is there already."""
+        """Records in the folder."""
         truth = self._appenders[GROUND_TRUTH]
         scans, odometry, images = (self._count(frames) for frames in (self._scans, ODOMETRY_FILE, IMAGES_FILE))
         return RecordCounts(scans, odometry, images, truth.content(0, truth.size).count(b"\n"))
 
     @property
     def is_gapless(self) -> bool:
-        """Whether no record before another one is missing, as a power cut may have left it."""
+        """Whether no record is missing before another one, which can happen after a power cut."""
         return self._next_sequence == sum(self.counts[:3])
 
     def write(self, item: RecordedItem) -> None:
         """Append one record.
 
         Raises:
-            OutputError: it cannot be written, has a stamp or pose that is not finite, or comes from another sensor.
+            OutputError: the record cannot be written, has a stamp or pose that is not finite, or is of another sensor.
         """
         self._check(item)
-        with _reported(self._folder):
+        with _translate_errors(self._folder):
             match item:
                 case LaserScan(stamp, ranges_m, _, pose):
                     self._append(self._scans, stamp, pose, ranges_m)
@@ -184,7 +184,7 @@ class RecordingWriter:
         return (appender.size - HEADER_BYTES) // frames.frame_bytes if appender else 0
 
     def _append_image(self, image: CameraImage) -> None:
-        """The file first: a frame without its file would be a fault, a file without its frame is overwritten."""
+        """Write the file before the frame: a frame without a file is a fault, a file without a frame is overwritten."""
         suffix, encoded = image_suffix(image.encoded), image.encoded
         image_path(self._folder, self._count(IMAGES_FILE), suffix).write_bytes(encoded)
         pose = _NO_POSE if image.T_odom_base is None else image.T_odom_base
@@ -194,9 +194,9 @@ class RecordingWriter:
 def write_recording(
     folder: Path, laser: LaserModel, camera: CameraModel | None, records: Iterable[RecordedItem]
 ) -> None:
-    """Write ``records`` as a new recording at ``folder``; equal records give equal bytes.
+    """Write ``records`` to a new recording folder; equal records give equal bytes.
 
-    Everything that a source yields comes back to the last bit; ground truth to nine digits after the point.
+    Sensor records are lossless; ground truth has nine decimals.
 
     Raises:
         OutputError: as ``RecordingWriter.create`` and ``write``.
@@ -207,7 +207,7 @@ def write_recording(
 
 
 class _Appender:
-    """A file that grows by whole pieces."""
+    """A file that grows by complete records."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -219,7 +219,7 @@ class _Appender:
         return os.pread(self.file.fileno(), end - start, start)
 
     def append(self, piece: bytes) -> None:
-        """Write the whole piece, or nothing and raise OSError: a full disk may take a part of it."""
+        """Append the whole piece, or undo a partial write (disk full) and raise OSError."""
         written = 0
         try:
             while written < len(piece):
@@ -230,16 +230,16 @@ class _Appender:
         self.size += len(piece)
 
     def cut(self, size: int) -> None:
-        """Forget what lies beyond ``size``."""
+        """Truncate the file to ``size`` bytes."""
         self.file.truncate(size)
         self.size = size
 
 
 def _cut_to_whole_frames(appender: _Appender, frames: FrameFile) -> int:
-    """Remove what is no whole frame from the end, write the header if there is none; the sequence to go on with.
+    """Remove incomplete frames from the end, and write the header if it is missing; returns the next sequence number.
 
     Raises:
-        SourceError: the file is of another laser or version.
+        SourceError: the file does not match the laser or version.
     """
     header = appender.content(0, HEADER_BYTES)
     if header != frames.header[: len(header)]:
@@ -259,8 +259,8 @@ def _cut_to_whole_frames(appender: _Appender, frames: FrameFile) -> int:
 
 
 @contextmanager
-def _reported(folder: Path) -> Iterator[None]:
-    """Turn what the system raises into one clear line."""
+def _translate_errors(folder: Path) -> Iterator[None]:
+    """Translate OSError to OutputError with a one-line message."""
     try:
         yield
     except OSError as error:
