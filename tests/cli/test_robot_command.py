@@ -72,7 +72,7 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
         (["--certificate", "nowhere"], "--certificate and --key belong together"),
         (
             ["--server", "https://localhost", "--certificate", "no.pem", "--key", "no.key"],
-            "no certificate with its key",
+            "cannot read the certificate and its key",
         ),
         (["--state", "/dev/null/state"], "cannot be made"),
         (["--ca", "nowhere"], "no certificate authority"),

@@ -98,7 +98,7 @@ def test_what_never_will(cloud, transport, status, more):
 
 def test_answers_that_are_none(cloud, transport):
     cloud.canned += [(200, {}, b"noise"), (502, {}, b"<html>"), (404, {}, b"[]")]
-    with pytest.raises(UnavailableError, match="the answer is broken"):
+    with pytest.raises(UnavailableError, match="the reply is broken"):
         transport.send(PACKETS, -1)
     with pytest.raises(UnavailableError, match=r"Bad Gateway \(502\)"):
         transport.send(PACKETS, -1)
@@ -117,7 +117,7 @@ def test_an_answer_that_cannot_be_unpacked_is_none(cloud, transport):
 )
 def test_another_server_is_no_cloud(cloud, transport, body):
     cloud.canned.append((200, {}, body))
-    with pytest.raises(CloudError, match="not as a cloud of fcslam"):
+    with pytest.raises(CloudError, match="not that of an fcslam cloud"):
         transport.state()
 
 

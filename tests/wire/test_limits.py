@@ -50,7 +50,7 @@ def detector_update(**changes):
 
 
 REFUSED_BODIES = [
-    (replace(HELLO, robot="bob"), "speaks for robot"),
+    (replace(HELLO, robot="bob"), "holds a record of robot"),
     (replace(HELLO, epoch=8), "epoch 8 in a packet of epoch 7"),
     (replace(HELLO, detector_versions={Channel.LIDAR: "two words"}), "detector version of lidar"),
     (hello(beam_count=0), "0 beams"),
@@ -67,7 +67,7 @@ REFUSED_BODIES = [
     (hello(max_range_m=INF), "maximum range"),
     (hello(T_base_laser=(0.0, NAN, 0.0)), "T_base_laser"),
     (hello(T_base_laser=(0.0, 0.0, 6.3)), "angle"),
-    (replace(KEYSCAN, id=KeyscanId("bob", 0)), "speaks for robot"),
+    (replace(KEYSCAN, id=KeyscanId("bob", 0)), "holds a record of robot"),
     (replace(KEYSCAN, id=KeyscanId("alice", -1)), "number"),
     (replace(KEYSCAN, id=KeyscanId("alice", 2**31)), "number"),
     (replace(KEYSCAN, stamp=NAN), "stamp is not finite"),

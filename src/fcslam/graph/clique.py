@@ -1,7 +1,8 @@
 """Maximum clique: exact branch and bound with a greedy colouring bound, sets as the bits of one integer.
 
-Tomita and Kameda 2007 (MCR): a clique takes at most one vertex of each colour class, so that a branch whose colours
-cannot beat the best clique so far is left. Vertices go by falling degree, ties by number: the result is deterministic.
+Tomita and Kameda 2007 (MCR): a clique takes at most one vertex of each colour class, so a branch with too few
+colours to beat the best clique is pruned. Vertices are ordered by falling degree, then by number: the result is
+deterministic.
 """
 
 from collections.abc import Iterator
@@ -11,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 NODE_BUDGET = 50_000
-"""Branches looked at, at most, before the best clique so far is returned as not proven ..."""
+"""Largest number of branches; after them the best clique so far is returned as not proven ..."""
 
 VERTEX_BUDGET = 4_000_000
-"""... and branches times vertices: a branch of a large graph takes longer."""
+"""... and of branches times vertices: a branch of a large graph takes longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,15 +23,20 @@ class Clique:
     """Vertices that are pairwise adjacent."""
 
     members: tuple[int, ...]
-    """Rising."""
+    """Vertices in ascending order."""
     exact: bool
-    """Whether no larger one exists, or the node budget ran out before that was known."""
+    """Whether it is proven that no larger clique exists."""
 
 
 def maximum_clique(adjacent: NDArray[np.bool_], node_budget: int = NODE_BUDGET) -> Clique:
-    """Largest clique of a graph given by its adjacency matrix (K, K), symmetric; the diagonal does not count.
+    """Find the largest clique of a graph.
 
-    Within ``node_budget`` branches it is exact; after them it is the largest found, at least a greedy one.
+    Args:
+        adjacent: adjacency matrix, shape (K, K), symmetric; the diagonal does not count.
+        node_budget: largest number of branches.
+
+    Returns:
+        The largest clique; if the budget ran out, the largest one found, at least the greedy one.
 
     Raises:
         ValueError: the matrix is not square or not symmetric.
@@ -49,7 +55,7 @@ def maximum_clique(adjacent: NDArray[np.bool_], node_budget: int = NODE_BUDGET) 
 
 
 def _search(neighbours: list[int], node_budget: int) -> tuple[int, bool]:
-    """Largest clique as bits, and whether it is proven. An explicit stack: cliques outgrow Python's recursion."""
+    """Largest clique as bits, and whether it is proven. An explicit stack: large cliques exceed Python's recursion."""
     best, best_size, nodes = 0, 0, 0
     everything = (1 << len(neighbours)) - 1
     stack: list[tuple[int, int, list[tuple[int, int]]]] = [(0, everything, _coloured(everything, neighbours))]
@@ -71,7 +77,7 @@ def _search(neighbours: list[int], node_budget: int) -> tuple[int, bool]:
 
 
 def _coloured(vertices: int, neighbours: list[int]) -> list[tuple[int, int]]:
-    """(vertex, colours used up to it), rising: no clique among the vertices up to there has more members."""
+    """(vertex, colours used so far), ascending: no clique among the vertices so far has more members than colours."""
     result: list[tuple[int, int]] = []
     colour = 0
     while vertices:

@@ -11,21 +11,21 @@ from fcslam.graph.pose_graph import PoseGraph, anchors
 from fcslam.records import FloatArray
 
 HUBER_WIDTH = 1.345
-"""95 % efficiency on normal residuals; in standard deviations."""
+"""Width of the Huber loss in standard deviations: 95 % efficiency on normal residuals."""
 
 CAUCHY_WIDTH = 2.385
-"""As HUBER_WIDTH."""
+"""Width of the Cauchy loss in standard deviations: 95 % efficiency on normal residuals."""
 
 
 class Loss(StrEnum):
-    """How the residual of a closure counts; odometry always counts squared."""
+    """Loss of the residual of a closure; odometry always has the squared loss."""
 
     SQUARED = "squared"
     HUBER = "huber"
     CAUCHY = "cauchy"
 
     def weights(self, chi2: FloatArray) -> FloatArray:
-        """Weight in [0, 1] of residuals of squared Mahalanobis length ``chi2``."""
+        """Weights in [0, 1], shape (K,), of residuals with squared Mahalanobis lengths ``chi2``, shape (K,)."""
         if self is Loss.HUBER:
             return HUBER_WIDTH / np.maximum(np.sqrt(chi2), HUBER_WIDTH)
         if self is Loss.CAUCHY:
@@ -34,20 +34,22 @@ class Loss(StrEnum):
 
 
 class FactorCache:
-    """Factors of a growing graph: a solve after new closures builds the new ones only."""
+    """Factors of a growing graph; each is built once."""
 
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
         self._trusted = gtsam.NonlinearFactorGraph()
         self._closures: list[tuple[int, int, Any, FloatArray]] = []
         self._robust: dict[Loss, list[Any]] = {}
-        """Factors of the closures under losses that were asked for."""
+        """Factors of the closures, by loss."""
         self._built = 0
 
     def squared(self, weights: FloatArray, poses: FloatArray) -> Any:
-        """Factor graph with closure k's information scaled by ``weights[k]`` (closures only, in their order).
+        """Factor graph with the information of the closures scaled by weights; closures of weight 0 are left out.
 
-        A closure of weight 0 is left out. Each component that remains is anchored at its first variable in ``poses``.
+        Args:
+            weights: one for each closure, in their order, shape (K,).
+            poses: shape (N, 3); each connected component is anchored at the pose of its first variable.
         """
         self._update()
         graph = gtsam.NonlinearFactorGraph(self._trusted)
@@ -58,7 +60,7 @@ class FactorCache:
         return graph
 
     def robust(self, loss: Loss, kept: NDArray[np.bool_], poses: FloatArray) -> Any:
-        """Factor graph with the closures in ``kept`` (closures only) under ``loss``, anchored as in :meth:`squared`."""
+        """Factor graph with closures under ``loss`` where ``kept``, shape (K,), is true; anchored as in ``squared``."""
         if loss is Loss.SQUARED:
             return self.squared(kept.astype(np.float64), poses)
         self._update()
@@ -79,7 +81,7 @@ class FactorCache:
         return built
 
     def _anchor(self, graph: Any, kept: NDArray[np.bool_], poses: FloatArray) -> None:
-        """Hold the first variable of every component that the closures in ``kept`` leave."""
+        """Add a prior on the first variable of every connected component."""
         connects = np.ones(len(self.graph.edges), dtype=bool)
         connects[self.graph.arrays().robust] = kept
         noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
@@ -87,7 +89,7 @@ class FactorCache:
             graph.push_back(gtsam.PriorFactorPose2(variable, gtsam.Pose2(*poses[variable].tolist()), noise))
 
     def _update(self) -> None:
-        """Build the factors of edges that are new."""
+        """Build the factors of new edges."""
         edges = self.graph.arrays()
         new = slice(self._built, None)
         roots = np.linalg.cholesky(edges.information[new]).transpose(0, 2, 1)
@@ -101,7 +103,7 @@ class FactorCache:
 
 
 def to_values(poses: ArrayLike) -> Any:
-    """GTSAM's values of poses (N, 3), keyed by row."""
+    """GTSAM values of poses (N, 3), keyed by row."""
     values = gtsam.Values()
     for key, pose in enumerate(np.asarray(poses, dtype=np.float64).tolist()):
         values.insert(key, gtsam.Pose2(*pose))
@@ -109,7 +111,7 @@ def to_values(poses: ArrayLike) -> Any:
 
 
 def from_values(values: Any) -> FloatArray:
-    """Poses (N, 3) of GTSAM's values, in the order of their keys."""
+    """Poses (N, 3) of GTSAM values, in the order of their keys."""
     poses: FloatArray = gtsam.utilities.extractPose2(values)
     return poses
 

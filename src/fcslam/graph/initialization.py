@@ -1,8 +1,8 @@
-"""Initial poses of a graph without a good estimate: chordal relaxation, two sparse linear systems.
+"""Initial poses of a graph without a good estimate, by chordal relaxation: two sparse linear systems.
 
 Rotations as complex numbers of any length minimise ``sum k |u_j - u_i e^(i theta_ij)|^2``; translations follow with
-the rotations held (Carlone et al., ICRA 2015, in the plane). GTSAM's LAGO does the same work but takes only diagonal
-information, one component at a time.
+the rotations held (Carlone et al., ICRA 2015, in the plane). GTSAM's LAGO solves the same problem, but takes only
+diagonal information and one component at a time.
 """
 
 import numpy as np
@@ -14,23 +14,28 @@ from fcslam.geometry import se2
 from fcslam.graph.pose_graph import PoseGraph, anchors
 from fcslam.records import FloatArray
 
-_SPREAD = 1e4
-"""Edges count between 1/_SPREAD and _SPREAD times the median one, so that the linear systems stay well conditioned."""
+_INFORMATION_RATIO = 1e4
+"""Largest ratio of an edge's information to the median, and its inverse: the linear systems stay well conditioned."""
 
-_FORGETTING = -0.9
+_WEIGHT_EXPONENT = -0.9
 """Exponent of chi-square in the weight of a closure."""
 
-_SETTLED = 1e-3
-"""Change of every weight at which reweighting ends."""
+_WEIGHT_TOLERANCE = 1e-3
+"""Largest change of a weight at which reweighting ends."""
 
 _Complex = NDArray[np.complex128]
 
 
 def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray:
-    """Poses (N, 3) near the optimum of the graph's edges, from no estimate at all.
+    """Compute poses near the optimum of the graph without any initial estimate.
 
-    Each connected component keeps the initial pose of its first variable. ``weights`` (E,) in [0, 1] scale the edges;
-    one of weight 0 is left out (``~graph.arrays().robust`` places the variables by odometry alone).
+    Args:
+        graph: N variables and E edges; each connected component keeps the initial pose of its first variable.
+        weights: factors in [0, 1] of the edges' information, shape (E,); an edge of weight 0 is left out
+            (``~graph.arrays().robust`` leaves odometry alone). None: all are 1.
+
+    Returns:
+        Poses, shape (N, 3), metres and radians.
     """
     edges = graph.arrays()
     scale = np.ones(len(edges.i)) if weights is None else np.asarray(weights, dtype=np.float64)
@@ -41,8 +46,8 @@ def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray
     i, j, T_i_j, scale = edges.i[kept], edges.j[kept], edges.T_i_j[kept], scale[kept]
     fixed = anchors(graph.components(kept))
     information = edges.information[kept]
-    k_heading = np.sqrt(scale * _moderate(information[:, 2, 2]))
-    k_position = np.sqrt(scale * _moderate(0.5 * (information[:, 0, 0] + information[:, 1, 1])))
+    k_heading = np.sqrt(scale * _clip_to_median(information[:, 2, 2]))
+    k_position = np.sqrt(scale * _clip_to_median(0.5 * (information[:, 0, 0] + information[:, 1, 1])))
 
     turn = np.exp(1j * T_i_j[:, 2])
     heading = np.angle(_least_squares((i, j), k_heading, turn, 0.0 * turn, (fixed, np.exp(1j * start[fixed, 2]))))
@@ -55,28 +60,35 @@ def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray
 
 
 def initialize_robust(graph: PoseGraph, rounds: int = 20) -> FloatArray:
-    """Poses (N, 3) as :func:`initialize` gives them, with closures reweighted until the false ones hardly count.
+    """Compute poses as :func:`initialize`, with closures reweighted until false ones hardly count.
 
-    Iteratively reweighted least squares, weight ``d^-1.8`` at a residual of d > 1 standard deviations. Where odometry
-    has drifted far this starts :func:`fcslam.graph.optimizer.optimize_gnc` in the right basin and odometry does not:
-    on the INTEL graph of 1,228 poses with as many random false closures as true ones it keeps every true closure and
-    rejects every false one; from odometry two thirds of the true ones are lost.
+    Iteratively reweighted least squares with weight ``d^-1.8`` at a residual of d > 1 standard deviations. After large
+    drift, :func:`fcslam.graph.optimizer.optimize_gnc` converges from here and not from odometry: on the INTEL graph of
+    1,228 poses with as many random false closures as true ones, it keeps every true closure and rejects every false
+    one; from odometry it loses two thirds of the true ones.
+
+    Args:
+        graph: N variables.
+        rounds: largest number of reweightings.
+
+    Returns:
+        Poses, shape (N, 3), metres and radians.
     """
     robust = graph.arrays().robust
     weights = np.ones(len(robust))
     poses = initialize(graph, weights)
     for _ in range(rounds):
-        reweighted = np.where(robust, np.maximum(graph.chi2(poses), 1.0) ** _FORGETTING, 1.0)
-        if np.abs(reweighted - weights).max(initial=0.0) < _SETTLED:
+        reweighted = np.where(robust, np.maximum(graph.chi2(poses), 1.0) ** _WEIGHT_EXPONENT, 1.0)
+        if np.abs(reweighted - weights).max(initial=0.0) < _WEIGHT_TOLERANCE:
             break
         weights = reweighted
         poses = initialize(graph, weights)
     return poses
 
 
-def _moderate(information: FloatArray) -> FloatArray:
+def _clip_to_median(information: FloatArray) -> FloatArray:
     middle = np.median(information)
-    return np.clip(information, middle / _SPREAD, middle * _SPREAD)
+    return np.clip(information, middle / _INFORMATION_RATIO, middle * _INFORMATION_RATIO)
 
 
 def _least_squares(

@@ -19,25 +19,34 @@ from fcslam.graph.pose_graph import PoseGraph, anchors
 from fcslam.records import FloatArray, frozen
 
 _TOLERANCE = 1e-6
-_UNTIL_CONVERGED = 100
+"""Relative and absolute change of the cost at which Levenberg-Marquardt ends."""
+_MAXIMUM_ITERATIONS = 100
+"""Limit of Levenberg-Marquardt's iterations; it converges long before."""
 _BINARY = 1e-4
 """Distance from 0 or 1 at which a weight is decided."""
-_POLISH_ROUNDS = 200
+_TRUSTED_WEIGHT = 0.5
+"""A closure of a larger weight is trusted at the start of a refinement."""
+_REFINEMENT_ROUNDS = 200
+"""Limit of alternating solves and decisions, which end by themselves."""
 
 
 class GncSettings(Settings):
-    """Graduated non-convexity."""
+    """Graduated non-convexity (Yang et al., RA-L 2020)."""
 
     inlier_probability: float = Field(
-        default=0.99, gt=0.0, lt=1.0, description="A true closure passes the chi-square test with this probability"
+        default=0.99, gt=0.0, lt=1.0, description="probability with which a true closure passes the chi-square test"
     )
-    control_step: float = Field(default=1.4, gt=1.0, description="Factor by which the loss sharpens from step to step")
+    control_step: float = Field(
+        default=1.4, gt=1.0, description="factor of the control parameter from step to step, which sharpens the loss"
+    )
     first_iterations: int = Field(
-        default=5, ge=1, description="Solver iterations with every closure, before the first step"
+        default=5, ge=1, description="solver iterations with all closures before the first step"
     )
-    step_iterations: int = Field(default=1, ge=1, description="Solver iterations in each step")
+    step_iterations: int = Field(default=1, ge=1, description="solver iterations in each step")
     maximum_steps: int = Field(
-        default=100, ge=1, description="Steps after which undecided closures are decided as they are"
+        default=100,
+        ge=1,
+        description="largest number of steps; closures that are still undecided are then decided by their residuals",
     )
 
     @property
@@ -48,10 +57,10 @@ class GncSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class SolveStats:
-    """How a solve went."""
+    """Statistics of a solve."""
 
     iterations: int
-    """Solver iterations, of all steps together."""
+    """Solver iterations of all steps together."""
     initial_cost: float
     """Half the sum of the edges' losses at the initial poses."""
     final_cost: float
@@ -59,10 +68,10 @@ class SolveStats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Optimised poses and what each edge counted for."""
+    """Optimised poses and the weight of each edge."""
 
     poses: FloatArray
-    """Shape (N, 3)."""
+    """Shape (N, 3), metres and radians."""
     weights: FloatArray
     """Shape (E,), in [0, 1]; 1 for odometry."""
     stats: SolveStats
@@ -76,13 +85,20 @@ def optimize(
     kept: ArrayLike | None = None,
     factors: FactorCache | None = None,
 ) -> Solution:
-    """Levenberg-Marquardt from ``initial`` (N, 3), by default the graph's own poses.
+    """Optimise a pose graph by Levenberg-Marquardt.
 
-    Closures not in ``kept`` (E,) are left out, by default none. ``factors``: a cache kept by the caller makes repeated
-    solves of a growing graph cheaper.
+    Args:
+        graph: N variables and E edges.
+        initial: poses to start from, shape (N, 3), metres and radians; None: the graph's own.
+        loss: loss of the closures.
+        kept: closures that count, shape (E,); None: all.
+        factors: a cache that makes repeated solves of a growing graph cheaper.
+
+    Returns:
+        Poses (N, 3) and weights (E,).
 
     Raises:
-        ValueError: ``initial`` does not fit the graph, or ``factors`` belong to another one.
+        ValueError: ``initial`` does not fit the graph, or ``factors`` belong to another graph.
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
     if not graph.edges:
@@ -90,7 +106,7 @@ def optimize(
     robust = graph.arrays().robust
     counts = np.ones(int(robust.sum()), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)[robust]
     problem, values = cache.robust(loss, counts, start), to_values(start)
-    result, iterations = _levenberg_marquardt(problem, values, _UNTIL_CONVERGED)
+    result, iterations = _levenberg_marquardt(problem, values, _MAXIMUM_ITERATIONS)
     poses = from_values(result)
     weights = counts * loss.weights(graph.chi2(poses)[robust])
     return _solution(graph, start, poses, weights, SolveStats(iterations, problem.error(values), problem.error(result)))
@@ -103,15 +119,23 @@ def optimize_gnc(
     settings: GncSettings | None = None,
     factors: FactorCache | None = None,
 ) -> Solution:
-    """Poses under the truncated squared loss on closures: each ends at weight 1 (true) or 0 (false).
+    """Optimise under the truncated squared loss on closures: each ends at weight 1 (inlier) or 0 (outlier).
 
-    Graduated non-convexity (Yang et al., RA-L 2020, truncated least squares, eqs. 12-14); odometry is known to be
-    true. ``initial`` and ``factors`` as in :func:`optimize`; ``initial`` should be the odometry or better.
+    Graduated non-convexity (Yang et al., RA-L 2020, truncated least squares, eqs. 12-14); odometry always counts.
 
-    The steps run here, around GTSAM's solver, and not in ``gtsam.GncLMOptimizer``: that one starts every step again
-    from the initial poses and solves it to the end, while one warm iteration a step decides as well in a
-    tenth of the time (``benchmarks/results/graph.md``, m3500 with 100 random false loops). Neither is sure to find
-    the best set: the odometry's drift may favour a false loop.
+    The steps run here, around GTSAM's solver, and not in ``gtsam.GncLMOptimizer``, which starts every step again from
+    the initial poses and solves it to convergence. One warm iteration per step decides as well in a tenth of the time
+    (``benchmarks/results/graph.md``, m3500 with 100 random false loops). Neither is sure to find the best set: the
+    drift of the odometry may favour a false loop.
+
+    Args:
+        graph: N variables and E edges.
+        initial: poses to start from, shape (N, 3), odometry or better; None: the graph's own.
+        settings: steps and threshold.
+        factors: as in :func:`optimize`.
+
+    Returns:
+        Poses (N, 3) and weights (E,).
 
     Raises:
         ValueError: as :func:`optimize`.
@@ -125,8 +149,8 @@ def optimize_gnc(
     steps = _Steps(cache, to_values(start))
     steps.solve(np.ones(int(robust.sum())), chosen.first_iterations)
     _graduate(steps, limit, chosen)
-    weights = _polish(steps, limit, (steps.chi2() <= limit).astype(np.float64))
-    return _concluded(graph, start, steps, weights, limit)
+    weights = _alternate(steps, limit, (steps.chi2() <= limit).astype(np.float64))
+    return _with_truncated_cost(graph, start, steps, weights, limit)
 
 
 def refine_inliers(
@@ -137,13 +161,23 @@ def refine_inliers(
     settings: GncSettings | None = None,
     factors: FactorCache | None = None,
 ) -> Solution:
-    """The last part of :func:`optimize_gnc` alone, from closures that are trusted already.
+    """Alternate solving and deciding every closure by its residual, until no decision changes.
 
-    Solves with closures of ``weights`` (E,) above one half, then decides every closure by its residual, and so on until
-    no decision changes. For a graph most of whose closures are false, where a start with all of them is no start.
+    The last part of :func:`optimize_gnc`, from closures that are trusted already: for graphs most of whose closures are
+    false, where optimising with all of them gives no useful start.
+
+    Args:
+        graph: N variables and E edges.
+        initial: poses to start from, shape (N, 3); None: the graph's own.
+        weights: weights of the edges, shape (E,); closures above one half are trusted at the start.
+        settings: threshold of the decision.
+        factors: as in :func:`optimize`.
+
+    Returns:
+        Poses (N, 3) and weights (E,).
 
     Raises:
-        ValueError: the weights do not fit the graph, or as :func:`optimize`.
+        ValueError: ``weights`` do not fit the graph, or as :func:`optimize`.
     """
     chosen = settings or GncSettings()
     start, cache = _start(graph, initial), _cache(graph, factors)
@@ -154,12 +188,12 @@ def refine_inliers(
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
     robust = graph.arrays().robust
     steps = _Steps(cache, to_values(start))
-    decided = _polish(steps, chosen.limit, (trusted[robust] > 0.5).astype(np.float64))
-    return _concluded(graph, start, steps, decided, chosen.limit)
+    decided = _alternate(steps, chosen.limit, (trusted[robust] > _TRUSTED_WEIGHT).astype(np.float64))
+    return _with_truncated_cost(graph, start, steps, decided, chosen.limit)
 
 
 class _Steps:
-    """The state of a solve in steps: current values, weights by which they were found, iterations so far."""
+    """State of a solve in steps: present values, and iterations so far."""
 
     def __init__(self, cache: FactorCache, values: Any) -> None:
         self.cache, self.values, self.iterations = cache, values, 0
@@ -171,13 +205,13 @@ class _Steps:
         self.iterations += used
 
     def chi2(self) -> FloatArray:
-        """Of the closures."""
+        """Squared Mahalanobis lengths of the closures' residuals, shape (K,)."""
         chi2: FloatArray = self.cache.graph.chi2(from_values(self.values))[self._robust]
         return chi2
 
 
 def _graduate(steps: _Steps, limit: float, settings: GncSettings) -> None:
-    """Sharpen the loss from almost squared to truncated, an iteration or so at a time."""
+    """Sharpen the loss from almost squared to truncated, with few iterations per step."""
     chi2 = steps.chi2()
     largest = chi2.max(initial=0.0)
     if largest <= limit:
@@ -192,22 +226,24 @@ def _graduate(steps: _Steps, limit: float, settings: GncSettings) -> None:
         mu *= settings.control_step
 
 
-def _polish(steps: _Steps, limit: float, weights: FloatArray) -> FloatArray:
+def _alternate(steps: _Steps, limit: float, weights: FloatArray) -> FloatArray:
     """Alternate solve and decision until no decision changes; returns the weights of the last solve.
 
-    Each round lowers the truncated loss, so it ends by itself; the bound is for the tolerance of the solver.
+    Each round lowers the truncated loss, so it ends by itself; the limit covers the tolerance of the solver.
     """
-    for _ in range(_POLISH_ROUNDS):
-        steps.solve(weights, _UNTIL_CONVERGED)
+    for _ in range(_REFINEMENT_ROUNDS):
+        steps.solve(weights, _MAXIMUM_ITERATIONS)
         decided = (steps.chi2() <= limit).astype(np.float64)
         if np.array_equal(decided, weights):
             return weights
         weights = decided
-    steps.solve(weights, _UNTIL_CONVERGED)
+    steps.solve(weights, _MAXIMUM_ITERATIONS)
     return weights
 
 
-def _concluded(graph: PoseGraph, start: FloatArray, steps: _Steps, weights: FloatArray, limit: float) -> Solution:
+def _with_truncated_cost(
+    graph: PoseGraph, start: FloatArray, steps: _Steps, weights: FloatArray, limit: float
+) -> Solution:
     poses, robust = from_values(steps.values), graph.arrays().robust
     costs = [_truncated(graph.chi2(x), robust, limit) for x in (start, poses)]
     return _solution(graph, start, poses, weights, SolveStats(steps.iterations, *costs))
@@ -225,7 +261,7 @@ def _truncated(chi2: FloatArray, robust: ArrayLike, limit: float) -> float:
 
 
 def _levenberg_marquardt(problem: Any, values: Any, iterations: int) -> tuple[Any, int]:
-    """GTSAM's solver; returns the values and the iterations used."""
+    """Run GTSAM's solver; returns the values and the number of iterations."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(_TOLERANCE)
@@ -251,7 +287,7 @@ def _cache(graph: PoseGraph, factors: FactorCache | None) -> FactorCache:
 def _solution(
     graph: PoseGraph, start: FloatArray, poses: FloatArray, closure_weights: FloatArray, stats: SolveStats
 ) -> Solution:
-    """The solution with each component (of edges that count) moved so that its first variable is where it started."""
+    """The solution, with each connected component moved so that its first variable is at its initial pose."""
     weights = np.ones(len(graph.edges))
     weights[graph.arrays().robust] = closure_weights
     components = graph.components(weights > 0.0)

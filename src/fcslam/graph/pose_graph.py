@@ -12,13 +12,13 @@ from fcslam.geometry import se2
 from fcslam.records import FloatArray, frozen
 
 MAXIMUM_INFORMATION = 1e8
-"""No measurement counts as better than 0.1 mm or 0.1 mrad: a stiffer one makes the linear systems indeterminate."""
+"""Largest eigenvalue of an information matrix, 0.1 mm or 0.1 mrad: stiffer edges make the systems ill-conditioned."""
 
 _MINIMUM_INFORMATION = 1e-4
-"""Of a bounded matrix, where rounding may have eaten the small eigenvalues."""
+"""Smallest eigenvalue of a bounded matrix, where rounding may have destroyed small ones."""
 
 _ASYMMETRY = 1e-6
-"""Relative asymmetry of an information matrix that rounding may explain."""
+"""Largest relative asymmetry of an information matrix that counts as rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,8 +26,8 @@ class Edge:
     """A measured motion between two variables.
 
     Raises:
-        ValueError: the variables are not two, a number is not finite, or the information is no symmetric positive
-            definite matrix (rounding aside, which is repaired).
+        ValueError: the two variables are the same, a number is not finite, or the information is not symmetric
+            positive definite (asymmetry by rounding is repaired).
     """
 
     i: int
@@ -37,7 +37,7 @@ class Edge:
     information: FloatArray
     """Inverse covariance of T_i_j in the tangent space at T_i_j (x, y, theta of j), shape (3, 3)."""
     robust: bool
-    """Whether it may be false (a closure); odometry is trusted."""
+    """Whether the edge may be false (a closure); odometry is trusted."""
 
     def __post_init__(self) -> None:
         where = f"edge {self.i} -> {self.j}"
@@ -49,7 +49,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class EdgeArrays:
-    """All edges of a graph, one row each; information is bounded by MAXIMUM_INFORMATION (eigenvalues)."""
+    """All edges of a graph, one row each; eigenvalues of the information are at most MAXIMUM_INFORMATION."""
 
     i: NDArray[np.int64]
     j: NDArray[np.int64]
@@ -75,7 +75,7 @@ class PoseGraph:
 
     @property
     def edges(self) -> Sequence[Edge]:
-        """In the order in which they were added."""
+        """Edges in the order in which they were added."""
         return self._edges
 
     def add_variable(self, pose: ArrayLike) -> int:
@@ -91,7 +91,7 @@ class PoseGraph:
         """Append an edge; returns its number.
 
         Raises:
-            ValueError: it names a variable that the graph does not have.
+            ValueError: the edge names a variable that the graph does not have.
         """
         if max(edge.i, edge.j) >= len(self):
             raise ValueError(f"edge {edge.i} -> {edge.j}: the graph has variables 0 to {len(self) - 1}")
@@ -103,7 +103,7 @@ class PoseGraph:
         return np.array(self._poses, dtype=np.float64).reshape(-1, 3)
 
     def arrays(self) -> EdgeArrays:
-        """The edges as arrays; only those added since the last call are converted."""
+        """Edges as arrays; only those added since the last call are converted."""
         known = len(self._arrays.i)
         if known < len(self._edges):
             old, new = self._arrays, _stack(self._edges[known:])
@@ -117,7 +117,7 @@ class PoseGraph:
         return self._arrays
 
     def chi2(self, poses: ArrayLike | None = None) -> FloatArray:
-        """Squared Mahalanobis length of every edge's residual at ``poses`` (N, 3), by default the initial ones."""
+        """Squared Mahalanobis length of every edge's residual, shape (E,), at ``poses`` (N, 3); None: initial poses."""
         x = self.poses() if poses is None else np.asarray(poses, dtype=np.float64)
         edges = self.arrays()
         # The residual that the solver minimises: the logarithm, not the difference of coordinates.
@@ -126,9 +126,9 @@ class PoseGraph:
         return chi2
 
     def components(self, kept: ArrayLike | None = None) -> NDArray[np.int64]:
-        """Number of each variable's connected component, shape (N,), counted in the order of first variables.
+        """Number of the connected component of each variable, shape (N,), counted in the order of first variables.
 
-        ``kept`` (E,) marks the edges that connect; by default all do.
+        ``kept``, shape (E,), marks the edges that connect; None: all.
         """
         edges = self.arrays()
         mask = np.ones(len(edges.i), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)
@@ -141,7 +141,7 @@ class PoseGraph:
 
 
 def anchors(components: NDArray[np.int64]) -> NDArray[np.int64]:
-    """First variable of each component, shape (C,)."""
+    """First variable of each connected component, shape (C,); ``components`` as from ``PoseGraph.components``, (N,)."""
     return np.unique(components, return_index=True)[1].astype(np.int64)
 
 

@@ -1,7 +1,7 @@
 """Correlative scan matching (Karto) by branch and bound (Hess et al., ICRA 2016): the global search.
 
-The field is drawn as a likelihood grid; each level of a pyramid holds the maximum over windows of 2^h cells, so one
-look-up bounds a whole square of shifts from above, and only squares that can still win are opened.
+The field is drawn as a likelihood grid. Each level of a pyramid holds the maximum over windows of 2^h cells, so one
+look-up bounds the score of a whole square of shifts. Squares whose bound is below the best score are pruned.
 """
 
 from dataclasses import dataclass
@@ -16,18 +16,27 @@ from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
+MAXIMUM_REACH_M = 25.0
+"""Points farther than this do not enlarge the likelihood grid."""
+REACH_QUANTILE = 0.9
+"""The angle step moves a point at this quantile of the distances by one cell."""
+
 
 class SearchConfig(Settings):
     """Correlative search by branch and bound."""
 
-    cell_m: float = Field(default=0.1, gt=0, description="cell of the likelihood grid")
-    smear_m: float = Field(default=0.1, gt=0, description="standard deviation of the likelihood around a surface")
+    cell_m: float = Field(default=0.1, gt=0, description="side of a cell of the likelihood grid [m]")
+    smear_m: float = Field(default=0.1, gt=0, description="standard deviation of the likelihood around a surface [m]")
     levels: int = Field(
-        default=6, ge=1, le=10, description="levels of the pyramid; the coarsest step is 2^(levels - 1)"
+        default=6, ge=1, le=10, description="levels of the pyramid; a step on the coarsest one is 2^(levels - 1) cells"
     )
-    points: int = Field(default=120, gt=0, description="at most this many points are scored")
-    distance_penalty: float = Field(default=0.2, ge=0, lt=1, description="score lost at the edge of the window (Karto)")
-    angle_penalty: float = Field(default=0.1, ge=0, lt=1, description="score lost at the largest turn (Karto)")
+    points: int = Field(default=120, gt=0, description="largest number of points that are scored")
+    distance_penalty: float = Field(
+        default=0.2, ge=0, lt=1, description="share of the score lost at the edge of the window, as in Karto"
+    )
+    angle_penalty: float = Field(
+        default=0.1, ge=0, lt=1, description="share of the score lost at the largest turn, as in Karto"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +49,10 @@ class SearchWindow:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """The best pose of a search."""
+    """Best pose of a search."""
 
     T_field_base: FloatArray
+    """Shape (3,), metres and radians."""
     score: float
     """Mean likelihood of the points, in [0, 1], without the penalty."""
 
@@ -54,6 +64,7 @@ class LikelihoodPyramid:
     levels: NDArray[np.uint8]
     """Shape (levels, H, W)."""
     corner: FloatArray
+    """Lower left corner of the grid in the field's coordinates, shape (2,), metres."""
     cell_m: float
 
 
@@ -62,7 +73,15 @@ def likelihood_pyramid(
 ) -> LikelihoodPyramid:
     """Draw the surfaces around the guess and build the pyramid.
 
-    ``visible_only`` draws those alone that face the guess (Karto's visibility filter): right for one scan near it.
+    Args:
+        field: surfaces.
+        T_field_guess: centre of the grid, shape (3,), metres and radians in the field's coordinates.
+        half_side_m: half side of the grid, metres.
+        config: cell, smear and levels.
+        visible_only: draw only surfaces that face the guess (Karto's visibility filter), for one scan near the guess.
+
+    Returns:
+        The pyramid, shape (levels, H, W).
     """
     size = int(np.ceil(2.0 * half_side_m / config.cell_m)) + 1
     corner = np.asarray(T_field_guess[:2]) - half_side_m
@@ -81,19 +100,28 @@ def search(
     config: SearchConfig,
     visible_only: bool = False,
 ) -> SearchResult:
-    """Best pose of the scan in the window around the guess, to half a cell and half an angle step.
+    """Find the best pose of a scan in a window around the guess, to half a cell and half an angle step.
 
-    The guess itself, with score 0, where no pose of the window lays a point on a surface.
+    Args:
+        scan: points in ``base``.
+        field: surfaces.
+        T_field_guess: centre of the window, shape (3,), metres and radians in the field's coordinates.
+        window: half side and half angle.
+        config: grid and penalties.
+        visible_only: match only surfaces that face the guess.
+
+    Returns:
+        The best pose; the guess itself, with score 0, if no pose of the window puts a point on a surface.
     """
     thinned = scan.thinned(config.cell_m, config.points)
     reach = float(np.max(np.hypot(*thinned.points.T), initial=1.0))
-    half_side = min(reach, 25.0) + window.radius_m + config.cell_m
+    half_side = min(reach, MAXIMUM_REACH_M) + window.radius_m + config.cell_m
     pyramid = likelihood_pyramid(field, T_field_guess, half_side, _shallow(config, window), visible_only)
     return search_pyramid(thinned, pyramid, T_field_guess, window, config)
 
 
 def _shallow(config: SearchConfig, window: SearchWindow) -> SearchConfig:
-    """No more levels than the window can use."""
+    """The settings with no more levels than the window can use."""
     usable = int(np.log2(window.radius_m / config.cell_m + 1.0)) + 1
     return config.model_copy(update={"levels": min(config.levels, max(1, usable))})
 
@@ -101,8 +129,8 @@ def _shallow(config: SearchConfig, window: SearchWindow) -> SearchConfig:
 def search_pyramid(
     scan: PointScan, pyramid: LikelihoodPyramid, T_field_guess: FloatArray, window: SearchWindow, config: SearchConfig
 ) -> SearchResult:
-    """As ``search``, on a pyramid that stands already."""
-    reach = float(np.quantile(np.hypot(*scan.points.T), 0.9)) if len(scan) else 1.0
+    """As :func:`search`, on a pyramid that was built before; ``T_field_guess`` has shape (3,)."""
+    reach = float(np.quantile(np.hypot(*scan.points.T), REACH_QUANTILE)) if len(scan) else 1.0
     step_rad = 2.0 * np.arcsin(min(0.5, 0.5 * pyramid.cell_m / max(reach, 1.0)))
     turns = int(np.ceil(window.angle_rad / step_rad))
     shifts = int(np.ceil(window.radius_m / pyramid.cell_m))
@@ -197,7 +225,7 @@ def _branch_and_bound(  # type: ignore[no-untyped-def]
     best = best_raw = 0.0
     best_pose = guess.copy()
     stack = np.empty((4 * (top + 2), 3), np.int64)
-    # Small turns first: a good early score closes most of the rest.
+    # Small turns first: an early good score prunes most of the rest.
     for order in range(2 * turns + 1):
         turn = (order + 1) // 2 if order % 2 else -(order // 2)
         cells = _cells_of(points, guess, corner, cell, turn * step)

@@ -1,4 +1,4 @@
-"""The surfaces seen so far, and for every place near them the nearest one: a labelled distance field.
+"""A labelled distance field: the surfaces seen so far, and for every cell near them the nearest one.
 
 Surfaces are *surfels*: running means of returns that fell together, with a normal towards the robot. A sparse grid of
 tiles stores in each cell the nearest surfel, so the distance to the map is exact (no interpolation) and costs one
@@ -21,38 +21,38 @@ TILE: Final = 16
 REACH_M: Final = 0.5
 """Cells farther than this from every surfel hold none."""
 MERGE_M: Final = 0.05
-"""A return this close to a surfel that faces the same way joins it."""
+"""A return this close to a surfel that faces the same way is merged into it."""
 MEAN_OVER: Final = 30.0
-"""A surfel forgets beyond this many returns, so it can follow its surface."""
+"""A surfel is a running mean over this many returns, so it can follow its surface."""
 TABLE: Final = 512
 """Tiles along one side of the field: 409.6 m, more than any submap with any laser."""
 EMPTY: Final = -1
 MOST_SURFELS: Final = 32767
-"""As many as a label can tell apart: 1.6 km of walls. What comes after joins surfels or is left out."""
+"""Largest number of labels: 1.6 km of walls. Later returns are merged into surfels or left out."""
 
 MOST_NEW_TILES: Final = 9
-"""One surfel reaches into no more tiles."""
+"""Largest number of tiles within reach of one surfel."""
 
 _REACH_CELLS = round(REACH_M / CELL_M)
 
 
 class FieldArrays(NamedTuple):
-    """A field as compiled code sees it."""
+    """The arrays of a field, for compiled code."""
 
     corner: FloatArray
-    """Lower left corner of the table, shape (2,)."""
+    """Lower left corner of the table, shape (2,), metres."""
     table: NDArray[np.int32]
     """Storage number of each tile, or EMPTY; shape (rows, columns)."""
     labels: NDArray[np.int16]
     """Nearest surfel of each cell of each stored tile, or EMPTY; shape (tiles, TILE, TILE)."""
     surfels: FloatArray
-    """x, y, normal x, normal y, returns, whether all of them stood alone; shape (capacity, 6)."""
+    """x, y, normal x, normal y, number of returns, whether all of them were solitary; shape (capacity, 6)."""
     used: NDArray[np.int64]
     """Tiles and surfels in use, shape (2,)."""
 
 
 class SurfelField:
-    """Nearest-surfel field around an origin, in the coordinates of its submap."""
+    """Nearest-surfel field around an origin, in the coordinate frame of its submap."""
 
     def __init__(self, origin_xy: FloatArray) -> None:
         self.arrays = FieldArrays(
@@ -64,14 +64,14 @@ class SurfelField:
         )
 
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
-        """Add a scan seen from ``T_field_base``; returns outside the table are left out."""
+        """Add a scan taken at ``T_field_base``, shape (3,), metres and radians; drop returns outside the table."""
         done = 0
         while (done := _insert(scan.points, scan.normals, scan.solitary, T_field_base, done, self.arrays)) < len(scan):
             self._grow()
 
     @property
     def points(self) -> FloatArray:
-        """Positions of the surfels, shape (N, 2)."""
+        """Positions of the surfels, shape (N, 2), metres."""
         return self.arrays.surfels[: self.arrays.used[1], :2]
 
     @property
@@ -82,17 +82,17 @@ class SurfelField:
 
     @property
     def solitary(self) -> NDArray[np.bool_]:
-        """Surfels all of whose returns stood alone, shape (N,)."""
-        alone: NDArray[np.bool_] = self.arrays.surfels[: self.arrays.used[1], 5] > 0.0
-        return alone
+        """Surfels all of whose returns were solitary, shape (N,)."""
+        solitary: NDArray[np.bool_] = self.arrays.surfels[: self.arrays.used[1], 5] > 0.0
+        return solitary
 
     def nearest(self, points: FloatArray) -> NDArray[np.int32]:
-        """Label of the surfel nearest to the cell of each point, or ``EMPTY``; shape (N,)."""
+        """Label of the surfel nearest to the cell of each point (N, 2), metres, or ``EMPTY``; shape (N,)."""
         labels: NDArray[np.int32] = _labels_at(points, self.arrays)
         return labels
 
     def compact(self) -> None:
-        """Give back the storage that is not used; for a field that is complete."""
+        """Free unused storage of a complete field."""
         corner, table, labels, surfels, used = self.arrays
         rows, columns = np.nonzero(table != EMPTY)
         if not len(rows):
@@ -138,7 +138,7 @@ def _labels_at(points, field):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-untyped-def]
-    """Insert returns from ``start`` on; returns how many are done when all are, or when storage must grow."""
+    """Insert returns from index ``start`` on, until all are inserted or storage must grow; returns the next index."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
     for i in range(start, len(points)):
         x = T[0] + cos * points[i, 0] - sin * points[i, 1]
@@ -147,7 +147,7 @@ def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-unty
         ny = sin * normals[i, 0] + cos * normals[i, 1]
         if not _within(x, y, field):
             continue
-        # A thin wall's other side may hold the cell: one step towards the robot this side does.
+        # The cell may belong to the other side of a thin wall; one step towards the robot it belongs to this side.
         label = label_at(x, y, field)
         ahead = label_at(x + CELL_M * nx, y + CELL_M * ny, field)
         if _merge(x, y, nx, ny, solitary[i], label, field) or _merge(x, y, nx, ny, solitary[i], ahead, field):
@@ -172,10 +172,10 @@ def _within(x, y, field):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _merge(x, y, nx, ny, alone, label, field):  # type: ignore[no-untyped-def]
-    """Join a return to its surfel if it is near and does not face away; whether it did.
+def _merge(x, y, nx, ny, solitary, label, field):  # type: ignore[no-untyped-def]
+    """Merge a return into a surfel that is near and does not face away; returns whether it did.
 
-    Near is also where the return's own cell would stay with that surfel: one added there could not be found again.
+    A surfel is near as well if the return's own cell would keep its label: a new surfel there would own no cell.
     """
     if label == EMPTY:
         return False
@@ -190,7 +190,7 @@ def _merge(x, y, nx, ny, alone, label, field):  # type: ignore[no-untyped-def]
         if (px - s[0]) ** 2 + (py - s[1]) ** 2 > (px - x) ** 2 + (py - y) ** 2:
             return False
     s[4] = min(s[4] + 1.0, MEAN_OVER)
-    if not alone:
+    if not solitary:
         s[5] = 0.0
     gain = 1.0 / s[4]
     s[0] += gain * dx
@@ -209,7 +209,7 @@ def _merge(x, y, nx, ny, alone, label, field):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
-    """Give the surfel every cell within reach that has no nearer one, row by row of the disc, tile by tile."""
+    """Label every cell within reach that has no nearer surfel, row by row of the disc and tile by tile."""
     corner, labels, surfels = field.corner, field.labels, field.surfels
     cx = int(np.floor((x - corner[0]) / CELL_M))
     cy = int(np.floor((y - corner[1]) / CELL_M))
@@ -235,7 +235,7 @@ def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _tile_at(tx, ty, field):  # type: ignore[no-untyped-def]
-    """Storage number of a tile, which is taken now if it had none."""
+    """Storage number of a tile; allocates it if it had none."""
     tile = field.table[ty, tx]
     if tile == EMPTY:
         tile = field.used[0]
@@ -245,7 +245,14 @@ def _tile_at(tx, ty, field):  # type: ignore[no-untyped-def]
 
 
 def field_of(scans: list[tuple[PointScan, FloatArray]]) -> SurfelField:
-    """Field of scans given with their poses in the field's coordinates, around the first of them."""
+    """Build a field around the first of several scans.
+
+    Args:
+        scans: points in ``base`` and ``T_field_base``, shape (3,), of each scan.
+
+    Returns:
+        The field.
+    """
     field = SurfelField(scans[0][1] if scans else se2.IDENTITY)
     for scan, T_field_base in scans:
         field.insert(scan, T_field_base)

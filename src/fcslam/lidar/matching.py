@@ -14,30 +14,46 @@ from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
 OPPOSED: Final = -0.1
-"""Normals with a smaller product face away from each other; a right angle, as at a corner, may still meet."""
+"""Normals with a smaller dot product face away from each other; those at a right angle, as at a corner, do not."""
 ALONG: Final = 0.25
-"""How much a squared distance along the surface counts against one across it in a point's weight."""
+"""Weight of the squared distance along the surface, relative to that across it, in a point's robust weight."""
+
+NO_NORMAL_WEIGHT: Final = 0.5
+"""Weight of points without a normal: their surface is uncertain."""
+ALONG_LIMIT2: Final = 9.0
+"""A point on a surface is within 3 times ``explained_m`` of the surfel itself (squared): the surface ends somewhere."""
+DAMPING: Final = 1e-6
+"""Added to the diagonal of the normal equations, so that an unconstrained direction stays solvable."""
+SMALL_STEP_M: Final = 2e-4
+SMALL_STEP_RAD: Final = 1e-4
+"""A smaller step means that Gauss-Newton has converged at the present scale of the loss."""
+SHRINK: Final = 0.6
+FAST_SHRINK: Final = 0.35
+"""Factor of the loss scale after each step; the fast one after a small step."""
 
 
 class MatchingConfig(Settings):
     """Gauss-Newton scan matching."""
 
-    iterations: int = Field(default=20, gt=0, description="at most this many Gauss-Newton steps")
-    wide_scale_m: float = Field(default=0.30, gt=0, description="scale of the robust loss at the first step")
-    narrow_scale_m: float = Field(default=0.06, gt=0, description="scale of the robust loss at the end")
+    iterations: int = Field(default=20, gt=0, description="largest number of Gauss-Newton steps")
+    wide_scale_m: float = Field(default=0.30, gt=0, description="scale of the robust loss at the first step [m]")
+    narrow_scale_m: float = Field(default=0.06, gt=0, description="scale of the robust loss at the last step [m]")
     point_sigma_m: float = Field(
-        default=0.03, gt=0, description="standard deviation of one point's distance; wide, as neighbours err together"
+        default=0.03,
+        gt=0,
+        description="standard deviation of a point's distance; wide, as errors of neighbours are correlated [m]",
     )
-    explained_m: float = Field(default=0.10, gt=0, description="a point this close to its surface is explained")
+    explained_m: float = Field(default=0.10, gt=0, description="a point this close to its surface lies on it [m]")
 
 
 @dataclass(frozen=True, slots=True)
 class ScanMatch:
-    """Where a scan lies in a field."""
+    """Pose of a scan in a field."""
 
     T_field_base: FloatArray
+    """Shape (3,), metres and radians."""
     information: FloatArray
-    """Of the points alone, without the prior; (x, y in the field, theta), shape (3, 3)."""
+    """Information of the points without the prior, over (x, y) in the field and theta, shape (3, 3)."""
     explained: float
     """Share of the scan's points that lie on a surface."""
     known: float
@@ -51,9 +67,17 @@ def match_scan(
     prior_information: FloatArray,
     config: MatchingConfig,
 ) -> ScanMatch:
-    """Pose that minimises the robust distances to the field, held by a prior at the guess.
+    """Find the pose that minimises the robust distances of the points to the field, with a prior at the guess.
 
-    ``prior_information``: (3, 3), of (x, y, theta) in the field's coordinates; zeros for none.
+    Args:
+        scan: points in ``base``.
+        field: surfaces.
+        T_field_guess: start, and mean of the prior, shape (3,), metres and radians.
+        prior_information: over (x, y, theta) in the field's coordinates, shape (3, 3); zeros for no prior.
+        config: loss and iterations.
+
+    Returns:
+        The pose, the information of the points, and the share of points on known surfaces.
     """
     pose, information, explained, known = _match(
         _Points(scan.points, scan.normals, scan.solitary, scan.origin), T_field_guess, prior_information, field.arrays,
@@ -63,7 +87,7 @@ def match_scan(
 
 
 class _Points(NamedTuple):
-    """A scan as compiled code sees it."""
+    """The arrays of a scan, for compiled code."""
 
     points: FloatArray
     normals: FloatArray
@@ -84,13 +108,13 @@ def _match(scan, guess, prior, field, iterations, wide, narrow, sigma, explained
         offset[2] = (offset[2] + np.pi) % (2.0 * np.pi) - np.pi
         for r in range(3):
             b[r] += prior[r, 0] * offset[0] + prior[r, 1] * offset[1] + prior[r, 2] * offset[2]
-            A[r, r] += 1e-6
+            A[r, r] += DAMPING
         step = -np.linalg.solve(A, b)
         pose += step
-        small = abs(step[0]) + abs(step[1]) < 2e-4 and abs(step[2]) < 1e-4
+        small = abs(step[0]) + abs(step[1]) < SMALL_STEP_M and abs(step[2]) < SMALL_STEP_RAD
         if small and scale <= narrow:
             break
-        scale = max(narrow, scale * (0.35 if small else 0.6))
+        scale = max(narrow, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
     H, g = _normal_equations(scan, pose, field, narrow)
     explained, known = _explained(scan, pose, field, explained_m)
@@ -123,13 +147,13 @@ def _normal_equations(scan, pose, field, scale):  # type: ignore[no-untyped-def]
         if nx == 0.0 and ny == 0.0:
             nx, ny = mx, my
         if nx == 0.0 and ny == 0.0 and scan.solitary[i]:
-            w = 0.5 * (c2 / (c2 + d2)) ** 2
+            w = NO_NORMAL_WEIGHT * (c2 / (c2 + d2)) ** 2
             _add(H, g, w, 1.0, 0.0, -ry, dx)
             _add(H, g, w, 0.0, 1.0, rx, dy)
         elif nx == 0.0 and ny == 0.0:
-            # Far along a wall, returns in a row repeat the pattern of the beams: how far they are would tie the robot
-            # to where it stood before, with great certainty. Only their bearing counts.
-            w = 0.5 * (c2 / (c2 + d2)) ** 2
+            # Far along a wall, returns in a row repeat the pattern of the beams: their range would bind the robot to
+            # its previous position with false certainty. Only their bearing counts.
+            w = NO_NORMAL_WEIGHT * (c2 / (c2 + d2)) ** 2
             bx, by = points[i, 0] - scan.origin[0], points[i, 1] - scan.origin[1]
             length = max(np.hypot(bx, by), 1e-9)
             nx, ny = -(sin * bx + cos * by) / length, (cos * bx - sin * by) / length
@@ -179,7 +203,7 @@ def _explained(scan, pose, field, limit):  # type: ignore[no-untyped-def]
         d = abs(s[2] * dx + s[3] * dy)
         if s[2] == 0.0 and s[3] == 0.0:
             d = np.hypot(dx, dy)
-        elif dx * dx + dy * dy > 9.0 * limit * limit:
+        elif dx * dx + dy * dy > ALONG_LIMIT2 * limit * limit:
             continue
         if d < limit:
             explained += 1

@@ -1,4 +1,4 @@
-"""Occupancy grid by ray casting: every beam passes the cells up to its end and hits the last one."""
+"""Occupancy grid by ray casting: each beam passes the cells up to its end and hits the last one."""
 
 import math
 from collections.abc import Sequence
@@ -18,17 +18,25 @@ from fcslam.runs.map_files import Cells
 Counts = NDArray[np.uint32]
 
 FARTHEST_M = 1e7
-"""Poses beyond it are taken for a mistake: a float no longer resolves cells out there."""
+"""Poses farther from the origin are refused: floats no longer resolve cells there."""
 
 
 class OccupancyConfig(Settings):
     """The occupancy grid."""
 
-    resolution_m: float = Field(default=0.05, ge=0.001, le=10.0, description="side of a cell")
-    usable_range_m: float = Field(default=30.0, gt=0, le=1000.0, description="longer beams clear so far, hit nothing")
-    minimum_passes: int = Field(default=2, ge=1, description="beams through a cell before it counts as known")
-    occupied_ratio: float = Field(default=0.15, gt=0, lt=1, description="hits per pass above which a cell is occupied")
-    maximum_cells: int = Field(default=64_000_000, ge=1024, description="a larger grid gets a coarser resolution")
+    resolution_m: float = Field(default=0.05, ge=0.001, le=10.0, description="side of a cell [m]")
+    usable_range_m: float = Field(
+        default=30.0, gt=0, le=1000.0, description="longer beams clear cells up to this range and hit nothing [m]"
+    )
+    minimum_passes: int = Field(default=2, ge=1, description="least number of beams through a known cell")
+    occupied_ratio: float = Field(
+        default=0.15, gt=0, lt=1, description="ratio of hits to passes above which a cell is occupied"
+    )
+    maximum_cells: int = Field(
+        default=64_000_000,
+        ge=1024,
+        description="largest number of cells; a larger grid gets cells twice as wide, until it fits",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +80,19 @@ class _Layout(NamedTuple):
 
 
 def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
-    """Count hits and passes of all beams; a range that is no return (0, not finite, at the maximum) adds nothing.
+    """Count hits and passes of all beams. Invalid ranges (0, not finite, at the maximum) add nothing.
 
-    The grid spans all hits and all lasers; beams that see nothing in usable range clear inside it only.
+    The grid spans all hits and all lasers; beams without a hit in usable range clear cells inside of it only.
+
+    Args:
+        keyscans: ranges (beam_count,) in metres, their laser, and ``T_map_base`` (3,).
+        config: resolution, usable range and size.
+
+    Returns:
+        Counts, shape (H, W), in ``map``.
 
     Raises:
-        ValueError: ranges do not fit their laser, or a pose is not finite or out of all bounds.
+        ValueError: the number of ranges is not that of the beams, or a pose is not finite or too far away.
     """
     lasers = list(dict.fromkeys(laser for _, laser, _ in keyscans))
     groups = [_stacked([scan for scan in keyscans if scan[1] == laser], laser) for laser in lasers]
@@ -92,7 +107,7 @@ def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
 
 
 def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
-    """``Occupancy`` of every cell by Karto's rule: known after enough passes, occupied by the share of hits."""
+    """``Occupancy`` of every cell, shape (H, W), by Karto's rule: enough passes make it known, enough hits occupied."""
     cells: Cells = _classify(grid.hits, grid.passes, config.minimum_passes, config.occupied_ratio)
     cells.setflags(write=False)
     return cells
@@ -166,7 +181,7 @@ def _cast(beams, layout, usable, hits, passes):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _traverse(x0, y0, x1, y1, passes):  # type: ignore[no-untyped-def]
-    """A pass for each cell on the way, the first and the last included; whether the last lies in the grid.
+    """Count a pass for each cell of a beam, including the first and the last; returns whether the last is in the grid.
 
     Coordinates are in cells. Amanatides and Woo, "A fast voxel traversal algorithm for ray tracing", 1987.
     """

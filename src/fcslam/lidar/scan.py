@@ -17,9 +17,9 @@ MINIMUM_GAP_M = 0.15
 GAP_PER_SPACING = 3.0
 """Neighbouring returns closer than this many beam spacings lie on one surface."""
 LINE_TOLERANCE_M = 0.05
-"""A normal is kept only if its neighbours lie this close to the fitted line (standard deviation)."""
+"""Largest standard deviation of the neighbours from the fitted line of a normal."""
 ROUNDEST = 0.1
-"""And only if they spread this much less across the line than along it (variances)."""
+"""Largest ratio of the neighbours' variance across the fitted line to that along it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +31,9 @@ class PointScan:
     normals: FloatArray
     """Shape (N, 2): unit vectors towards the laser; (0, 0) where the surface is not a line."""
     solitary: NDArray[np.bool_]
-    """Shape (N,): returns that stand alone, on no line and in no row: a post, a trunk."""
+    """Shape (N,): returns on no line and in no row, as from a post or a trunk."""
     origin: FloatArray
-    """Where the laser is, shape (2,)."""
+    """Position of the laser, shape (2,), metres."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -46,15 +46,22 @@ class PointScan:
         return self.only(keep)
 
     def only(self, kept: NDArray[Any]) -> "PointScan":
-        """The returns with these indices, or where this mask is true."""
+        """The returns with the indices ``kept``, shape (K,), or where the mask ``kept``, shape (N,), is true."""
         return PointScan(self.points[kept], self.normals[kept], self.solitary[kept], self.origin)
 
 
 def point_scan(ranges_m: Ranges, laser: LaserModel) -> PointScan:
-    """Points and normals of the valid returns (0 < range < maximum, finite).
+    """Convert the valid ranges of a scan (finite, over 0, below the maximum) to points with normals.
+
+    Args:
+        ranges_m: shape (beam_count,), metres.
+        laser: geometry and mounting of the laser.
+
+    Returns:
+        Points and normals in ``base``, shape (N, 2).
 
     Raises:
-        ValueError: there is not one range for each beam.
+        ValueError: the number of ranges is not the number of beams.
     """
     if np.shape(ranges_m) != (laser.beam_count,):
         raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {np.shape(ranges_m)}")

@@ -1,4 +1,4 @@
-"""A submap: the surfaces and the free space that the keyscans around one keyscan saw, in that keyscan's base."""
+"""Submaps: surfaces and free space seen by the keyscans around one anchor keyscan, in the base of the anchor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,13 +21,15 @@ RADIUS_M: Final = 30.0
 SPACING_M: Final = 0.1
 """Surfaces are compared at points this far apart."""
 SEEN_THROUGH: Final = 3
-"""Scans whose beams passed where others had a return before that is taken for something that moved ..."""
+"""A surfel counts as moving, and is dropped, if the beams of at least this many scans passed through its cell ..."""
 SEEN_THROUGH_RATIO: Final = 2
-"""... if they are more than so many times those that had the return: walls seen at a grazing angle are passed, too."""
+"""... and of more than this many times the scans with a return in it: beams at a grazing angle pass walls, too."""
 EXPLAINED_M: Final = 0.15
+"""A point this close to a surfel that faces the same way lies on its surface."""
 VIOLATION_M: Final = 0.30
+"""A point in free space farther than this from any surfel contradicts the submap."""
 LEVER_M: Final = 3.0
-"""Lever at which a turn moves a point as far as a shift does: about what a submap of a room has."""
+"""Lever arm that scales turns to shifts: about that of the points in a submap of a room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,20 +39,28 @@ class FreeSpace:
     cells: NDArray[np.bool_]
     """Shape (H, W), row = y."""
     corner: FloatArray
+    """Lower left corner of cell (0, 0), shape (2,), metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Submap:
-    """What was seen around an anchor keyscan; everything in the anchor's base."""
+    """Surfaces and free space around an anchor keyscan, in the anchor's base."""
 
     field: SurfelField
     surface: PointScan
-    """The surfels, about 0.1 m apart, without those that later or earlier beams passed through: people who walk by."""
+    """Surfels about 0.1 m apart, without moving ones (people), which beams of other scans passed through."""
     free: FreeSpace
 
 
 def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
-    """Submap of scans given with their poses in the anchor's base (T_anchor_base)."""
+    """Build a submap.
+
+    Args:
+        scans: points in ``base`` and ``T_anchor_base``, shape (3,), metres and radians, of each scan.
+
+    Returns:
+        The submap in the anchor's base.
+    """
     near = [(_near(scan, pose), pose) for scan, pose in scans]
     field = field_of(near)
     surface = _spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
@@ -121,7 +131,7 @@ def _spaced(surfels: PointScan) -> PointScan:
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How well a submap, laid on another, agrees with what the other saw."""
+    """Agreement of one submap with another at a given transform."""
 
     explained: float
     """Share of the points in known area that lie on a surface facing the same way."""
@@ -144,7 +154,16 @@ class Agreement:
 
 
 def agreement(query: Submap, target: Submap, T_target_query: FloatArray) -> Agreement:
-    """Agreement of ``query`` with ``target`` when its anchor lies at ``T_target_query``."""
+    """Measure how well ``query`` agrees with ``target``.
+
+    Args:
+        query: the submap whose points are counted.
+        target: the submap that they are compared with.
+        T_target_query: pose of the query's anchor in the target's anchor, shape (3,), metres and radians.
+
+    Returns:
+        Shares of points, and the normal tensor.
+    """
     known, explained, violating, tensor = _agreement(
         query.surface.points, query.surface.normals, T_target_query,
         target.field.arrays, target.free.cells, target.free.corner,

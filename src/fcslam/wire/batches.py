@@ -1,4 +1,4 @@
-"""Several packets in one request or answer: each is preceded by its length; docs/wire.md says the rest."""
+"""Batches: several packets in one request or reply, each preceded by its length (docs/wire.md)."""
 
 import struct
 from collections.abc import Iterable
@@ -7,24 +7,24 @@ from fcslam.errors import PacketError
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS, MAXIMUM_PACKET_BYTES
 
 MEDIA_TYPE = "application/vnd.fcslam.packets"
-"""Content type of requests and answers."""
+"""Content type of requests and replies."""
 CORRECTION_HEADER = "Fcslam-Correction"
 """Version of the newest correction that the robot has; absent: none."""
 AGENT_HEADER = "Fcslam-Agent"
-"""128 random bits in hexadecimal: tells two agents apart that go by one name."""
+"""128 random bits in hexadecimal that distinguish two agents of the same name."""
 
 REFUSED_HEADER = "Fcslam-Refused"
-"""In an answer: how many of the robot's packets count for nothing."""
+"""In a reply: number of the robot's packets that were refused."""
 
 LENGTH = struct.Struct(">I")
 """Length of the packet that follows: 4 bytes, big endian."""
 
 
 def write_batch(packets: Iterable[bytes]) -> bytes:
-    """The bytes of encoded packets that travel together; of none, no bytes.
+    """Join encoded packets to one batch; no packets give no bytes.
 
     Raises:
-        PacketError: they are too many, one is empty or too long, or all together are.
+        PacketError: there are too many packets, one is empty or too long, or the batch is too long.
     """
     chosen = tuple(packets)
     _check_count(len(chosen))
@@ -36,11 +36,11 @@ def write_batch(packets: Iterable[bytes]) -> bytes:
 
 
 def read_batch(data: bytes) -> list[bytes]:
-    """The encoded packets that ``write_batch`` put into ``data``; what is in them is not looked at.
+    """Split a batch into encoded packets, without decoding them.
 
     Raises:
-        PacketError: ``data`` is no batch, with the reason; none of it is given then, as bytes may have gone astray
-            anywhere.
+        PacketError: ``data`` is not a batch; the message says why. No packet is returned then, as any byte may be
+            corrupt.
     """
     _check_size(len(data))
     packets: list[bytes] = []

@@ -1,4 +1,4 @@
-"""Each record as its protobuf message: writing and reading stand side by side."""
+"""Conversion between records and protobuf messages, with writing and reading side by side."""
 
 from collections.abc import Callable
 from types import MappingProxyType
@@ -111,7 +111,7 @@ def _read_constraint(message: pb.Constraint, envelope: pb.Packet) -> Constraint:
 
 
 def _write_place(place: Place) -> pb.Place:
-    """Keypoints travel in ascending order, and their descriptors with them."""
+    """Keypoints are sent in ascending order, with their descriptors."""
     codes = quantise_keypoints(place.keypoints)
     order = ascending(codes)
     return pb.Place(
@@ -142,7 +142,7 @@ def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
 
 
 def _check_at_most(count: int, most: int, what: str) -> None:
-    """Before memory is taken for them."""
+    """Refuse a count before memory is allocated for it."""
     if count > most:
         raise PacketError(f"{what}: {count}, at most {most}")
 
@@ -188,7 +188,7 @@ def _write_pose(pose: FloatArray) -> pb.Pose:
 
 
 def _read_pose(message: Message, field: str) -> FloatArray:
-    """An absent pose is no identity: it is refused."""
+    """Refuse an absent pose; it would read as the identity."""
     if not message.HasField(field):
         raise PacketError(f"{message.DESCRIPTOR.name.lower()}: {field} is missing")
     pose: pb.Pose = getattr(message, field)
@@ -196,10 +196,10 @@ def _read_pose(message: Message, field: str) -> FloatArray:
 
 
 def read_channel(code: int) -> Channel:
-    """The channel that a packet's number stands for.
+    """The channel of a code in a packet.
 
     Raises:
-        PacketError: none does.
+        PacketError: the code is unknown.
     """
     channel = _CHANNEL_OF_CODE.get(code)
     if channel is None:
@@ -208,7 +208,7 @@ def read_channel(code: int) -> Channel:
 
 
 class Codec(NamedTuple):
-    """How one kind of record is written and read; reading takes the robot and the epoch from the envelope."""
+    """Writer and reader of one kind of record; the reader takes robot and epoch from the envelope."""
 
     type: type
     write: Callable[[Any], Message]

@@ -1,4 +1,4 @@
-"""Which packets may be trusted: the same checks before writing and after reading."""
+"""Validation of packets: the same checks before writing and after reading."""
 
 import math
 from collections.abc import Callable
@@ -30,25 +30,25 @@ FULL_TURN_RAD = 2.0 * math.pi
 
 
 def check(packet: Packet) -> None:
-    """Refuse what breaks a limit or a promise of the format.
+    """Refuse a packet that violates the format.
 
     Raises:
-        PacketError: with the reason.
+        PacketError: the packet is not valid; the message says why.
     """
     check_name(packet.robot, "robot")
     _check_count(packet.epoch, "epoch", MAXIMUM_SEQUENCE)
     _check_count(packet.sequence, "sequence", MAXIMUM_SEQUENCE)
     _require(math.isfinite(packet.time), "time is not finite")
     robot = _robot_of(packet.body)
-    _require(robot == packet.robot, f"a packet of robot {packet.robot} speaks for robot {robot!r}")
+    _require(robot == packet.robot, f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
     _CHECKS[type(packet.body)](packet.body, packet)
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse a name that is no plain word of at most 64 letters, digits and ``. _ + -``.
+    """Refuse a name that is not 1 to 64 letters, digits and ``. _ + -``.
 
     Raises:
-        PacketError: naming ``what`` it was for.
+        PacketError: the name is not valid; the message begins with ``what``.
     """
     _require(NAME.fullmatch(name) is not None, f"{what}: {name[:64]!r} is no name (1-64 of A-Z a-z 0-9 . _ + -)")
 
@@ -70,7 +70,7 @@ def _check_laser(laser: LaserModel) -> None:
     turns = 0.0 < abs(laser.angle_increment_rad) <= FULL_TURN_RAD
     _require(turns, "laser: beams do not turn, or by more than a full turn")
     span = abs(laser.angle_increment_rad) * laser.beam_count
-    # a full turn may be closed by one beam twice, and drivers round the increment
+    # The first and last beam of a full turn may coincide, and drivers round the increment.
     _require(span <= 1.01 * FULL_TURN_RAD + abs(laser.angle_increment_rad), "laser: beams cover over a full turn")
     _require(0.0 < laser.max_range_m <= MAXIMUM_LASER_RANGE_M, "laser: maximum range is not in (0, 1000] m")
     _check_pose(np.array(laser.T_base_laser), "laser: T_base_laser")
@@ -96,7 +96,7 @@ def _check_constraint(constraint: Constraint, _: Packet) -> None:
 
 
 def _check_information(information: FloatArray) -> None:
-    """Symmetric and, in units of its own standard deviations and as rounded, clearly positive definite."""
+    """Refuse a matrix that is not symmetric or, as rounded and with a unit diagonal, not clearly positive definite."""
     _check_shape(information, (3, 3), "constraint: information")
     sent = unpack_information(pack_information(information))
     _require(bool(np.isfinite(sent).all()), "constraint: information is not finite")
@@ -179,6 +179,6 @@ def _check_count(value: int, what: str, maximum: int) -> None:
 
 
 def _require(condition: bool, reason: str) -> None:
-    """False also for comparisons with NaN: every condition is written so that NaN fails it."""
+    """Every condition is written so that NaN fails it."""
     if not condition:
         raise PacketError(reason)

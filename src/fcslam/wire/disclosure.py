@@ -1,4 +1,4 @@
-"""What leaves a robot and what comes back, field by field of the schema, and what each field could tell a stranger."""
+"""What leaves a robot and what comes back, field by field of the schema, and what each field reveals."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -56,10 +56,10 @@ REVEALS: Mapping[str, str] = MappingProxyType(
         "Acknowledgement.sequence": "how much the cloud has",
     }
 )
-"""By message and field of fcslam.proto; a test asks for every field, and for no other."""
+"""By message and field of fcslam.proto; a test checks that the list is complete."""
 
 PLAIN = frozenset({"Pose"})
-"""Messages that say no more than the field that they stand in."""
+"""Messages without a meaning of their own besides the field that holds them."""
 
 _TYPES = {
     FieldDescriptor.TYPE_DOUBLE: "double",
@@ -76,14 +76,14 @@ class FieldDisclosure:
     """One field of one message."""
 
     name: str
-    """With the fields that it stands in, as in ``detectors.version``."""
+    """Path of the field, as in ``detectors.version``."""
     type: str
     reveals: str
 
 
 @dataclass(frozen=True, slots=True)
 class Disclosure:
-    """One kind of message, or the envelope that all of them have."""
+    """One kind of message, or the envelope of all messages."""
 
     name: str
     direction: str
@@ -91,7 +91,7 @@ class Disclosure:
 
 
 def disclosures() -> list[Disclosure]:
-    """The envelope and every kind of message in the order of the schema, with all that is in them."""
+    """The envelope and every kind of message with all their fields, in the order of the schema."""
     envelope: Any = pb.Packet.DESCRIPTOR
     own = tuple(
         FieldDisclosure(field.name, _type(field), _reveals(field))

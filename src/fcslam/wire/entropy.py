@@ -1,13 +1,11 @@
-"""An arithmetic coder of bits with known probabilities, and whole numbers whose probabilities are learnt on the way.
+"""Adaptive arithmetic coder for bits and integers.
 
-Every function here that is given ``bit`` or ``value`` writes it or, if the coder reads, ignores it and returns what was
-read: what a stream means is written down once, for both ways. All of it is whole-number arithmetic, so all machines
-agree to the last bit.
+Functions with a parameter ``bit`` or ``value`` write it; if the coder reads, they ignore it and return what they read.
+So one function defines both directions. The arithmetic is in integers, so results are the same on every machine.
 
-The coder is the carry-less range coder of Mahoney's PAQ: an interval of 32-bit numbers is narrowed to the share of each
-bit's probability, and leading bytes that its ends have in common are done. A stream ends with the fewest bytes that
-name a number in the last interval; zeros at its end are left out, and whatever is not this very ending is refused. So
-there is one stream for each content.
+The coder is the carry-less range coder of Mahoney's PAQ: an interval of 32-bit numbers shrinks by the probability of
+each bit, and leading bytes that its ends share are output. A stream ends with the fewest bytes that name a number in
+the last interval, without trailing zeros; any other ending is refused. So each content has exactly one stream.
 """
 
 from typing import Final
@@ -25,9 +23,9 @@ Model = NDArray[np.int64]
 _READS, _LOW, _HIGH, _NUMBER, _POSITION, _SIZE = range(6)
 _ONE: Final = 65536
 _LEAST: Final = 32
-"""No bit is believed impossible."""
+"""Least probability of a bit: none is impossible."""
 _MEMORY: Final = 50
-"""A context's probability is that of about so many bits before."""
+"""A context adapts to about this many recent bits."""
 _MOST_DIGITS: Final = 20
 CONTEXTS_OF_NUMBER: Final = 2 * _MOST_DIGITS + 2
 
@@ -49,7 +47,7 @@ def reader(data: Bytes) -> Coder:
 
 @njit(cache=True, nogil=True)
 def fresh_model(contexts: int) -> Model:
-    """A model that knows nothing yet."""
+    """A model without any data: all bits have probability 1/2."""
     model = np.zeros((contexts, 2), np.int64)
     model[:, 0] = _ONE // 2
     return model

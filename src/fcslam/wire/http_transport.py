@@ -1,4 +1,4 @@
-"""A robot's side of HTTP: batches of packets to the cloud, its answers back. It tries once; its caller tries again."""
+"""HTTP client of a robot: sends batches of packets and reads replies. It does not retry; its caller does."""
 
 import ipaddress
 import ssl
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 CONNECT_TIMEOUT_S, ANSWER_TIMEOUT_S = 5.0, 30.0
 
 _LATER = frozenset({408, 425, 429, 500, 502, 503, 504, 507})
-"""Answers of a cloud, or of what stands before it, that may be others soon."""
+"""Status codes of a cloud, or a proxy before it, after which a retry may succeed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """One packet of a batch that the cloud will never take; its number is used up all the same.
+    """A packet of a batch that the cloud refuses for good; it keeps its sequence number.
 
-    Those before it are stored, those after it are not.
+    Packets before it are stored, packets after it are not.
     """
 
     index: int
@@ -35,69 +35,75 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class HttpResponse:
-    """What came of a batch."""
+    """Reply of the cloud to a batch."""
 
     packets: tuple[bytes, ...] = ()
     """Encoded packets from the cloud."""
     refusal: Refusal | None = None
     refused: int = 0
-    """How many of the robot's packets count for nothing by now; some were found out after they were stored."""
+    """Number of the robot's refused packets so far; some were refused after they were stored."""
 
 
 @dataclass(frozen=True, slots=True)
 class CloudState:
-    """What the cloud has of a robot."""
+    """The packets that the cloud has of a robot."""
 
     expected: Mapping[int, int]
-    """The next sequence that it expects, by epoch."""
+    """Next expected sequence number, by epoch."""
     refused: Mapping[tuple[int, int], str] = field(default_factory=dict)
-    """Why packets count for nothing, by epoch and sequence."""
+    """Reason of every refused packet, by epoch and sequence."""
 
 
 class BatchTransport(Protocol):
-    """How a robot reaches the cloud."""
+    """Connection of a robot to the cloud."""
 
     def state(self) -> CloudState:
-        """What the cloud has of this robot.
+        """Ask the cloud which packets of this robot it has.
 
         Raises:
-            UnavailableError: it cannot be asked now.
-            CloudError: it turns this robot away.
+            UnavailableError: the cloud cannot be reached now.
+            CloudError: the cloud rejects this robot.
         """
 
     def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
-        """Hand over a batch of encoded packets, tell the newest correction (-1: none), wait for the answer.
+        """Send a batch of encoded packets with the version of the newest correction (-1: none), and wait for the reply.
 
-        Without packets it asks for what is new. Nothing is known of a batch whose answer is lost, so it comes again.
+        Without packets it only asks for news. A batch whose reply is lost has to be sent again.
 
         Raises:
-            UnavailableError: no answer came, or the cloud is busy.
-            OversizeError: it takes no batch of this size.
-            CloudError: it turns this robot away.
+            UnavailableError: no reply came, or the cloud is busy.
+            OversizeError: the batch is too large for the cloud.
+            CloudError: the cloud rejects this robot.
         """
 
     def detector(self, channel: Channel, version: str) -> bytes:
-        """The file of a detector that was announced.
+        """Download the file of an announced detector.
 
         Raises:
-            UnavailableError: it cannot be had now.
-            CloudError: there is none of this version.
+            UnavailableError: the cloud cannot be reached now.
+            CloudError: there is no such version.
         """
 
 
 class HttpTransport:
-    """One connection to one cloud for one robot; docs/howto-robot.md says what it makes of which answer."""
+    """Connection of one robot to one cloud; docs/howto-robot.md lists how it handles status codes."""
 
     def __init__(
         self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None,
         own: tuple[Path, Path] | None = None,
     ) -> None:  # fmt: skip
-        """``agent`` tells two processes apart that go by one name; ``ca`` is a PEM file, the system's if not given.
+        """Open a client.
 
-        ``own``: PEM files of the robot's certificate and its key, which it shows instead of a token.
+        Args:
+            url: address of the cloud.
+            robot: name of the robot.
+            agent: random identifier that distinguishes two processes of the same name.
+            token: bearer token, if the cloud asks for one.
+            ca: PEM file of certificate authorities; None: those of the system.
+            own: PEM files of the robot's certificate and key, in place of a token.
 
         Raises:
-            CloudError: ``url`` is none, or would show the token to the network; ``ca`` or ``own`` cannot be read.
+            CloudError: ``url`` is not an address or would send the token unencrypted; ``ca`` or ``own`` cannot be read.
         """
         import httpx
 
@@ -115,7 +121,7 @@ class HttpTransport:
         )
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._client.close()
 
     def state(self) -> CloudState:
@@ -123,11 +129,11 @@ class HttpTransport:
         response = self._ask("GET", f"robots/{self._robot}/state", accept="application/json")
         self._require(response, 200)
         try:
-            told = response.json()
-            expected = {int(epoch): int(sequence) for epoch, sequence in told["next"].items()}
-            refused = {(int(one["epoch"]), int(one["sequence"])): str(one["reason"]) for one in told["refused"]}
+            state = response.json()
+            expected = {int(epoch): int(sequence) for epoch, sequence in state["next"].items()}
+            refused = {(int(one["epoch"]), int(one["sequence"])): str(one["reason"]) for one in state["refused"]}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise CloudError(f"{self._url}: answers, but not as a cloud of fcslam; give its address") from error
+            raise CloudError(f"{self._url}: the reply is not that of an fcslam cloud; check the address") from error
         return CloudState(expected, refused)
 
     def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
@@ -142,14 +148,14 @@ class HttpTransport:
             index = _detail(response).get("index")
             if isinstance(index, int) and 0 <= index < len(packets):
                 return HttpResponse(refusal=Refusal(index, self._reason(response)))
-            raise UnavailableError(self._reason(response))  # the batch went astray on its way
+            raise UnavailableError(self._reason(response))  # the batch was corrupted on its way
         self._require(response, 200)
         try:
             return HttpResponse(
                 tuple(read_batch(response.content)), refused=int(response.headers.get(REFUSED_HEADER, 0))
             )
         except (PacketError, ValueError) as error:
-            raise UnavailableError(f"{self._url}: the answer is broken ({error})") from error
+            raise UnavailableError(f"{self._url}: the reply is broken ({error})") from error
 
     def detector(self, channel: Channel, version: str) -> bytes:
         """As in BatchTransport."""
@@ -168,7 +174,7 @@ class HttpTransport:
         except httpx.RequestError as error:
             if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
                 raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error
-            # A cloud that does not believe a certificate hangs up, as TLS 1.3 has it, without a word that gets here.
+            # A cloud that rejects a certificate closes the connection; with TLS 1.3 the reason may not arrive here.
             hint = (
                 "; if that stays, it does not trust this robot's certificate"
                 if self._has_own and isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError)
@@ -177,13 +183,13 @@ class HttpTransport:
             raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{hint}") from error
 
     def _require(self, response: "httpx.Response", status: int) -> None:
-        """Turn any other answer into an error."""
+        """Raise an error for any other status."""
         code = response.status_code
         if code == status:
             return
         after = response.headers.get("Retry-After", "")
         wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
-        is_other_agent = code == 409 and "index" not in _detail(response)  # it may be gone soon
+        is_other_agent = code == 409 and "index" not in _detail(response)  # another agent may stop soon
         if code in _LATER or is_other_agent:
             raise UnavailableError(self._reason(response), wait_s)
         raise (OversizeError if code == 413 else CloudError)(self._reason(response))
@@ -205,11 +211,11 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
 def _check_url(url: str, token: str | None, own: tuple[Path, Path] | None) -> None:
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise CloudError(f"{url!r} is no address of a cloud; give one as https://cloud.example:8443")
+        raise CloudError(f"{url!r} is not the address of a cloud; give one like https://cloud.example:8443")
     if token and parts.scheme == "http" and not _is_loopback(parts.hostname):
-        raise CloudError(f"{url}: a token would be readable on its way; use https")
+        raise CloudError(f"{url}: a token would be sent unencrypted; use https")
     if own and parts.scheme == "http":
-        raise CloudError(f"{url}: nobody is shown a certificate there; use https")
+        raise CloudError(f"{url}: certificates need https")
 
 
 def _is_loopback(host: str) -> bool:
@@ -223,10 +229,12 @@ def _trust(ca: Path | None, own: tuple[Path, Path] | None) -> ssl.SSLContext:
     try:
         context = ssl.create_default_context(cafile=None if ca is None else str(ca))
     except (OSError, ssl.SSLError) as error:
-        raise CloudError(f"{ca}: no certificate authority can be read ({error}); give a PEM file") from error
+        raise CloudError(f"{ca}: cannot read a certificate authority ({error}); give a PEM file") from error
     if own is not None:
         try:
             context.load_cert_chain(*own, password=no_passphrase)
         except (OSError, ssl.SSLError) as error:
-            raise CloudError(f"{own[0]}, {own[1]}: no certificate with its key ({error}); give PEM files") from error
+            raise CloudError(
+                f"{own[0]}, {own[1]}: cannot read the certificate and its key ({error}); give PEM files"
+            ) from error
     return context

@@ -1,12 +1,12 @@
-"""Keys of TLS: one that is encrypted is an error here, and not a prompt that nobody sees."""
+"""TLS keys: an encrypted key is an error instead of a prompt on a terminal."""
 
 import ssl
 
 
 def no_passphrase() -> str:
-    """To be given to ``load_cert_chain`` as its password, lest OpenSSL ask a terminal.
+    """Password callback for ``load_cert_chain``, so that OpenSSL does not ask on the terminal.
 
     Raises:
-        ssl.SSLError: always, as it is called only where a key is encrypted.
+        ssl.SSLError: always; OpenSSL calls it only for an encrypted key.
     """
     raise ssl.SSLError("the key is encrypted; give one without a passphrase: openssl pkey -in KEY -out KEY2")

@@ -1,4 +1,4 @@
-"""How many bytes of which kind each robot exchanged with the cloud."""
+"""Traffic between robots and cloud: packets and bytes by robot and kind."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from fcslam.wire.packets import Label
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """Packets and their bytes, without what a network adds to them."""
+    """Packets and their bytes, without the overhead of the network."""
 
     count: int = 0
     bytes: int = 0
@@ -25,14 +25,14 @@ class Ledger:
     """The traffic up to one moment."""
 
     accepted: Mapping[Label, Traffic]
-    """By robot, kind and, of places, channel; the kind also tells the direction."""
+    """By robot, kind and, for places, channel; the kind determines the direction."""
     refused: Traffic
-    """Not by robot: whom refused bytes come from is not known."""
+    """Traffic that was refused; its sender is not known."""
 
     def total(
         self, robot: str | None = None, kind: PacketKind | None = None, channel: Channel | None = None
     ) -> Traffic:
-        """Accepted traffic of one robot or of all, of one kind or of all, of places of one channel or of everything."""
+        """Accepted traffic, optionally of one robot, one kind, or the places of one channel."""
         chosen = (
             traffic
             for label, traffic in self.accepted.items()
@@ -65,5 +65,5 @@ class Counter:
         self._refused += Traffic(1, size)
 
     def ledger(self) -> Ledger:
-        """What was counted so far; later traffic does not change it."""
+        """The traffic so far; later traffic does not change the result."""
         return Ledger(MappingProxyType(dict(self._accepted)), self._refused)

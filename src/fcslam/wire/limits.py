@@ -1,4 +1,4 @@
-"""Every limit of the format, version 1. A packet beyond one of them is neither written nor read."""
+"""All limits of the format, version 1. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
@@ -21,7 +21,7 @@ KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
 BYTES_PER_AXIS = 2
 
 MAXIMUM_NETWORK_BYTES = 64 * 1024 * 1024
-"""Of a detector's file; those of today have 0.5 to 5 MB."""
+"""Largest file of a detector; present ones have 0.5 to 5 MB."""
 DIGEST_BYTES = 32
 
 MAXIMUM_COORDINATE_M = 1e6
@@ -31,8 +31,8 @@ MAXIMUM_INFORMATION = 2.0**40
 MINIMUM_INFORMATION = 2.0**-20
 """A standard deviation of 1 km or 1000 rad. Both bounds hold for the diagonal."""
 MINIMUM_CORRELATION_EIGENVALUE = 1e-6
-"""Well above the rounding of float32: what is positive definite here stays so."""
+"""Well above the rounding of float32, so that positive definite matrices stay positive definite."""
 
 MAXIMUM_BATCH_BYTES = 1024 * 1024
 MAXIMUM_BATCH_PACKETS = 1024
-"""Of packets that travel together, their lengths included in the bytes."""
+"""Limits of a batch; the bytes include the length of each packet."""

@@ -8,7 +8,7 @@ from fcslam.records import Channel, Constraint, Correction, DetectorFile, Keysca
 
 
 class PacketKind(StrEnum):
-    """What a packet carries; the names of the fields of ``Packet.body`` in fcslam.proto."""
+    """Kind of record in a packet; the names of the fields of ``Packet.body`` in fcslam.proto."""
 
     HELLO = "hello"
     KEYSCAN = "keyscan"
@@ -20,12 +20,12 @@ class PacketKind(StrEnum):
 
 
 UPLINK = frozenset({PacketKind.HELLO, PacketKind.KEYSCAN, PacketKind.CONSTRAINT, PacketKind.PLACE})
-"""What robots send; the other kinds come back from the cloud."""
+"""Kinds that robots send; the cloud sends the others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """How to read the packets that follow: the first of an epoch, and again whenever a detector has changed."""
+    """Describes the packets that follow: the first packet of an epoch, repeated after each change of a detector."""
 
     robot: str
     epoch: int
@@ -35,7 +35,7 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
-    """What the cloud tells a robot: this packet is stored and need not be sent again."""
+    """From cloud to robot: a packet is stored and need not be sent again."""
 
     robot: str
     epoch: int
@@ -46,7 +46,7 @@ class Acknowledgement:
 
 @dataclass(frozen=True, slots=True)
 class DetectorUpdate:
-    """What the cloud tells a robot: there is a newer detector, to be fetched and used from then on."""
+    """From cloud to robot: a newer detector to download and use from then on."""
 
     robot: str
     file: DetectorFile
@@ -57,10 +57,10 @@ Body = Hello | Keyscan | Constraint | Place | Correction | Acknowledgement | Det
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One record on its way between one robot and the cloud."""
+    """One record between a robot and the cloud, in its envelope."""
 
     robot: str
-    """Sender or, for what the cloud sends, addressee."""
+    """Sender; of a packet from the cloud, recipient."""
     epoch: int
     """Grows with every start of the robot."""
     sequence: int
@@ -71,5 +71,5 @@ class Packet:
 
     @property
     def order(self) -> tuple[float, str, int, int]:
-        """Key of the canonical order: by it a set of packets becomes one sequence, however they arrived."""
+        """Key of the canonical order, which does not depend on the order of arrival."""
         return self.time, self.robot, self.epoch, self.sequence

@@ -1,4 +1,4 @@
-"""Packets to bytes and back; docs/wire.md says what the bytes mean."""
+"""Encoding and decoding of packets (format: docs/wire.md)."""
 
 from typing import Any, NamedTuple
 
@@ -23,19 +23,19 @@ from fcslam.wire.messages import Packet, PacketKind
 
 
 class Label(NamedTuple):
-    """What a packet's traffic is counted by."""
+    """Attributes by which the traffic of a packet is counted."""
 
     robot: str
     kind: PacketKind
     channel: Channel | None = None
-    """Of a place; None for every other kind."""
+    """Channel of a place; None for other kinds."""
 
 
 def encode(packet: Packet) -> bytes:
-    """The bytes of a packet; keypoints are rounded to 1 cm, information matrices to float32, nothing else changes.
+    """Encode a packet. Keypoints are rounded to 1 cm and information matrices to float32; the rest is exact.
 
     Raises:
-        PacketError: the packet breaks a limit of the format, with the reason.
+        PacketError: the packet exceeds a limit of the format; the message says which.
     """
     check(packet)
     kind, codec = CODEC_OF_TYPE[type(packet.body)]
@@ -52,10 +52,10 @@ def encode(packet: Packet) -> bytes:
 
 
 def decode(data: bytes) -> Packet:
-    """The packet that ``encode`` made ``data`` of, checked in everything that one packet alone can tell.
+    """Decode a packet and check everything that does not depend on other packets.
 
     Raises:
-        PacketError: ``data`` is not a valid packet of a known version, with the reason.
+        PacketError: ``data`` is not a valid packet of a known version; the message says why.
     """
     message, kind = _parse(data)
     body = CODECS[kind].read(getattr(message, kind), message)
@@ -65,10 +65,10 @@ def decode(data: bytes) -> Packet:
 
 
 def readdress(data: bytes, epoch: int, sequence: int) -> bytes:
-    """The same packet with another epoch and number on its envelope.
+    """The same packet with another epoch and sequence number.
 
     Raises:
-        PacketError: ``data`` is not a packet of a known version, with the reason.
+        PacketError: ``data`` is not a packet of a known version; the message says why.
     """
     message, _ = _parse(data)
     message.epoch, message.sequence = epoch, sequence
@@ -76,10 +76,10 @@ def readdress(data: bytes, epoch: int, sequence: int) -> bytes:
 
 
 def read_label(data: bytes) -> Label:
-    """Robot, kind and channel of a packet without the cost, and without the checks, of reading its body.
+    """Robot, kind and channel of a packet; its body is not decoded or checked.
 
     Raises:
-        PacketError: ``data`` is not a packet of a known version, or a place of an unknown channel, with the reason.
+        PacketError: ``data`` is not a packet of a known version, or a place of an unknown channel.
     """
     message, kind = _parse(data)
     check_name(message.robot, "robot")
@@ -87,10 +87,10 @@ def read_label(data: bytes) -> Label:
 
 
 def unpacked_size(data: bytes) -> int:
-    """Bytes of a packet with its streams unpacked, as its counts tell them without the cost of reading its body.
+    """Bytes of a packet with its streams unpacked, computed from its counts without decoding the body.
 
-    What a robot may ask for is measured by it: a stream of few bytes may take as long to read as a long one. What is
-    no packet has the size that it has; its reader refuses it before it unpacks anything.
+    Rate limits use this size, as a short stream may take as long to decode as a long one. For bytes that are not a
+    packet it is their length; ``decode`` refuses them before it unpacks anything.
     """
     try:
         message, kind = _parse(data)
@@ -105,7 +105,7 @@ def unpacked_size(data: bytes) -> int:
 
 
 def read_number(data: bytes) -> tuple[str, int, int] | None:
-    """Robot, epoch and sequence of what ``decode`` refuses: whose number is used up by it; None if nobody can tell."""
+    """Robot, epoch and sequence of a packet that ``decode`` refuses, which keeps its number; None if unreadable."""
     message = pb.Packet()
     try:
         message.ParseFromString(data)

@@ -1,11 +1,11 @@
-"""What the bits of a descriptor let expect of one another: a fixed linear prediction of each, for the entropy coder.
+"""Linear prediction of descriptor bits for the entropy coder, with fixed weights.
 
-Descriptors are far from noise. Their bits depend on one another, as neighbouring comparisons of a patch or channels of
-a network do, and keypoints next to each other look alike. So bit b of a descriptor is taken to be 1 with probability
+The bits of a descriptor depend on one another, as neighbouring comparisons of a patch or channels of a network do, and
+neighbouring keypoints have similar descriptors. So bit b of a descriptor is predicted to be 1 with probability
 1 / (1 + exp(-z)), z = bias_b + sum_j own_jb x_j + sum_j neighbour_jb y_j, where x are the bits before it in the same
-descriptor, y those of the descriptor at the nearest keypoint that came before, and bits count as +1 and -1. The weights
-are part of the format, one set a channel; `tools/descriptor_predictors.py` fitted them. Descriptors of another detector
-than they were fitted to lose nothing but bytes.
+descriptor, y those of the descriptor at the nearest earlier keypoint, and bits count as +1 and -1. The weights are part
+of the format, one set for each channel; `tools/descriptor_predictors.py` fitted them. For descriptors of other
+detectors the coding is lossless as well, but needs more bytes.
 """
 
 from functools import lru_cache
@@ -20,10 +20,10 @@ from fcslam.records import Channel, frozen
 from fcslam.wire.entropy import Bytes, Coder, code_bit
 
 WEIGHT_UNIT: Final = 1 / 64
-"""Of ``own`` and ``neighbour``, and of z."""
+"""Unit of ``own``, ``neighbour`` and z."""
 BIAS_UNIT: Final = 1 / 16
 _LARGEST: Final = 512
-"""|z| beyond 8 is cut: no bit is believed impossible."""
+"""|z| is limited to 8: no bit is impossible."""
 
 
 class Predictor(NamedTuple):
@@ -32,14 +32,14 @@ class Predictor(NamedTuple):
     bias: NDArray[np.int32]
     """Shape (256,)."""
     own: NDArray[np.int32]
-    """Shape (256, 256): row j is what bit j tells about the later ones."""
+    """Shape (256, 256): row j is the weight of bit j for the later bits."""
     neighbour: NDArray[np.int32]
-    """Shape (256, 256): row j is what bit j of the neighbour tells."""
+    """Shape (256, 256): row j is the weight of bit j of the neighbour."""
 
 
 @lru_cache
 def predictor_of(channel: Channel) -> Predictor:
-    """The weights for a channel's descriptors."""
+    """The weights of one channel."""
     with resources.as_file(resources.files(__package__) / "predictors" / f"{channel}.npy") as path:
         table = np.load(path, allow_pickle=False).astype(np.int32)
     scale = round(BIAS_UNIT / WEIGHT_UNIT)
@@ -49,7 +49,7 @@ def predictor_of(channel: Channel) -> Predictor:
 PROBABILITIES: Final = frozen(
     np.rint(65536 / (1.0 + np.exp(-WEIGHT_UNIT * np.arange(-_LARGEST, _LARGEST + 1)))), np.int64
 )
-"""Of a one in 1/65536, by z from the least to the largest."""
+"""Probability of a 1 in units of 1/65536, for z from the smallest to the largest."""
 
 
 @njit(cache=True, nogil=True)
@@ -63,7 +63,7 @@ def code_descriptors(
     neighbour: NDArray[np.int32],
     probabilities: NDArray[np.int64],
 ) -> None:
-    """Write ``bits`` (N, 256) or fill them with what is read; ``keypoints`` (N, axes) are known to both sides."""
+    """Write ``bits`` (N, 256), or read them in place; both sides know ``keypoints`` (N, axes)."""
     for i in range(len(bits)):
         expected = bias.copy()
         if i > 0:
@@ -77,7 +77,7 @@ def code_descriptors(
 
 @njit(cache=True, nogil=True)
 def nearest_before(keypoints: NDArray[np.int64], i: int) -> int:
-    """Which of the ``keypoints`` (N, axes) before keypoint i > 0 is the nearest to it; of several the first."""
+    """Index of the nearest of the ``keypoints`` (N, axes) before keypoint i > 0; of several the first."""
     nearest, least = 0, np.int64(1) << 62
     for k in range(i):
         distance = np.int64(0)
@@ -91,7 +91,7 @@ def nearest_before(keypoints: NDArray[np.int64], i: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _add(expected: NDArray[np.int32], weights: NDArray[np.int32], bit: int) -> None:
-    """Over all of them: what was expected of the bits before does not matter any more, and this way it is fastest."""
+    """Add the weights of one bit. Earlier bits are included, as one loop without a condition is fastest."""
     if bit:
         for b in range(len(expected)):
             expected[b] += weights[b]

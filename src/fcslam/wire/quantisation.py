@@ -1,6 +1,6 @@
-"""Ranges, keypoints and information matrices in the precision that the wire carries.
+"""Quantisation of ranges, keypoints and information matrices to the precision of the wire.
 
-A robot works with the ranges that it sends, ``dequantise(quantise(ranges))``, so that it and the cloud see the same
+A robot maps with the ranges that it sends, ``dequantise(quantise(ranges))``, so that it and the cloud see the same
 numbers.
 """
 
@@ -24,7 +24,7 @@ _MIRROR = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 
 
 def quantise(ranges_m: ArrayLike) -> RangeCodes:
-    """Ranges (N,) in steps of 2 mm; 0 for what is no return (NaN, infinite, not positive, beyond 131.07 m)."""
+    """Ranges (N,) in metres as steps of 2 mm (N,); 0 for no return (NaN, infinite, not positive, over 131.07 m)."""
     ranges = np.asarray(ranges_m, dtype=np.float64)
     steps = np.where((ranges > 0.0) & (ranges < MAXIMUM_RANGE_M + RANGE_STEP_M / 2), ranges, 0.0) / RANGE_STEP_M
     return np.rint(steps).astype(np.uint16)

@@ -1,7 +1,7 @@
-"""Ranges, keypoints and descriptors as streams of bytes: nothing is lost, and what is to be expected costs little.
+"""Lossless streams of ranges, keypoints and descriptors, by entropy coding.
 
-A content travels coded where that is shorter than its plain bytes, else plainly. Which of the two it is follows from
-the length, as the receiver knows how many numbers to expect. No stream can stand for more than these.
+A stream is coded if that is shorter than the plain bytes. The receiver tells the two apart by the length, because it
+knows how many numbers to expect. No stream can hold more numbers.
 """
 
 from collections.abc import Callable
@@ -33,21 +33,21 @@ RangeCodes = NDArray[np.uint16]
 KeypointCodes = NDArray[np.int16]
 
 _APART: Final = 2
-"""Keypoints so many steps apart along x, or more, tell little about each other's y and z."""
+"""Keypoints this many steps apart along x, or more, share one set of contexts for y and z."""
 _MOST_AXES: Final = 3
 _REFUSED: Final = -1
 
 
 def pack_ranges(codes: RangeCodes) -> bytes:
-    """Ranges (N,) in steps, 0 for none."""
+    """Encode ranges (N,) in steps of 2 mm, 0 for no return."""
     return _pack(codes.astype("<u2").tobytes(), _code_ranges, codes.astype(np.int64))
 
 
 def unpack_ranges(data: bytes, count: int) -> RangeCodes:
-    """Inverse of ``pack_ranges``.
+    """Inverse of ``pack_ranges``: ``count`` ranges in steps of 2 mm, shape (count,).
 
     Raises:
-        PacketError: ``data`` was not made by it of ``count`` ranges.
+        PacketError: ``data`` is not a stream of ``count`` ranges.
     """
     if len(data) == BYTES_PER_RANGE * count:
         return np.frombuffer(data, "<u2").astype(np.uint16)
@@ -59,15 +59,15 @@ def unpack_ranges(data: bytes, count: int) -> RangeCodes:
 
 
 def pack_keypoints(codes: KeypointCodes) -> bytes:
-    """Keypoints (N, axes) in steps, rows in ascending order."""
+    """Encode keypoints (N, axes) in steps of 1 cm, rows in ascending order."""
     return _pack(codes.astype("<i2").tobytes(), _code_keypoints, codes.astype(np.int64))
 
 
 def unpack_keypoints(data: bytes, count: int, axes: int) -> KeypointCodes:
-    """Inverse of ``pack_keypoints``.
+    """Inverse of ``pack_keypoints``: ``count`` keypoints in steps of 1 cm, shape (count, axes).
 
     Raises:
-        PacketError: ``data`` was not made by it of ``count`` keypoints.
+        PacketError: ``data`` is not a stream of ``count`` keypoints.
     """
     if len(data) == BYTES_PER_AXIS * count * axes:
         codes = np.frombuffer(data, "<i2").reshape(count, axes).astype(np.int64)
@@ -85,21 +85,21 @@ def unpack_keypoints(data: bytes, count: int, axes: int) -> KeypointCodes:
 
 
 def ascending(keypoints: NDArray[Any]) -> NDArray[np.int64]:
-    """The order in which keypoints travel: by x, then y, then z; those at one point stay as they are."""
+    """Order of keypoints (N, axes) on the wire, shape (N,): by x, then y, then z; equal ones keep their order."""
     return np.lexsort(keypoints.T[::-1])
 
 
 def pack_descriptors(descriptors: Codes, keypoints: KeypointCodes, channel: Channel) -> bytes:
-    """Descriptors (N, 32) of keypoints in ascending order."""
+    """Encode descriptors (N, 32) of keypoints (N, axes) in ascending order."""
     bits = np.unpackbits(descriptors, axis=1)
     return _pack(descriptors.tobytes(), code_descriptors, bits, *_expectation(keypoints, channel))
 
 
 def unpack_descriptors(data: bytes, keypoints: KeypointCodes, channel: Channel) -> Codes:
-    """Inverse of ``pack_descriptors``.
+    """Inverse of ``pack_descriptors``: one descriptor for each of the keypoints (N, axes), shape (N, 32).
 
     Raises:
-        PacketError: ``data`` was not made by it of as many descriptors.
+        PacketError: ``data`` is not a stream of N descriptors.
     """
     count = len(keypoints)
     if len(data) == CODE_BYTES * count:
@@ -122,7 +122,7 @@ def _pack(plain: bytes, code: Callable[..., None], *content: NDArray[Any]) -> by
 
 
 def _unpack(data: bytes, plain: int, what: str, code: Callable[..., None], *content: NDArray[Any]) -> None:
-    """Fill the first of ``content`` with what ``data`` holds."""
+    """Decode ``data`` into the first array of ``content``."""
     if len(data) > plain:
         raise PacketError(f"{what}: {len(data)} bytes, at most {plain}")
     stream = np.frombuffer(bytearray(data), np.uint8)
@@ -134,7 +134,7 @@ def _unpack(data: bytes, plain: int, what: str, code: Callable[..., None], *cont
 
 @njit(cache=True, nogil=True)
 def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
-    """Each range: whether there is one, which the beam before tells; its difference from the last one that was."""
+    """Code whether each range is a return, in the context of the beam before, and its difference from the last one."""
     model = fresh_model(2 + CONTEXTS_OF_NUMBER)
     last, none = np.int64(0), 0
     for k in range(len(codes)):
@@ -148,7 +148,7 @@ def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
 
 @njit(cache=True, nogil=True)
 def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
-    """The grid of each axis, then each keypoint's differences from the one before, in steps of the grid."""
+    """Code the grid of each axis, then the differences of consecutive keypoints in steps of the grid."""
     axes = codes.shape[1]
     model = fresh_model((2 + _MOST_AXES * (1 + _APART)) * CONTEXTS_OF_NUMBER)
     grid = np.ones(axes, np.int64)
@@ -168,7 +168,7 @@ def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None
 
 @njit(cache=True, nogil=True)
 def _common_divisor(values: NDArray[np.int64]) -> int:
-    """Of all differences; 0 if there are none."""
+    """Greatest common divisor of all differences; 0 if there are none."""
     divisor = np.int64(0)
     for k in range(1, len(values)):
         a, b = divisor, abs(values[k] - values[k - 1])
