@@ -19,7 +19,7 @@ from typing import Any
 import common
 import numpy as np
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import Track, run_of
 from fcslam.config import dump
 from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
@@ -77,10 +77,10 @@ def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: floa
     config = MissionConfig()
     budgets = {robot: Budget(1e3 * budget_kbps) for robot in robots}
     streams = [numbered(budgets[robot].fit(packets)) for robot, (_, packets) in robots.items()]
-    fleet = Fleet(config.fleet, config.seed)
+    cloud = Cloud(config.fleet, config.seed)
     for packet in heapq.merge(*streams, key=lambda packet: packet.order):
-        fleet.receive(encode(packet))
-    result = fleet.finalize()
+        cloud.receive(encode(packet))
+    result = cloud.finalize()
     tracks = {robot: track(frontend) for robot, (frontend, _) in robots.items()}
     with tempfile.TemporaryDirectory() as place:
         run_of(result, tracks, (), dump(config), config.map, with_local_maps=False).save(Path(place) / "run")

@@ -22,7 +22,7 @@ from typing import Any
 import common
 import numpy as np
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.evaluation.fleet.closures import ClosureScope, evaluate_closures
 from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
 from fcslam.metrics.closures import ClosureCriteria
@@ -79,7 +79,7 @@ def fly(sources: list[Source]) -> tuple[Ledger, list[Packet]]:
     """The whole traffic of a mission, and the packets that carried places."""
     config = MissionConfig()
     robots = [RobotFrontend(source.name, config.robot) for source in sources]
-    transport = InMemoryTransport(Fleet(config.fleet, config.seed).receive)
+    transport = InMemoryTransport(Cloud(config.fleet, config.seed).receive)
     streams = [packets(source, robot) for source, robot in zip(sources, robots, strict=True)]
     places = []
     for packet in heapq.merge(*streams, key=lambda packet: packet.order):

@@ -100,20 +100,22 @@ def record(place: Path, sessions: int, path_m: float, seed: int) -> None:
 def live(place: Path, sessions: int, path_m: float, seed: int, most_nearby: int) -> tuple[list[tuple], str]:
     """One row after each session, and what the end took."""
     from fcslam.cloud.fleet import Fleet
-    from fcslam.cloud.journal import StoredJournal
+    from fcslam.cloud.packet_log import PacketLog, PacketNumber
+    from fcslam.cloud.sessions import robot_and_epoch, session_name
     from fcslam.mission import MissionConfig
     from fcslam.service.mission_store import MissionStore
+    from fcslam.wire.packets import decode
 
     warm_up()
     config, store, drivers = MissionConfig(), MissionStore(place / "mission.sqlite"), robots(sessions, path_m, seed)
     matcher = config.fleet.matcher.model_copy(update={"most_nearby": most_nearby})
     settings = config.fleet.model_copy(update={"matcher": matcher})
-    fleet = Fleet(settings, config.seed, StoredJournal(store.packet))
+    fleet, log = Fleet(settings, config.seed), PacketLog()
     rows, turn, before_mb = [], 0, resident_mb()
     for epoch in range(sessions):
         with Watches().on() as watches:
             first, began = turn, time.process_time()
-            turn = take_session(fleet, store, epoch, turn, watches)
+            turn = take_session(fleet, log, store, epoch, turn, watches)
             spent_s = time.process_time() - began
         memory_mb = resident_mb() - before_mb
         costs = mean(watches.place.spent_s), mean(watches.quick.spent_s), 1e3 * spent_s / (turn - first)
@@ -121,7 +123,10 @@ def live(place: Path, sessions: int, path_m: float, seed: int, most_nearby: int)
     spent, memory_mb = [], []
     for _ in range(2):
         began = time.process_time()
-        result = fleet.finalize()
+        arrived = ((e.time, PacketNumber(session_name(e.robot, e.epoch), e.sequence)) for e in store.envelopes())
+        result = fleet.finalize(
+            log, arrived, lambda n: decode(store.packet(*robot_and_epoch(n.session), n.sequence).data)
+        )
         spent.append(time.process_time() - began)
         memory_mb.append(peak_mb() - before_mb)
     maps, rmse_m, f1 = against_truth(result, drivers, config.map)
@@ -144,14 +149,20 @@ def state(fleet: Any, drivers: list[Any], grid: Any, costs: tuple[float, ...]) -
     return places, held, poses, closures, *costs, *against_truth(result, drivers, grid)
 
 
-def take_session(fleet: Any, store: Any, epoch: int, turn: int, watches: Watches) -> int:
-    """A session's packets take effect; returns the next turn."""
+def take_session(fleet: Any, log: Any, store: Any, epoch: int, turn: int, watches: Watches) -> int:
+    """A session's packets take effect; returns how many packets did so far."""
+    from fcslam.cloud.packet_log import PacketNumber
+    from fcslam.cloud.sessions import session_name
     from fcslam.wire.messages import PacketKind
+    from fcslam.wire.packets import decode
 
-    while packets := [packet for packet in store.turns(turn, 64) if packet.epoch == epoch]:
+    while packets := [packet for _, packet in store.arrivals(turn, 64) if packet.epoch == epoch]:
         for packet in packets:
+            session = session_name(packet.robot, packet.epoch)
+            log.add(PacketNumber(session, packet.sequence), packet.time)
             with watches.place() if packet.kind is PacketKind.PLACE else ExitStack():
-                fleet.receive(packet.data)
+                for _ in log.ready(session):
+                    fleet.apply(decode(packet.data))
         turn += len(packets)
     return turn
 

@@ -166,7 +166,7 @@ async def _robot(name: str, agenda: list[Due], url: str, began: float, sent: lis
 async def _watch(mission: Path, looks: list[Look]) -> None:
     with closing(sqlite3.connect(f"{mission.as_uri()}?mode=ro", uri=True)) as database:
         while True:
-            (stored,) = database.execute("SELECT ifnull(max(turn) + 1, 0) FROM packets").fetchone()
+            (stored,) = database.execute("SELECT count(*) FROM packets").fetchone()
             (applied,) = database.execute("SELECT ifnull(max(value), 0) FROM facts WHERE name = 'applied'").fetchone()
             looks.append(Look(time.perf_counter(), stored, int(applied)))
             await asyncio.sleep(LOOK_EVERY_S)

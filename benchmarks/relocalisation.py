@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import common
 import numpy as np
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.sessions import session_name
 from fcslam.geometry import se2
 from fcslam.lidar.lost import LostConfig
@@ -181,7 +181,7 @@ def mission(
 ) -> tuple[list[Told], tuple[float, float, float]]:
     """Corrections of the second robot as they come; in the end RMSE, maximum, share of keyscans in other maps."""
     drive = drives[1]
-    cloud = Fleet(MissionConfig().fleet, 0)
+    cloud = Cloud(MissionConfig().fleet, 0)
     chains: dict[int, list[FloatArray]] = {}
     origins: dict[str, FloatArray] = {}
     newest, corrections = 0.0, []
@@ -200,7 +200,7 @@ def mission(
         for body in (decode(data).body for data in replies):
             if isinstance(body, Correction):
                 # A map's origin is the first keyscan of its oldest session.
-                oldest = next(c.robot for c in cloud.corrections() if c.map_index == body.map_index)
+                oldest = next(c.robot for c in cloud.fleet.corrections() if c.map_index == body.map_index)
                 estimate = se2.compose(origins[oldest], se2.compose(body.T_map_odom, chain[-1]))
                 off = se2.between(drive.truth([newest])[0], estimate)
                 off_m, off_rad = float(np.hypot(off[0], off[1])), abs(float(off[2]))
@@ -214,7 +214,7 @@ def true_poses(robot, drives: Sequence[Drive]) -> FloatArray:
     return names[robot.robot].truth(robot.stamps)
 
 
-def final_errors(cloud: Fleet, drives: Sequence[Drive]) -> tuple[float, float, float]:
+def final_errors(cloud: Cloud, drives: Sequence[Drive]) -> tuple[float, float, float]:
     robots = cloud.finalize().robots
     home = next(robot.map_index for robot in robots if robot.robot == drives[0].name)
     here = [robot for robot in robots if robot.map_index == home]

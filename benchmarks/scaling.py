@@ -113,7 +113,7 @@ class Watches:
         with ExitStack() as stack:
             for owner, name, watch in (
                 (JointGraph, "optimize", self.quick),
-                (fleet, "reconsider", self.robust),
+                (fleet, "reevaluate", self.robust),
                 (mapper, "optimize", self.robot_solve),
             ):
                 stack.enter_context(patch.object(owner, name, watch.watch(getattr(owner, name))))
@@ -122,14 +122,14 @@ class Watches:
 
 def drive_again(log: Path, rounds: int) -> list[tuple]:
     """One row after 1, 2, 4 ... rounds of the recording."""
-    from fcslam.cloud.fleet import Fleet
+    from fcslam.cloud.cloud import Cloud
     from fcslam.mission import MissionConfig
     from fcslam.robot.frontend import RobotFrontend
     from fcslam.sources import open_source
 
     warm_up()
     config = MissionConfig()
-    robot, cloud, source = RobotFrontend("robot", config.robot), Fleet(config.fleet, config.seed), open_source(log)
+    robot, cloud, source = RobotFrontend("robot", config.robot), Cloud(config.fleet, config.seed), open_source(log)
     repeated, rows = Repeated(), []
     with Watches().on() as watches:
         for number in range(1, rounds + 1):
@@ -213,7 +213,7 @@ def drive_fleet(robots: int, buildings: int) -> tuple:
     """A simulated fleet, spread evenly over buildings."""
     import numpy as np
 
-    from fcslam.cloud.fleet import Fleet
+    from fcslam.cloud.cloud import Cloud
     from fcslam.mission import MissionConfig
     from fcslam.records import ClosureStatus
     from fcslam.robot.frontend import RobotFrontend
@@ -223,7 +223,7 @@ def drive_fleet(robots: int, buildings: int) -> tuple:
     sizes = [robots // buildings + (building < robots % buildings) for building in range(buildings)]
     recordings = [recording for building, size in enumerate(sizes) for recording in simulated(building, size)]
     frontends = [RobotFrontend(recording.name, config.robot) for recording in recordings]
-    cloud = Fleet(config.fleet, config.seed)
+    cloud = Cloud(config.fleet, config.seed)
     with Watches().on() as watches:
         streams = [packets(f, r.scans(), watches) for f, r in zip(frontends, recordings, strict=True)]
         send(heapq.merge(*streams, key=lambda packet: packet.order), cloud, watches)
@@ -252,13 +252,13 @@ def simulated(building: int, robots: int, path_length_m: float = 60.0) -> Iterat
 
 def warm_up() -> None:
     """Load or compile every kernel of robot and cloud."""
-    from fcslam.cloud.fleet import Fleet
+    from fcslam.cloud.cloud import Cloud
     from fcslam.mission import MissionConfig
     from fcslam.robot.frontend import RobotFrontend
 
     config, watches = MissionConfig(), Watches()
     streams = [packets(RobotFrontend(r.name, config.robot), r.scans(), watches) for r in simulated(99, 2, 20.0)]
-    cloud = Fleet(config.fleet, config.seed)
+    cloud = Cloud(config.fleet, config.seed)
     send(itertools.chain(*streams), cloud, watches)
     cloud.finalize()
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from fcslam.cloud import fleet
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud import recognition
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.simulation.ground_truth import write_ground_truth
 from fcslam.simulation.simulated_fleet import SimulatedFleet
@@ -46,12 +46,12 @@ def logs(drawn, tmp_path_factory):
 
 @pytest.fixture
 def scripted(monkeypatch):
-    """Makes a fleet whose place matcher finds what the given scripts say."""
-    monkeypatch.setattr(fleet, "PlaceMatcher", ScriptedMatcher)
+    """Makes a cloud whose place matcher finds what the given scripts say."""
+    monkeypatch.setattr(recognition, "PlaceMatcher", ScriptedMatcher)
 
-    def make(*scripts, **settings) -> Fleet:
+    def make(*scripts, **settings) -> Cloud:
         monkeypatch.setattr(ScriptedMatcher, "script", [line for script in scripts for line in script])
         monkeypatch.setattr(ScriptedMatcher, "predictions", {})
-        return Fleet(FleetConfig(**settings), seed=0)
+        return Cloud(FleetConfig(**settings), seed=0)
 
     return make

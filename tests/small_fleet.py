@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.result import FleetResult
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.simulation.noise import LidarSettings
@@ -30,10 +30,10 @@ def in_order(packets: Iterable[Packet]) -> list[Packet]:
     return sorted(packets, key=lambda packet: packet.order)
 
 
-def feed(fleet: Fleet, packets: Iterable[Packet]) -> Fleet:
+def feed(cloud: Cloud, packets: Iterable[Packet]) -> Cloud:
     for packet in packets:
-        fleet.receive(encode(packet))
-    return fleet
+        cloud.receive(encode(packet))
+    return cloud
 
 
 def fingerprint(result: FleetResult) -> tuple[object, ...]:

@@ -113,7 +113,7 @@ def test_numbers_add_up(run, drawn):
     assert values["recorded_time"] == pytest.approx(sum(r.stamps[-1] - r.stamps[0] for r in drawn.robots))
     assert values["keyscans"] == values["keyscan_packets"] == run.pose_graph_g2o.count("VERTEX_SE2")
     assert values["hello_packets"] == 3
-    assert values["correction_packets"] == values["place_packets"]
+    assert 3 <= values["correction_packets"] < values["place_packets"], "only those that are news"
     packets = sum(values[f"{kind}_packets"] for kind in ("hello", "keyscan", "constraint", "place"))
     assert values["acknowledgement_packets"] == packets
     for figure in ("packets", "bytes"):
@@ -184,6 +184,6 @@ def test_a_refusal_by_the_cloud_is_not_lost(logs, monkeypatch):
     def refuse(_self, _data):
         raise PacketError("no room")
 
-    monkeypatch.setattr(mission.Fleet, "receive", refuse)
+    monkeypatch.setattr(mission.Cloud, "receive", refuse)
     with pytest.raises(FcslamError, match=r"robot_1.*no room"):
         run_mission([open_source(logs[0])], MissionConfig())

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.report import Track, run_of, traffic_metrics
 from fcslam.cloud.sessions import check_robot, robot_of, session_name
@@ -66,11 +67,11 @@ def run_mission(
     _check_robots(sources)
     _check_vetoes(vetoes, [source.name for source in sources])
     robots = [RobotFrontend(source.name, config.robot) for source in sources]
-    cloud = Fleet(config.fleet, config.seed)
+    cloud = Cloud(config.fleet, config.seed)
     for veto in vetoes:
-        cloud.veto(veto)
+        cloud.fleet.veto(veto)
     transport = InMemoryTransport(cloud.receive)
-    meter = _Meter(watch, cloud)
+    meter = _Meter(watch, cloud.fleet)
     streams = [_packets(source, robot, meter) for source, robot in zip(sources, robots, strict=True)]
     for packet in heapq.merge(*streams, key=lambda packet: packet.order):
         reply = transport.send(encode(packet))
@@ -100,9 +101,9 @@ class _Meter:
 
     EVERY = 50
 
-    def __init__(self, watch: Watch, cloud: Fleet) -> None:
+    def __init__(self, watch: Watch, fleet: Fleet) -> None:
         self._watch = watch
-        self._cloud = cloud
+        self._fleet = fleet
         self._span: dict[str, tuple[float, float]] = {}
         self.scans = self.keyscans = 0
 
@@ -122,7 +123,7 @@ class _Meter:
 
     def tell(self, fusing: bool = False) -> None:
         """Where the mission is now."""
-        closures = self._cloud.closure_counts()
+        closures = self._fleet.closure_counts()
         self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing))
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fcslam.cloud.closure_log import ClosureLedger
+from fcslam.cloud.closure_log import ClosureLog
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import Channel, ClosureStatus, KeyscanId
 from tests.scripted import Script, verified
@@ -18,7 +18,7 @@ def found(line, **changed):
 
 
 def test_ties_are_what_is_accepted_between_a_robot_and_others_the_newest_first():
-    ledger = ClosureLedger()
+    ledger = ClosureLog()
     entries = [ledger.add(found(line)) for line in LINES]
     ledger.add(found(LINES[0], strict=False))
     for entry in entries[1:]:

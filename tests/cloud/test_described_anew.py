@@ -41,12 +41,13 @@ def test_the_result_is_a_function_of_the_set_with_two_versions_too(scripted):
 
 
 def test_a_version_is_described_once_and_after_its_hello(scripted):
-    fleet = feed(scripted(SCRIPT), FIRST)
+    cloud = feed(scripted(SCRIPT), FIRST)
     hello, place, *_ = again("a")
     early = replace(place, sequence=hello.sequence)
     with pytest.raises(PacketError, match=f"place of detector {ANEW}; test-1 was announced"):
-        fleet.receive(encode(early))
-    fleet.receive(encode(hello))
-    fleet.receive(encode(place))
+        cloud.receive(encode(early))
+    # The refused packet keeps its number.
+    for packet in (hello, place):
+        cloud.receive(encode(replace(packet, sequence=packet.sequence + 1)))
     with pytest.raises(PacketError, match="described before"):
-        fleet.receive(encode(replace(place, sequence=place.sequence + 1)))
+        cloud.receive(encode(replace(place, sequence=place.sequence + 2)))

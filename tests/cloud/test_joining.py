@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.cloud.closure_log import ClosureLedger, Entry
-from fcslam.cloud.joining import first_estimate, judge
+from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
+from fcslam.cloud.joining import decide_join, first_estimate
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
@@ -23,7 +23,7 @@ def entry(i, j, T_i_j, information=CLOSURE_INFORMATION):
     closure = LoopClosure(
         i, j, Channel.LIDAR, 0.5, frozen(T_i_j), frozen(information), ClosureStatus.VERIFIED, "", informative=True
     )
-    return Entry(closure, independent=True)
+    return ClosureEntry(closure, independent=True)
 
 
 def graph_of(**trajectories):
@@ -74,7 +74,7 @@ def test_the_verdict_is_the_same_from_both_sides(turned):
     evidence = entries([(0, 0), (8, 8), (16, 16), (24, 24)], turned=turned)
     evidence += entries([(4, 4), (12, 12)], shift=np.array([5.0, 1.0, 0.3]))
     for robots in (("a", "b"), ("b", "a")):
-        verdict = judge(evidence, robots, graph, SETTINGS)
+        verdict = decide_join(evidence, robots, graph, SETTINGS)
         assert verdict.members == (0, 1, 2, 3)
         assert verdict.runner_up == (4, 5)
         assert verdict.dominant
@@ -85,13 +85,13 @@ def test_the_verdict_is_the_same_from_both_sides(turned):
 def test_only_a_rival_that_could_join_two_maps_contests_the_cluster(rivals, contested):
     graph = graph_of(a=POSES, b=POSES)
     evidence = entries([(0, 0), (8, 8), (16, 16)]) + entries(rivals, shift=np.array([5.0, 1.0, 0.3]))
-    verdict = judge(evidence, ("a", "b"), graph, SETTINGS)
+    verdict = decide_join(evidence, ("a", "b"), graph, SETTINGS)
     assert not verdict.dominant
     assert verdict.contested is contested
 
 
 def test_the_ledger_books_what_geometry_says():
-    ledger = ClosureLedger()
+    ledger = ClosureLog()
     (line,) = closures(("a", POSES), ("b", POSES), [(3, 4)])
     confirmed = ledger.add(PlaceMatch(line.i, line.j, Channel.CAMERA, 0.4, verified(line), predicted=False))
     assert confirmed.closure.status is ClosureStatus.VERIFIED

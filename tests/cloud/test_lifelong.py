@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.lidar.occupancy import OccupancyConfig
@@ -54,7 +54,7 @@ def packets(sessions):
 
 @pytest.fixture(scope="module")
 def forgetful(packets):
-    return feed(Fleet(ONE_A_SQUARE, 0), packets)
+    return feed(Cloud(ONE_A_SQUARE, 0), packets)
 
 
 def places_of(sessions):
@@ -68,15 +68,15 @@ def places_of(sessions):
 
 
 def test_a_keyscan_is_held_as_long_as_a_place_needs_it_and_no_longer(forgetful, sessions):
-    (matcher,) = forgetful._matchers.values()
+    (matcher,) = forgetful.fleet._recognition._matchers.values()
     places = places_of(sessions)
     needed, named = set(), set()
     for (session, number), (first, last) in places.items():
         numbers = {(session, k) for k in range(first, last + 1)}
         named |= numbers
         needed |= numbers if (session, number) in matcher else set()
-    held = {tuple(k.id) for robot in forgetful.estimate().robots for k in robot.keyscans}
-    everything = {(robot.robot, k) for robot in forgetful.estimate().robots for k in range(len(robot.stamps))}
+    held = {tuple(k.id) for robot in forgetful.fleet.estimate().robots for k in robot.keyscans}
+    everything = {(robot.robot, k) for robot in forgetful.fleet.estimate().robots for k in range(len(robot.stamps))}
     assert len(matcher) < 0.75 * len(places)
     assert held == everything - (named - needed)
     assert held != everything
@@ -87,7 +87,7 @@ def test_the_result_is_a_function_of_the_set_of_packets_whatever_was_forgotten(f
     kept = [[k.id for k in robot.keyscans] for robot in expected.robots]
     shuffled = [packets[k] for k in np.random.default_rng(5).permutation(len(packets))]
     for arrived in (shuffled, [packet for session in reversed(sessions) for packet in session]):
-        result = feed(Fleet(ONE_A_SQUARE, 0), arrived).finalize()
+        result = feed(Cloud(ONE_A_SQUARE, 0), arrived).finalize()
         assert fingerprint(result) == fingerprint(expected)
         assert [[k.id for k in robot.keyscans] for robot in result.robots] == kept
 
@@ -100,21 +100,21 @@ def test_poses_and_stamps_of_all_keyscans_stay(forgetful, sessions):
 
 
 def test_a_place_described_anew_after_its_keyscans_have_gone_changes_nothing(packets, sessions):
-    fleet = feed(Fleet(ONE_A_SQUARE, 0), packets)
-    before, last = fleet.estimate(), sessions[0][-1]
+    cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
+    before, last = cloud.fleet.estimate(), sessions[0][-1]
     hello = sessions[0][0].body
     assert isinstance(hello, Hello)
     gone = next(
         p.body
         for p in sessions[0]
-        if isinstance(p.body, Place) and len(fleet._store.keyscans("a", p.body.first, p.body.last)) == 0
+        if isinstance(p.body, Place) and len(cloud.fleet._sessions.keyscans("a", p.body.first, p.body.last)) == 0
     )
     anew = replace(hello, detector_versions={Channel.LIDAR: "another"}), replace(gone, detector_version="another")
     for number, body in enumerate(anew, last.sequence + 1):
-        fleet.receive(encode(Packet("a", 0, number, packets[-1].time, body)))
-    after = fleet.estimate()
+        cloud.receive(encode(Packet("a", 0, number, packets[-1].time, body)))
+    after = cloud.fleet.estimate()
     assert after.closures == before.closures
-    assert len(fleet.finalize().robots) == SESSIONS
+    assert len(cloud.finalize().robots) == SESSIONS
 
 
 def surfaces(result, drawn, count):
@@ -140,9 +140,9 @@ def labelled(seen):
 
 def test_the_map_of_many_sessions_is_no_worse_than_that_of_few(packets, sessions, drawn):
     first_two = in_order(packet for session in sessions[:2] for packet in session)
-    few = feed(Fleet(FEW_ENOUGH_TO_MEET, 0), first_two).finalize()
-    many = feed(Fleet(FEW_ENOUGH_TO_MEET, 0), packets).finalize()
-    whole = feed(Fleet(NEVER_FORGETS, 0), packets).finalize()
+    few = feed(Cloud(FEW_ENOUGH_TO_MEET, 0), first_two).finalize()
+    many = feed(Cloud(FEW_ENOUGH_TO_MEET, 0), packets).finalize()
+    whole = feed(Cloud(NEVER_FORGETS, 0), packets).finalize()
     assert sum(len(robot.keyscans) for robot in many.robots) < 0.6 * sum(len(robot.stamps) for robot in many.robots)
     assert set(map_of(few).values()) == set(map_of(many).values()) == {0}
     errors_few, f1_few = surfaces(few, drawn, 2)
@@ -154,12 +154,12 @@ def test_the_map_of_many_sessions_is_no_worse_than_that_of_few(packets, sessions
 
 def test_a_session_of_which_everything_was_forgotten_still_has_its_trajectory_and_empty_maps(packets, tmp_path):
     """Parted from the sessions that made it forget by a veto, it has a map of its own with nothing in it."""
-    fleet = feed(Fleet(ONE_A_SQUARE, 0), packets)
-    empty = next(robot.robot for robot in fleet.estimate().robots if not robot.keyscans)
-    others = [robot.robot for robot in fleet.estimate().robots if robot.robot != empty]
+    cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
+    empty = next(robot.robot for robot in cloud.fleet.estimate().robots if not robot.keyscans)
+    others = [robot.robot for robot in cloud.fleet.estimate().robots if robot.robot != empty]
     for other in others:
-        fleet.veto(Veto(empty, other))
-    result = fleet.estimate()
+        cloud.fleet.veto(Veto(empty, other))
+    result = cloud.fleet.estimate()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     run_of(result, tracks, [], "", OccupancyConfig()).save(tmp_path / "run")
     run = open_run(tmp_path / "run")
@@ -167,5 +167,5 @@ def test_a_session_of_which_everything_was_forgotten_still_has_its_trajectory_an
     assert [t.robot for t in run.trajectories.values() if t.map_index == alone.map_index] == [empty]
     assert len(alone.stamps) == len(tracks[empty].stamps) > 0
     assert run.map_files[f"map_{alone.map_index}.pgm"].startswith(b"P5")
-    whole = {robot.robot: robot for robot in fleet.finalize().robots}[empty]
+    whole = {robot.robot: robot for robot in cloud.finalize().robots}[empty]
     assert whole.keyscans, "the veto known from the beginning, others made it forget nothing"

@@ -6,8 +6,8 @@ from itertools import pairwise, permutations
 import numpy as np
 import pytest
 
-from fcslam.cloud.closure_log import ClosureLedger
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.closure_log import ClosureLog
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.settings import FleetConfig
@@ -44,7 +44,7 @@ def between(result, status):
 
 def ledger_of(*scripts, turned=()):
     """Verified matches in this order; ``turned`` ones are told from the other end."""
-    ledger = ClosureLedger()
+    ledger = ClosureLog()
     for number, line in enumerate(line for script in scripts for line in script):
         told = replace(line, i=line.j, j=line.i, T_i_j=se2.inverse(line.T_i_j)) if number in turned else line
         ledger.add(PlaceMatch(told.i, told.j, Channel.LIDAR, 0.5, verified(told), predicted=False))
@@ -62,7 +62,7 @@ def own_maps(**moved):
 @pytest.fixture(scope="module")
 def results(packets):
     return {
-        strategy: feed(Fleet(FleetConfig(fusion=strategy), seed=0), packets).finalize() for strategy in FusionStrategy
+        strategy: feed(Cloud(FleetConfig(fusion=strategy), seed=0), packets).finalize() for strategy in FusionStrategy
     }
 
 
@@ -156,9 +156,9 @@ def test_two_matches_join_what_the_joint_graph_leaves_apart(scripted, strategy):
 
 @rigid
 def test_a_veto_takes_a_match_away(scripted, strategy):
-    fleet = scripted(closures(A, B, MEETINGS[:2]), fusion=strategy)
-    fleet.veto(Veto("a", "b", (8.0, LATER + 8.0)))
-    result = feed(fleet, two_robots()).finalize()
+    cloud = scripted(closures(A, B, MEETINGS[:2]), fusion=strategy)
+    cloud.fleet.veto(Veto("a", "b", (8.0, LATER + 8.0)))
+    result = feed(cloud, two_robots()).finalize()
     assert map_of(result) == {"a": 0, "b": 1}
     (revoked,) = between(result, ClosureStatus.REVOKED)
     assert revoked.reason == "vetoed by hand"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.records import Constraint, ConstraintKind, Correction, Keyscan
@@ -31,14 +31,14 @@ def driven():
 def test_odom_is_where_the_cloud_thinks_it_is(driven):
     """The newest pose is the cloud's own, to the last digit that matters."""
     packets, localizer, poses = driven
-    fleet = Fleet(FleetConfig(), 0)
+    cloud = Cloud(FleetConfig(), 0)
     newest = Localizer(lambda: 0.0)
     for packet in packets:
-        for body in (decode(data).body for data in fleet.receive(encode(packet))):
+        for body in (decode(data).body for data in cloud.receive(encode(packet))):
             if isinstance(body, Correction):
                 newest.correct(body)
     keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
-    (mapped,) = fleet.finalize().robots
+    (mapped,) = cloud.finalize().robots
     last = next(pose for pose in poses if pose.stamp == keyscans[-1].stamp)
     for motion in (
         p.body for p in packets if isinstance(p.body, Constraint) and p.body.kind is ConstraintKind.ODOMETRY

@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import pytest
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import FeatureError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.features.detector_kinds import DetectorKind
-from fcslam.records import CameraImage, Channel, DetectorFile, LaserScan, Place
+from fcslam.records import CameraImage, Channel, LaserScan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.image_buffer import ImageBufferConfig
 from fcslam.robot.views import ViewsConfig
-from fcslam.wire.messages import DetectorUpdate, Hello
-from fcslam.wire.packets import decode, encode
+from fcslam.wire.messages import Hello
+from fcslam.wire.packets import encode
 from tests.features.networks import tiny_network
 from tests.robot.test_views import records_of
 from tests.small_fleet import fingerprint
@@ -154,7 +154,7 @@ def fleet(seen):
 
 
 def received(packets):
-    cloud = Fleet(FleetConfig(), 0)
+    cloud = Cloud(FleetConfig(), 0)
     for packet in packets:
         cloud.receive(encode(packet))
     return cloud.finalize()
@@ -182,23 +182,3 @@ def test_codes_of_different_versions_are_not_compared(fleet):
     apart = received([*fleet["stayed"], *fleet["new"]])
     assert {robot.map_index for robot in apart.robots} == {0, 1}
     assert between(apart) == []
-
-
-def detector_updates(cloud, packet):
-    replies = [decode(reply).body for reply in cloud.receive(encode(packet))]
-    return [body.file for body in replies if isinstance(body, DetectorUpdate)]
-
-
-def test_the_cloud_tells_of_a_release_until_it_is_taken(fleet):
-    cloud = Fleet(FleetConfig(join_maps=False), 0)
-    other = DetectorFile(Channel.CAMERA, "other-1", 1, 5, bytes(32))
-    cloud.announce(other)
-    cloud.announce(SHIPPED)
-    told = [(packet.body, detector_updates(cloud, packet)) for packet in fleet["switched"]]
-    orb = places(fleet["stayed"], told[0][0].detector_versions[Channel.CAMERA])[0].detector_version
-    for body, files in told:
-        asks = isinstance(body, Hello) and body.detector_versions[Channel.CAMERA] == orb
-        asks |= isinstance(body, Place) and body.detector_version == orb
-        assert files == ([SHIPPED] if asks else [])
-    hello = Hello("blind", 0, told[0][0].laser, {Channel.LIDAR: "birdseye-1"})  # it has no camera
-    assert detector_updates(cloud, replace(fleet["new"][0], robot="blind", body=hello)) == []

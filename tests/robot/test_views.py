@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.config import dump, load
 from fcslam.errors import FeatureError
@@ -167,7 +167,7 @@ def test_no_packet_holds_a_piece_of_an_image(seen):
 def test_what_cameras_saw_joins_two_maps():
     """Two robots that drive the same way, from unknown starts: camera places alone tell how they lie."""
     ways = ([(1.5, 1.5), (14.5, 1.5), (14.5, 6.0)], [(4.0, 1.6), (14.4, 1.6), (14.4, 8.0)])
-    config, cloud, truth = RobotConfig(channels=(Channel.CAMERA,)), Fleet(FleetConfig(), 0), {}
+    config, cloud, truth = RobotConfig(channels=(Channel.CAMERA,)), Cloud(FleetConfig(), 0), {}
     for number, way in enumerate(ways):
         records, poses = records_of(way, 10 + number)
         robot = RobotFrontend(f"r{number}", config)
@@ -221,7 +221,7 @@ def corridor_of_one_pattern(period_m):
 def test_corridors_that_repeat_themselves_join_nothing_by_their_images_alone():
     """Two robots in stretches 24 m apart that look the same: no wall fixes a match, so nobody guesses."""
     walls, count = corridor_of_one_pattern(8.0)
-    config, cloud = RobotConfig(channels=(Channel.CAMERA,)), Fleet(FleetConfig(), 0)
+    config, cloud = RobotConfig(channels=(Channel.CAMERA,)), Cloud(FleetConfig(), 0)
     for number, start in enumerate((0.0, 24.0)):
         records, _ = records_of([(start, 0.0), (start + 12.0, 0.0)], 10 + number, walls, lambda number: number // count)
         robot = RobotFrontend(f"r{number}", config)

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fcslam.cloud.replies import SessionCorrection
 from fcslam.errors import PacketConflictError, PacketError
 from fcslam.records import Correction, frozen
 from fcslam.service import intake as module
 from fcslam.service.intake import LEASE_S, BusyError, Intake, LeaseError, RefusedPacketError
-from fcslam.service.mission_store import MissionStore, SessionCorrection
+from fcslam.service.mission_store import MissionStore
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
@@ -53,8 +54,25 @@ def test_what_is_acknowledged_is_stored_without_a_gap(data, tmp_path_factory):
         missing = next(n for n in range(len(DATA) + 1) if n not in sent)
         expected = [Acknowledgement("a", 0, missing - 1)] if missing else []
         assert answer == expected
-        assert [p.data for p in desk.store.turns(0, 100)] == DATA[:missing]
+        assert desk.intake.ready_count() == missing
+        assert desk.intake.ready_count() + desk.intake.waiting_count() == len(sent)
+        assert {p.data for _, p in desk.store.arrivals(0, 100)} == {DATA[k] for k in sent}
     desk.store.close()
+
+
+def test_a_restarted_intake_acknowledges_the_same(desk):
+    desk.take(*DATA[:3], DATA[5])
+    desk.intake = Intake(desk.store, lambda: desk.now, lambda: 1e9)
+    assert desk.take() == [Acknowledgement("a", 0, 2)]
+    assert desk.intake.waiting_count("a") == 1
+    assert desk.take(*DATA[3:5]) == [Acknowledgement("a", 0, 5)]
+
+
+def test_a_conflict_in_a_batch_leaves_the_packets_before_it_acknowledged(desk):
+    desk.take(*DATA[:2])
+    with pytest.raises(PacketConflictError):
+        desk.take(DATA[2], encode(replace(PACKETS[3], sequence=1)))
+    assert desk.take() == [Acknowledgement("a", 0, 2)]
 
 
 def test_every_epoch_in_a_batch_is_acknowledged(desk):
@@ -88,7 +106,7 @@ def test_a_bad_packet_is_refused_and_those_before_it_are_stored(desk, bad, reaso
         with pytest.raises(RefusedPacketError, match=reason) as caught:
             desk.take(*DATA[:3], bad, *DATA[4:6])
         assert caught.value.index == 3
-    assert [p.data for p in desk.store.turns(0, 100) if p.refusal is None] == DATA[:3]
+    assert [p.data for _, p in desk.store.arrivals(0, 100) if p.refusal is None] == DATA[:3]
 
 
 def test_the_number_of_a_refused_packet_is_used_up_so_the_next_ones_are_acknowledged(desk):
@@ -107,7 +125,7 @@ def test_two_packets_with_one_number_are_a_conflict(desk):
 def test_bytes_that_are_no_batch_change_nothing(desk):
     with pytest.raises(PacketError, match="batch"):
         desk.intake.take("a", "x", write_batch(DATA[:2])[:-1], -1)
-    assert desk.store.turn_count() == 0
+    assert desk.store.envelopes() == []
 
 
 def test_a_second_agent_waits_until_the_first_is_silent_long_enough(desk):
@@ -140,7 +158,7 @@ def test_a_packet_far_ahead_has_to_wait_for_those_before_it(desk, monkeypatch):
     with pytest.raises(BusyError, match="send packet 0 first"):
         desk.take(DATA[4])
     assert desk.take(DATA[3]) == []
-    assert desk.store.waiting_count() == 1
+    assert desk.intake.waiting_count() == 1
 
 
 def test_packets_that_wait_for_one_before_them_keep_out_neither_it_nor_other_robots(desk, monkeypatch):

@@ -1,4 +1,4 @@
-"""What is stored is there once, as it came, whatever the order; its turns follow the numbers of each session."""
+"""Packets are stored once and unchanged, in the order of their arrival."""
 
 import os
 import sqlite3
@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fcslam.cloud.replies import NEWS_M, NEWS_RAD, SessionCorrection
 from fcslam.errors import PacketConflictError, StoreError
 from fcslam.records import Channel, Correction, Veto, frozen
-from fcslam.service.mission_store import NEWS_M, NEWS_RAD, MissionStore, SessionCorrection, StoredPacket, check_mission
+from fcslam.service.mission_store import MissionStore, StoredPacket, check_mission
 from fcslam.wire.messages import PacketKind
 
 NUMBERS = st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 2), st.integers(0, 12))
@@ -35,36 +36,34 @@ def correction(robot, x, epoch=0, y=0.0, theta=0.0, map_index=0, quality=0.25):
     return SessionCorrection(robot, epoch, 1.0, Correction(robot, 0, map_index, frozen((x, y, theta)), quality))
 
 
+def stored(store):
+    return [packet for _, packet in store.arrivals(0, 1000)]
+
+
 @pytest.mark.slow
 @given(batches=BATCHES)
-def test_any_order_and_any_repetition_give_the_same_set_and_the_same_acknowledgement(batches, tmp_path_factory):
+def test_packets_are_stored_once_in_the_order_of_their_arrival(batches, tmp_path_factory):
     path = tmp_path_factory.mktemp("store") / "mission.sqlite"
     store = MissionStore(path)
-    seen: set[tuple[str, int, int]] = set()
-    turns: list[tuple[str, int, int]] = []
+    expected: dict[tuple[str, int, int], None] = {}
     for batch in batches:
         new = store.put([packet(*number) for number in batch], received_s=1.0)
-        assert new == len(set(batch) - seen)
-        seen |= set(batch)
-        told = [(p.robot, p.epoch, p.sequence) for p in store.turns(0, 1000)]
-        assert told[: len(turns)] == turns, "what has a turn keeps it"
-        turns = told
-        for robot, epoch in {number[:2] for number in seen}:
-            missing = next(n for n in range(14) if (robot, epoch, n) not in seen)
-            assert store.next_sequence(robot, epoch) == missing
-            assert [n for *session, n in turns if session == [robot, epoch]] == list(range(missing))
-    assert store.turn_count() + store.waiting_count() == len(seen)
-    kept = store.turns(0, 1000)
-    assert all(p == packet(p.robot, p.epoch, p.sequence) for p in kept)
+        assert new == len(set(batch) - expected.keys())
+        expected |= dict.fromkeys(batch)
+        assert stored(store) == [packet(*number) for number in expected]
+    arrivals = store.arrivals(0, 1000)
+    assert [arrival for arrival, _ in arrivals] == list(range(1, len(expected) + 1))
+    assert [e[:3] for e in store.envelopes()] == list(expected)
     store.close()
     again = MissionStore(path)
-    assert again.turns(0, 1000) == kept
+    assert again.arrivals(0, 1000) == arrivals
     again.close()
 
 
-def test_turns_can_be_read_in_pieces(store):
+def test_arrivals_can_be_read_in_pieces(store):
     store.put([packet(sequence=k) for k in range(7)], 0.0)
-    assert [p.sequence for after in (0, 3, 6) for p in store.turns(after, 3)] == list(range(7))
+    assert [p.sequence for after in (0, 3, 6) for _, p in store.arrivals(after, 3)] == list(range(7))
+    assert [e.sequence for e in store.envelopes(until=4)] == [0, 1, 2, 3]
 
 
 def test_another_packet_with_the_same_number_is_a_conflict_and_those_before_it_are_stored(store):
@@ -72,17 +71,16 @@ def test_another_packet_with_the_same_number_is_a_conflict_and_those_before_it_a
     with pytest.raises(PacketConflictError, match="other content") as caught:
         store.put([packet(sequence=0), packet(sequence=1, data=b"other"), packet(sequence=2)], 0.0)
     assert caught.value.index == 1
-    assert [p.data for p in store.turns(0, 10)] == [b"a 0 0", b"a 0 1"]
+    assert [p.data for p in stored(store)] == [b"a 0 1", b"a 0 0"]
 
 
 def test_a_batch_that_fails_in_the_middle_leaves_nothing(store, monkeypatch):
     store.put([packet(sequence=0)], 0.0)
     with pytest.raises(StoreError, match="full"):
         store.put([packet(sequence=1), replace(packet(sequence=2), data=None)], 0.0)  # type: ignore[arg-type]
-    assert store.next_sequence("a", 0) == 1
-    assert store.waiting_count() == 0
+    assert [p.sequence for p in stored(store)] == [0]
     store.put([packet(sequence=1)], 0.0)
-    assert store.turn_count() == 2
+    assert [p.sequence for p in stored(store)] == [0, 1]
 
 
 def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
@@ -92,19 +90,19 @@ def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
     store._database.share(lambda database: database.execute(f"PRAGMA max_page_count={pages + 2}"))
     with pytest.raises(StoreError, match="is the disk full"):
         store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
-    assert store.turns(0, 10) == [packet()]
+    assert stored(store) == [packet()]
     store._database.share(lambda database: database.execute("PRAGMA max_page_count=100000"))
     store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
-    assert store.turn_count() == 9
+    assert len(stored(store)) == 9
     store.close()
 
 
 def test_what_another_process_wrote_is_seen(store, tmp_path):
     other = MissionStore(tmp_path / "mission.sqlite")
     other.put([packet()], 0.0)
-    other.refuse(0, "no good")
+    other.refuse("a", 0, 0, "no good")
     assert store.refusals("a") == [(0, 0, "no good")]
-    assert store.turns(0, 1)[0].refusal == "no good"
+    assert store.packet("a", 0, 0).refusal == "no good"
     other.close()
 
 
@@ -168,7 +166,7 @@ def test_vetoes_and_requests_are_kept_in_their_order(store):
     store.put([packet()], 0.0)
     number = store.ask_to_finalize()
     asked = store.finalization(number)
-    assert (asked.turns, asked.vetoes, asked.run) == (1, 2, None)
+    assert (asked.arrivals, asked.vetoes, asked.run) == (1, 2, None)
     store.answer(number, "1")
     assert store.finalization(number).run == "1"
     assert store.vetoes() == vetoes
@@ -179,8 +177,7 @@ def test_an_export_is_the_mission_and_nothing_else_is(store, tmp_path):
     store.export(tmp_path / "out.sqlite")
     check_mission(tmp_path / "out.sqlite")
     copy = MissionStore(tmp_path / "out.sqlite")
-    assert copy.turns(0, 10) == store.turns(0, 10)
-    assert copy.waiting_count() == 1
+    assert copy.arrivals(0, 10) == store.arrivals(0, 10)
     copy.close()
     with pytest.raises(StoreError):
         store.export(tmp_path / "out.sqlite")
@@ -199,9 +196,9 @@ def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypa
 
     monkeypatch.setattr(os, "link", meanwhile)
     store.export(tmp_path / "out.sqlite")
-    assert store.turn_count() == 2
+    assert len(stored(store)) == 2
     copy = MissionStore(tmp_path / "out.sqlite")
-    assert copy.turn_count() == 1
+    assert len(stored(copy)) == 1
     copy.close()
 
 

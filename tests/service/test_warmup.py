@@ -26,7 +26,7 @@ def news(before):
     return {name: sorted(kinds - before.get(name, set())) for name, kinds in compiled().items()
             if kinds - before.get(name, set())}
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 
 from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.report import keyscan_track, run_of
@@ -42,10 +42,10 @@ for data in stream:
 of_decoding = news(decoding)
 warm_up_fleet()
 warm = compiled()
-fleet = Fleet(FleetConfig(), seed=1)
+cloud = Cloud(FleetConfig(), seed=1)
 for data in stream:
-    fleet.receive(data)
-result = fleet.finalize()
+    cloud.receive(data)
+result = cloud.finalize()
 tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
 run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False)
 between = sum(c.i.robot != c.j.robot for c in result.closures)

@@ -173,14 +173,14 @@ def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkey
     packets = stream("a", POSES, start_s=0.0)
     cloud.put(packets)
     fleet = type(cloud.worker._fleet)
-    receive = fleet.receive
+    apply = fleet.apply
 
-    def fragile(self, data):
-        if data == encode(packets[-1]):
+    def fragile(self, packet):
+        if encode(packet) == encode(packets[-1]):
             raise ZeroDivisionError("oh")
-        return receive(self, data)
+        apply(self, packet)
 
-    monkeypatch.setattr(fleet, "receive", fragile)
+    monkeypatch.setattr(fleet, "apply", fragile)
     with pytest.raises(ZeroDivisionError):
         cloud.work()
     cloud.restart()
@@ -192,10 +192,10 @@ def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkey
 def test_corrections_leave_while_there_is_still_a_queue(cloud):
     cloud.put(two_robots())
     waiting = []
-    while cloud.store.applied() < cloud.store.turn_count():
+    while cloud.store.applied() < len(cloud.store.envelopes()):
         cloud.worker.step()
         if cloud.store.correction("a", 0) is not None:
-            waiting.append(cloud.store.turn_count() - cloud.store.applied())
+            waiting.append(len(cloud.store.envelopes()) - cloud.store.applied())
     assert waiting[0] > len(waiting) // 2, "most packets wait when the first correction is there"
     assert waiting == list(range(waiting[0], -1, -1)), "a packet takes longer than a look here: each is a step"
 
@@ -204,17 +204,17 @@ def test_a_quick_worker_looks_after_a_number_of_packets_all_the_same(cloud, monk
     cloud.put(two_robots())
     monkeypatch.setattr(cloud.worker, "_clock", lambda: 0.0)
     cloud.worker.step()
-    assert cloud.store.applied() == AT_ONCE < cloud.store.turn_count()
+    assert cloud.store.applied() == AT_ONCE < len(cloud.store.envelopes())
 
 
 def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch):
     cloud.put(stream("a", POSES, start_s=0.0))
 
-    def hungry(self, data):
+    def hungry(self, packet):
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(type(cloud.worker._fleet), "receive", hungry)
+        patched.setattr(type(cloud.worker._fleet), "apply", hungry)
         with pytest.raises(MemoryError):
             cloud.work()
     assert cloud.store.refusals("a") == []

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fcslam.cloud.closure_log import Entry
+from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.graph import cluster
 from fcslam.graph.cluster import ClusterDecision
@@ -12,8 +12,8 @@ from fcslam.graph.consistency import Closures, ConsistencySettings
 from fcslam.records import FloatArray
 
 
-def judge(
-    entries: Sequence[Entry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
+def decide_join(
+    entries: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
 ) -> ClusterDecision:
     """The dominant cluster among the closures of two robots, on the trajectories as they are estimated now."""
     a, b = (graph.path(robot, settings) for robot in robots)
@@ -22,14 +22,14 @@ def judge(
 
 
 def first_estimate(
-    members: Sequence[Entry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
+    members: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
 ) -> FloatArray:
     """T_a_b of the two robots' maps, from the two matched places that lie farthest apart."""
     a, b = (graph.path(robot, settings) for robot in robots)
     return cluster.relative_frame(a, b, _closures(members, robots[0]))
 
 
-def _closures(entries: Sequence[Entry], robot_a: str) -> Closures:
+def _closures(entries: Sequence[ClosureEntry], robot_a: str) -> Closures:
     """The closures seen from one robot."""
     told = [entry.closure for entry in entries]
     closures = Closures(

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from fcslam.cloud.closure_log import ClosureLedger, Entry
+from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
 from fcslam.graph.consistency import ConsistencySettings
@@ -15,12 +15,12 @@ CONTRADICTS = "contradicts the joint graph"
 VETOED = "vetoed by hand"
 
 
-def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySettings) -> Fusion:
+def reevaluate(graph: JointGraph, closures: ClosureLog, settings: ConsistencySettings) -> Fusion:
     """Solve from the evidence alone; the graph takes the poses over, every entry learns its status.
 
     No earlier estimate, join or verdict plays a part: what joined two maps once and is outvoted now is revoked.
     """
-    entries = [entry for entry in ledger if entry.closure.status is not ClosureStatus.CANDIDATE]
+    entries = [entry for entry in closures if entry.closure.status is not ClosureStatus.CANDIDATE]
     _enter(graph, (entry for entry in entries if entry.edge is None))
     solution = solve_jointly(_evidence(graph, entries), settings)
     graph.take(solution.poses)
@@ -38,10 +38,10 @@ def reconsider(graph: JointGraph, ledger: ClosureLedger, settings: ConsistencySe
     members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
     T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
     T_local_base = dict(zip(robots, solution.own, strict=True))
-    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in ledger))
+    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in closures))
 
 
-def _enter(graph: JointGraph, entries: Iterable[Entry]) -> None:
+def _enter(graph: JointGraph, entries: Iterable[ClosureEntry]) -> None:
     """Give closures that nothing rested on so far an edge, which counts for nothing yet."""
     for entry in entries:
         closure = entry.closure
@@ -49,7 +49,7 @@ def _enter(graph: JointGraph, entries: Iterable[Entry]) -> None:
         graph.count(entry.edge, holds=False)
 
 
-def _evidence(graph: JointGraph, entries: list[Entry]) -> JointEvidence:
+def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
     count = len(graph.graph.edges)
     informative, independent, vetoed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
     for entry in entries:
@@ -59,7 +59,7 @@ def _evidence(graph: JointGraph, entries: list[Entry]) -> JointEvidence:
     return JointEvidence(graph.graph, tuple(graph.robots().values()), informative, independent, vetoed)
 
 
-def _decide(entry: Entry, holds: bool, apart: str) -> None:
+def _decide(entry: ClosureEntry, holds: bool, apart: str) -> None:
     """The entry's status; ``apart`` says why its robots share no map, if they do not."""
     accepted_before = entry.closure.status is ClosureStatus.ACCEPTED
     if entry.vetoed:

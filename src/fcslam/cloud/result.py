@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.cloud.closure_log import ClosureLedger
+from fcslam.cloud.closure_log import ClosureLog
 from fcslam.cloud.joint_graph import JointGraph
-from fcslam.cloud.robots import RobotStore
+from fcslam.cloud.session_store import SessionStore
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import ClosureStatus, Correction, FloatArray, Keyscan, LaserModel, LoopClosure, frozen
 
@@ -68,28 +68,30 @@ def map_indices(maps: Sequence[Sequence[str]]) -> dict[str, int]:
     return {robot: k for k, robots in enumerate(by_size) for robot in robots}
 
 
-def conclude(store: RobotStore, graph: JointGraph, ledger: ClosureLedger, fusion: Fusion, version: int) -> FleetResult:
+def conclude(
+    sessions: SessionStore, graph: JointGraph, closures: ClosureLog, fusion: Fusion, version: int
+) -> FleetResult:
     """Collect the result."""
     index = map_indices(fusion.maps)
     robots = tuple(
         MappedRobot(
             robot,
             index[robot],
-            frozen(store.stamps(robot)),
-            store.keyscans(robot),
+            frozen(sessions.stamps(robot)),
+            sessions.keyscans(robot),
             fusion.T_map_base[robot],
             fusion.T_local_base[robot],
-            store.laser(robot),
+            sessions.laser(robot),
         )
-        for robot in store.robots
+        for robot in sessions.robots
     )
     corrections = tuple(
         Correction(robot, version, index[robot], frozen(graph.T_map_odom(robot, fusion.T_map_base[robot][-1])))
-        for robot in store.robots
+        for robot in sessions.robots
     )
     left_out = {
         entry.edge
-        for entry, closure in zip(ledger, fusion.closures, strict=True)
+        for entry, closure in zip(closures, fusion.closures, strict=True)
         if closure.status is not ClosureStatus.ACCEPTED
     }
     return FleetResult(robots, fusion.closures, corrections, graph.held(fusion.T_map_base, left_out))

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fcslam.cloud.closure_log import ClosureLedger, Entry
+from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.result import Fusion
 from fcslam.geometry import se2
@@ -27,7 +27,7 @@ from fcslam.records import ClosureStatus, FloatArray, LoopClosure, frozen
 class _Match:
     """One point that two robots know, (2,) in the own map of each."""
 
-    entry: Entry
+    entry: ClosureEntry
     robots: tuple[str, str]
     """a and b, a the one that started first."""
     xy_a: FloatArray
@@ -42,7 +42,7 @@ class _Match:
 _Links = Mapping[tuple[str, str], Sequence[_Match]]
 
 
-def fuse_rigidly(ledger: ClosureLedger, T_local_base: Mapping[str, FloatArray], strategy: FusionStrategy) -> Fusion:
+def fuse_rigidly(closures: ClosureLog, T_local_base: Mapping[str, FloatArray], strategy: FusionStrategy) -> Fusion:
     """Every robot's own map (N, 3) moved as a whole, into the frame of the robot of its map that started first.
 
     ``T_local_base`` has the robots in the order in which they started. Whatever geometry verified between two robots
@@ -50,24 +50,24 @@ def fuse_rigidly(ledger: ClosureLedger, T_local_base: Mapping[str, FloatArray], 
     rests on end accepted, the others verified; closures within robots keep their verdict.
     """
     order = list(T_local_base)
-    matches = [_match(entry, T_local_base, order) for entry in ledger if _is_valid(entry)]
+    matches = [_match(entry, T_local_base, order) for entry in closures if _is_valid(entry)]
     links = _links(matches, strategy)
     maps, frames = [[robot] for robot in order], {robot: np.zeros(3) for robot in order}
-    used: dict[Entry, str] = {}
+    used: dict[ClosureEntry, str] = {}
     for robots, members in links.items():
         if _join(robots, _relation(members, strategy), maps, frames):
             used |= {match.entry: f"one of {len(members)} matched points of {strategy}" for match in members}
     T_map_base: dict[str, FloatArray] = {
         robot: frozen(se2.compose(frames[robot], poses)) for robot, poses in T_local_base.items()
     }
-    return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used, strategy) for entry in ledger))
+    return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used, strategy) for entry in closures))
 
 
-def _is_valid(entry: Entry) -> bool:
+def _is_valid(entry: ClosureEntry) -> bool:
     return entry.is_between and not entry.vetoed and entry.closure.status is not ClosureStatus.CANDIDATE
 
 
-def _match(entry: Entry, T_local_base: Mapping[str, FloatArray], order: Sequence[str]) -> _Match:
+def _match(entry: ClosureEntry, T_local_base: Mapping[str, FloatArray], order: Sequence[str]) -> _Match:
     i, j = entry.closure.i, entry.closure.j
     xy_i = se2.compose(T_local_base[i.robot][i.number], entry.closure.T_i_j)[:2]
     xy_j = T_local_base[j.robot][j.number][:2]
@@ -119,7 +119,7 @@ def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], fra
     return True
 
 
-def _closure(entry: Entry, used: Mapping[Entry, str], strategy: FusionStrategy) -> LoopClosure:
+def _closure(entry: ClosureEntry, used: Mapping[ClosureEntry, str], strategy: FusionStrategy) -> LoopClosure:
     """The closure with its verdict."""
     if not _is_valid(entry):
         return entry.closure

@@ -1,18 +1,18 @@
-"""Submaps of places, built from a robot's keyscans when they are asked for; the latest ones are kept."""
+"""Submaps of places, built from keyscans on demand and cached."""
 
 from fcslam.cloud.joint_graph import JointGraph
-from fcslam.cloud.robots import RobotStore
+from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import Channel, KeyscanId, Place
 
 
-class SubmapShelf:
-    """Holds ``capacity`` submaps; the one that was not used for longest goes first."""
+class SubmapCache:
+    """Holds up to ``capacity`` submaps; the least recently used one is dropped first."""
 
-    def __init__(self, store: RobotStore, graph: JointGraph, capacity: int) -> None:
-        self._store = store
+    def __init__(self, sessions: SessionStore, graph: JointGraph, capacity: int) -> None:
+        self._sessions = sessions
         self._graph = graph
         self._capacity = capacity
         self._submaps: dict[tuple[KeyscanId, Channel], Submap] = {}
@@ -29,14 +29,14 @@ class SubmapShelf:
         return submap
 
     def drop(self, place: Place) -> None:
-        """Make room: the submap around this place is hardly asked for again."""
+        """Drop the submap around a place from the cache."""
         self._submaps.pop((place.id, place.channel), None)
 
     def _build(self, place: Place) -> Submap:
         robot = place.id.robot
-        laser, anchor = self._store.laser(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
+        laser, anchor = self._sessions.laser(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
         poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))
-        keyscans = self._store.keyscans(robot, place.first, place.last)
+        keyscans = self._sessions.keyscans(robot, place.first, place.last)
         return build_submap(
             [(point_scan(keyscan.ranges_m, laser), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]
         )

@@ -1,30 +1,34 @@
-"""Batches of packets from robots: checked, stored, acknowledged. No network here, and no waiting for the fleet."""
+"""Checks, stores and acknowledges batches of packets; knows no network and does not wait for the fleet."""
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from fcslam.cloud.sessions import check_robot
-from fcslam.errors import FcslamError, PacketError
+from fcslam.cloud.packet_log import PacketLog, PacketNumber
+from fcslam.cloud.replies import ReplyState, replies
+from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
+from fcslam.errors import FcslamError, PacketConflictError, PacketError
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.service.mission_store import MissionStore, StoredPacket
 from fcslam.wire.batches import read_batch, write_batch
-from fcslam.wire.messages import UPLINK, Acknowledgement, Body, DetectorUpdate, Hello, Packet, PacketKind
+from fcslam.wire.messages import UPLINK, Hello, PacketKind
 from fcslam.wire.packets import decode, encode, read_label, read_number
 
 LEASE_S = 30.0
-"""So long after an agent's last request its robot is its own."""
+"""How long after its last request an agent keeps its robot to itself."""
 LONGEST_QUEUE = 50_000
-"""Packets that have a turn and have not taken effect: more are not taken in before some have."""
+"""Largest number of packets that arrived and did not take effect yet; the service takes no more until some did."""
 MOST_EARLY = 20_000
-"""Packets of one robot that wait for one before them, in all its sessions."""
+"""Largest number of packets of one robot, in all its sessions, that wait for one before them."""
 FURTHEST_AHEAD = 20_000
-"""Numbers after the first missing packet of a session: what is further ahead has to wait for it."""
+"""How far a packet's number may be ahead of the first missing packet of its session."""
 RETRY_AFTER_S = 2
+"""What the service asks of a robot whose packets it cannot take now."""
 
 
 class BusyError(FcslamError):
-    """Nothing is wrong, but it has to wait."""
+    """The service cannot take the packets now; the robot sends them again later."""
 
 
 class LeaseError(FcslamError):
@@ -40,13 +44,22 @@ class RefusedPacketError(FcslamError):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class IntakeReply:
     """What goes back to a robot."""
 
     batch: bytes
     """Acknowledgements and, if they are news, a correction and detectors."""
     refused: int
-    """How many of the robot's packets count for nothing, those that the worker refused later included."""
+    """How many of the robot's packets were refused, by the worker too."""
+
+
+class SessionState(NamedTuple):
+    """How far a session has arrived."""
+
+    robot: str
+    epoch: int
+    next: int
+    """Number of the first packet that is missing."""
 
 
 class Intake:
@@ -59,19 +72,21 @@ class Intake:
         wall_clock: Callable[[], float],
         announced: Callable[[], Mapping[Channel, DetectorFile]] = dict,
     ) -> None:
-        """``announced``: detectors that robots are to take."""
+        """``announced``: detectors that robots are to use."""
         self._store, self._clock, self._wall_clock, self._announced = store, clock, wall_clock, announced
         self._lock = threading.Lock()
         self._leases: dict[str, tuple[str, float]] = {}
-        """Agent of each robot, and when it was heard last."""
+        """Agent of each robot, and when its last request came."""
+        self._log = PacketLog()
+        self._note((e.robot, e.epoch, e.sequence) for e in store.envelopes())
 
-    def take(self, robot: str, agent: str, batch: bytes, known_correction: int) -> Answer:
-        """Store a robot's packets; what comes back acknowledges all that is stored without a gap.
+    def take(self, robot: str, agent: str, batch: bytes, known_correction: int) -> IntakeReply:
+        """Store a robot's packets; the reply acknowledges all that is stored without a gap.
 
         Raises:
             PacketError: the batch cannot be taken apart; nothing is stored.
             RefusedPacketError: a packet of it is refused.
-            PacketConflictError: a packet has the number of another one.
+            PacketConflictError: another packet has the number of one of them; those before it are stored.
             LeaseError: another agent speaks for the robot.
             BusyError: it has to be sent again later.
             StoreError: the disk is full; nothing is stored.
@@ -79,18 +94,48 @@ class Intake:
         self._lease(robot, agent)
         check_robot(robot)
         packets, refusal = _checked(robot, read_batch(batch))
-        self._make_room(robot, packets)
-        self._store.put(packets, self._wall_clock())
+        numbers = [(packet.robot, packet.epoch, packet.sequence) for packet in packets]
+        self._make_room(robot, numbers)
+        try:
+            self._store.put(packets, self._wall_clock())
+        except PacketConflictError as conflict:
+            self._note(numbers[: conflict.index])
+            raise
+        self._note(numbers)
         if refusal:
             raise refusal
-        epochs = sorted({packet.epoch for packet in packets}) or [s.epoch for s in self._store.sessions(robot)[-1:]]
-        answer = self._answer(robot, epochs, known_correction)
-        return Answer(answer, self._store.refusal_count(robot))
+        epochs = sorted({epoch for _, epoch, _ in numbers}) or [s.epoch for s in self.sessions(robot)[-1:]]
+        return IntakeReply(self._replies(robot, epochs, known_correction), self._store.refusal_count(robot))
 
     def last_heard_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never since the service started."""
         lease = self._leases.get(robot)
         return None if lease is None else self._clock() - lease[1]
+
+    def sessions(self, robot: str | None = None) -> list[SessionState]:
+        """Sessions of one robot or of all, by robot and epoch."""
+        with self._lock:
+            found = [(*robot_and_epoch(name), self._log.next_sequence(name)) for name in self._log.sessions]
+        return [SessionState(*session) for session in sorted(found) if robot in (None, session[0])]
+
+    def ready_count(self) -> int:
+        """How many packets have arrived with all those before them in their sessions."""
+        return self._log.released
+
+    def waiting_count(self, robot: str | None = None) -> int:
+        """How many packets of one robot or of all wait for one before them."""
+        with self._lock:
+            names = [name for name in self._log.sessions if robot in (None, robot_of(name))]
+            return sum(self._log.waiting_count(name) for name in names)
+
+    def _note(self, numbers: Iterable[tuple[str, int, int]]) -> None:
+        """Take packets that are stored into the log; their effect is the worker's."""
+        with self._lock:
+            for robot, epoch, sequence in numbers:
+                session = session_name(robot, epoch)
+                self._log.add(PacketNumber(session, sequence), 0.0)
+                for _ in self._log.ready(session):
+                    pass
 
     def _lease(self, robot: str, agent: str) -> None:
         now = self._clock()
@@ -103,47 +148,37 @@ class Intake:
                 )
             self._leases[robot] = agent, now
 
-    def _make_room(self, robot: str, packets: Sequence[StoredPacket]) -> None:
-        queue = self._store.turn_count() - self._store.applied()
+    def _make_room(self, robot: str, numbers: Sequence[tuple[str, int, int]]) -> None:
+        """Refuse, for now, what would make the queue or the robot's waiting packets too many."""
+        queue = self.ready_count() - self._store.applied()
         if queue > LONGEST_QUEUE:
             raise BusyError(f"{queue} packets have not taken effect yet; send these again later")
-        expected = {session.epoch: session.next for session in self._store.sessions(robot)}
-        for packet in packets:
-            first = expected.get(packet.epoch, 0)
-            if packet.sequence > first + FURTHEST_AHEAD:
-                raise BusyError(f"{robot}: packet {packet.sequence} is far ahead; send packet {first} first")
-        early = _early(packets, expected)
-        if early and self._store.waiting_count(robot) + len(early) > MOST_EARLY:
-            epoch = early[0].epoch
+        with self._lock:
+            for _, epoch, sequence in numbers:
+                first = self._log.next_sequence(session_name(robot, epoch))
+                if sequence > first + FURTHEST_AHEAD:
+                    raise BusyError(f"{robot}: packet {sequence} is far ahead; send packet {first} first")
+            early = self._log.would_wait(PacketNumber(session_name(robot, epoch), k) for _, epoch, k in numbers)
+        if early and self.waiting_count(robot) + len(early) > MOST_EARLY:
+            session = early[0].session
             raise BusyError(
                 f"{robot}: over {MOST_EARLY} packets wait for one before them; "
-                f"send packet {expected.get(epoch, 0)} of epoch {epoch} first"
+                f"send packet {self._log.next_sequence(session)} of epoch {robot_and_epoch(session)[1]} first"
             )
 
-    def _answer(self, robot: str, epochs: Sequence[int], known_correction: int) -> bytes:
-        told: list[tuple[int, float, Body]] = []
-        for epoch in epochs:
-            expected = self._store.next_sequence(robot, epoch)
-            if expected > 0:
-                told.append((epoch, 0.0, Acknowledgement(robot, epoch, expected - 1)))
-        news = self._store.correction(robot, epochs[-1]) if epochs else None
-        if news and news.correction.version > known_correction:
-            told.append((news.epoch, news.time, news.correction))
-        if epochs:
-            told += [
-                (epochs[-1], 0.0, DetectorUpdate(robot, file)) for file in self._newer_detectors(robot, epochs[-1])
-            ]
-        return write_batch(
-            encode(Packet(robot, epoch, number, time_s, body)) for number, (epoch, time_s, body) in enumerate(told)
+    def _replies(self, robot: str, epochs: Sequence[int], known_correction: int) -> bytes:
+        announced, newest = self._announced(), epochs[-1] if epochs else None
+        state = ReplyState(
+            {epoch: self._log.next_sequence(session_name(robot, epoch)) for epoch in epochs},
+            None if newest is None else self._store.correction(robot, newest),
+            self._detector_versions(robot, newest) if announced and newest is not None else None,
         )
+        return write_batch(encode(reply) for reply in replies(robot, state, known_correction, announced))
 
-    def _newer_detectors(self, robot: str, epoch: int) -> list[DetectorFile]:
-        """Of the channels that the robot has, what it does not use yet."""
-        announced = self._announced()
-        data = self._store.newest_hello(robot, epoch) if announced else None
+    def _detector_versions(self, robot: str, epoch: int) -> Mapping[Channel, str] | None:
+        data = self._store.newest_hello(robot, epoch)
         hello = decode(data).body if data else None
-        versions = hello.detector_versions if isinstance(hello, Hello) else {}
-        return [file for channel, file in announced.items() if versions.get(channel, file.version) != file.version]
+        return hello.detector_versions if isinstance(hello, Hello) else None
 
 
 def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], RefusedPacketError | None]:
@@ -158,19 +193,6 @@ def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], Re
                 packets.append(StoredPacket(*number, 0.0, None, None, data, str(error)))
             return packets, RefusedPacketError(str(error), index)
     return packets, None
-
-
-def _early(packets: Sequence[StoredPacket], expected: Mapping[int, int]) -> list[StoredPacket]:
-    """Those that do not follow on what is stored without a gap; ``expected`` next numbers by epoch."""
-    ahead = dict(expected)
-    early: list[StoredPacket] = []
-    for packet in sorted(packets, key=lambda packet: packet.sequence):
-        following = ahead.get(packet.epoch, 0)
-        if packet.sequence > following:
-            early.append(packet)
-        else:
-            ahead[packet.epoch] = max(following, packet.sequence + 1)
-    return early
 
 
 def _read(robot: str, data: bytes) -> StoredPacket:

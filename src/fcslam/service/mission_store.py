@@ -1,49 +1,43 @@
-"""One mission on disk: packets as received are the truth, and everything else can be made from them again.
+"""One mission on disk: packets as received are the truth, and everything else can be computed from them again.
 
-Written by the service (packets, vetoes, requests) and by the worker (what it made of them). A packet is stored once,
-and stays as it came. Its **turn** is its place in the order in which packets take effect: that of arrival, but within
-a session that of their numbers. A packet has no turn while one before it is missing.
+The service writes packets, vetoes and requests; the worker writes results. A packet is stored once and never changes.
+Packets are numbered by **arrival**. The order in which they take effect follows from it: ``cloud.packet_log``.
 """
 
-import math
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
+from fcslam.cloud.replies import SessionCorrection, is_news
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import PacketConflictError, StoreError
 from fcslam.records import Channel, Correction, Veto, frozen
-from fcslam.storage.database import Database, check_file, told
+from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import Label
 
 APPLIED = "applied"
-"""A fact: how many turns have taken effect."""
+"""A fact: how many packets took effect."""
 CONFIG = "config"
 """A fact: the mission's configuration."""
 
-NEWS_M, NEWS_RAD, NEWS_QUALITY = 1e-3, 1e-5, 0.02
-"""A correction that differs from the last one by less is none: 100 m from the origin of `odom` the first two are 1 mm.
-Without a closure it is the same but for rounding, and each robot would be told so with every answer. Whether anybody
-bears it out is always news."""
-
-_VERSION = 2
+_VERSION = 3
+_COLUMNS = "robot, epoch, sequence, time, kind, channel, data, refusal"
 
 _SCHEMA = """
 CREATE TABLE packets (
+    arrival INTEGER PRIMARY KEY,
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, sequence INTEGER NOT NULL,
     received REAL NOT NULL, time REAL NOT NULL, kind TEXT, channel TEXT,
-    refusal TEXT, turn INTEGER UNIQUE, data BLOB NOT NULL,
-    PRIMARY KEY (robot, epoch, sequence)
+    refusal TEXT, data BLOB NOT NULL,
+    UNIQUE (robot, epoch, sequence)
 ) STRICT;
 CREATE INDEX refusals ON packets (robot, epoch, sequence) WHERE refusal IS NOT NULL;
 CREATE INDEX hellos ON packets (robot, epoch, sequence) WHERE kind = 'hello';
-CREATE TABLE sessions (
-    robot TEXT NOT NULL, epoch INTEGER NOT NULL, next INTEGER NOT NULL, PRIMARY KEY (robot, epoch)
-) STRICT;
 CREATE TABLE corrections (
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, version INTEGER NOT NULL UNIQUE, time REAL NOT NULL,
     map_index INTEGER NOT NULL, x REAL NOT NULL, y REAL NOT NULL, theta REAL NOT NULL, quality REAL NOT NULL,
@@ -53,7 +47,7 @@ CREATE TABLE vetoes (
     number INTEGER PRIMARY KEY, robot_i TEXT NOT NULL, robot_j TEXT NOT NULL, stamp_i REAL, stamp_j REAL
 ) STRICT;
 CREATE TABLE finalizations (
-    number INTEGER PRIMARY KEY, turns INTEGER NOT NULL, vetoes INTEGER NOT NULL, run TEXT, failure TEXT
+    number INTEGER PRIMARY KEY, arrivals INTEGER NOT NULL, vetoes INTEGER NOT NULL, run TEXT, failure TEXT
 ) STRICT;
 CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT
 """
@@ -61,7 +55,7 @@ CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT
 
 @dataclass(frozen=True, slots=True)
 class StoredPacket:
-    """A packet as it came, and what its envelope says."""
+    """A packet as received, and the contents of its envelope."""
 
     robot: str
     epoch: int
@@ -73,36 +67,25 @@ class StoredPacket:
     """Of a place."""
     data: bytes
     refusal: str | None = None
-    """Why it does not count; its number is used up all the same."""
+    """Why it has no effect; its number is used up."""
 
 
-@dataclass(frozen=True, slots=True)
-class Session:
-    """How far a robot's session is."""
-
-    robot: str
-    epoch: int
-    next: int
-    """Number of the first packet that is missing."""
-
-
-@dataclass(frozen=True, slots=True)
-class SessionCorrection:
-    """A session's correction; versions are the store's: they grow whatever is restarted."""
+class Envelope(NamedTuple):
+    """What orders a packet."""
 
     robot: str
     epoch: int
+    sequence: int
     time: float
-    """The largest stamp that the robot had seen when it sent what this rests on."""
-    correction: Correction
+    is_refused: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Finalization:
-    """A request for the result of the first ``turns`` packets and ``vetoes`` vetoes."""
+    """A request for the result of the first ``arrivals`` packets and ``vetoes`` vetoes."""
 
     number: int
-    turns: int
+    arrivals: int
     vetoes: int
     run: str | None
     """Name of the run folder, once it is there."""
@@ -145,38 +128,33 @@ class MissionStore:
             )
         return new
 
-    def turns(self, after: int, limit: int) -> list[StoredPacket]:
-        """Packets in the order of their turns, beginning with turn ``after`` (the first is 0), at most ``limit``."""
-        columns = "robot, epoch, sequence, time, kind, channel, data, refusal"
-        statement = f"SELECT {columns} FROM packets WHERE turn >= ? ORDER BY turn LIMIT ?"
+    def arrivals(self, after: int, limit: int) -> list[tuple[int, StoredPacket]]:
+        """At most ``limit`` packets with their arrival, in its order; the first arrival is 1."""
+        statement = f"SELECT arrival, {_COLUMNS} FROM packets WHERE arrival > ? ORDER BY arrival LIMIT ?"
+        return [(arrival, _packet(*row)) for arrival, *row in self._database.rows(statement, (after, limit))]
+
+    def packet(self, robot: str, epoch: int, sequence: int) -> StoredPacket:
+        """A packet that is stored."""
+        statement = f"SELECT {_COLUMNS} FROM packets WHERE robot = ? AND epoch = ? AND sequence = ?"
+        (row,) = self._database.rows(statement, (robot, epoch, sequence))
+        return _packet(*row)
+
+    def envelopes(self, until: int | None = None) -> list[Envelope]:
+        """The envelopes of all packets, or of those that arrived first until arrival ``until``, in that order."""
+        statement = (
+            "SELECT robot, epoch, sequence, time, refusal IS NOT NULL FROM packets"
+            " WHERE ?1 IS NULL OR arrival <= ?1 ORDER BY arrival"
+        )
         return [
-            StoredPacket(
-                robot, epoch, sequence, time, kind and PacketKind(kind), channel and Channel(channel), data, refusal
-            )
-            for robot, epoch, sequence, time, kind, channel, data, refusal in self._database.rows(
-                statement, (after, limit)
-            )
+            Envelope(robot, epoch, sequence, time, bool(refused))
+            for robot, epoch, sequence, time, refused in self._database.rows(statement, (until,))
         ]
 
-    def packet(self, robot: str, epoch: int, sequence: int) -> bytes:
-        """A packet that is stored, as it came."""
-        where = "robot = ? AND epoch = ? AND sequence = ?"
-        data: bytes = self._database.value(f"SELECT data FROM packets WHERE {where}", (robot, epoch, sequence))
-        return data
-
-    def turn_count(self) -> int:
-        """Packets that have a turn."""
-        return int(self._database.value("SELECT ifnull(max(turn) + 1, 0) FROM packets"))
-
-    def waiting_count(self, robot: str | None = None) -> int:
-        """Packets of one robot or of all without a turn: one before them is missing."""
-        statement = "SELECT count(*) FROM packets WHERE turn IS NULL AND (?1 IS NULL OR robot = ?1)"
-        return int(self._database.value(statement, (robot,)))
-
-    def refuse(self, turn: int, reason: str) -> None:
-        """The packet of this turn does not fit what its robot sent before."""
+    def refuse(self, robot: str, epoch: int, sequence: int, reason: str) -> None:
+        """Note that a packet does not fit what its robot sent before."""
+        statement = "UPDATE packets SET refusal = ? WHERE robot = ? AND epoch = ? AND sequence = ?"
         with self._database.transaction() as database:
-            database.execute("UPDATE packets SET refusal = ? WHERE turn = ?", (reason, turn))
+            database.execute(statement, (reason, robot, epoch, sequence))
 
     def refusals(self, robot: str) -> list[tuple[int, int, str]]:
         """Epoch, number and reason of every refused packet of a robot."""
@@ -194,15 +172,6 @@ class MissionStore:
             self._database.value("SELECT count(*) FROM packets WHERE robot = ? AND refusal IS NOT NULL", (robot,))
         )
 
-    def sessions(self, robot: str | None = None) -> list[Session]:
-        """Sessions of one robot or of all, by robot and epoch."""
-        statement = "SELECT robot, epoch, next FROM sessions WHERE ?1 IS NULL OR robot = ?1 ORDER BY robot, epoch"
-        return [Session(*row) for row in self._database.rows(statement, (robot,))]
-
-    def next_sequence(self, robot: str, epoch: int) -> int:
-        """Number of the first packet of the session that is missing."""
-        return next((session.next for session in self.sessions(robot) if session.epoch == epoch), 0)
-
     def newest_hello(self, robot: str, epoch: int) -> bytes | None:
         """What the session said last of its detectors."""
         where = "robot = ? AND epoch = ? AND kind = 'hello' AND refusal IS NULL"
@@ -210,35 +179,22 @@ class MissionStore:
         hello: bytes | None = self._database.value(statement, (robot, epoch))
         return hello
 
-    def progress(self, turns: int, corrections: Sequence[SessionCorrection]) -> None:
-        """So many turns have taken effect; corrections that are news get a new version."""
+    def progress(self, applied: int, corrections: Sequence[SessionCorrection]) -> None:
+        """Note how many packets took effect; corrections that are news get a new version."""
         with self._database.transaction() as database:
-            _remember(database, APPLIED, str(turns))
+            _remember(database, APPLIED, str(applied))
             for correction in corrections:
-                told = correction.correction
-                row = (told.map_index, *told.T_map_odom.tolist(), told.quality)
-                database.execute(
-                    "INSERT INTO corrections SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7, ?8"
-                    " FROM corrections WHERE true ON CONFLICT (robot, epoch) DO UPDATE SET version = excluded.version,"
-                    " time = excluded.time, map_index = excluded.map_index, x = excluded.x, y = excluded.y,"
-                    " theta = excluded.theta, quality = excluded.quality WHERE map_index != ?4"
-                    f" OR max(abs(x - ?5), abs(y - ?6)) >= {NEWS_M}"
-                    f" OR min(abs(theta - ?7), {2.0 * math.pi} - abs(theta - ?7)) >= {NEWS_RAD}"
-                    f" OR abs(quality - ?8) >= {NEWS_QUALITY} OR (quality = 0) != (?8 = 0)",
-                    (correction.robot, correction.epoch, correction.time, *row),
-                )
+                known = _read_correction(database.execute, correction.robot, correction.epoch)
+                if is_news(None if known is None else known.correction, correction.correction):
+                    _write_correction(database, correction)
 
     def applied(self) -> int:
-        """Turns that have taken effect, whatever was restarted since."""
+        """How many packets took effect, restarts notwithstanding."""
         return int(self.fact(APPLIED) or 0)
 
     def correction(self, robot: str, epoch: int) -> SessionCorrection | None:
         """The newest correction of a session."""
-        columns = "time, version, map_index, quality, x, y, theta"
-        statement = f"SELECT {columns} FROM corrections WHERE robot = ? AND epoch = ?"
-        for time, version, map_index, quality, *pose in self._database.rows(statement, (robot, epoch)):
-            return SessionCorrection(robot, epoch, time, Correction(robot, version, map_index, frozen(pose), quality))
-        return None
+        return _read_correction(self._database.rows, robot, epoch)
 
     def veto(self, veto: Veto) -> None:
         """Keep a veto."""
@@ -252,17 +208,17 @@ class MissionStore:
         return [Veto(i, j, None if stamp_i is None else (stamp_i, stamp_j)) for i, j, stamp_i, stamp_j in rows]
 
     def ask_to_finalize(self) -> int:
-        """Ask for the result of all that has a turn now; returns the number of the request."""
+        """Ask for the result of all packets that arrived; returns the number of the request."""
         with self._database.transaction() as database:
             database.execute(
-                "INSERT INTO finalizations (turns, vetoes)"
-                " SELECT (SELECT ifnull(max(turn) + 1, 0) FROM packets), (SELECT count(*) FROM vetoes)"
+                "INSERT INTO finalizations (arrivals, vetoes)"
+                " SELECT (SELECT ifnull(max(arrival), 0) FROM packets), (SELECT count(*) FROM vetoes)"
             )
             return int(database.execute("SELECT last_insert_rowid()").fetchone()[0])
 
     def finalizations(self) -> list[Finalization]:
         """All requests, the oldest first."""
-        columns = "number, turns, vetoes, run, failure"
+        columns = "number, arrivals, vetoes, run, failure"
         return [
             Finalization(*row) for row in self._database.rows(f"SELECT {columns} FROM finalizations ORDER BY number")
         ]
@@ -299,17 +255,22 @@ class MissionStore:
                 refused += Traffic(packets, size)
         return Ledger(accepted, refused)
 
-    def arrived(self, after: int, limit: int) -> list[tuple[int, str, PacketKind | None, Channel | None, Traffic]]:
-        """What came in after a row of the file (0: all), at most ``limit`` packets.
+    def traffic_since(
+        self, after: int, limit: int
+    ) -> list[tuple[int, str, PacketKind | None, Channel | None, Traffic]]:
+        """The traffic of at most ``limit`` packets after an arrival, refused ones included.
 
-        Last row, robot, kind, channel and traffic of each of its parts; refused packets count, too.
+        Last arrival, robot, kind, channel and traffic of each group.
         """
-        chosen = "SELECT rowid, robot, kind, channel, length(data) AS size FROM packets WHERE rowid > ? ORDER BY rowid"
-        parts = "max(rowid), robot, kind, channel, count(*), sum(size)"
-        statement = f"SELECT {parts} FROM ({chosen} LIMIT ?) GROUP BY robot, kind, channel"
+        chosen = (
+            "SELECT arrival, robot, kind, channel, length(data) AS size FROM packets"
+            " WHERE arrival > ? ORDER BY arrival LIMIT ?"
+        )
+        groups = "robot, kind, channel"
+        statement = f"SELECT max(arrival), {groups}, count(*), sum(size) FROM ({chosen}) GROUP BY {groups}"
         return [
-            (row, robot, kind and PacketKind(kind), channel and Channel(channel), Traffic(count, size))
-            for row, robot, kind, channel, count, size in self._database.rows(statement, (after, limit))
+            (arrival, robot, kind and PacketKind(kind), channel and Channel(channel), Traffic(count, size))
+            for arrival, robot, kind, channel, count, size in self._database.rows(statement, (after, limit))
         ]
 
     def export(self, path: Path) -> None:
@@ -328,7 +289,10 @@ def check_mission(path: Path) -> None:
         StoreError: it is not what ``MissionStore.export`` writes.
     """
     check_file(path, _SCHEMA, _VERSION)
-    with told(path), closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found:
+    with (
+        translate_errors(path),
+        closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found,
+    ):
         labels = found.execute("SELECT DISTINCT kind, channel, refusal IS NULL FROM packets").fetchall()
         facts = dict(found.execute("SELECT name, value FROM facts").fetchall())
     try:
@@ -354,8 +318,6 @@ def _put(database: sqlite3.Connection, packets: Sequence[StoredPacket], received
         elif not _is_there(database, packet):
             conflict = index
             break
-    for robot, epoch in dict.fromkeys((packet.robot, packet.epoch) for packet in packets):
-        _give_turns(database, robot, epoch)
     return new, conflict
 
 
@@ -373,16 +335,30 @@ def _is_there(database: sqlite3.Connection, packet: StoredPacket) -> bool:
     return bool(data == packet.data)
 
 
-def _give_turns(database: sqlite3.Connection, robot: str, epoch: int) -> None:
-    """Packets of a session that miss nothing any more come next, in the order of their numbers."""
-    session = (robot, epoch)
-    row = database.execute("SELECT next FROM sessions WHERE robot = ? AND epoch = ?", session).fetchone()
-    first = end = row[0] if row else 0
-    turn = database.execute("SELECT ifnull(max(turn) + 1, 0) FROM packets").fetchone()[0]
-    give = "UPDATE packets SET turn = ? WHERE robot = ? AND epoch = ? AND sequence = ?"
-    while database.execute(give, (turn + end - first, *session, end)).rowcount:
-        end += 1
+def _packet(
+    robot: str, epoch: int, sequence: int, time: float, kind: str | None, channel: str | None, data: bytes,
+    refusal: str | None,
+) -> StoredPacket:  # fmt: skip
+    read = PacketKind(kind) if kind else None, Channel(channel) if channel else None
+    return StoredPacket(robot, epoch, sequence, time, *read, data, refusal)
+
+
+def _read_correction(
+    query: Callable[[str, tuple[str, int]], Iterable[Any]], robot: str, epoch: int
+) -> SessionCorrection | None:
+    columns = "time, version, map_index, quality, x, y, theta"
+    statement = f"SELECT {columns} FROM corrections WHERE robot = ? AND epoch = ?"
+    for time, version, map_index, quality, *pose in query(statement, (robot, epoch)):
+        return SessionCorrection(robot, epoch, time, Correction(robot, version, map_index, frozen(pose), quality))
+    return None
+
+
+def _write_correction(database: sqlite3.Connection, news: SessionCorrection) -> None:
+    """Replace the session's correction; its version is the mission's next one."""
+    correction = news.correction
+    row = (news.robot, news.epoch, news.time, correction.map_index, *correction.T_map_odom.tolist(), correction.quality)
     database.execute(
-        "INSERT INTO sessions VALUES (?, ?, ?) ON CONFLICT (robot, epoch) DO UPDATE SET next = excluded.next",
-        (*session, end),
+        "INSERT OR REPLACE INTO corrections"
+        " SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7, ?8 FROM corrections",
+        row,
     )

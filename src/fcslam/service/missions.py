@@ -13,7 +13,7 @@ from fcslam.service.intake import Intake
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, MissionStore
 from fcslam.service.supervisor import RunningWorker
-from fcslam.storage.database import told
+from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing, write_file
 from fcslam.wire.checks import check_name
 
@@ -134,7 +134,7 @@ class Missions:
         folder = self.folder(name)
         if folder.store.exists():
             raise ServiceError(f"mission '{name}' is there already; choose another name")
-        with told(folder.store):
+        with translate_errors(folder.store):
             folder.path.mkdir(parents=True, exist_ok=True)
             with replacing(folder.store) as unfinished:
                 shutil.copyfile(path, unfinished)
@@ -150,11 +150,11 @@ class Missions:
 
     def _opened(self, name: str) -> OpenMission:
         folder = self.folder(name)
-        with told(folder.path):
+        with translate_errors(folder.path):
             folder.path.mkdir(parents=True, exist_ok=True)
         mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._launch, self.detectors)
         try:
-            with told(self._open_file):
+            with translate_errors(self._open_file):
                 write_file(self._open_file, name + "\n")
         except BaseException:
             mission.close()

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
@@ -55,10 +55,10 @@ def warm_up_decoding() -> None:
 def warm_up_fleet() -> None:
     """Make ready for all that the worker does: decode, match, verify, solve, decide, map."""
     vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
-    fleet = Fleet(FleetConfig(matcher=MatcherConfig(small_fleet=0, vocabulary=vocabulary)), seed=0)
+    cloud = Cloud(FleetConfig(matcher=MatcherConfig(small_fleet=0, vocabulary=vocabulary)), seed=0)
     for data in _packets():
-        fleet.receive(data)
-    result = fleet.finalize()
+        cloud.receive(data)
+    result = cloud.finalize()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False)
 

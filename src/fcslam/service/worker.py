@@ -19,23 +19,27 @@ import select
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO
 
 from fcslam.cloud.fleet import Fleet
-from fcslam.cloud.journal import StoredJournal
+from fcslam.cloud.packet_log import PacketLog, PacketNumber
+from fcslam.cloud.replies import SessionCorrection
 from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
-from fcslam.cloud.sessions import session_name
+from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump
 from fcslam.errors import PacketError
 from fcslam.runs import Metric, Run
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, SessionCorrection, StoredPacket
+from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.service.supervisor import READY
 from fcslam.service.warmup import warm_up_fleet
+from fcslam.wire.messages import Packet
+from fcslam.wire.packets import decode
 
 AT_ONCE = 64
 AT_ONCE_S = 0.25
@@ -61,10 +65,14 @@ class Worker:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._tell = folder, store, clock, tell
-        self._fleet = Fleet(self._config.fleet, self._config.seed, StoredJournal(store.packet))
-        self._turn = self._vetoes = 0
+        self._fleet = Fleet(self._config.fleet, self._config.seed)
+        self._log = PacketLog()
+        self._ready: deque[StoredPacket] = deque()
+        """Packets that may take effect and did not yet."""
+        self._arrivals = self._vetoes = 0
+        """How many packets and vetoes were read."""
         self._resumed_at = store.applied()
-        """Turns that took effect before a restart: what they bring is known already."""
+        """How many packets took effect before a restart: their results are stored already."""
         self._times: dict[tuple[str, int], float] = {}
         """Newest time of each session."""
         self._published = -1
@@ -76,7 +84,7 @@ class Worker:
 
     def wait_s(self) -> float:
         """How long there is nothing to do unless something comes in."""
-        return max(self._publish_at - self._clock(), 0.0) if self._published < self._turn else LIVE_EVERY_S
+        return max(self._publish_at - self._clock(), 0.0) if self._published < self._applied else LIVE_EVERY_S
 
     def _take_vetoes(self) -> bool:
         vetoes = self._store.vetoes()[self._vetoes :]
@@ -87,35 +95,58 @@ class Worker:
             self._published = -1
         return bool(vetoes)
 
+    @property
+    def _applied(self) -> int:
+        """How many packets took effect or were refused."""
+        return self._log.released - len(self._ready)
+
     def _take_packets(self) -> bool:
+        """Apply packets for about ``AT_ONCE_S``; False: there are none."""
         began = self._clock()
-        packets = self._store.turns(self._turn, AT_ONCE)
-        for packet in packets:
-            self._take(packet)
-            self._turn += 1
+        applied, arrivals = self._applied, self._arrivals
+        if not self._ready:
+            self._read_arrivals()
+        while self._ready:
+            self._apply(self._ready.popleft())
             if self._clock() > began + AT_ONCE_S:
                 break
-        if packets and self._turn > self._resumed_at:
-            self._store.progress(self._turn, self._corrections())
-        return bool(packets)
+        if self._applied > max(applied, self._resumed_at):
+            self._store.progress(self._applied, self._corrections())
+        return self._arrivals > arrivals or self._applied > applied
 
-    def _take(self, packet: StoredPacket) -> None:
-        """One packet takes effect, or is refused and from now on counts as refused."""
-        if packet.refusal is None:
-            try:
-                self._fleet.receive(packet.data)
-            except PacketError as error:
-                self._store.refuse(self._turn, str(error))
-            except MemoryError:
-                raise  # the machine's fault, not the packet's: the next worker tries again
-            except Exception as error:
-                # Nobody knows what it left behind: the next worker begins anew and without it.
-                self._store.refuse(self._turn, f"the cloud failed on it: {type(error).__name__}: {error}")
-                raise
+    def _read_arrivals(self) -> None:
+        """Read what arrived, and queue the packets that may take effect now."""
+        read = self._store.arrivals(self._arrivals, AT_ONCE)
+        arrived = {(packet.robot, packet.epoch, packet.sequence): packet for _, packet in read}
+        for self._arrivals, packet in read:
+            session = session_name(packet.robot, packet.epoch)
+            number = PacketNumber(session, packet.sequence)
+            if packet.refusal is None:
+                self._log.add(number, packet.time)
             else:
-                self._times[packet.robot, packet.epoch] = packet.time
-                return
-        self._fleet.skip(packet.robot, packet.epoch, packet.sequence)
+                self._log.refuse(number)
+            for _, sequence in self._log.ready(session):
+                key = (packet.robot, packet.epoch, sequence)
+                self._ready.append(arrived.get(key) or self._store.packet(*key))
+
+    def _apply(self, packet: StoredPacket) -> None:
+        """One packet takes effect, or is refused and from now on counts as refused."""
+        try:
+            self._fleet.apply(decode(packet.data))
+        except PacketError as error:
+            self._refuse(packet, str(error))
+        except MemoryError:
+            raise  # the machine's fault, not the packet's: the next worker tries again
+        except Exception as error:
+            # What it left behind is unknown: the next worker starts again without it.
+            self._refuse(packet, f"the cloud failed on it: {type(error).__name__}: {error}")
+            raise
+        else:
+            self._times[packet.robot, packet.epoch] = packet.time
+
+    def _refuse(self, packet: StoredPacket, reason: str) -> None:
+        self._store.refuse(packet.robot, packet.epoch, packet.sequence, reason)
+        self._log.refuse(PacketNumber(session_name(packet.robot, packet.epoch), packet.sequence))
 
     def _corrections(self) -> list[SessionCorrection]:
         by_session = {correction.robot: correction for correction in self._fleet.corrections()}
@@ -128,7 +159,7 @@ class Worker:
     def _finalize(self) -> bool:
         """Answer the oldest request whose packets and vetoes have all taken effect."""
         for asked in self._store.finalizations():
-            if asked.run or asked.failure or asked.turns > self._turn or asked.vetoes > self._vetoes:
+            if asked.run or asked.failure or asked.arrivals > self._arrivals or asked.vetoes > self._vetoes:
                 continue
             self._answer(asked)
             return True
@@ -137,7 +168,7 @@ class Worker:
     def _answer(self, asked: Finalization) -> None:
         name = str(asked.number)
         try:
-            self._run(self._fleet.finalize()).save(self._folder.run(name), force=True)
+            self._run(self._result()).save(self._folder.run(name), force=True)
         except (
             Exception
         ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
@@ -148,10 +179,23 @@ class Worker:
         self._published = -1
         self._tell("finalized", asked.number)
 
+    def _result(self) -> FleetResult:
+        """The result of all packets that took effect."""
+        envelopes = self._store.envelopes(self._arrivals)
+        arrived = (
+            (envelope.time, PacketNumber(session_name(envelope.robot, envelope.epoch), envelope.sequence))
+            for envelope in envelopes
+            if not envelope.is_refused
+        )
+        return self._fleet.finalize(self._log, arrived, self._read)
+
+    def _read(self, number: PacketNumber) -> Packet:
+        return decode(self._store.packet(*robot_and_epoch(number.session), number.sequence).data)
+
     def _publish(self) -> bool:
         """Write the live run folder, if something is new and the last time is long enough ago."""
         now = self._clock()
-        if self._published == self._turn or self._turn < self._resumed_at or now < self._publish_at:
+        if self._published == self._applied or self._applied < self._resumed_at or now < self._publish_at:
             return False
         try:
             self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False))
@@ -159,9 +203,9 @@ class Worker:
             _log.error("the live map stays as it was: %s: %s", type(error).__name__, error)
             self._publish_at = now + PAUSE_S
             return False
-        self._published = self._turn
+        self._published = self._applied
         self._publish_at = self._clock() + max((self._clock() - now) / LIVE_SHARE, LIVE_EVERY_S)
-        self._tell("live", self._turn)
+        self._tell("live", self._applied)
         return True
 
     def _run(self, result: FleetResult, with_local_maps: bool = True) -> Run:
@@ -170,7 +214,7 @@ class Worker:
             for state in self._fleet.vocabularies()
         ]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-        metrics = [Metric("turns", self._turn, "1"), *words, *traffic_metrics(self._store.traffic(), tracks)]
+        metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(self._store.traffic(), tracks)]
         return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)
 
 

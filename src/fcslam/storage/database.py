@@ -1,4 +1,4 @@
-"""SQLite as this project uses it: one file, durable transactions, one kind of error."""
+"""SQLite databases: one file, durable transactions, schema versions, one kind of error."""
 
 import os
 import sqlite3
@@ -45,7 +45,7 @@ class Database:
         self._path = path
         self._lock, self._reading_lock, self._sharing_lock = threading.Lock(), threading.Lock(), threading.Lock()
         self._waiting: deque[_Waiting] = deque()
-        with told(path):
+        with translate_errors(path):
             # What is acknowledged must outlast a loss of power: FULL.
             self._connection = _connected(path, "journal_mode=WAL", "synchronous=FULL")
             # A commit takes as long as the disk does. On a connection of their own readers see what was there before.
@@ -65,7 +65,7 @@ class Database:
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
         """What is executed in the block happens as a whole and is on disk afterwards, or does not happen at all."""
-        with self._lock, told(self._path):
+        with self._lock, translate_errors(self._path):
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 yield self._connection
@@ -108,7 +108,7 @@ class Database:
 
     def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
         """All rows that a query finds."""
-        with self._reading_lock, told(self._path):
+        with self._reading_lock, translate_errors(self._path):
             return self._reading.execute(statement, values).fetchall()
 
     def value(self, statement: str, values: Sequence[object] = ()) -> Any:
@@ -124,7 +124,10 @@ class Database:
         """
         staging = path.with_name(f".{path.name}.partial")
         # A connection of its own: it takes long, and in write-ahead mode keeps nobody waiting.
-        with told(path), closing(sqlite3.connect(self._path, timeout=BUSY_S, isolation_level=None)) as connection:
+        with (
+            translate_errors(path),
+            closing(sqlite3.connect(self._path, timeout=BUSY_S, isolation_level=None)) as connection,
+        ):
             connection.execute("PRAGMA trusted_schema=OFF")
             staging.unlink(missing_ok=True)
             try:
@@ -140,7 +143,10 @@ def check_file(path: Path, schema: str, version: int) -> None:
     Raises:
         StoreError: it is broken, or has other tables than those of ``schema``, or anything else.
     """
-    with told(path), closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found:
+    with (
+        translate_errors(path),
+        closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found,
+    ):
         found.execute("PRAGMA trusted_schema=OFF")
         if _shape(found) != _expected(schema, version):
             raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
@@ -175,8 +181,8 @@ def _expected(schema: str, version: int) -> tuple[int, list[tuple[Any, ...]]]:
 
 
 @contextmanager
-def told(path: Path) -> Iterator[None]:
-    """Turn what disks and SQLite have to say into one line."""
+def translate_errors(path: Path) -> Iterator[None]:
+    """Raise errors of the disk and of SQLite as a ``StoreError`` of one line."""
     try:
         yield
     except (OSError, sqlite3.DatabaseError) as error:

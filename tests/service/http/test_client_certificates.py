@@ -52,7 +52,7 @@ def connect(tmp_path, scripted, authority):
 
 
 def stored(connect):
-    return connect.desk.state.mission.store.turn_count()
+    return connect.desk.state.mission.intake.ready_count()
 
 
 def test_a_robot_with_its_certificate_needs_no_token(connect, authority):

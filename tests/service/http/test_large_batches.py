@@ -38,7 +38,7 @@ def test_a_batch_that_unpacks_to_too_much_is_sent_in_parts(tmp_path, scripted, p
             desk.now += sender.step()
         transport.close()
         statuses = desk.state.measures.text(desk.state.mission).decode()
-        assert desk.state.mission.store.next_sequence("alice", 0) == 35
+        assert desk.state.mission.intake.sessions("alice") == [("alice", 0, 35)]
     assert 'fcslam_refusals_total{status="413"}' in statuses, "it was too much at once"
     assert outbox.waiting == (0, 0)
     outbox.close()

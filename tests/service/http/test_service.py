@@ -95,7 +95,7 @@ def test_a_body_that_is_too_long_is_not_read(desk, announced):
     content = body if announced else iter([body[: 2**19], body[2**19 :]])
     response = desk.ask("POST", PACKETS, "a", content=content)
     assert response.status_code == 413
-    assert desk.state.mission.store.turn_count() == 0
+    assert desk.state.mission.store.envelopes() == []
 
 
 def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
@@ -357,5 +357,5 @@ def test_robots_with_a_camera_are_told_of_a_newer_detector_until_they_have_it(de
 def test_packets_are_on_disk_before_they_are_acknowledged(desk):
     desk.told(desk.send("a", A[:7]))
     seen = MissionStore(desk.state.mission.folder.store)
-    assert [packet.data for packet in seen.turns(0, 100)] == A[:7]
+    assert [packet.data for _, packet in seen.arrivals(0, 100)] == A[:7]
     seen.close()

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import EvaluationError
 from fcslam.evaluation.places.scoring import DescribedSet, PlaceFeatures
@@ -73,7 +73,7 @@ def planar_inliers(a: PlaceFeatures, b: PlaceFeatures) -> int:
 
 def _corrected(packets: list[Packet]) -> FloatArray:
     """Of every keyscan, after all closures, shape (N, 3)."""
-    cloud = Fleet(FleetConfig(join_maps=False), 0)
+    cloud = Cloud(FleetConfig(join_maps=False), 0)
     for packet in packets:
         cloud.receive(encode(packet))
     return cloud.finalize().robots[0].T_map_base

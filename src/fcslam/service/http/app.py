@@ -14,13 +14,13 @@ from fcslam.service.http.missions import file_router, mission_router
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.http.prometheus import Measures
-from fcslam.service.http.robots import network_router, robot_router
+from fcslam.service.http.robots import detector_router, robot_router
 from fcslam.service.http.state import ServiceState
 from fcslam.service.http.viewers import fleet_router, map_router
 
 PREFIX = "/api/v1"
 ROUTERS = (
-    robot_router, network_router, fleet_router, map_router, mission_router, file_router, decision_router, event_router,
+    robot_router, detector_router, fleet_router, map_router, mission_router, file_router, decision_router, event_router,
 )  # fmt: skip
 
 

@@ -73,7 +73,7 @@ def decision_router(state: ServiceState) -> APIRouter:
 
 def _veto(state: ServiceState, told: NewVeto) -> VetoCount:
     mission = state.mission
-    known = {robot.robot for robot in mission.store.sessions()}
+    known = {robot.robot for robot in mission.intake.sessions()}
     unknown = [name for name in (told.robot_i, told.robot_j) if robot_of(name) not in known]
     if unknown:
         raise HTTPException(404, f"there is no robot '{unknown[0]}'; there are {', '.join(sorted(known))}")

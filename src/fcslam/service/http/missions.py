@@ -20,7 +20,7 @@ from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.mission_store import check_mission
 from fcslam.service.missions import EXPORT, IMPORT
-from fcslam.storage.database import told
+from fcslam.storage.database import translate_errors
 
 FILE = "application/vnd.sqlite3"
 """Media type of an exported mission."""
@@ -128,7 +128,7 @@ async def _receive(request: Request, path: Path) -> None:
             size += len(chunk)
             if size > LONGEST_IMPORT_BYTES:
                 raise HTTPException(413, f"the file is over {LONGEST_IMPORT_BYTES} bytes")
-            with told(path):
+            with translate_errors(path):
                 await run_in_threadpool(file.write, chunk)
 
 

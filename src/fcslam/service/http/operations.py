@@ -18,7 +18,7 @@ def operations_router(state: ServiceState) -> APIRouter:
     def get_health() -> Health:
         """200 while packets are taken in and the worker is ready for them, 503 otherwise."""
         try:
-            state.mission.store.turn_count()
+            state.mission.store.applied()
         except StoreError as error:
             raise HTTPException(503, "the mission cannot be read") from error
         if state.closing:

@@ -26,7 +26,7 @@ class Measures:
             "fcslam_answer_bytes", "Bytes of packets sent to a robot", ("robot", "kind"), registry=self._registry
         )
         self._refused = Counter("fcslam_refusals", "Requests refused, by status", ("status",), registry=self._registry)
-        self._turns = Gauge("fcslam_packets_stored", "Packets of the open mission", registry=self._registry)
+        self._packets = Gauge("fcslam_packets_stored", "Packets of the open mission", registry=self._registry)
         self._queue = Gauge("fcslam_packets_queued", "Packets without effect so far", registry=self._registry)
         self._waiting = Gauge("fcslam_packets_waiting", "Packets after one that is missing", registry=self._registry)
         self._starts = Gauge("fcslam_worker_starts", "Starts of the open mission's worker", registry=self._registry)
@@ -45,10 +45,10 @@ class Measures:
 
     def text(self, mission: OpenMission) -> bytes:
         """All measures in Prometheus's text format."""
-        turns = mission.store.turn_count()
-        self._turns.set(turns)
-        self._queue.set(turns - mission.store.applied())
-        self._waiting.set(mission.store.waiting_count())
+        ready = mission.intake.ready_count()
+        self._packets.set(ready)
+        self._queue.set(ready - mission.store.applied())
+        self._waiting.set(mission.intake.waiting_count())
         self._starts.set(mission.worker.starts)
         self._alive.set(mission.worker.pid is not None)
         self._uplink.follow(mission)
@@ -60,8 +60,8 @@ class _Uplink(Collector):
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._row: dict[str, int] = {}
-        """Up to which row of its file each mission is counted."""
+        self._counted: dict[str, int] = {}
+        """Last arrival that is counted, by mission."""
         self._traffic: defaultdict[tuple[str, str, str, str], Traffic] = defaultdict(Traffic)
         """By mission, robot, kind and channel; without a kind are packets that could not be read."""
 
@@ -69,10 +69,10 @@ class _Uplink(Collector):
         """Count what came in since the last time; all of it, the first time."""
         name = mission.folder.name
         with self._lock:
-            while arrived := mission.store.arrived(self._row.get(name, 0), _AT_ONCE):
-                for row, robot, kind, channel, traffic in arrived:
+            while groups := mission.store.traffic_since(self._counted.get(name, 0), _AT_ONCE):
+                for arrival, robot, kind, channel, traffic in groups:
                     self._traffic[name, robot, kind or "", channel or ""] += traffic
-                    self._row[name] = max(self._row.get(name, 0), row)
+                    self._counted[name] = max(self._counted.get(name, 0), arrival)
 
     def collect(self) -> Iterator[CounterMetricFamily]:
         """For the registry."""

@@ -11,7 +11,7 @@ from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import RateLimit, read_body
 from fcslam.service.http.responses import PacketProblem, PacketRefusal, RobotState, content, refusals
 from fcslam.service.http.state import ServiceState
-from fcslam.service.intake import Answer
+from fcslam.service.intake import IntakeReply
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, REFUSED_HEADER, read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.packets import unpacked_size
@@ -49,20 +49,20 @@ def robot_router(state: ServiceState) -> APIRouter:
         body = await read_body(request, MAXIMUM_BATCH_BYTES)
         mission = state.mission
 
-        def take() -> Answer:
+        def take() -> IntakeReply:
             _check_rate(state.rate, robot, body)
             return mission.intake.take(robot, agent, body, correction)
 
-        answer = await run_in_threadpool(take)
+        reply = await run_in_threadpool(take)
         mission.worker.ring()
-        state.measures.answer(robot, answer.batch)
-        return Response(answer.batch, media_type=MEDIA_TYPE, headers={REFUSED_HEADER: str(answer.refused)})
+        state.measures.answer(robot, reply.batch)
+        return Response(reply.batch, media_type=MEDIA_TYPE, headers={REFUSED_HEADER: str(reply.refused)})
 
     @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
     def get_state(robot: Name) -> RobotState:
         """Where a robot that starts again goes on, and which of its packets were refused."""
         store = state.mission.store
-        sessions = store.sessions(robot)
+        sessions = state.mission.intake.sessions(robot)
         newest = sessions[-1].epoch if sessions else None
         correction = None if newest is None else store.correction(robot, newest)
         return RobotState(
@@ -77,7 +77,7 @@ def robot_router(state: ServiceState) -> APIRouter:
     return router
 
 
-def network_router(state: ServiceState) -> APIRouter:
+def detector_router(state: ServiceState) -> APIRouter:
     """Detectors for robots."""
     router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
 

@@ -44,12 +44,12 @@ def fleet_router(state: ServiceState) -> APIRouter:
     @router.get("/fleet")
     def get_fleet() -> FleetSummary:
         """Counts."""
-        store, run = state.mission.store, _live_run(state)
+        mission, run = state.mission, _live_run(state)
         return FleetSummary(
-            mission=state.mission.folder.name,
-            packets=store.turn_count(),
-            applied=store.applied(),
-            waiting=store.waiting_count(),
+            mission=mission.folder.name,
+            packets=mission.intake.ready_count(),
+            applied=mission.store.applied(),
+            waiting=mission.intake.waiting_count(),
             robots=list(run.trajectories),
             maps=len({robot.map_index for robot in run.trajectories.values()}),
             # JSON has no NaN
@@ -63,7 +63,7 @@ def fleet_router(state: ServiceState) -> APIRouter:
         """All robots' sessions."""
         return [
             robot
-            for name in dict.fromkeys(s.robot for s in state.mission.store.sessions())
+            for name in dict.fromkeys(s.robot for s in state.mission.intake.sessions())
             for robot in _sessions(state, name)
         ]
 
@@ -179,7 +179,7 @@ def _detectors(state: ServiceState) -> list[DetectorSummary]:
 def _sessions(state: ServiceState, robot: str) -> list[RobotSession]:
     store, mapped = state.mission.store, _live_run(state).trajectories
     told = []
-    for session in store.sessions(robot):
+    for session in state.mission.intake.sessions(robot):
         name = session_name(robot, session.epoch)
         known, correction = mapped.get(name), store.correction(robot, session.epoch)
         told.append(

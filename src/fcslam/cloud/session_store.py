@@ -1,7 +1,7 @@
-"""What the cloud keeps of each robot's session: its packets in order, its laser, its keyscans."""
+"""What the cloud keeps of each session, and the checks of a packet against the earlier ones of its session."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -9,108 +9,43 @@ from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, Place
 from fcslam.wire.limits import MAXIMUM_COORDINATE_M
-from fcslam.wire.messages import Hello, Packet
+from fcslam.wire.messages import Hello
 
 FARTHEST_M = MAXIMUM_COORDINATE_M / 4.0
-"""Of a robot from its start. What joining and optimising maps adds fits between this and what a packet can tell."""
+"""Largest distance of a robot from its start, in metres. Joining and optimising maps moves poses further away; a
+quarter of the packet format's limit leaves room for that."""
 
 
-class RobotStore:
-    """Packets as received are the truth: each is taken once, a robot's in the order of their numbers.
+class SessionStore:
+    """Laser, detectors, keyscans and places of every session; to the cloud each session is a robot.
 
-    A packet that is refused leaves nothing behind, not even its number.
+    Packets of a session come in the order of their numbers. A refused packet changes nothing.
     """
 
     def __init__(self) -> None:
-        self._times: dict[str, dict[int, float]] = {}
-        """Of all packets that came, by session and number."""
-        self._early: dict[tuple[str, int], Packet] = {}
-        """Those that have not taken effect."""
-        self._newest = (-math.inf, "", 0)
-        """In canonical order."""
-        self._in_order = True
-        self._skipped: set[tuple[str, int]] = set()
-        """Robot and number of packets that will never come."""
-        self._expected: dict[str, int] = {}
         self._hellos: dict[str, Hello] = {}
         self._stamps: dict[str, list[float]] = {}
-        """Of every keyscan."""
+        """Of every keyscan, in seconds."""
         self._keyscans: dict[str, list[Keyscan | None]] = {}
-        """None where it was let go."""
+        """None where it was released."""
         self._holders: dict[str, list[int]] = {}
         """How many places hold each keyscan."""
         self._connected: dict[str, int] = {}
-        """Keyscans that motions tie to the first; only they are known to others."""
+        """How many keyscans are connected to the first one by motions; only these are used."""
         self._T_odom_base: dict[str, FloatArray] = {}
-        """Where the motions lead to, from the first keyscan."""
+        """Pose of the newest connected keyscan, by the motions alone, shape (3,)."""
         self._announced: dict[str, set[tuple[Channel, str]]] = {}
-        """Detectors that each robot has said it describes places with, of all its hellos."""
+        """Channels and detector versions of all hellos."""
         self._places: set[tuple[KeyscanId, Channel, str]] = set()
-        """With their detector versions."""
-        self._replies: dict[str, int] = {}
+        """Keyscan, channel and detector version of every place."""
 
     @property
     def robots(self) -> tuple[str, ...]:
         """Robots with at least one keyscan, in the order of their first."""
         return tuple(self._connected)
 
-    @property
-    def arrived_in_canonical_order(self) -> bool:
-        """Whether the packets came in the order in which a replay would bring them."""
-        return self._in_order
-
-    def knows(self, packet: Packet) -> bool:
-        """Whether a packet with this number was here before, or will never come."""
-        robot, sequence = packet.robot, packet.sequence
-        return sequence in self._times.get(robot, ()) or (robot, sequence) in self._skipped
-
-    def admit(self, packet: Packet) -> Iterator[Packet]:
-        """The packets that may take effect now that this one is here; none if it was here before or comes early.
-
-        A packet counts as taken when the next one is asked for.
-        """
-        if self.knows(packet):
-            return
-        robot, sequence = packet.robot, packet.sequence
-        order = packet.time, robot, sequence
-        self._in_order &= order > self._newest
-        self._newest = max(order, self._newest)
-        self._times.setdefault(robot, {})[sequence] = packet.time
-        self._early[robot, sequence] = packet
-        yield from self._ready(robot)
-
-    def skip(self, robot: str, sequence: int) -> Iterator[Packet]:
-        """As ``admit``, for a packet that was refused for good: those after it need not wait for its number."""
-        self._skipped.add((robot, sequence))
-        yield from self._ready(robot)
-
-    def _ready(self, robot: str) -> Iterator[Packet]:
-        while True:
-            sequence = self._expected.get(robot, 0)
-            if (robot, sequence) not in self._skipped:
-                ready = self._early.get((robot, sequence))
-                if ready is None:
-                    return
-                yield ready
-                del self._early[robot, sequence]
-            self._expected[robot] = sequence + 1
-
-    @property
-    def skipped(self) -> frozenset[tuple[str, int]]:
-        """Robot and number of every packet that will never come."""
-        return frozenset(self._skipped)
-
-    def withdraw(self, packet: Packet) -> None:
-        """Forget a packet that turned out to be refused: the next one with its number takes its place."""
-        del self._times[packet.robot][packet.sequence], self._early[packet.robot, packet.sequence]
-
-    def canonical(self) -> list[tuple[str, int]]:
-        """Session and number of all packets in canonical order; a session's name tells its epoch."""
-        times = [(time, robot, sequence) for robot, of in self._times.items() for sequence, time in of.items()]
-        return [(robot, sequence) for _, robot, sequence in sorted(times)]
-
-    def greet(self, hello: Hello) -> None:
-        """The robot begins, or has changed a detector.
+    def add_hello(self, hello: Hello) -> None:
+        """Note how to read the session's packets: at its start, or because a detector changed.
 
         Raises:
             PacketError: it has another laser than before.
@@ -143,8 +78,8 @@ class RobotStore:
         if number == 0:
             self._connected[robot] = 1
 
-    def connect(self, motion: Constraint) -> None:
-        """The motion that leads to the newest keyscan.
+    def add_motion(self, motion: Constraint) -> None:
+        """Connect the newest keyscan to the one before.
 
         Raises:
             PacketError: it does not, the keyscan has one already, or it leads out of all bounds.
@@ -189,7 +124,7 @@ class RobotStore:
                 raise PacketError(f"{robot}: names keyscan {number}, which it never sent")
 
     def hold(self, place: Place) -> bool:
-        """Keep the keyscans of the submap around a place until it is released; False if some were let go before."""
+        """Keep the keyscans of a place's submap until ``release``; False if some of them were released before."""
         robot, numbers = place.id.robot, slice(place.first, place.last + 1)
         if None in self._keyscans[robot][numbers]:
             return False
@@ -197,7 +132,7 @@ class RobotStore:
         return True
 
     def release(self, place: Place) -> None:
-        """A place that was held is needed no more: let those keyscans go that no other place holds."""
+        """Undo ``hold``: drop the keyscans that no other place holds."""
         robot, holders = place.id.robot, self._holders[place.id.robot]
         for number in range(place.first, place.last + 1):
             holders[number] -= 1
@@ -205,7 +140,7 @@ class RobotStore:
                 self._keyscans[robot][number] = None
 
     def keyscans(self, robot: str, first: int = 0, last: int | None = None) -> tuple[Keyscan, ...]:
-        """Connected keyscans first to last (inclusive) of a robot, without those that were let go."""
+        """Connected keyscans first to last (inclusive) of a robot, without released ones."""
         end = self._connected[robot] if last is None else last + 1
         return tuple(keyscan for keyscan in self._keyscans[robot][first:end] if keyscan is not None)
 
@@ -214,7 +149,7 @@ class RobotStore:
         return self._stamps[keyscan.robot][keyscan.number]
 
     def stamps(self, robot: str) -> FloatArray:
-        """When the robot's connected keyscans were taken, shape (N,), whether they were let go or not."""
+        """When the robot's connected keyscans were taken, shape (N,), released or not."""
         return np.array(self._stamps[robot][: self._connected[robot]])
 
     def detector_versions(self, robot: str) -> Mapping[Channel, str]:
@@ -224,9 +159,3 @@ class RobotStore:
     def laser(self, robot: str) -> LaserModel:
         """The robot's laser."""
         return self._hellos[robot].laser
-
-    def number_replies(self, robot: str, count: int) -> int:
-        """Number of the first of ``count`` packets that go to the robot now."""
-        first = self._replies.get(robot, 0)
-        self._replies[robot] = first + count
-        return first

@@ -1,0 +1,77 @@
+"""The cloud within one process: encoded packets in, replies out, one map in the end."""
+
+from dataclasses import replace
+
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.packet_log import PacketLog, PacketNumber
+from fcslam.cloud.replies import ReplyState, SessionCorrection, is_news, replies
+from fcslam.cloud.result import FleetResult
+from fcslam.cloud.sessions import in_session
+from fcslam.cloud.settings import FleetConfig
+from fcslam.errors import PacketError
+from fcslam.records import Place
+from fcslam.wire.messages import Packet
+from fcslam.wire.packets import decode, encode
+
+
+class Cloud:
+    """A fleet and the packets that it is made of, in memory."""
+
+    def __init__(self, config: FleetConfig, seed: int) -> None:
+        self.fleet = Fleet(config, seed)
+        self._log = PacketLog()
+        self._packets: dict[PacketNumber, tuple[float, bytes]] = {}
+        """Time and bytes."""
+        self._corrections: dict[str, SessionCorrection] = {}
+        """The newest that was sent, by session."""
+        self._sent = 0
+        """How many corrections were sent: the version of the next one."""
+
+    def receive(self, data: bytes) -> list[bytes]:
+        """Apply an encoded packet, and those that waited for it; returns encoded replies to its sender.
+
+        Raises:
+            PacketError: the packet is invalid or does not fit what its robot sent before; then it has no effect and
+                its number is used up.
+        """
+        packet = decode(data)
+        number = PacketNumber(in_session(packet).robot, packet.sequence)
+        if number not in self._log:
+            self._packets[number] = packet.time, data
+        self._log.add(number, packet.time)
+        refusal = None
+        for ready in self._log.ready(number.session):
+            try:
+                self.fleet.apply(packet if ready == number else self._read(ready))
+            except PacketError as error:
+                self._log.refuse(ready)
+                del self._packets[ready]
+                refusal = error if ready == number else refusal
+        if refusal is not None:
+            raise refusal
+        return [encode(reply) for reply in self._replies(packet, number.session)]
+
+    def finalize(self) -> FleetResult:
+        """The result of all packets so far; it depends on their set alone."""
+        arrived = ((time_s, number) for number, (time_s, _) in self._packets.items())
+        return self.fleet.finalize(self._log, arrived, self._read)
+
+    def _read(self, number: PacketNumber) -> Packet:
+        return decode(self._packets[number][1])
+
+    def _replies(self, packet: Packet, session: str) -> list[Packet]:
+        robot, epoch = packet.robot, packet.epoch
+        news = self._corrected(packet, session) if isinstance(packet.body, Place) else None
+        known = -1 if news is None else news.correction.version - 1
+        state = ReplyState({epoch: self._log.next_sequence(session)}, news)
+        return replies(robot, state, known, {})
+
+    def _corrected(self, packet: Packet, session: str) -> SessionCorrection | None:
+        """The session's correction if it is news."""
+        estimate, last = self.fleet.correction(session), self._corrections.get(session)
+        if estimate is None or not is_news(last.correction if last else None, estimate):
+            return None
+        correction = replace(estimate, robot=packet.robot, version=self._sent)
+        self._sent += 1
+        self._corrections[session] = SessionCorrection(packet.robot, packet.epoch, packet.time, correction)
+        return self._corrections[session]

@@ -1,0 +1,176 @@
+"""Decisions about closures: which are accepted, which maps they join, and what is revoked when evidence turns."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
+from fcslam.cloud.joining import decide_join, first_estimate
+from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.reevaluation import reevaluate
+from fcslam.cloud.result import Fusion
+from fcslam.cloud.session_store import SessionStore
+from fcslam.cloud.settings import FleetConfig
+from fcslam.geometry import se2
+from fcslam.places.matcher import PlaceMatch
+from fcslam.records import ClosureStatus, Constraint, KeyscanId, Veto
+
+CONTESTED_GROWTH = 1.1
+"""After a re-evaluation confirmed a contested join, the number of closures grows by this factor before the next one:
+the same evidence would be weighed again at every place."""
+
+
+class ClosureDecisions:
+    """Accepts closures, joins maps, applies vetoes and re-evaluates all of it when evidence turns."""
+
+    def __init__(self, config: FleetConfig, sessions: SessionStore, graph: JointGraph) -> None:
+        self._config = config
+        self._sessions = sessions
+        self._graph = graph
+        self.closures = ClosureLog()
+        self.maps: list[list[str]] = []
+        """Sessions by map; maps, and the sessions in them, in the order in which they started."""
+        self.version = 0
+        """How often the joint graph was solved."""
+        self._vetoes: list[Veto] = []
+        self._contested = False
+        """Whether evidence has turned against a join."""
+        self._postponed_until = 0
+        """Number of closures below which a contested join is not re-evaluated."""
+
+    @property
+    def vetoes(self) -> tuple[Veto, ...]:
+        """All vetoes, in their order."""
+        return tuple(self._vetoes)
+
+    def map_of(self, session: str) -> list[str]:
+        """The sessions that share a map with this one, itself included."""
+        return next(sessions for sessions in self.maps if session in sessions)
+
+    def counts(self) -> dict[str, int]:
+        """Accepted closures so far, by kind."""
+        accepted = [entry.is_between for entry in self.closures if entry.closure.status is ClosureStatus.ACCEPTED]
+        return {"within robots": accepted.count(False), "between robots": accepted.count(True)}
+
+    def start_map(self, session: str) -> None:
+        """A new session begins in a map of its own."""
+        self.maps.append([session])
+
+    def add_local(self, closure: Constraint) -> None:
+        """Accept a closure that a robot found within its own map, unless it is vetoed."""
+        i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)
+        edge = self._graph.close(i, j, closure.T_i_j, closure.information)
+        entry = self.closures.add_local(closure, edge)
+        self._apply_vetoes([entry])
+        if entry.vetoed:
+            self._graph.count(edge, holds=False)
+
+    def add_matches(self, matches: Iterable[PlaceMatch], session: str) -> None:
+        """Accept the matches of a session's new place that fit the joint map; join maps on a dominant cluster."""
+        entries = [self.closures.add(match) for match in matches if not self.closures.confirms(match)]
+        self._apply_vetoes(entries)
+        undecided = [entry for entry in entries if not entry.vetoed and not self._accept_if_consistent(entry)]
+        for other in dict.fromkeys(entry.closure.i.robot for entry in undecided):
+            self._decide_pair(other, session)
+
+    def optimize_if_due(self) -> None:
+        """Solve the joint graph if enough closures are new; re-evaluate if evidence turned against a join."""
+        # The graph of a robot alone is solved once, at the end.
+        if len(self._sessions.robots) > 1 and self._graph.is_due(self._config.solve_every):
+            self._optimize()
+        if self._contested and len(self.closures) >= self._postponed_until:
+            self.reevaluate()
+
+    def veto(self, veto: Veto) -> bool:
+        """Exclude closures from now on; maps that only they joined are separated.
+
+        Returns whether the veto changed a decision.
+        """
+        self._vetoes.append(veto)
+        vetoed = self._apply_vetoes([entry for entry in self.closures if not entry.vetoed])
+        changes = any(entry.closure.status is not ClosureStatus.CANDIDATE for entry in vetoed)
+        if changes:
+            self.reevaluate()
+        return changes
+
+    def reevaluate(self) -> Fusion:
+        """Decide every closure again from all evidence: revoke outvoted ones, separate maps that only they joined."""
+        fusion = reevaluate(self._graph, self.closures, self._config.consistency)
+        self.maps = [list(sessions) for sessions in fusion.maps]
+        self._contested, self._postponed_until = False, int(CONTESTED_GROWTH * len(self.closures))
+        self.version += 1
+        return fusion
+
+    def _apply_vetoes(self, entries: Sequence[ClosureEntry]) -> list[ClosureEntry]:
+        """Mark the entries that a veto excludes, and return them."""
+        vetoed = [entry for entry in entries if self._is_vetoed(entry)]
+        for entry in vetoed:
+            entry.vetoed = True
+        return vetoed
+
+    def _is_vetoed(self, entry: ClosureEntry) -> bool:
+        i, j = entry.closure.i, entry.closure.j
+        stamps = self._sessions.stamp(i), self._sessions.stamp(j)
+        return any(veto.forbids(i.robot, stamps[0], j.robot, stamps[1]) for veto in self._vetoes)
+
+    def _accept_if_consistent(self, entry: ClosureEntry) -> bool:
+        """Accept a verified closure that fits the joint map; False if only a cluster may accept it."""
+        closure = entry.closure
+        if closure.status is not ClosureStatus.VERIFIED:
+            return True
+        if closure.i.robot in self.map_of(closure.j.robot):
+            off = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
+            if np.hypot(off[0], off[1]) < self._config.surprise_m and abs(off[2]) < self._config.surprise_rad:
+                self._accept(entry, "fits the joint map")
+                return True
+        entry.independent = True  # the joint map did not predict this closure
+        return False
+
+    def _decide_pair(self, a: str, b: str) -> None:
+        """Join the maps of two sessions, or accept more closures between them, if one cluster dominates."""
+        entries = self.closures.evidence(a, b)
+        decision = decide_join(entries, (a, b), self._graph, self._config.consistency)
+        joined = b in self.map_of(a)
+        self._contested |= joined and decision.contested
+        if not decision.dominant:
+            _explain(entries, decision.reason)
+            return
+        members = [entries[k] for k in decision.members]
+        if not joined:
+            self._join(members, a, b)
+        reason = f"in the dominant cluster of {len(members)} closures ({decision.separate_places} places apart)"
+        fresh = [entry for entry in members if entry.closure.status is not ClosureStatus.ACCEPTED]
+        for entry in fresh:
+            self._accept(entry, reason)
+        _explain(entries, "outside the dominant cluster")
+        if fresh:
+            self._optimize()
+
+    def _join(self, members: list[ClosureEntry], a: str, b: str) -> None:
+        """Move the younger map into the older one's frame."""
+        older, younger = self.map_of(a), self.map_of(b)
+        T_a_b = first_estimate(members, (a, b), self._graph, self._config.consistency)
+        if self.maps.index(older) > self.maps.index(younger):
+            older, younger, T_a_b = younger, older, se2.inverse(T_a_b)
+        self._graph.move(younger, T_a_b)
+        self.maps.remove(younger)
+        older.extend(younger)
+        older.sort(key=self._sessions.robots.index)
+
+    def _accept(self, entry: ClosureEntry, reason: str) -> None:
+        closure = entry.closure
+        if entry.edge is None:
+            entry.edge = self._graph.close(closure.i, closure.j, closure.T_i_j, closure.information)
+        self._graph.count(entry.edge, holds=True)
+        entry.set(ClosureStatus.ACCEPTED, reason)
+
+    def _optimize(self) -> None:
+        self._graph.optimize()
+        self.version += 1
+
+
+def _explain(entries: Iterable[ClosureEntry], reason: str) -> None:
+    """State why closures that are still only verified were not accepted."""
+    for entry in entries:
+        if entry.closure.status is ClosureStatus.VERIFIED:
+            entry.set(ClosureStatus.VERIFIED, reason)

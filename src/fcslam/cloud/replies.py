@@ -1,0 +1,83 @@
+"""What the cloud replies to a robot: acknowledgements, a correction if it is news, and newer detectors.
+
+The same replies leave the service (``service.intake``) and the cloud within one process (``cloud.cloud``).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+
+from fcslam.records import Channel, Correction, DetectorFile
+from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Packet
+
+NEWS_M, NEWS_RAD, NEWS_QUALITY = 1e-3, 1e-5, 0.02
+"""A correction that differs less from the last one is not sent. At 100 m from the origin of ``odom`` the first two
+thresholds are 1 mm. Without a closure the correction changes by rounding alone, and every reply would carry it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionCorrection:
+    """The correction of one session."""
+
+    robot: str
+    epoch: int
+    time: float
+    """The largest stamp that the robot had seen when it sent what the correction rests on."""
+    correction: Correction
+
+
+@dataclass(frozen=True, slots=True)
+class ReplyState:
+    """What the replies to one robot depend on."""
+
+    next_sequences: Mapping[int, int]
+    """By epoch, ascending: number of the first packet that did not arrive; the last epoch is the current one."""
+    correction: SessionCorrection | None = None
+    """Newest correction of the current epoch."""
+    detector_versions: Mapping[Channel, str] | None = None
+    """What the robot describes places with, by its last hello; None before it."""
+
+
+def replies(
+    robot: str, state: ReplyState, known_correction: int, announced: Mapping[Channel, DetectorFile]
+) -> list[Packet]:
+    """The packets that go back to a robot, numbered from 0.
+
+    Args:
+        robot: who gets them.
+        state: what the cloud knows of the robot.
+        known_correction: version of the newest correction that the robot has; -1: none.
+        announced: detectors that robots are to use, by channel.
+    """
+    number = count()
+    packets = [
+        _packet(robot, epoch, number, Acknowledgement(robot, epoch, expected - 1))
+        for epoch, expected in state.next_sequences.items()
+        if expected > 0
+    ]
+    if not state.next_sequences:
+        return packets
+    if (news := state.correction) and news.correction.version > known_correction:
+        packets.append(_packet(robot, news.epoch, number, news.correction, news.time))
+    epoch = max(state.next_sequences)
+    versions = state.detector_versions or {}
+    for channel, file in announced.items():
+        if versions.get(channel, file.version) != file.version:  # a robot without the channel needs no detector
+            packets.append(_packet(robot, epoch, number, DetectorUpdate(robot, file)))
+    return packets
+
+
+def is_news(old: Correction | None, new: Correction) -> bool:
+    """Whether a robot that has ``old`` is to get ``new``; whether the correction is supported is always news."""
+    if old is None or old.map_index != new.map_index:
+        return True
+    x, y, theta = np.abs(old.T_map_odom - new.T_map_odom)
+    turned = min(theta, 2.0 * np.pi - theta)
+    changed = abs(old.quality - new.quality) >= NEWS_QUALITY or (old.quality == 0.0) != (new.quality == 0.0)
+    return bool(max(x, y) >= NEWS_M or turned >= NEWS_RAD or changed)
+
+
+def _packet(robot: str, epoch: int, number: "count[int]", body: Body, time_s: float = 0.0) -> Packet:
+    return Packet(robot, epoch, next(number), time_s, body)
