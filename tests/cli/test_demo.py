@@ -67,7 +67,7 @@ def test_it_says_where_everything_is(tmp_path, capsys):
     assert last == [
         f"run folder: {tmp_path / 'demo' / 'run'}",
         f"figure: {tmp_path / 'demo' / 'figure.png'}",
-        f"every figure measured: {tmp_path / 'demo' / 'evaluation.csv'}",
+        f"all numbers: {tmp_path / 'demo' / 'evaluation.csv'}",
     ]
     assert [line[:6] for line in said.err.splitlines() if " of 5 " in line] == [f"{k} of 5" for k in range(1, 6)]
 
