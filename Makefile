@@ -1,4 +1,4 @@
-# Everything runs from .venv, which the first target that needs it makes.
+# Everything runs from .venv; the first target that needs it creates it.
 PYTHON ?= python3.11
 EXTRAS ?= dev
 VENV := .venv
@@ -23,17 +23,17 @@ BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmar
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo         simulate a fleet, map it, compare with the truth, draw it all"
-	@echo "make test         the tests that need nothing but this folder"
-	@echo "make test-fast    those of them that take less than a second or two each"
+	@echo "make demo         simulate a fleet, map it, evaluate it against ground truth, draw the result"
+	@echo "make test         all tests that need no recordings"
+	@echo "make test-fast    the same without the slow tests"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make check        linter, formatting, types"
-	@echo "make bench        the benchmarks; those on recordings only if FCSLAM_DATA names their folder"
-	@echo "make install      .venv alone; EXTRAS=dev,train,federated,sim,foxglove for more"
-	@echo "make learning     torch and Flower, for training the detector, if they can be had"
-	@echo "make gl           the GL library of the simulated cameras, if it may be installed without a question"
+	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
+	@echo "make install      create .venv; EXTRAS=dev,train,federated,sim,foxglove adds packages"
+	@echo "make learning     install torch and Flower, for training the detector, if they are available"
+	@echo "make gl           install the GL library of the simulated cameras, if permitted"
 	@echo "make docs         write docs/settings.md, the reference of all settings"
-	@echo "make proto        generate the wire format's Python code anew"
+	@echo "make proto        generate the Python code of the wire format"
 
 install: $(INSTALLED)
 

@@ -122,6 +122,7 @@ def test_the_command_is_measured_and_its_failure_ends_the_script(common):
         common.run_fcslam("map", "no-such-log", "--output", "nowhere")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("common")
 def test_the_search_finds_where_a_piece_was_cut_out():
     wean_hall = load(FOLDER / "wean_hall.py")

@@ -92,6 +92,7 @@ def test_choices_and_faults_are_said(tmp_path, capsys):
 # Names
 
 
+@pytest.mark.slow
 def test_names_tell_equal_files_apart(tmp_path, bag, capsys):
     twin = save(tmp_path / "run1.mcap", drive(30))
     assert "NAME=LOG" in refused(capsys, "map", bag, twin, "-o", tmp_path / "out")
@@ -154,6 +155,7 @@ def test_bad_bags_leave_nothing(tmp_path, capsys):
 # fcslam convert
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["a.clf", "a.log.gz", "a.clf.xz", "a.clf.bz2", "a.bag", "a.mcap", "a.db3", "folder", "a.fcslam"]
 )
@@ -173,6 +175,7 @@ def test_options_choose_what_is_converted(tmp_path):
     assert open_source(tmp_path / "other.clf").survey().scan_count == 7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.clf", "a.bag", "folder", "a.fcslam"])
 def test_only_force_replaces(tmp_path, bag, capsys, name):
     output = tmp_path / name

@@ -145,6 +145,7 @@ def test_each_subcommand_has_its_own_options_only(arguments, fleet, tmp_path, ca
     assert "Traceback" not in error
 
 
+@pytest.mark.slow
 def test_a_fleet_without_images_is_said(fleet, tmp_path, capsys):
     assert federate(fleet, tmp_path / "run", robots=("bare",)) == BAD_INPUT
     assert "no round can be completed: bare: " in capsys.readouterr().err

@@ -203,6 +203,7 @@ def test_little_damage_is_tolerated_and_reported(tmp_path, capsys, lines, report
     assert names_in(tmp_path / "run") == RUN_FILES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ranges", [(float("nan"),) * 8, (-1.0,) * 8, (81.91,) * 8, (0.0,) * 8])
 def test_a_laser_that_never_sees_anything_is_no_traceback(tmp_path, capsys, ranges):
     log = save(tmp_path / "blind.log", [flaser(100 + 0.2 * k, pose_at(k), ranges=ranges) for k in range(40)])
@@ -260,6 +261,7 @@ def refused(capsys, tmp_path, *arguments):
     return error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "reason"), BAD_LOGS.values(), ids=BAD_LOGS)
 @pytest.mark.parametrize("first", [True, False])
 def test_a_bad_recording_is_refused(tmp_path, log, capsys, make, reason, first):

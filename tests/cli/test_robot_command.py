@@ -52,6 +52,7 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     assert "belongs to robot 'alice'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_token_goes_with_every_request(log, cloud, tmp_path):
     (tmp_path / "token").write_text("s3cret\n")
     arguments = ["--server", cloud.url, "--state", str(tmp_path), "--token-file", str(tmp_path / "token")]

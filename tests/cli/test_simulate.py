@@ -75,6 +75,7 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["notes"]
 
 
+@pytest.mark.slow
 def test_without_a_gl_library_one_line_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(engine, "_BACKENDS", ("none",))
     monkeypatch.delenv("MUJOCO_GL", raising=False)

@@ -165,6 +165,7 @@ def test_a_veto_parts_what_only_liars_joined(scripted):
     assert fingerprint(feed(before, two_robots()).finalize()) == fingerprint(result)
 
 
+@pytest.mark.slow
 def test_a_veto_clears_the_way_for_the_truth_whenever_it_comes(scripted):
     """Four aliases keep six true closures from joining; vetoed, before or after, they do so no more."""
     alias = closures(A, B, OTHERS[:4], shift=ALIAS)

@@ -129,6 +129,7 @@ def test_corrections_and_graph_say_the_same_as_the_poses(results, strategy):
 # Evidence written by hand
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("strategy", "off_m"), [("two_point", 3.0), ("n_point", 0.5), ("joint", 0.0)])
 def test_a_false_first_match_ruins_who_trusts_it(scripted, strategy, off_m):
     script = [*closures(A, B, MEETINGS[:1], shift=ALIAS), *closures(A, B, MEETINGS[1:])]
@@ -146,6 +147,7 @@ def test_true_matches_of_robots_without_drift_leave_no_error(scripted, strategy)
     assert {c.reason for c in between(result, ClosureStatus.VERIFIED)} <= {"not needed by two_point"}
 
 
+@pytest.mark.slow
 @rigid
 def test_two_matches_join_what_the_joint_graph_leaves_apart(scripted, strategy):
     """The paper asks for no third witness."""

@@ -55,6 +55,7 @@ def test_without_closures_sessions_stay_apart_and_a_third_is_told_from_the_secon
     assert map_of(feed(scripted(), packets).finalize()) == {"a": 0, "a+1": 1, "a+7": 2}
 
 
+@pytest.mark.slow
 def test_sessions_in_any_order_of_arrival_give_the_same_result(scripted):
     script = closures(("a", POSES), ("a+1", POSES), PAIRS)
     expected = fingerprint(feed(scripted(script), in_order(two_starts())).finalize())

@@ -208,6 +208,7 @@ def test_the_command_shows_tables_and_writes_files(scenes, tmp_path, capsys, mon
     assert names == ["i_dim.png", "matching_accuracy.png", "v_turn.png"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

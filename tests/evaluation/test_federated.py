@@ -238,6 +238,7 @@ def test_an_arm_may_not_take_the_name_of_another(name, robots, tmp_path):
         run_study(study(robots, tmp_path, arms={name: {}}))
 
 
+@pytest.mark.slow
 def test_a_network_matches_a_view_with_itself(robots, tmp_path):
     torch.manual_seed(1)
     network = KeypointNetwork("light").eval()

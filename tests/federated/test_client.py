@@ -52,6 +52,7 @@ def same(first, second):
     return all(np.array_equal(first[name], second[name]) for name in first)
 
 
+@pytest.mark.slow
 def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
     whole = robot(folder, tmp_path / "labels").learn(start, 0, "run", settings())
     kept = {name: array.copy() for name, array in start.items()}
@@ -66,6 +67,7 @@ def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
     assert {array.dtype for array in whole.weights.values()} == {np.dtype(np.float32)}
 
 
+@pytest.mark.slow
 def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
     first = robot(folder, tmp_path)
     first.learn(start, 0, "run", settings())

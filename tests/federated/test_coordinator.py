@@ -60,6 +60,7 @@ def by_hand(strategy, answers, before, memory):
     return new
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum"])
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_round_merges_as_a_hand_would(strategy, share, tmp_path):

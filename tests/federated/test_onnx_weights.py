@@ -36,6 +36,7 @@ def lived_in(encoder):
     return network.eval()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["light", "vgg"])
 def test_it_is_the_same_function(encoder, tmp_path):
     network = lived_in(encoder)
@@ -59,6 +60,7 @@ def test_the_network_that_comes_with_fcslam_can_be_trained_on():
     assert np.allclose(maps.code_logits[0], logits, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_its_normalisations_begin_as_none(tmp_path):
     """So everything that training moves is there, and statistics can be frozen."""
     export_onnx(lived_in("light"), tmp_path / "detector.onnx")
@@ -123,6 +125,7 @@ def test_a_fleet_goes_on_from_the_start_it_had_whatever_public_images_there_are_
     assert any((begun[name] != array).any() for name, array in first([]).items())
 
 
+@pytest.mark.slow
 def test_another_network_is_refused_by_name(tmp_path):
     export_onnx(lived_in("light"), tmp_path / "light.onnx")
     quantise_onnx(tmp_path / "light.onnx", tmp_path / "int8.onnx", [np.full((64, 64), 128, np.uint8)])

@@ -202,6 +202,7 @@ def test_robots_that_never_met_are_mapped_each_in_its_own_frame() -> None:
         assert np.allclose(solution.poses[world.variable(robot, 0)], STARTS[robot])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", ["informative", "independent", "excluded"])
 def test_evidence_that_does_not_count_joins_nobody(column: str) -> None:
     world = World(2)

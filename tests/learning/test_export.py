@@ -63,6 +63,7 @@ def test_other_weights_have_another_version():
     assert detector_version(first).startswith("light-")
 
 
+@pytest.mark.slow
 def test_a_place_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):

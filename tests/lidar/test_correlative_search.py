@@ -54,6 +54,7 @@ def penalised(result, guess, window, scan, config):
     return result.score * (1 - away) * (1 - config.angle_penalty * (turn / max(1, turns)) ** 2)
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 2**32 - 1),
     radius=st.sampled_from([0.0, 0.3, 0.75, 1.2]),

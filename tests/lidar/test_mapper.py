@@ -109,6 +109,7 @@ def test_submaps_cover_the_drive(mapped):
     assert mapped.submaps[-1].last == len(travel) - 1
 
 
+@pytest.mark.slow
 def test_the_same_recording_gives_the_same_bytes(scans, mapped):
     again = Mapped(scans)
     assert again.poses.tobytes() == mapped.poses.tobytes()

@@ -74,6 +74,7 @@ def test_without_returns_poses_follow_odometry(truth, odometry):
     np.testing.assert_allclose(poses, odometry, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_blind_stretch_is_bridged_by_odometry(truth):
     odometry = drifting(truth, np.random.default_rng(2), scale=1.05, veer_rad_m=0.03)
     blind = range(150, 190)
@@ -106,6 +107,7 @@ def test_a_standing_robot_stands(truth):
     np.testing.assert_array_equal(found, np.zeros((20, 3)))
 
 
+@pytest.mark.slow
 def test_somebody_who_walks_by_does_not_take_the_robot_along(truth, odometry):
     """A legs-sized box keeps pace with the robot for 10 m."""
     scans = []

@@ -116,6 +116,7 @@ def test_the_mean_along_the_way_is_that_of_its_terms(similarity, places, reach):
     np.testing.assert_allclose(sequence_similarity(3.0 * similarity, places, reach), 3.0 * mean)
 
 
+@pytest.mark.slow
 @given(similarities, st.integers(1, 4), st.integers(0, 3))
 def test_a_way_driven_back_counts_as_one_driven_again(similarity, length, reach):
     for way in (temporally_consistent, sequence_similarity):

@@ -72,6 +72,7 @@ def contents(packets):
     return [encode(packet) for packet in packets]
 
 
+@pytest.mark.slow
 def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     cloud = FakeCloud(correction=CORRECTION.version)
     agent = drive(tmp_path, Network(cloud), scans)
@@ -86,6 +87,7 @@ def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_outage_leaves_no_trace(scans, alone, tmp_path):
     """The cloud is away until the recording is over; the front end never waits for it."""
     cloud, back = FakeCloud(), threading.Event()
@@ -117,6 +119,7 @@ def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_pa
     assert seen[-1] is False
 
 
+@pytest.mark.slow
 def test_a_robot_that_starts_anew_has_a_new_epoch_and_the_old_one_is_not_lost(scans, alone, tmp_path):
     cloud = FakeCloud()
     with pytest.raises(KeyboardInterrupt):
@@ -136,6 +139,7 @@ def test_another_recording_cannot_be_resumed(scans, tmp_path):
         drive(tmp_path, Network(FakeCloud()), scans[1:], resume=True)
 
 
+@pytest.mark.slow
 def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone, tmp_path):
     """The cloud is away until the outbox is full."""
     cloud = FakeCloud()
@@ -233,6 +237,7 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     assert np.array_equal(agent.trajectory()[0], stamps), "not even if it was called the same map then"
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, tmp_path):
     class Closed(Network):
         def state(self):

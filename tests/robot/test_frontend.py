@@ -40,6 +40,7 @@ def bodies(packets, kind):
     return [packet.body for packet in packets if isinstance(packet.body, kind)]
 
 
+@pytest.mark.slow
 def test_packets_are_numbered_timed_and_survive_the_wire(scans):
     _, packets = drive(scans)
     assert [packet.sequence for packet in packets] == list(range(len(packets)))
@@ -50,6 +51,7 @@ def test_packets_are_numbered_timed_and_survive_the_wire(scans):
         assert encode(decode(encode(packet))) == encode(packet)
 
 
+@pytest.mark.slow
 def test_broken_images_cause_no_packet_and_change_none(scans):
     camera = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
     seen = [CameraImage(scan.stamp, bytes(5000), camera, scan.T_odom_base) for scan in scans]
@@ -103,6 +105,7 @@ def test_every_scan_has_a_pose_on_a_keyscan(scans):
             assert np.allclose(pose.T_keyscan_base, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_ranges_between_two_steps_of_the_wire_make_no_difference(scans):
     """The robot works with the ranges that the cloud sees: what the wire rounds off changes nothing."""
     rng = np.random.default_rng(0)

@@ -24,6 +24,7 @@ def driven(records, config=ROBOT):
     return robot, packets + robot.finish()
 
 
+@pytest.mark.slow
 def test_a_kidnapped_robot_begins_anew_where_it_was_put_down():
     scans, moment = kidnapping()
     robot, packets = driven(scans)
@@ -55,6 +56,7 @@ def replace_epoch(packet):
     return encode(replace(packet, epoch=0, body=body))
 
 
+@pytest.mark.slow
 def test_who_cannot_be_lost_ties_the_two_places_together():
     scans, moment = kidnapping()
     robot, packets = driven(scans, BLIND)
@@ -88,6 +90,7 @@ def test_doubt_that_passes_leaves_no_trace():
     assert [encode(packet) for packet in packets] == [encode(packet) for packet in driven(scans, BLIND)[1]]
 
 
+@pytest.mark.slow
 def test_a_recording_that_ends_in_doubt_is_whole():
     scans, moment = kidnapping()
     end = next(k for k, scan in enumerate(scans) if scan.stamp > moment) + 3

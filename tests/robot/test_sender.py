@@ -55,6 +55,7 @@ MOMENTS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(st.lists(MOMENTS, max_size=40), st.integers(1, 7), st.sets(st.integers(0, 40), max_size=5))
 def test_every_packet_arrives_once_and_in_order(tmp_path_factory, moments, large, unwanted):

@@ -147,6 +147,7 @@ def test_without_odometry_at_the_image_the_robot_stands(seen):
     assert len(places(bodies_of(blind)[0])) >= 7
 
 
+@pytest.mark.slow
 def test_no_packet_holds_a_piece_of_an_image(seen):
     """Every packet that a robot with a camera sends, whatever its kind: not 12 bytes of a file, nor 12 grey levels."""
     records, _ = seen

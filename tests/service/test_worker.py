@@ -123,6 +123,7 @@ def rng_order():
     return batches
 
 
+@pytest.mark.slow
 def test_a_worker_that_starts_again_goes_on_as_if_nothing_had_been(cloud, tmp_path, scripted):
     packets = two_robots()
     undisturbed = Cloud(tmp_path / "undisturbed")
@@ -320,6 +321,7 @@ def test_more_robots_join_a_mission_that_was_finished(cloud, tmp_path):
     together.store.close()
 
 
+@pytest.mark.slow
 def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scripted):
     scripted(closures(("a", POSES), ("a+1", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)]))
     first, again = stream("a", POSES, start_s=0.0), stream("a", POSES, start_s=600_000.0)

@@ -35,6 +35,7 @@ def test_the_default_building_is_large_enough_for_a_fleet(seed):
     assert len(plan.rooms) >= 8
 
 
+@pytest.mark.slow
 @every_building
 def test_every_room_has_a_straight_free_way_in(building):
     plan = draw_floor_plan(np.random.default_rng(2), building)

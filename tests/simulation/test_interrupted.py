@@ -51,6 +51,7 @@ def interrupted_and_resumed(robot, folder, items, tail, monkeypatch):
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("items", [0, 1, 2, 37, 100, 10_000])
 def test_interrupted_and_resumed_is_the_same_as_uninterrupted(items, tmp_path, monkeypatch):
     (robot,) = simulate_fleet(BLIND, 1).robots
@@ -95,6 +96,7 @@ def test_what_is_left_out_is_not_made_and_the_rest_is_the_same():
         np.testing.assert_array_equal(a.ranges_m, b.ranges_m)
 
 
+@pytest.mark.slow
 def test_the_command_goes_on(tmp_path, monkeypatch):
     """The second robot is cut off by Ctrl-C, the first is whole."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
@@ -148,6 +150,7 @@ def test_resume_leaves_a_folder_of_something_else_alone(tmp_path, capsys):
     assert files(tmp_path) == {Path("notes"): b"mine"}
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_the_recordings_go_on_later(tmp_path, capsys):
     """A limit on file sizes stands for the disk."""
     whole, full = tmp_path / "whole", tmp_path / "full"

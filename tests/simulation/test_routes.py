@@ -85,6 +85,7 @@ def test_what_cannot_be_reached_is_not_free():
     assert np.all(sides) or not np.any(sides)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_drive_has_the_length_and_the_speeds_asked(seed):
     waypoints = route_of(seed)
@@ -97,6 +98,7 @@ def test_a_drive_has_the_length_and_the_speeds_asked(seed):
     assert np.abs(turns).max() <= TURN_RATE_RAD_S * period_s + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length_m", [0.5, 5.0, 300.0])
 def test_short_and_long_routes(length_m):
     assert length(route_of(3, length_m=length_m)) == pytest.approx(length_m)

@@ -74,6 +74,7 @@ def test_slips_make_odometry_longer_and_nothing_else():
     np.testing.assert_allclose(ends[:, 1:], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_default_odometry_is_bad_enough_to_need_a_map(seed):
     truth = true_drive(seed)

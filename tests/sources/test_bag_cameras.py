@@ -154,6 +154,7 @@ def unmounted(topic, kind, message):
     return topic, kind, message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -219,6 +220,7 @@ def test_the_camera_heard_most_is_chosen_and_said_and_the_user_may_choose(tmp_pa
         open_source(bag, BagOptions(camera_topic="/scan")).survey()
 
 
+@pytest.mark.slow
 def test_the_truth_is_never_taken_for_odometry(tmp_path):
     """Not even where it is the only topic of its type: then odometry is read from tf."""
 

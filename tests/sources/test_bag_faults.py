@@ -242,6 +242,7 @@ def test_a_laser_that_claims_to_see_for_ever(tmp_path):
 # Files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "remedy"), [("run.bag", "rosbag reindex"), ("run.mcap", "mcap recover"), ("run.db3", "ros2 bag reindex")]
 )

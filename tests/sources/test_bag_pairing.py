@@ -41,6 +41,7 @@ def assert_on_the_line(pose, stamp):
 times = st.integers(0, 40_000).map(lambda ms: ms / 1000)
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(st.lists(times, min_size=2, max_size=30, unique=True), st.lists(times, max_size=20), st.floats(0.0, 3.0))
 def test_a_robot_on_a_line_is_where_the_line_says(readings, scans, late_s):

@@ -32,6 +32,7 @@ def recordings(draw):
     return records
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(recordings(), st.sampled_from(["", ".gz", ".xz", ".bz2"]))
 def test_what_is_written_reads_back_equal(tmp_path_factory, records, suffix):

@@ -263,6 +263,7 @@ def test_random_words_never_break_the_reader(tmp_path, first, lines):
     survives(save(tmp_path / "run.log", [first, *lines]))
 
 
+@pytest.mark.slow
 @fuzz
 @given(st.data())
 def test_a_spliced_log_never_breaks_the_reader(tmp_path, data):
@@ -272,6 +273,7 @@ def test_a_spliced_log_never_breaks_the_reader(tmp_path, data):
     survives(written(tmp_path / "run.log", log[:start] + data.draw(st.binary(max_size=20)) + log[end:]))
 
 
+@pytest.mark.slow
 @fuzz
 @given(st.data())
 def test_a_flipped_archive_never_breaks_the_reader(tmp_path, data):

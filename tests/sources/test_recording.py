@@ -75,6 +75,7 @@ def spoil(path, at, by=b"\xff"):
     path.write_bytes(content)
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(recordings())
 def test_what_is_written_reads_back_to_the_last_bit(tmp_path_factory, records):
@@ -259,6 +260,7 @@ def test_a_file_that_is_missing_is_named(tmp_path, name):
         open_source(folder).survey()
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.sampled_from(["meta.yaml", "scans.bin", "odometry.bin", "images.bin", "images/00000001.png"]), st.data())
 def test_no_damage_ends_in_anything_but_fewer_records_or_a_refusal(tmp_path_factory, name, data):
@@ -285,6 +287,7 @@ def test_a_recording_without_scans(tmp_path):
         open_source(written(tmp_path, [image(1.0)])).survey()
 
 
+@pytest.mark.slow
 def test_what_is_on_the_disk_when_the_process_dies_is_whole(tmp_path):
     script = f"""
 import os, sys

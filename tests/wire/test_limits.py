@@ -167,6 +167,7 @@ ALLOWED_BODIES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", ALLOWED_BODIES)
 def test_a_body_at_a_limit_is_written_and_read(body):
     assert same(decode(encode(packet(body))).body, body)

@@ -79,6 +79,7 @@ def test_a_grid_is_seen():
     assert abs(coarse - fine) <= 6
 
 
+@pytest.mark.slow
 @CHANNELS
 @given(data=st.data())
 def test_any_descriptors_come_back(channel, data):
@@ -89,6 +90,7 @@ def test_any_descriptors_come_back(channel, data):
     assert np.array_equal(unpack_descriptors(packed, points, channel), expected)
 
 
+@pytest.mark.slow
 @CHANNELS
 def test_likely_descriptors_come_back_from_less(channel):
     """Descriptors drawn by the predictor itself cost what its probabilities say."""

@@ -101,6 +101,7 @@ def test_nothing_is_read_of_a_body_before_it_is_known_who_sends_it(desk, routes)
     assert {path: asyncio.run(ask("POST", path)) for path in posts} == dict.fromkeys(posts, 401)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("who", ["a", "eye", "boss"])
 def test_who_has_the_right_is_not_turned_away(desk, routes, who):
     desk.told(desk.send("a", A[:9]))

@@ -98,6 +98,7 @@ def test_a_body_that_is_too_long_is_not_read(desk, announced):
     assert desk.state.mission.store.envelopes() == []
 
 
+@pytest.mark.slow
 def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
     statuses = [desk.ask("POST", PACKETS, "a", content=b"").status_code for _ in range(200)]
     limit = statuses.index(429)
