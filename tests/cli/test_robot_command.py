@@ -63,7 +63,7 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--server", "cloud"], "no address of a cloud"),
+        (["--server", "cloud"], "not the address of a cloud"),
         (["--speed", "fast"], "--speed 'fast' is no speed"),
         (["--speed", "-1"], "no speed"),
         (["--speed", "nan"], "no speed"),
@@ -76,7 +76,7 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
             "cannot read the certificate and its key",
         ),
         (["--state", "/dev/null/state"], "cannot be made"),
-        (["--ca", "nowhere"], "no certificate authority"),
+        (["--ca", "nowhere"], "cannot read a certificate authority"),
     ],
 )
 def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reason):

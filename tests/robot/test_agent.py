@@ -135,7 +135,7 @@ def test_a_robot_that_starts_anew_has_a_new_epoch_and_the_old_one_is_not_lost(sc
 def test_another_recording_cannot_be_resumed(scans, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         drive(tmp_path, Network(FakeCloud()), stop_after(scans, 20))
-    with pytest.raises(StateError, match="not what this recording said"):
+    with pytest.raises(StateError, match="differs from that of the interrupted run"):
         drive(tmp_path, Network(FakeCloud()), scans[1:], resume=True)
 
 

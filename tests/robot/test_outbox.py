@@ -151,7 +151,7 @@ def test_a_robot_that_was_lost_goes_on_in_the_next_epoch(outbox, path):
     assert anew.begin("r", resume=False) == 0
     anew.put(of_part(0, 0))
     assert [anew.part(epoch) for epoch in (0, 2, 3, 4)] == [None, None, None, 0]
-    with pytest.raises(StateError, match="not what this recording said"):
+    with pytest.raises(StateError, match="differs from that of the interrupted run"):
         anew.put([replace(said(0, KEYSCAN), epoch=0)])
     anew.close()
 
@@ -237,7 +237,7 @@ def test_what_is_resumed_must_be_the_same(outbox, path):
     with pytest.raises(StateError, match="another recording"):
         again.begin("another", resume=True)
     again.begin("r", resume=True)
-    with pytest.raises(StateError, match="packet 1 is not what this recording said"):
+    with pytest.raises(StateError, match="packet 1 differs from that of the interrupted run"):
         again.put([said(0), said(1, LIDAR_PLACE)])
     again.close()
 

@@ -136,7 +136,7 @@ def test_a_network_comes_as_it_is(cloud, transport):
 
 @pytest.mark.parametrize("url", ["cloud.example", "ftp://cloud.example", "https://", "8443", ""])
 def test_an_address_must_be_one(url):
-    with pytest.raises(CloudError, match="no address of a cloud"):
+    with pytest.raises(CloudError, match="not the address of a cloud"):
         HttpTransport(url, "r", "ab" * 16)
 
 

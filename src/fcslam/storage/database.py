@@ -36,20 +36,32 @@ class Database:
         StoreError: from every method: the disk is full or broken, and nothing has changed.
     """
 
-    def __init__(self, path: Path, schema: str, version: int) -> None:
+    def __init__(self, path: Path, schema: str, version: int, *, exclusive: bool = False) -> None:
         """Open the file; one that is not there yet is made by ``schema``.
 
+        Args:
+            path: the file.
+            schema: SQL statements that make its tables.
+            version: version of the schema.
+            exclusive: no other process may open the file. A loss of power may then take the last transactions, but a
+                transaction costs no wait for the disk.
+
         Raises:
-            StoreError: it was made by something else, or cannot be used.
+            StoreError: the file was made by something else, or cannot be used.
         """
         self._path = path
         self._lock, self._reading_lock, self._sharing_lock = threading.Lock(), threading.Lock(), threading.Lock()
         self._waiting: deque[_Waiting] = deque()
         with translate_errors(path):
-            # What is acknowledged must outlast a loss of power: FULL.
-            self._connection = _connected(path, "journal_mode=WAL", "synchronous=FULL")
-            # A commit takes as long as the disk does. On a connection of their own readers see what was there before.
-            self._reading = _connected(path, "query_only=ON")
+            if exclusive:
+                pragmas = ("locking_mode=EXCLUSIVE", "journal_mode=WAL", "synchronous=NORMAL")
+                self._connection = self._reading = _connected(path, *pragmas, timeout_s=0.0)
+                self._reading_lock = self._lock
+            else:
+                # What is acknowledged must outlast a loss of power: FULL.
+                self._connection = _connected(path, "journal_mode=WAL", "synchronous=FULL")
+                # A commit takes as long as the disk does. A second connection lets readers see the state before it.
+                self._reading = _connected(path, "query_only=ON")
         with self.transaction() as connection:
             if not _shape(connection)[1]:
                 _make(connection, schema, version)
@@ -57,9 +69,10 @@ class Database:
                 raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
 
     def close(self) -> None:
-        """Let go of the file."""
-        with self._lock, self._reading_lock:
+        """Close the file."""
+        with self._lock:
             self._connection.close()
+        with self._reading_lock:
             self._reading.close()
 
     @contextmanager
@@ -154,9 +167,9 @@ def check_file(path: Path, schema: str, version: int) -> None:
             raise StoreError(f"{path}: broken")
 
 
-def _connected(path: Path, *pragmas: str) -> sqlite3.Connection:
+def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> sqlite3.Connection:
     # Transactions begin where this module says so.
-    connection = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+    connection = sqlite3.connect(path, timeout=timeout_s, isolation_level=None, check_same_thread=False)
     for pragma in ("trusted_schema=OFF", *pragmas):
         connection.execute(f"PRAGMA {pragma}")
     return connection
