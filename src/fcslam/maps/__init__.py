@@ -1,1 +1,1 @@
-"""Maps of several robots: fused from their keyscans, drawn as pictures, cut into tiles."""
+"""Maps of several robots: fused from keyscans, drawn as pictures and figures, cut into tiles."""

@@ -1,6 +1,6 @@
-"""The map as a picture for people: walls, every robot's way, and where the robots met.
+"""The picture of a map: walls, trajectories of the robots, and closures between robots.
 
-Drawn with OpenCV: a sixth of the time that matplotlib takes, and no pixel of a wall is interpolated.
+Drawn with OpenCV, which takes a sixth of the time of matplotlib and does not interpolate walls.
 """
 
 import math
@@ -23,10 +23,11 @@ Color = tuple[int, int, int]
 LONG_SIDE_PX: Final = 1600
 MARGIN_PX: Final = 40
 NARROWEST_PX: Final = 640
-"""The legend needs some width, however small the map is."""
+"""Smallest width of the picture, which the legend needs."""
 RAY_M: Final = 0.15
-"""Known area thinner than this (single beams through windows) does not widen the picture."""
+"""Known area thinner than this, such as single beams through windows, does not extend the picture."""
 FARTHEST_PX: Final = 100_000.0
+"""Pixel coordinates are clipped to this, because OpenCV's fixed-point coordinates overflow beyond."""
 
 LINE_HEIGHT_PX: Final = 40
 SWATCH_PX: Final = 34
@@ -34,15 +35,18 @@ GAP_PX: Final = 14
 FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE: Final = 0.75
 CLOSURES_APART_M: Final = 1.5
-"""Closures are drawn no closer than this to one another."""
+"""Smallest distance between the midpoints of two drawn closures."""
 SUBPIXEL_BITS: Final = 4
+"""Fractional bits of OpenCV's fixed-point coordinates."""
 
 
 class DrawnClosure(NamedTuple):
-    """A loop closure as it is drawn: where its two ends are in ``map``."""
+    """A loop closure for the picture: positions of both ends in ``map``."""
 
     xy_a: FloatArray
+    """Shape (2,), metres."""
     xy_b: FloatArray
+    """Shape (2,), metres."""
     robot_a: str
     robot_b: str
 
@@ -61,7 +65,7 @@ ROBOTS: Final = tuple(map(_bgr, palette.ROBOTS))
 
 @dataclass(frozen=True, slots=True)
 class _Viewport:
-    """The part of the map that is shown, and how map coordinates become pixels."""
+    """The visible part of the map, and the transform from map coordinates to pixels."""
 
     cells: Cells  # row 0 at the lowest y
     corner_xy: FloatArray  # lower left corner in map
@@ -70,7 +74,7 @@ class _Viewport:
     offset_px: int  # from the left edge of the canvas
 
     def pixels(self, points: FloatArray) -> FloatArray:
-        """Points (N, 2+) of ``map`` in pixels, pixel centres at whole numbers; those that are not finite left out."""
+        """Transform points (N, 2+) of ``map`` to pixels (M, 2), whole numbers at centres; drops non-finite points."""
         x, y = ((_finite(points) - self.corner_xy) * (self.cell_px / self.cell_m)).T
         column = self.offset_px + x - 0.5
         row = MARGIN_PX + self.cells.shape[0] * self.cell_px - y - 0.5
@@ -78,10 +82,12 @@ class _Viewport:
 
 
 def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closures: Sequence[DrawnClosure]) -> bytes:
-    """PNG of the map, about 1600 pixels on its long side; what is known and where robots were fits in.
+    """Draw the map as a PNG of about 1600 pixels on its long side, cropped to known area and trajectories.
 
-    ``trajectories`` holds each robot's poses or points in ``map``, shape (N, 2+), drawn from a dot at the first;
-    of ``closures`` those between two robots are counted, and drawn as far as they do not crowd.
+    Args:
+        fused: the map.
+        trajectories: each robot's poses or points in ``map``, shape (N, 2+), drawn with a dot at the first.
+        closures: closures; those between two robots are counted, and drawn unless they are too close together.
     """
     view = _view(fused, trajectories.values())
     canvas = _canvas(view)
@@ -101,7 +107,7 @@ def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closure
 
 
 def _spread(closures: Sequence[DrawnClosure]) -> list[DrawnClosure]:
-    """The shortest closures that keep their distance from one another."""
+    """Select the shortest closures with at least ``CLOSURES_APART_M`` between their midpoints."""
     drawn: list[DrawnClosure] = []
     for closure in sorted(closures, key=lambda m: float(np.hypot(*(m.xy_b - m.xy_a)))):
         middle = closure.xy_a + closure.xy_b
@@ -111,7 +117,7 @@ def _spread(closures: Sequence[DrawnClosure]) -> list[DrawnClosure]:
 
 
 def _view(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> _Viewport:
-    """Crop to what matters, then whole pixels per cell, or whole cells per pixel where the map is large."""
+    """Crop the map and scale it to whole pixels per cell, or to whole cells per pixel for a large map."""
     low, high = _shown_box(fused, trajectories)
     cells = fused.cells[low[0] : high[0], low[1] : high[1]]
     corner = np.array(fused.origin_xy) + fused.resolution_m * low[::-1]
@@ -123,7 +129,7 @@ def _view(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> _Viewport:
 
 
 def _shown_box(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and one past the last (row, column) of known area, single beams apart, and of trajectories."""
+    """First and one past the last (row, column) of known area, without single beams, and of trajectories."""
     shape = fused.cells.shape
     side = max(1, round(RAY_M / fused.resolution_m))
     shown = (fused.cells != Occupancy.UNKNOWN).astype(np.uint8)
@@ -140,13 +146,13 @@ def _shown_box(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> tuple
 
 
 def _finite(points: FloatArray) -> FloatArray:
-    """The (x, y) of points (N, 2+) that have one, shape (M, 2)."""
+    """Finite (x, y) of points (N, 2+), shape (M, 2)."""
     xy = np.asarray(points, dtype=np.float64)[:, :2]
     return np.asarray(xy[np.isfinite(xy).all(axis=1)])
 
 
 def _shrunk(cells: Cells, factor: int) -> Cells:
-    """Blocks of cells as one: a wall in it stays a wall, and what is known stays known."""
+    """Downsample cells (H, W) by a factor: a block with a wall is a wall, one with known cells is known."""
     height, width = cells.shape
     padded = np.pad(cells, ((0, -height % factor), (0, -width % factor)))
     blocks = padded.reshape(padded.shape[0] // factor, factor, -1, factor)
@@ -163,7 +169,7 @@ def _canvas(view: _Viewport) -> Image:
 
 
 def _draw_trajectory(canvas: Image, pixels: FloatArray, color: Color) -> None:
-    """A coloured line with a light edge, so that it stands off from walls and from other lines."""
+    """Draw a coloured line with a light outline, so that it contrasts with walls and other lines."""
     _draw_line(canvas, pixels, FLOOR, 5)
     _draw_line(canvas, pixels, color, 2)
 
@@ -185,7 +191,7 @@ def _fixed_point(pixels: FloatArray) -> NDArray[np.int32]:
 
 
 def _legend(labels: list[tuple[str, Color]], width_px: int, pixels_per_m: float) -> Image:
-    """Names beside their colours, in as many lines as they need, and a scale bar at the right of the first line."""
+    """Legend of names and colours over several lines, with a scale bar at the right of the first line."""
     length_m = round_length(0.2 * width_px / pixels_per_m)
     bar_px = round(length_m * pixels_per_m)
     right = width_px - MARGIN_PX
@@ -214,7 +220,7 @@ def _draw_scale(strip: Image, right: int, bar_px: int, text: str) -> None:
 
 
 def round_length(length_m: float) -> float:
-    """The longest of 1, 2, 5 times a power of ten that is not over ``length_m``."""
+    """Largest number of the form 1, 2 or 5 times a power of ten that does not exceed ``length_m``."""
     power = 10.0 ** math.floor(math.log10(length_m))
     return power * max(factor for factor in (1, 2, 5) if factor == 1 or factor * power <= length_m)
 

@@ -10,10 +10,16 @@ from fcslam.runs.map_files import OccupancyMap
 def fuse(
     keyscans: Sequence[Keyscan], T_map_base: FloatArray, lasers: Mapping[str, LaserModel], config: OccupancyConfig
 ) -> OccupancyMap:
-    """Map of all keyscans at their poses (N, 3); ``lasers`` holds each robot's own. The order does not matter.
+    """Compute the occupancy map of keyscans; their order does not matter.
+
+    Args:
+        keyscans: N keyscans of any robots.
+        T_map_base: their poses in ``map``, shape (N, 3), metres and radians.
+        lasers: the laser of each robot.
+        config: the occupancy grid.
 
     Raises:
-        ValueError: poses do not fit the keyscans, ranges do not fit the laser, or a pose is not finite.
+        ValueError: the numbers of poses and keyscans or of ranges and beams differ, or a pose is not finite.
         KeyError: a keyscan's robot has no laser.
     """
     castings = [

@@ -1,4 +1,4 @@
-"""The colours of maps in all pictures, as 0xRRGGBB: a robot has the same one everywhere."""
+"""Colours of all pictures of maps, as 0xRRGGBB. A robot has the same colour in every picture."""
 
 from typing import Final
 
@@ -9,7 +9,7 @@ FLOOR: Final = 0xFFFFFF
 WALL: Final = 0x1F2A33
 FURNITURE: Final = 0xB0BEC5
 INK: Final = 0x37474F
-# Told apart by people with colour-blind eyes too (after Okabe and Ito).
+# Distinguishable with colour vision deficiency (after Okabe and Ito).
 ROBOTS: Final = (0x0072B2, 0xE66100, 0x009E73, 0x7B4FB5, 0xE0A800, 0x56B4E9, 0x8C564B, 0x607D3B)
 CLOSURES: Final = {Channel.LIDAR: 0xC2185B, Channel.CAMERA: 0x3D1E8F}
-"""By the channel that recognised the place."""
+"""Colour of a closure by its channel."""

@@ -1,1 +1,1 @@
-"""Keypoint detectors on scenes with known homographies."""
+"""Evaluation of keypoint detectors on scenes with known homographies."""

@@ -1,4 +1,4 @@
-"""What is compared on scenes: detectors run here, and features that any program extracted."""
+"""The detectors of a homography evaluation: detectors that run here, and features that other programs extracted."""
 
 import time
 from collections import defaultdict
@@ -27,40 +27,41 @@ from fcslam.metrics.framing import Framing, Size
 from fcslam.metrics.homography import inside
 
 _CANDIDATES = 1500
-"""Features that ORB and SIFT are asked for, as in SuperPoint's evaluation."""
+"""Most features of ORB and SIFT, as in SuperPoint's evaluation."""
 _NETWORK_CANDIDATES = 2000
+"""Most features of a network."""
 _NETWORKS = (EvaluatedDetectorKind.ONNX, EvaluatedDetectorKind.LOGITS)
 
 
 @dataclass(frozen=True, slots=True)
 class FramedImage:
-    """An image of a scene, brought to a size."""
+    """An image of a scene, scaled and cropped to a size."""
 
     path: Path
     file_size: Size
-    """Of the image in its file."""
+    """Size of the original image."""
     framing: Framing
     grey: GreyImage
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedDetector:
-    """Something that finds keypoints in pictures, the strongest first, in pixels of the framed picture."""
+    """A named source of keypoints, the strongest first, in pixels of the framed image."""
 
     name: str
     find: Callable[[FramedImage], Keypoints]
     is_timed: bool
-    """Whether its time is that of finding."""
+    """Whether the run time of ``find`` is that of detection."""
 
 
 class Stopwatch:
-    """How long detectors take for a picture: processor time, which other work on the machine hardly changes."""
+    """CPU time of detectors per image, which other load on the machine hardly affects."""
 
     def __init__(self) -> None:
         self._seconds: defaultdict[tuple[str, Size], list[float]] = defaultdict(list)
 
     def find(self, detector: EvaluatedDetector, picture: FramedImage) -> Keypoints:
-        """What the detector finds."""
+        """Run a detector and record its CPU time."""
         began = time.process_time()
         found = detector.find(picture)
         if detector.is_timed:
@@ -69,15 +70,15 @@ class Stopwatch:
         return found
 
     def milliseconds(self) -> Mapping[tuple[str, Size], float]:
-        """Median for each detector and size."""
+        """Median CPU time for each detector and image size."""
         return {key: 1e3 * float(np.median(seconds)) for key, seconds in self._seconds.items()}
 
 
 def frame(path: Path, size: Size) -> FramedImage:
-    """The image in a file, scaled bilinearly and cropped to ``size``.
+    """Read an image, scale it bilinearly and crop it to ``size``.
 
     Raises:
-        FeatureError: it cannot be read.
+        FeatureError: the image cannot be read.
     """
     image = read_grey(path)
     height, width = image.shape
@@ -90,9 +91,12 @@ def frame(path: Path, size: Size) -> FramedImage:
 def choose_detectors(
     names: Sequence[EvaluatedDetectorKind], weights: Sequence[Path], folders: Sequence[Path]
 ) -> tuple[EvaluatedDetector, ...]:
-    """The folders' features first, then the named detectors; if nothing is named, all there are.
+    """Choose extracted features first, then the named detectors; by default all available detectors.
 
-    ``weights``: of networks, each of which is a detector; if none is given, those that come with fcslam.
+    Args:
+        names: kinds of detectors.
+        weights: ONNX files, each a detector of its own; empty: the bundled network.
+        folders: folders with extracted features.
 
     Raises:
         FeatureError: a network's weights cannot be used.
@@ -114,7 +118,7 @@ def choose_detectors(
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """OpenCV on a single thread, as a robot would run it and as times are comparable."""
+    """Run OpenCV on a single thread, as on a robot, so that CPU times are comparable."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -142,7 +146,7 @@ def _classical(name: EvaluatedDetectorKind) -> EvaluatedDetector:
 
 
 def _run_here(name: str, find: Callable[[GreyImage], Keypoints]) -> EvaluatedDetector:
-    find(np.zeros((32, 32), np.uint8))  # what the first call alone costs is nobody's time
+    find(np.zeros((32, 32), np.uint8))  # warm-up: excludes the cost of the first call
     return EvaluatedDetector(name, lambda picture: find(picture.grey), is_timed=True)
 
 
@@ -153,7 +157,7 @@ def _extracted(folder: Path) -> EvaluatedDetector:
 
 
 def _read_framed(folder: Path, picture: FramedImage) -> ImageFeatures:
-    """Features of the image in its file, brought to where they are in the framed picture."""
+    """Features of the original image, transformed to pixels of the framed image."""
     path = folder / picture.path.parent.name / f"{picture.path.stem}.npz"
     features, size = read_features(path)
     if size != picture.file_size:

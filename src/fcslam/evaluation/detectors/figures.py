@@ -1,4 +1,4 @@
-"""Pictures of matches, right and wrong, and curves of matching accuracy."""
+"""Figures of correct and wrong matches, and curves of matching accuracy."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -38,7 +38,7 @@ def draw_figures(
     truth: HomographyGroundTruth,
     watch: Callable[[], None] = lambda: None,
 ) -> None:
-    """Write ``matching_accuracy.png`` and, for each scene, ``SCENE.png``: matches of a pair of middling difficulty.
+    """Write ``matching_accuracy.png`` and, for each scene, ``SCENE.png``: matches of its middle pair of images.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -71,7 +71,7 @@ def _draw_accuracy(path: Path, report: HomographyReport) -> None:
 
 
 def _draw_scene(path: Path, scene: Scene, detectors: Sequence[EvaluatedDetector], truth: HomographyGroundTruth) -> None:
-    """One row a detector: image 1 beside the one in the middle of the others."""
+    """Draw one row for each detector: image 1 beside the middle one of the other images."""
     other, H = scene.others[len(scene.others) // 2]
     first, second = frame(scene.reference, LARGE), frame(other, LARGE)
     true = framed_homography(H, first.framing, second.framing, truth)
@@ -96,7 +96,7 @@ def _draw_lines(axis: "Axes", here: Any, there: Any, right: Any) -> None:
 
 
 def _figure(rows: int, columns: int, size_in: tuple[float, float]) -> tuple[Any, Any]:
-    """A figure that belongs to no window, and its axes (rows, columns)."""
+    """A figure without a window, and its axes (rows, columns)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size_in, layout="constrained")

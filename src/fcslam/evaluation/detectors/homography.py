@@ -1,12 +1,12 @@
-"""Detectors and descriptors on scenes whose homographies are known: the paper's tables I and II, and more.
+"""Evaluates detectors and descriptors on scenes with known homographies: tables I and II of FC-SLAM, and more.
 
-The flavours, each as its origin has it:
+Each measure follows its original definition:
 
 - repeatability and localisation error at 320 x 240, NMS 4, the 300 strongest in common view (SuperPoint);
 - homography from mutual nearest neighbours at 640 x 480 among the 1000 strongest in common view (SuperPoint);
 - mean matching accuracy (D2-Net) and matching score (KP2D) at 640 x 480 among the 1000 strongest of each image.
 
-All but the first with NMS 8, and with the keypoints as the detector gives them.
+All but the first are computed with NMS 8 and without NMS.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,7 +38,7 @@ REPEATABILITY_NMS_PX: Final = 4
 MATCHING_NMS_PX: Final = (8, 0)
 ACCURACY_PX: Final = tuple(range(1, 11))
 DETECTED, IN_COMMON, MATCHED = 1000, 300, 1000
-"""The strongest keypoints that count: after NMS 4, of these in common view, and for matching."""
+"""Most keypoints: after NMS 4, of these in common view, and for matching."""
 
 DescribedKeypoints = ImageFeatures | FloatFeatures
 AnyKeypoints = TypeVar("AnyKeypoints", bound=Keypoints)
@@ -46,10 +46,10 @@ AnyKeypoints = TypeVar("AnyKeypoints", bound=Keypoints)
 
 @dataclass(frozen=True, slots=True)
 class MatchingResult:
-    """How well one pair of images matches."""
+    """Matching measures of one pair of images."""
 
     corner_error_px: float
-    """Of the homography from the matches; infinite if there is none."""
+    """Corner error of the homography estimated from the matches; infinite without one."""
     accuracy: FloatArray
     """Matching accuracy at ``ACCURACY_PX``, shape (10,)."""
     score: float
@@ -61,7 +61,7 @@ NO_MATCHES = MatchingResult(np.inf, np.zeros(len(ACCURACY_PX)), 0.0, 0)
 
 @dataclass(frozen=True, slots=True)
 class PairResult:
-    """What one detector makes of one pair of images."""
+    """Measures of one detector on one pair of images."""
 
     detector: str
     scene: str
@@ -70,20 +70,20 @@ class PairResult:
     """The second image: its file's name without the suffix."""
     repeatability: Repeatability
     matching: Mapping[int, MatchingResult]
-    """By NMS; empty for what has no descriptors."""
+    """Measures by NMS in pixels; empty for detectors without descriptors."""
 
 
 @dataclass(frozen=True, slots=True)
 class HomographyReport:
-    """Every pair by every detector, in this order, and how long a picture takes."""
+    """Measures of every detector on every pair, and CPU times."""
 
     detectors: tuple[str, ...]
     pairs: tuple[PairResult, ...]
     milliseconds: Mapping[tuple[str, Size], float]
-    """Median processor time for one picture on one thread, from grey levels to described keypoints."""
+    """Median CPU time for one image on one thread, from grey levels to described keypoints."""
 
     def of(self, detector: str) -> tuple[PairResult, ...]:
-        """Its pairs; those of all detectors are in one order."""
+        """The pairs of one detector; the order is the same for all detectors."""
         return tuple(pair for pair in self.pairs if pair.detector == detector)
 
 
@@ -98,11 +98,11 @@ def evaluate_homography(
     truth: HomographyGroundTruth = HomographyGroundTruth.CORRECTED,
     watch: Callable[[], None] = lambda: None,
 ) -> HomographyReport:
-    """Run every detector on every scene; ``watch`` is called after each scene of each.
+    """Run every detector on every scene; ``watch`` is called after each scene of each detector.
 
     Raises:
-        FeatureError: an image, or features extracted elsewhere, cannot be read.
-        EvaluationError: features are of another image.
+        FeatureError: an image, or extracted features, cannot be read.
+        EvaluationError: extracted features belong to another image.
     """
     stopwatch, pairs = Stopwatch(), list[PairResult]()
     with one_thread():
@@ -126,7 +126,7 @@ def _evaluate_scene(
 
 
 def _find_all(scene: Scene, detector: EvaluatedDetector, size: Size, stopwatch: Stopwatch) -> list[_Found]:
-    """Keypoints in image 1, then in the others."""
+    """Keypoints of image 1, then of the other images."""
     pictures = [frame(path, size) for path in (scene.reference, *(path for path, _ in scene.others))]
     return [_Found(picture, stopwatch.find(detector, picture)) for picture in pictures]
 
@@ -136,19 +136,19 @@ def _true(H: FloatArray, first: _Found, second: _Found, truth: HomographyGroundT
 
 
 def _match_all(first: _Found, second: _Found, H: FloatArray) -> dict[int, MatchingResult]:
-    """With each NMS."""
+    """Matching measures for each NMS."""
     here, there = described(first.keypoints), described(second.keypoints)
     return {nms_px: match_pair(thinned(here, nms_px), thinned(there, nms_px), H) for nms_px in MATCHING_NMS_PX}
 
 
 def repeat_pair(first: Keypoints, second: Keypoints, H: FloatArray) -> Repeatability:
-    """Repeatability of two pictures' keypoints, the strongest first, at size ``SMALL``; H (3, 3) is the true one."""
+    """Repeatability of the keypoints of two images of size ``SMALL``, the strongest first; H (3, 3) is the true one."""
     here, there = (_points(thinned(found, REPEATABILITY_NMS_PX))[:DETECTED] for found in (first, second))
     return repeatability(here, there, H, SMALL, IN_COMMON)
 
 
 def match_pair(first: DescribedKeypoints, second: DescribedKeypoints, H: FloatArray) -> MatchingResult:
-    """Match two pictures' keypoints, the strongest first, at size ``LARGE``; H (3, 3) is the true one."""
+    """Match the keypoints of two images of size ``LARGE``, the strongest first; H (3, 3) is the true homography."""
     common_first = first.take(in_common_view(_points(first), H, LARGE)[:MATCHED])
     common_second = second.take(in_common_view(_points(second), inverse(H), LARGE)[:MATCHED])
     first, second = first.take(slice(MATCHED)), second.take(slice(MATCHED))
@@ -165,7 +165,7 @@ def match_pair(first: DescribedKeypoints, second: DescribedKeypoints, H: FloatAr
 
 
 def matched_points(first: DescribedKeypoints, second: DescribedKeypoints) -> tuple[FloatArray, FloatArray]:
-    """Where mutual nearest neighbours by descriptor are in each picture, shape (K, 2) twice."""
+    """Positions of mutual nearest neighbours by descriptor in both images, pixels, shape (K, 2) each."""
     if not (len(first.scores) and len(second.scores)):
         return np.empty((0, 2)), np.empty((0, 2))
     pairs = mutual_pairs(*nearest_neighbours(first.descriptors, second.descriptors))
@@ -173,12 +173,12 @@ def matched_points(first: DescribedKeypoints, second: DescribedKeypoints) -> tup
 
 
 def thinned(found: AnyKeypoints, nms_px: float) -> AnyKeypoints:
-    """Those whose boxes hardly overlap those of stronger ones."""
+    """Keypoints after non-maximum suppression by boxes of side ``nms_px``."""
     return found.take(box_nms(found.keypoints_px, nms_px))
 
 
 def described(found: Keypoints) -> DescribedKeypoints:
-    """The same, known to have descriptors; raises TypeError if they have none."""
+    """Narrow the type to keypoints with descriptors; raises TypeError if they have none."""
     if isinstance(found, ImageFeatures | FloatFeatures):
         return found
     raise TypeError("keypoints without descriptors cannot be matched")

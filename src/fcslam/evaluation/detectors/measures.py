@@ -1,4 +1,4 @@
-"""The measures of ``homography``, pair by pair under one name each, and what a table says of them."""
+"""The measures of ``homography`` by name, for each pair and as means over pairs."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -13,9 +13,10 @@ from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
 
 CORRECT_CORNERS_PX = (1, 3, 5)
+"""Thresholds of the corner error of a correct homography."""
 
 Measures = Mapping[str, float]
-"""Of one pair, or means over pairs; what is not known is missing or NaN."""
+"""Measures of one pair, or means over pairs; an unknown measure is missing or NaN."""
 
 
 def pair_measures(pair: PairResult) -> dict[str, float]:
@@ -32,12 +33,12 @@ def pair_measures(pair: PairResult) -> dict[str, float]:
 
 
 def column(pairs: Sequence[PairResult], measure: str) -> FloatArray:
-    """One measure of every pair, shape (N,); NaN where it is not known."""
+    """One measure of every pair, shape (N,); NaN if unknown."""
     return np.array([pair_measures(pair).get(measure, np.nan) for pair in pairs], np.float64)
 
 
 def mean(pairs: Sequence[PairResult], measure: str, kind: SceneKind | None = None) -> float:
-    """Mean of a measure over the pairs, or those of one kind; NaN without any."""
+    """Mean of a measure over the pairs, or over those of one kind of scene; NaN without any."""
     values = column([pair for pair in pairs if kind in (None, pair.kind)], measure)
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else float("nan")
@@ -49,12 +50,12 @@ def interval(pairs: Sequence[PairResult], measure: str, seed: int) -> Interval:
 
 
 def difference(first: Sequence[PairResult], other: Sequence[PairResult], measure: str, seed: int) -> Interval:
-    """By how much ``first`` is above ``other`` on the same pairs, with the paired bootstrap interval."""
+    """Mean difference ``first`` minus ``other`` on the same pairs, with its paired bootstrap interval."""
     return mean_interval(column(first, measure) - column(other, measure), np.random.default_rng(seed))
 
 
 def write_pairs(report: HomographyReport, path: Path) -> None:
-    """Write a CSV file with a line for every pair by every detector, a column for every measure.
+    """Write a CSV file with a line for every detector and pair, and a column for every measure.
 
     Raises:
         OutputError: the file cannot be written.

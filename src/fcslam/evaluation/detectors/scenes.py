@@ -1,8 +1,8 @@
 """Scenes of a plane or a turning camera, in the layout of HPatches (Balntas et al. 2017).
 
 A scene is a folder with images ``1.*``, ``2.*`` ... and text files ``H_1_2``, ``H_1_3`` ..., 3 x 3 numbers each, which
-take pixels of image 1 to the other one. Its name begins with ``i_`` if the light changes, with ``v_`` if the viewpoint
-does.
+map pixels of image 1 to the other image. Its name begins with ``i_`` if the illumination changes, with ``v_`` if the
+viewpoint changes.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from fcslam.records import FloatArray, frozen
 
 
 class SceneKind(StrEnum):
-    """What changes between a scene's images, by its name."""
+    """Change between the images of a scene, from its name."""
 
     ILLUMINATION = "i"
     VIEWPOINT = "v"
@@ -25,13 +25,13 @@ class SceneKind(StrEnum):
 
     @classmethod
     def of(cls, name: str) -> "SceneKind":
-        """The kind that a scene's name tells."""
+        """The kind of a scene with this name."""
         return cls(name[0]) if name.startswith(("i_", "v_")) else cls.OTHER
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Images of the same thing."""
+    """Images of one scene with known homographies."""
 
     folder: Path
     reference: Path
@@ -41,17 +41,17 @@ class Scene:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of the folder."""
         return self.folder.name
 
     @property
     def kind(self) -> SceneKind:
-        """What changes."""
+        """Change between its images."""
         return SceneKind.of(self.name)
 
 
 def find_scenes(folders: Sequence[Path]) -> list[Scene]:
-    """Each folder is a scene, or holds scenes; sorted by name.
+    """Find scenes, sorted by name. Each folder is a scene, or contains scenes.
 
     Raises:
         EvaluationError: a folder is or holds none, two scenes have one name, or a scene's files do not fit together.

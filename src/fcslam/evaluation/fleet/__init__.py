@@ -1,1 +1,1 @@
-"""Runs against the ground truth, and pictures of them."""
+"""Evaluation of runs against the ground truth or reference relations."""

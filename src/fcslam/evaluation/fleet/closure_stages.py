@@ -1,4 +1,4 @@
-"""A run's closures against the truth: by channel, by stage, within robots and between them."""
+"""Precision and recall of a run's closures against the ground truth, by channel, stage and scope."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -28,31 +28,31 @@ BOTH = "both"
 CHANNELS: Mapping[str, frozenset[Channel]] = MappingProxyType(
     {**{str(channel): frozenset({channel}) for channel in Channel}, BOTH: frozenset(Channel)}
 )
-"""Each channel alone, and both together."""
+"""Sets of channels that are scored: each channel alone, and both together."""
 
 LIKE_HEADING_DEG = 45.0
-"""Headings that differ by less let cameras of usual width see the same things."""
+"""Largest difference of headings at which cameras with a common field of view see the same scene."""
 
 
 @dataclass(frozen=True, slots=True)
 class FleetClosureScore:
-    """What the truth says of one set of closures."""
+    """Scores of one set of closures against the ground truth."""
 
     precision: Precision
     recall: Recall
-    """Of all revisits."""
+    """Recall of all revisits."""
     recall_like_heading: Recall
-    """Of the revisits with like headings."""
+    """Recall of the revisits with similar headings."""
     recall_full_precision: Recall
-    """Of all revisits, by those closures alone that are more similar than every wrong one of their channel."""
+    """Recall of all revisits at 100 % precision: only closures more similar than every wrong one of their channel."""
 
 
 FleetClosures = Mapping[tuple[ClosureScope, ClosureStatus, str], FleetClosureScore]
-"""Scores by kind, stage and name in ``CHANNELS``."""
+"""Scores by scope, stage and name in ``CHANNELS``."""
 
 
 def score_closures(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> FleetClosures:
-    """Scores of all sets of closures; one with an end at which the truth is not known is not covered."""
+    """Score all sets of closures. A closure is not covered if the true pose of an end is unknown."""
     judged, sets = _judge(run, known, criteria), closure_sets(run)
     scores = {}
     for within in ClosureScope:
@@ -68,7 +68,7 @@ def score_closures(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> Fl
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """All closures with what the truth says of them; rows are those of the known poses."""
+    """All closures with their errors; rows are those of the known poses."""
 
     truth: PoseTable
     criteria: ClosureCriteria
@@ -83,7 +83,7 @@ class _Judged:
     def score(
         self, stage: Mask, channels: frozenset[Channel], revisits: Revisits, alike: Revisits
     ) -> FleetClosureScore:
-        """Of the closures of some channels for which ``stage``, shape (K,), holds."""
+        """Score the closures of some channels that ``stage``, shape (K,), selects."""
         sets = [stage & self.of_channel[channel] for channel in channels]
         members: Mask = np.logical_or.reduce(sets)
         surest: Mask = np.logical_or.reduce([self._at_full_precision(channel_set) for channel_set in sets])
@@ -99,7 +99,7 @@ class _Judged:
         return revisits.recall(correct, self.truth, self.criteria.reach_m)
 
     def _at_full_precision(self, members: Mask) -> Mask:
-        """The members that are more similar than every wrong one among them."""
+        """Members (K,) that are more similar than every wrong member."""
         wrong = members & self.errors.covered & ~self.errors.correct(self.criteria)
         surer: Mask = members & (self.similarity > np.max(self.similarity[wrong], initial=-np.inf))
         return surer
@@ -110,7 +110,7 @@ def _judge(run: Run, known: KnownPoses, criteria: ClosureCriteria) -> _Judged:
     pairs = closure_rows(run, truth)
     T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
     every_row, one_frame = np.arange(len(truth.stamps)), np.zeros(len(truth.stamps), dtype=np.int64)
-    # Closures end at stamps at which the truth is known: nothing has to be bridged by what the run believes.
+    # The truth is known at the stamps of the closures, so the run's trajectory does not bridge any gap.
     reference = PoseReference(truth, 0.0, every_row, truth.T_map_base, one_frame)
     return _Judged(
         truth, criteria, pairs, closure_errors(pairs, T_i_j, truth, reference),

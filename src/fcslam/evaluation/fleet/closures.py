@@ -1,4 +1,4 @@
-"""Precision and recall of a run's closures, stage by stage, against the optimised graph of reference relations."""
+"""Precision and recall of a run's closures by stage, against the optimised graph of reference relations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,15 +32,15 @@ STAGES: Mapping[ClosureStatus, frozenset[ClosureStatus]] = {
     ClosureStatus.VERIFIED: frozenset(ClosureStatus) - {ClosureStatus.CANDIDATE},
     ClosureStatus.ACCEPTED: frozenset({ClosureStatus.ACCEPTED}),
 }
-"""By which last status a closure has passed a stage. What was rejected or revoked was verified before; what was revoked
-was accepted once or vetoed by hand: the graph does without it."""
+"""Final statuses of the closures that passed each stage. Rejected and revoked closures were verified before. Revoked
+closures do not count as accepted, because the final graph does not contain them."""
 
 DISCARDED = (ClosureStatus.REJECTED, ClosureStatus.REVOKED)
-"""Shown beside the stages."""
+"""Statuses of discarded closures, which are reported beside the stages."""
 
 
 class ClosureScope(StrEnum):
-    """Whether a closure ties two moments of one robot or two robots."""
+    """Whether a closure connects poses of one robot or of two robots."""
 
     ROBOT = "intra_robot"
     FLEET = "inter_robot"
@@ -48,26 +48,26 @@ class ClosureScope(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ClosureScore:
-    """What the reference says of one set of closures."""
+    """Scores of one set of closures against the reference."""
 
     graph: Precision
-    """Against the optimised graph of the relations."""
+    """Precision against the optimised graph of the relations."""
     single: Precision
-    """Against one relation each, the one whose stamps lie nearest."""
+    """Precision against single relations, those with the nearest stamps."""
     recall: Recall | None
-    """None for what was turned down."""
+    """None for discarded closures."""
     chain: tuple[float, float]
-    """Median and maximum of the relations that lead from one end to the other; NaN for none."""
+    """Median and maximum number of relations between the ends of a closure; NaN without any."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClosureReport:
-    """A run's closures against a file of relations."""
+    """Scores of a run's closures against a relations file."""
 
     scores: Mapping[tuple[ClosureScope, ClosureStatus], ClosureScore]
     relations: RelationGraph
     stamps_in_run: int
-    """Of the relations' stamps, those at which the run has a pose of a robot."""
+    """Number of the relations' stamps at which the run has a pose."""
 
 
 def evaluate_closures(run: Path, relations: Path, criteria: ClosureCriteria) -> ClosureReport:
@@ -91,7 +91,7 @@ def evaluate_closures(run: Path, relations: Path, criteria: ClosureCriteria) -> 
 
 
 def closure_rows(run: Run, poses: PoseTable) -> Rows:
-    """Rows of both keyscans of each closure in the run's pose table, shape (K, 2); -1 where it cannot be told which."""
+    """Rows of both ends of each closure in ``poses``, shape (K, 2); -1 if a stamp is missing or ambiguous."""
     robots = {robot: number for number, robot in enumerate(run.trajectories)}
     rows = np.full((len(run.closures), 2), -1, dtype=np.int64)
     for end, names, stamps in (
@@ -139,21 +139,21 @@ def closure_metrics(report: ClosureReport) -> tuple[Metric, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Evidence:
-    """What is known of all closures together."""
+    """Errors and chains of all closures."""
 
     poses: PoseTable
     criteria: ClosureCriteria
     pairs: Rows
-    """Of the closures, shape (K, 2)."""
+    """Rows of the ends of the closures, shape (K, 2)."""
     by_graph: ClosureErrors
     by_one: ClosureErrors
     chains: FloatArray
-    """Relations from one end of each closure to the other, shape (K,); NaN where none lead there."""
+    """Number of relations between the ends of each closure, shape (K,); NaN if they are not connected."""
     revisits: Rows
-    """Pairs of rows that the relations name, shape (R, 2)."""
+    """Revisits according to the relations, pairs of rows, shape (R, 2)."""
 
     def score(self, members: Mask, within: ClosureScope, is_stage: bool) -> ClosureScore:
-        """Of the closures for which ``members``, shape (K,), holds."""
+        """Score the closures that ``members``, shape (K,), selects."""
         covered = self.chains[members & self.by_graph.covered]
         return ClosureScore(
             precision(self.by_graph, members, self.criteria),
@@ -185,13 +185,13 @@ def _gather(run: Run, poses: PoseTable, graph: RelationGraph, node_rows: Rows, c
 
 
 def _placed_reference(graph: RelationGraph, node_rows: Rows, poses: PoseTable, bridge_s: float) -> PoseReference:
-    """The graph's poses at which the run has one, too."""
+    """The graph's poses at stamps of the run."""
     known = np.flatnonzero(node_rows >= 0)
     return PoseReference(poses, bridge_s, node_rows[known], graph.T_component_base[known], graph.components[known])
 
 
 def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable, criteria: ClosureCriteria) -> Mask:
-    """Which relations join two visits, not two moments of one: shape (R,), for rows and stamps (R, 2)."""
+    """Whether a relation connects two visits, not two moments of one visit: shape (R,), for rows and stamps (R, 2)."""
     across = poses.robots[ends[:, 0]] != poses.robots[ends[:, 1]]
     least_s = np.where(across, ACROSS_ROBOTS_GAP_S, criteria.within_gap_s)
     longer: Mask = np.abs(stamps[:, 1] - stamps[:, 0]) > least_s
@@ -199,7 +199,7 @@ def _is_revisit(ends: Rows, stamps: FloatArray, poses: PoseTable, criteria: Clos
 
 
 def closure_sets(run: Run) -> dict[tuple[ClosureScope, ClosureStatus], Mask]:
-    """The closures of each stage, and those turned down, as masks (K,)."""
+    """Masks (K,) of the closures of each stage, and of discarded closures."""
     between = np.array([c.robot_i != c.robot_j for c in run.closures], dtype=np.bool_)
     sets: dict[tuple[ClosureScope, ClosureStatus], Mask] = {}
     for within, kind in ((ClosureScope.ROBOT, ~between), (ClosureScope.FLEET, between)):
@@ -210,7 +210,7 @@ def closure_sets(run: Run) -> dict[tuple[ClosureScope, ClosureStatus], Mask]:
 
 
 def _chains(graph: RelationGraph, node_rows: Rows, errors: ClosureErrors) -> FloatArray:
-    """Relations from one end of each closure to the other, shape (K,); NaN where the graph covers it not."""
+    """Number of relations between the ends of each closure, shape (K,); NaN if the graph does not cover it."""
     number_of = {row: number for number, row in enumerate(node_rows.tolist()) if row >= 0}
     covered = errors.covered
     pairs = np.array([(number_of[a], number_of[b]) for a, b in errors.ends[covered].tolist()], dtype=np.int64)
@@ -234,6 +234,6 @@ def _precision_metrics(name: str, found: Precision) -> list[Metric]:
 
 
 def _quantile(values: FloatArray, share: float) -> float:
-    """Quantile of the values that are numbers; NaN of none."""
+    """Quantile of the finite ``values`` (K,); NaN without any."""
     finite = values[np.isfinite(values)]
     return float(np.quantile(finite, share)) if len(finite) else np.nan

@@ -1,7 +1,7 @@
-"""The truth of a simulated fleet, or one measured from outside: where robots really were, and the true map.
+"""Reads the ground truth of a fleet, simulated or measured: true poses and the true map, in one coordinate frame.
 
-Truth of a robot is a TUM file, `<folder>/<robot>/ground_truth.tum` or `<folder>/<robot>.tum`; the true map is
-`<folder>/ground_truth/map.yaml`, as ROS map_server writes it. All of it is in one coordinate frame.
+The true poses of a robot are a TUM file, `<folder>/<robot>/ground_truth.tum` or `<folder>/<robot>.tum`. The true map is
+`<folder>/ground_truth/map.yaml`, in the format of ROS map_server.
 """
 
 from dataclasses import dataclass
@@ -20,28 +20,28 @@ from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, read_tum
 
 GAP_S = 0.25
-"""Between true poses further apart in time nothing is interpolated."""
+"""Longest gap between true poses that is interpolated."""
 
 LEAST_COVERED = 0.5
-"""Of a robot's scans. With fewer the truth is probably that of another recording."""
+"""Smallest share of a robot's scans with a true pose. With fewer, the truth is probably of another recording."""
 
 TRUE_MAP = Path("ground_truth", "map.yaml")
 
 
 @dataclass(frozen=True, slots=True)
 class KnownPoses:
-    """A run's poses at which the truth is known, row by row."""
+    """Estimated and true poses of a run, at the stamps at which the truth is known."""
 
     estimate: PoseTable
     truth: PoseTable
-    """The same rows; its poses are in the frame of the truth, which counts as one map."""
+    """True poses, row by row as in ``estimate``, in the frame of the truth, which counts as one map."""
 
 
 def truth_folder(run: Path, named: Path | None) -> Path:
-    """Where to look for the truth of the run folder ``run``: what was named, recordings beside it, or its parent.
+    """Folder with the ground truth of a run: ``named`` if given, else ``recordings`` beside the run, else its parent.
 
     Raises:
-        EvaluationError: there is no such folder.
+        EvaluationError: the folder does not exist.
     """
     beside = run.resolve().parent / "recordings"
     folder = named or (beside if beside.is_dir() else run.resolve().parent)
@@ -51,10 +51,10 @@ def truth_folder(run: Path, named: Path | None) -> Path:
 
 
 def known_poses(run: Run, folder: Path) -> KnownPoses:
-    """The run's poses with the truth at their stamps.
+    """Interpolate the true poses at the stamps of a run.
 
     Raises:
-        EvaluationError: a robot has no truth in ``folder``, it cannot be read, or it is not that of the robot's scans.
+        EvaluationError: the truth of a robot is missing, cannot be read, or does not cover the robot's scans.
     """
     if not run.trajectories:
         raise EvaluationError("the run has no robot, so there is nothing to compare with the truth")
@@ -72,10 +72,10 @@ def known_poses(run: Run, folder: Path) -> KnownPoses:
 
 
 def read_grid(path: Path) -> LabelledGrid:
-    """A map that ROS map_server can read, from its YAML file.
+    """Read a map in the format of ROS map_server from its YAML file.
 
     Raises:
-        EvaluationError: one of the two files is missing, broken, or says what no map can be.
+        EvaluationError: one of the two files is missing or invalid.
     """
     try:
         meta = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -93,7 +93,7 @@ def read_grid(path: Path) -> LabelledGrid:
 
 
 def _true_poses(trajectory: RobotTrajectory, stamps: FloatArray, folder: Path) -> FloatArray:
-    """Shape (N, 3), NaN where it is not known."""
+    """True poses (N, 3) at ``stamps`` (N,); NaN if unknown."""
     places = folder / trajectory.robot / "ground_truth.tum", folder / f"{trajectory.robot}.tum"
     path = next((place for place in places if place.is_file()), None)
     if path is None:

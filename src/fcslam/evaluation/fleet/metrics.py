@@ -1,4 +1,4 @@
-"""A fleet's report as named numbers, for tables and for programs."""
+"""The metrics of a fleet report by name, for tables and programs."""
 
 from fcslam.evaluation.fleet.closure_stages import FleetClosureScore
 from fcslam.evaluation.fleet.relations import relation_metrics
@@ -9,7 +9,7 @@ from fcslam.runs import Metric
 
 
 def fleet_metrics(report: FleetReport) -> tuple[Metric, ...]:
-    """The report as named numbers; what is not known is NaN, and there are no figures of a map without a true one."""
+    """List the metrics of a report. Unknown values are NaN; metrics of the map are missing without a true map."""
     metrics = [
         Metric("robots", len(report.robots), "1"),
         Metric("maps", report.maps, "1"),

@@ -1,4 +1,4 @@
-"""Relations as a pose graph: optimised together, they place stamps to each other that no single relation joins."""
+"""Relations as a pose graph. Its optimum gives relative poses of stamps that no single relation connects."""
 
 from dataclasses import dataclass
 
@@ -15,37 +15,38 @@ from fcslam.metrics.relations import Relations
 from fcslam.records import FloatArray, frozen
 
 SIGMA_M, SIGMA_DEG = 0.05, 1.0
-"""Stated standard deviation of a hand-made relation, the same for all: it says when relations contradict each other,
-and where they merely scatter it cancels out."""
+"""Assumed standard deviation of a manual relation, the same for all. It decides which relations contradict each other;
+for consistent relations, it cancels out."""
 
 
 @dataclass(frozen=True, slots=True)
 class RelationGraph:
-    """The stamps of relations at the poses that fit the relations best."""
+    """The optimised pose graph of a set of relations."""
 
     stamps: FloatArray
-    """Every stamp that a relation names, ascending, shape (M,)."""
+    """Stamps of all relations, ascending, shape (M,), seconds."""
     T_component_base: FloatArray
-    """Shape (M, 3); each component has a coordinate frame of its own."""
+    """Optimised poses, shape (M, 3); each component has its own coordinate frame."""
     components: NDArray[np.int64]
-    """Which component a stamp belongs to, joined by relations that hold, shape (M,)."""
+    """Connected component of each stamp by inlier relations, shape (M,)."""
     relations: Relations
-    """Those that the graph was built of; one that names the same stamp twice says nothing and is left out."""
+    """The relations of the graph; relations between equal stamps are dropped."""
     ends: NDArray[np.int64]
-    """Numbers of the stamps that each relation joins, shape (R, 2)."""
+    """Numbers of the stamps that each relation connects, shape (R, 2)."""
     holds: NDArray[np.bool_]
-    """Which relations the robust solve kept, shape (R,)."""
+    """Inliers of the robust optimisation, shape (R,)."""
     residual_m: FloatArray
-    """How far each relation is from the optimised poses, shape (R,); NaN across components."""
+    """Translation residual of each relation, shape (R,); NaN across components."""
     residual_deg: FloatArray
+    """Rotation residual of each relation, shape (R,); NaN across components."""
 
     @property
     def component_sizes(self) -> NDArray[np.int64]:
-        """Stamps in each component, the largest first."""
+        """Number of stamps in each component, the largest first, shape (C,)."""
         return np.sort(np.bincount(self.components))[::-1]
 
     def chain_lengths(self, pairs: NDArray[np.int64]) -> FloatArray:
-        """The fewest relations from one stamp to another for numbers of stamps (K, 2): shape (K,), inf if none lead."""
+        """Length of the shortest chain of relations between stamps with numbers (K, 2): shape (K,), inf without one."""
         joined = self.ends[self.holds]
         links = coo_array((np.ones(len(joined)), tuple(joined.T)), shape=(len(self.stamps), len(self.stamps)))
         sources, row = np.unique(pairs[:, 0], return_inverse=True)
@@ -56,7 +57,7 @@ class RelationGraph:
 
 
 def build_relation_graph(relations: Relations) -> RelationGraph:
-    """Optimise ``relations``, each of which may be false: graduated non-convexity decides."""
+    """Optimise ``relations``, any of which may be false, by graduated non-convexity."""
     useful = relations.where(relations.stamps[:, 0] != relations.stamps[:, 1])
     stamps, numbers = np.unique(useful.stamps, return_inverse=True)
     ends = numbers.reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The relations metric over run folders."""
+"""The relations metric of run folders."""
 
 import csv
 from dataclasses import dataclass
@@ -20,19 +20,19 @@ from fcslam.runs import Metric, Run, metrics_json, open_run
 
 @dataclass(frozen=True, slots=True)
 class RelationsQuestion:
-    """Which relations are asked for."""
+    """Selection of relations."""
 
     across_robots: bool = False
-    """Only those whose two stamps belong to different robots."""
+    """Only relations whose stamps belong to different robots."""
     minimum_gap_s: float | None = None
-    """Only those whose stamps lie further apart; if not said, 20 s across robots and everything otherwise."""
+    """Only relations whose stamps are further apart; None: 20 s across robots, no limit otherwise."""
     parts: Path | None = None
-    """Run folder that says which stamp belongs to which robot, if not the evaluated one: so that one robot's run is
-    measured by the same relations as the run of several that share its recording."""
+    """Run folder that assigns stamps to robots, if not the evaluated one. It lets you evaluate a run of one robot with
+    the same relations as a run of several robots from the same recording."""
 
     @property
     def gap_s(self) -> float:
-        """The gap that applies."""
+        """The effective minimum gap."""
         if self.minimum_gap_s is not None:
             return self.minimum_gap_s
         return ACROSS_ROBOTS_GAP_S if self.across_robots else 0.0
@@ -42,7 +42,7 @@ def evaluate_relations(run: Path, relations: Path, question: RelationsQuestion) 
     """Errors of the run folder ``run`` against the file ``relations``.
 
     Raises:
-        EvaluationError: one of them cannot be read, no relation is asked for, or none names a stamp of the run.
+        EvaluationError: one of them cannot be read, no relation is selected, or none has a stamp of the run.
     """
     reference = read_relations(relations)
     poses = pose_table(open_run(run))
@@ -68,7 +68,7 @@ def pose_table(run: Run) -> PoseTable:
 
 
 def relation_metrics(errors: RelationErrors) -> tuple[Metric, ...]:
-    """The errors as named numbers."""
+    """List the errors as metrics."""
     spreads = (("translation", errors.translation, "m"), ("rotation", errors.rotation, "deg"))
     return (
         *(

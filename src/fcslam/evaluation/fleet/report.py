@@ -1,4 +1,4 @@
-"""A run folder against the truth: trajectories, closures, joins of maps, the map itself, and what it took to send."""
+"""Evaluates a run folder against the ground truth: trajectories, closures, joins, the map, and the traffic."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,23 +27,23 @@ from fcslam.runs import Run, open_run
 
 @dataclass(frozen=True, slots=True)
 class RobotScore:
-    """One robot's trajectory and what it sent."""
+    """Scores of one robot's trajectory, and its traffic."""
 
     robot: str
     map_index: int
     poses: int
     """Laser scans in the run."""
     covered: int
-    """Those at which the truth is known."""
+    """Laser scans with a true pose."""
     joint: PositionErrors
-    """ATE with its whole map moved onto the truth."""
+    """ATE after alignment of the robot's whole map with the truth."""
     alone: PositionErrors
-    """ATE with this robot alone moved onto the truth."""
+    """ATE after alignment of this robot's trajectory with the truth."""
     path_length_m: float
-    """In truth."""
+    """Length of the true path."""
     duration_s: float
     uplink_bytes: float
-    """NaN where the run does not say."""
+    """NaN if the run does not have it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +53,18 @@ class Join:
     robot_a: str
     robot_b: str
     translation_m: float
-    """How wrongly they lie to each other."""
+    """Relative error of both robots, translation."""
     rotation_deg: float
+    """Relative error of both robots, rotation."""
 
     def is_false(self, criteria: ClosureCriteria) -> bool:
-        """Whether it is as wrong as a wrong closure."""
+        """Whether the relative error exceeds the thresholds of a wrong closure."""
         return self.translation_m > criteria.wrong_m or self.rotation_deg > criteria.wrong_deg
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceTraffic:
-    """Places that were sent; NaN where the run does not say."""
+    """Traffic of places; NaN if the run does not have it."""
 
     packets: float
     bytes: float
@@ -71,32 +72,32 @@ class PlaceTraffic:
 
 @dataclass(frozen=True, slots=True)
 class FleetReport:
-    """Everything that the truth says of a run."""
+    """Scores of a run against the ground truth."""
 
     truth: Path
-    """The folder that it was read from."""
+    """Folder of the ground truth."""
     criteria: ClosureCriteria
     robots: tuple[RobotScore, ...]
     maps: int
     joins: tuple[Join, ...]
-    """Of all pairs of robots that are in one map."""
+    """All pairs of robots in one map."""
     within: RelationErrors
-    """Relative poses of one robot."""
+    """Errors of relative poses of one robot."""
     across: RelationErrors
-    """Relative poses of different robots; those in different maps are not usable."""
+    """Errors of relative poses of different robots; pairs in different maps are unusable."""
     closures: FleetClosures
     agreement: GridAgreement | None
-    """Of the first map; None where no true map is known."""
+    """Agreement of the first map with the true map; None without a true map."""
     places: Mapping[Channel, PlaceTraffic]
 
     @property
     def false_joins(self) -> tuple[Join, ...]:
-        """The joins that are false."""
+        """Joins with a relative error above the thresholds."""
         return tuple(join for join in self.joins if join.is_false(self.criteria))
 
 
 def evaluate_fleet(run: Path, truth: Path | None = None, criteria: ClosureCriteria | None = None) -> FleetReport:
-    """Compare the run folder ``run`` with the truth in a folder, by default ``recordings`` beside it or its parent.
+    """Evaluate the run folder ``run`` against the ground truth in a folder, by default that of ``truth_folder``.
 
     Raises:
         EvaluationError: the run or a robot's truth is missing or cannot be read, or they are of different recordings.
@@ -121,7 +122,7 @@ def evaluate_fleet(run: Path, truth: Path | None = None, criteria: ClosureCriter
 
 
 def _poses(known: KnownPoses, rows: Mask) -> tuple[FloatArray, FloatArray]:
-    """``T_truth_base`` and ``T_map_base`` (N, 3) of the rows for which ``rows`` holds."""
+    """``T_truth_base`` and ``T_map_base`` (N, 3) of the rows that ``rows`` (M,) selects."""
     return known.truth.T_map_base[rows], known.estimate.T_map_base[rows]
 
 

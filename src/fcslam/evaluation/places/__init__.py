@@ -1,1 +1,1 @@
-"""Place recognition on images and LiDAR recordings."""
+"""Evaluation of place recognition on images and LiDAR recordings."""

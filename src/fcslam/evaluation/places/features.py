@@ -1,4 +1,4 @@
-"""Whose features describe the sets of places, and sets described by them."""
+"""Describes sets of places with the features of a chosen detector."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ from fcslam.records import Codes
 FEATURES_PER_IMAGE: Final = 500
 LONGEST_SIDE_PX: Final = 400
 FAST_THRESHOLD: Final = 20
-"""Of ORB, as OpenCV has it."""
+"""FAST threshold of ORB, OpenCV's default [grey levels of 255]."""
 
 _IMAGES = {".jpg", ".jpeg", ".png", ".ppm", ".tif", ".tiff"}
 
 
 @dataclass(frozen=True, slots=True)
 class FeatureChoice:
-    """A detector, or a folder with what another one found."""
+    """A detector, or a folder with the features that another program extracted."""
 
     name: str
     detector: FeatureDetector | None
     extracted: Path | None = None
 
     def of(self, image: Path, root: Path) -> PlaceFeatures:
-        """The 500 strongest features of an image of 400 pixels; ``root`` is the folder of its set.
+        """The 500 strongest features of an image downscaled to 400 pixels; ``root`` is the folder of its set.
 
         Raises:
             FeatureError: the image or its features cannot be read.
@@ -47,10 +47,10 @@ class FeatureChoice:
 
 
 def choose_features(choice: str) -> FeatureChoice:
-    """By a detector's name, an .onnx file, or a folder of extracted features.
+    """Choose features by a detector's name, an .onnx file, or a folder of extracted features.
 
     Raises:
-        FeatureError: it is none of these, or the network cannot be used.
+        FeatureError: ``choice`` is none of these, or the network cannot be used.
     """
     path = Path(choice)
     if choice == DetectorKind.ORB:
@@ -67,7 +67,7 @@ def choose_features(choice: str) -> FeatureChoice:
 def describe_sets(
     paths: Sequence[Path], labels: Collection[str], features: FeatureChoice, watch: Callable[[], None] = lambda: None
 ) -> list[DescribedSet]:
-    """Sets of images by ``features``, recordings by what the robot itself makes of them.
+    """Describe sets of images with ``features``, and recordings with the places of the robot's front end.
 
     Raises:
         EvaluationError: a set cannot be read, or two have one name.
@@ -90,7 +90,7 @@ def describe_sets(
 def describe_images(
     place_set: PlaceSet, root: Path, features: FeatureChoice, watch: Callable[[], None] = lambda: None
 ) -> DescribedSet:
-    """The features of every image of a set, each taken once.
+    """Describe every image of a set once.
 
     Raises:
         FeatureError: an image or its features cannot be read.
@@ -106,7 +106,7 @@ def describe_images(
 def describe_training(
     folders: Sequence[Path], features: FeatureChoice, watch: Callable[[], None] = lambda: None
 ) -> list[Codes]:
-    """Descriptors (N, 32) of every image in the folders and those below them.
+    """Descriptors (N, 32) of every image in the folders and their subfolders.
 
     Raises:
         FeatureError: a folder has no image, or one cannot be read.

@@ -1,4 +1,4 @@
-"""Precision over recall of every way to compare places, one panel for each question of each set."""
+"""Precision-recall curves of all scorers, one panel for each question of each set."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ COLOURS: Final = (
 
 
 def curves_figure(results: Sequence[SetResult]) -> Any:
-    """Single best answers: lines before geometry, dashes after it."""
+    """Draw the curves of the single best matches: solid before geometric verification, dashed after it."""
     panels = [(result, question) for result in results for question in result.place_set.questions]
     figure, axes = panel_figure(len(panels), 3, (4.6, 3.8))
     for axis, (result, question) in zip(axes, panels, strict=True):
@@ -39,7 +39,7 @@ def curves_figure(results: Sequence[SetResult]) -> Any:
 
 
 def panel_figure(panels: int, most_columns: int, size_in: tuple[float, float]) -> tuple[Any, list[Any]]:
-    """A figure that belongs to no window, and so many panels of that size row by row."""
+    """A figure without a window, with panels of the given size in inches, row by row."""
     from matplotlib.figure import Figure
 
     columns = min(most_columns, panels)

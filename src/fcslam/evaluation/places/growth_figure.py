@@ -1,4 +1,4 @@
-"""The picture and the table of a growing vocabulary."""
+"""The figure and the table of a growing vocabulary."""
 
 import csv
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ _LOGARITHMIC = ("words", "seconds")
 
 
 def draw_growth(growths: Mapping[str, Growth], caption: str, seed: int) -> Any:
-    """The paper's figure 4 with bands of 95 %, by bootstrap over the groups; ``caption`` says what arrived."""
+    """Draw figure 4 of FC-SLAM with 95 % bootstrap bands over the groups; ``caption`` describes the data."""
     figure, axes = panel_figure(len(_TITLES), 4, (4.4, 3.6))
     for axis, (measure, title) in zip(axes, _TITLES.items(), strict=True):
         for colour, (name, growth) in zip(COLOURS, growths.items(), strict=False):
@@ -58,7 +58,7 @@ def write_growth(folder: Path, growths: Mapping[str, Growth], caption: str, seed
 
 
 def _series(growth: Growth, measure: str, seed: int) -> FloatArray:
-    """Mean, low and high after every batch, shape (U, 3)."""
+    """Mean, lower and upper bound after every batch, shape (U, 3)."""
     if measure in MEASURES:
         return np.array([growth.intervals(update, seed)[measure] for update in range(len(growth.places))])
     values = growth.words if measure == "words" else growth.seconds

@@ -1,7 +1,7 @@
-"""LiDAR places of one robot's recording, as its frontend describes them, with the truth by its own corrected poses.
+"""LiDAR places of one robot's recording, with ground truth from its own optimised poses.
 
-Online, as in a fleet of one. Corrected poses are right to centimetres where reference relations judge them, which is
-nothing to the metre that a match may be off.
+The places come from the robot's front end, online. Optimised poses are accurate to centimetres according to reference
+relations, which is small compared to the 1 m of a match.
 """
 
 from pathlib import Path
@@ -27,18 +27,21 @@ from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
 SAME_M: Final = 1.0
+"""Largest distance of a match."""
 OTHER_M: Final = 10.0
-"""Submaps that are nearer show much of the same."""
+"""Smallest distance of different places; closer submaps overlap."""
 REVISIT_S: Final = 60.0
-"""Places that were described less long ago are not asked for."""
+"""Places newer than this are not retrieved."""
 
 
 def describe_recording(recording: Path) -> DescribedSet:
-    """Every LiDAR place of a recording. Match: within 1 m; different: more than 10 m away; both at least 60 s before.
+    """Describe all LiDAR places of a recording.
+
+    A match is within 1 m, a different place more than 10 m away; both are at least 60 s older than the query.
 
     Raises:
         SourceError: the recording cannot be read.
-        EvaluationError: it has no two places.
+        EvaluationError: the recording has fewer than two places.
     """
     source = open_source(recording)
     config = RobotConfig(channels=(Channel.LIDAR,), lost=LostConfig(doubted=0.0))  # one session, whatever happens
@@ -65,14 +68,14 @@ def describe_recording(recording: Path) -> DescribedSet:
 
 
 def planar_inliers(a: PlaceFeatures, b: PlaceFeatures) -> int:
-    """The most matches of two LiDAR places that one rigid motion explains."""
+    """Number of inliers of the best rigid motion between two LiDAR places."""
     matches = mutual_matches(a.descriptors, b.descriptors, MotionConfig().hamming_limit)
     found = rigid_hypotheses(a.positions, b.positions, matches, HypothesisConfig())
     return found[0].inlier_count if found else 0
 
 
 def _corrected(packets: list[Packet]) -> FloatArray:
-    """Of every keyscan, after all closures, shape (N, 3)."""
+    """Optimised poses of all keyscans, shape (N, 3)."""
     cloud = Cloud(FleetConfig(join_maps=False), 0)
     for packet in packets:
         cloud.receive(encode(packet))

@@ -1,4 +1,4 @@
-"""Place recognition: how well each way to compare places finds the same one again, before and after geometry."""
+"""Place recognition metrics of all scorers, before and after geometric verification."""
 
 import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,31 +32,31 @@ RANKS: Final = (1, 5, 10)
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How one way to compare places answers one question of a set."""
+    """Metrics of one scorer on one question of a set."""
 
     place_set: str
     question: str
     scorer: str
     is_verified: bool
     queries: int
-    """Those that have a match."""
+    """Queries that have a match."""
     measures: Mapping[str, Interval]
     """By name, with 95 % intervals by bootstrap over queries: ``recall_at_<k>``, ``average_precision`` and
     ``recall_at_full_precision`` of the single best matches, ``average_precision_multi`` (no interval),
     ``mismatch_rate``, ``significance``, ``relative_significance``."""
     curve: PrecisionRecall
-    """Of the single best matches."""
+    """Curve of the single best matches."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetResult:
-    """Everything about one set."""
+    """Results of all scorers on one set."""
 
     place_set: PlaceSet
     similarities: Mapping[str, FloatArray]
-    """By scorer, shape (Q, G), before geometry."""
+    """Similarities by scorer, shape (Q, G), before geometric verification."""
     verified: Mapping[str, FloatArray]
-    """After it; empty if it was not asked."""
+    """Similarities by scorer, shape (Q, G), after geometric verification; empty without it."""
     scores: tuple[Score, ...]
 
 
@@ -68,9 +68,15 @@ def evaluate_set(
     watch: Callable[[], None] = lambda: None,
     variants: Callable[[DescribedSet, Scorer], Mapping[str, FloatArray]] = plain,
 ) -> SetResult:
-    """Every scorer on every question; with a ``checker`` also after geometry. ``watch`` is called after each scorer.
+    """Evaluate every scorer on every question of a set.
 
-    ``variants``: what is made of a scorer's similarities; the name of each follows the scorer's.
+    Args:
+        described: the set.
+        scorers: scorers by name.
+        checker: geometric verification; None: none.
+        seed: seed of the bootstrap.
+        watch: called after each scorer.
+        variants: postprocessing of a scorer's similarities, by a suffix of the scorer's name.
     """
     similarities: dict[str, FloatArray] = {}
     verified: dict[str, FloatArray] = {}
@@ -89,7 +95,7 @@ def evaluate_set(
 
 
 def _scores(place_set: PlaceSet, name: str, stages: Sequence[tuple[FloatArray, bool]], seed: int) -> Iterator[Score]:
-    """Every question, before and after geometry."""
+    """Scores of every question, before and after geometric verification."""
     for question, truth in place_set.questions.items():
         for similarity, is_verified in stages:
             measures, retrieved = measure(similarity, truth, np.random.default_rng(seed))

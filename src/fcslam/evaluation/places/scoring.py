@@ -1,6 +1,6 @@
-"""What is compared on places: the fleet's own index in each of its strategies, and what it has to be better than.
+"""Scorers of the place evaluation: the fleet's place index with each strategy, and baselines.
 
-Each gives similarities (Q, G) of queries and gallery, 0 where a place is not retrieved or not admitted.
+Each computes similarities (Q, G) of queries and gallery; 0 if a place is not retrieved or not admitted.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,37 +20,38 @@ from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes, FloatArray
 
 BRUTE_FORCE_BITS: Final = 48
+"""Largest Hamming distance of matching descriptors."""
 BRUTE_FORCE, FOREIGN_TREE = "brute force", "foreign tree"
 FOREIGN_SHAPE: Final = TreeShape(branching=10, depth=4, smallest_split=2, iterations=8)
-"""As DBoW users have it."""
+"""The usual tree of DBoW2: 10 children, 4 levels."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceFeatures:
-    """What describes a place."""
+    """Features of a place."""
 
     positions: NDArray[np.float32]
-    """Shape (N, 2): pixels of an image, or metres in a submap."""
+    """Shape (N, 2): pixels of an image, or metres in the coordinate frame of a submap."""
     descriptors: Codes
     """Shape (N, 32)."""
 
 
 @dataclass(frozen=True, slots=True)
 class DescribedSet:
-    """A set of places and the features of each."""
+    """A set of places with the features of each."""
 
     place_set: PlaceSet
     queries: Sequence[PlaceFeatures]
     gallery: Sequence[PlaceFeatures]
     count_inliers: Callable[[PlaceFeatures, PlaceFeatures], int]
-    """Geometry: how many matches of two places one motion explains."""
+    """Geometric verification: number of inliers of two places."""
 
 
 Scorer = Callable[[DescribedSet], FloatArray]
 
 
 def brute_force(described: DescribedSet) -> FloatArray:
-    """How many descriptors of two places are each other's nearest, at most 48 bits apart."""
+    """Number of mutual nearest neighbours at most 48 bits apart, for all admitted pairs: shape (Q, G)."""
     scores = np.zeros(described.place_set.admitted.shape)
     for q, g in np.argwhere(described.place_set.admitted):
         scores[q, g] = matching_descriptors(described.queries[q].descriptors, described.gallery[g].descriptors)
@@ -58,15 +59,15 @@ def brute_force(described: DescribedSet) -> FloatArray:
 
 
 def matching_descriptors(a: Codes, b: Codes) -> float:
-    """Brute force for two places."""
+    """Number of mutual nearest neighbours at most 48 bits apart of descriptors (N, 32) and (M, 32)."""
     return float(len(mutual_matches(a, b, BRUTE_FORCE_BITS).pairs))
 
 
 class PretrainedVocabulary:
-    """Bags of words as DBoW2 has them: a k-means tree and idf of other images, and neither ever changes."""
+    """Bags of words as in DBoW2: a tree and idf weights trained offline on other images, which never change."""
 
     def __init__(self, training: Sequence[Codes], seed: int, shape: TreeShape = FOREIGN_SHAPE) -> None:
-        """Grow the tree on the descriptors (N, 32) of each of the other images."""
+        """Train the tree on the descriptors (N, 32) of each training image."""
         images = [code_words(codes) for codes in training]
         self._tree: Tree = grow_tree(np.concatenate(images), shape, np.uint64(seed))
         documents = np.zeros(len(self._tree.centres))
@@ -80,11 +81,11 @@ class PretrainedVocabulary:
         return int((self._tree.child_count == 0).sum())
 
     def bag(self, descriptors: Codes) -> BagOfWords:
-        """The words of descriptors (N, 32)."""
+        """Bag of words of descriptors (N, 32)."""
         return bag_of_words(find_leaves(self._tree, code_words(descriptors)).astype(np.int64), self._idf, 0)
 
     def __call__(self, described: DescribedSet) -> FloatArray:
-        """The scores of DBoW2: sum of min over the words."""
+        """L1 scores of DBoW2, shape (Q, G): sum of min over the words."""
         bags = [self.bag(place.descriptors) for place in described.gallery]
         ends = np.cumsum([0, *(len(bag.words) for bag in bags)])
         words, values = (np.concatenate(parts) for parts in zip(*((b.words, b.values) for b in bags), strict=True))
@@ -97,7 +98,7 @@ class PretrainedVocabulary:
 
 
 def strategy_scorer(config: VocabularyConfig, seed: int) -> Scorer:
-    """The fleet's own index: places arrive in the order of the set, and queries see those that are admitted."""
+    """Scorer of the fleet's place index: places arrive in the order of the set, and queries see the admitted ones."""
 
     def score(described: DescribedSet) -> FloatArray:
         index: PlaceIndex[int] = PlaceIndex(config, np.random.default_rng(seed))
@@ -107,7 +108,7 @@ def strategy_scorer(config: VocabularyConfig, seed: int) -> Scorer:
 
 
 def index_scores(index: PlaceIndex[int], described: DescribedSet) -> FloatArray:
-    """Put the gallery into ``index`` under its numbers from 0 and ask; of a stream, each place before it is added."""
+    """Add the gallery to ``index`` and query it: shape (Q, G). A stream queries each place before it is added."""
     admitted = described.place_set.admitted
     count = admitted.shape[1]
     scores = np.zeros(admitted.shape)
@@ -131,7 +132,7 @@ def index_scores(index: PlaceIndex[int], described: DescribedSet) -> FloatArray:
 def choose_scorers(
     strategies: Sequence[Strategy], vocabulary: VocabularyConfig, training: Sequence[Codes], seed: int
 ) -> Mapping[str, Scorer]:
-    """Brute force, the foreign tree if there are other images to train it on, and the index with each strategy."""
+    """Brute force, the pretrained vocabulary if there are training images, and the index with each strategy."""
     scorers: dict[str, Scorer] = {BRUTE_FORCE: brute_force}
     if training:
         scorers[FOREIGN_TREE] = PretrainedVocabulary(training, seed)
@@ -142,7 +143,7 @@ def choose_scorers(
 
 @njit(cache=True)
 def _common(query: FloatArray, ends: NDArray[np.int64], words: NDArray[np.int64], values: FloatArray) -> FloatArray:
-    """Sum of min(query, place) for every place; its words and values are from ``ends[k]`` to ``ends[k + 1]``."""
+    """Sum of min(query, place) for every place, whose words and values are from ``ends[k]`` to ``ends[k + 1]``."""
     scores = np.zeros(len(ends) - 1)
     for place in range(len(ends) - 1):
         for entry in range(ends[place], ends[place + 1]):

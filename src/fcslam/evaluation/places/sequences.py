@@ -1,4 +1,4 @@
-"""What a stream's own order adds to the similarities of its places, whoever computed them."""
+"""Variants of similarities that use the order of a stream."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,18 +11,18 @@ from fcslam.places.sequence import normalised_by_previous, sequence_similarity, 
 from fcslam.records import FloatArray
 
 PLACES: Final = 3
-"""Consecutive places that have to agree, as in DLoopDetector."""
+"""Consecutive places that must agree, as in DLoopDetector."""
 REACH: Final = 1
-"""Stored places by which a step of the query's way may differ from theirs."""
+"""Largest offset between the steps of the query and of the stored sequence, in places."""
 
 
 def plain(described: DescribedSet, scorer: Scorer) -> Mapping[str, FloatArray]:
-    """The similarities (Q, G) as they are, under an empty name."""
+    """The similarities (Q, G) unchanged, under an empty name."""
     return {"": scorer(described)}
 
 
 def in_sequence(described: DescribedSet, scorer: Scorer) -> Mapping[str, FloatArray]:
-    """The similarities (Q, G) as they are, and, of a stream, what its order makes of them, by name."""
+    """The similarities (Q, G) unchanged, and for a stream also their sequence variants, by name."""
     place_set = described.place_set
     if not place_set.is_online:
         return plain(described, scorer)

@@ -1,6 +1,6 @@
-"""Images of places with the truth of which of them show the same one.
+"""Sets of images with ground truth of which images show the same place.
 
-A folder says by what lies in it how it is read:
+The files in a folder decide how it is read:
 
 - ``dataset.csv`` (image, label, split, area; frames of clips ``<clip>_frame_<number>``): floors of a tower that look
   alike. A match is the same clip, at most 4 frame numbers apart; different is another area of the same floor, or the
@@ -15,7 +15,7 @@ A folder says by what lies in it how it is read:
 - ``matches.csv`` (query, gallery, relation) with folders ``queries`` and ``gallery``: relation is ``match`` or
   ``ignored``; what is not listed is different.
 
-Online: every image asks for the earlier ones, those that were just before it left out.
+Online: every image queries the earlier images, except the most recent ones.
 """
 
 import csv
@@ -40,7 +40,7 @@ SAME_CLIP_FRAMES: Final = 4
 OTHER_CLIP_FRAMES: Final = 12
 NEAR_PAIR: Final = 8
 TOUR_GAP: Final = 20
-"""Images of a tour that are nearer in time are not asked for."""
+"""Images of a tour that are not retrieved, because they are just before the query."""
 SEQUENCE_GAP_S: Final = 3.0
 SAME_OVERLAP, OTHER_OVERLAP = 0.5, 0.1
 
@@ -49,15 +49,15 @@ _FRAME = re.compile(r"(.+)_frame_(\d+)")
 
 @dataclass(frozen=True, slots=True)
 class PlaceSet:
-    """Queries (rows), gallery (columns), and what is known of them."""
+    """Queries (rows), gallery (columns), and their ground truth."""
 
     name: str
     queries: tuple[Path, ...]
     gallery: tuple[Path, ...]
     admitted: Pairs
-    """Shape (Q, G): whether the query may be answered by it."""
+    """Shape (Q, G): whether the query may retrieve the place."""
     questions: Mapping[str, PairTruth]
-    """By name; never about pairs that are not admitted."""
+    """Ground truth by name; pairs that are not admitted are ignored."""
 
     @property
     def is_online(self) -> bool:
@@ -66,10 +66,10 @@ class PlaceSet:
 
 
 def read_place_set(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
-    """The set in a folder; ``labels``: of a set that has labels, only these.
+    """Read the set in a folder; ``labels`` selects images of a set with labels.
 
     Raises:
-        EvaluationError: there is no set of a known kind, its files do not fit together, or nothing has those labels.
+        EvaluationError: the folder has no known set, its files are inconsistent, or no image has these labels.
         SourceError: a robot's recording cannot be read.
     """
     readers: dict[str, Callable[[], PlaceSet]] = {
@@ -94,12 +94,12 @@ def read_place_set(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
 
 
 def all_images(place_set: PlaceSet) -> tuple[Path, ...]:
-    """Each once: the gallery, then queries that are not in it."""
+    """All images once: the gallery, then queries that are not in it."""
     return tuple(dict.fromkeys((*place_set.gallery, *place_set.queries)))
 
 
 def _stream(folder: Path, images: tuple[Path, ...], admitted: Pairs, question: str, truth: PairTruth) -> PlaceSet:
-    """An online set; only what is admitted is asked."""
+    """An online set; pairs that are not admitted are ignored."""
     asked = PairTruth(truth.matches & admitted, truth.different & admitted)
     return PlaceSet(folder.resolve().name, images, images, admitted, {question: asked})
 

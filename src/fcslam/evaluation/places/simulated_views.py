@@ -1,7 +1,7 @@
-"""The images of a simulated fleet as places, and how much two of them show of the same walls.
+"""The images of a simulated fleet as places, and the overlap of their views.
 
-Robots are where the simulation had them, and what stands before a camera is what the LiDAR met in the camera's field of
-view: positions alone would call two sides of a wall one place.
+The overlap uses the true poses and the LiDAR returns in the camera's field of view. With positions alone, two sides of
+a wall would be one place.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, ima
 
 EVERY_M: Final = 1.0
 EVERY_RAD: Final = 0.5
-"""A place is so far from the one before it, or turned by so much, as a robot has it."""
+"""Distance or turn between two places of a robot, as in the robot's settings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class FleetViews:
     robots: NDArray[np.int64]
     """Shape (N,): the number of each image's robot."""
     overlap: FloatArray
-    """Shape (N, N), in [0, 1]: as ``lidar_overlap``."""
+    """Result of ``lidar_overlap``, shape (N, N), in [0, 1]."""
 
 
 class _ImagePlace(NamedTuple):
@@ -45,10 +45,10 @@ class _ImagePlace(NamedTuple):
 
 
 def read_fleet_views(folder: Path) -> FleetViews:
-    """Every image of a recorded fleet that is a place.
+    """Read the images of a recorded fleet that are places.
 
     Raises:
-        EvaluationError: there are no two recordings with a camera and the truth, or their sensors differ.
+        EvaluationError: there are fewer than two recordings with a camera and true poses, or their sensors differ.
         SourceError: a recording cannot be read.
     """
     robots = sorted(path.parent for path in folder.glob(f"*/{META}"))
@@ -72,16 +72,16 @@ def read_fleet_views(folder: Path) -> FleetViews:
 def lidar_overlap(
     T_building_laser: FloatArray, ranges_m: FloatArray, laser: LaserModel, half_view_rad: float
 ) -> FloatArray:
-    """Share of what is seen ahead from one pose that is seen ahead from the other, the smaller of both directions.
+    """Overlap of views: share of the returns of one view that the other view sees, the smaller of both directions.
 
-    A return counts as seen again if it lies in the other's field of view where the other's own return in that direction
-    is as far, to a tenth. Where the other has none it cannot be told.
+    The other view sees a return if it is in its field of view and its own return in that direction has the same range,
+    to a tenth. Directions without a return in the other view are ignored.
 
     Args:
-        T_building_laser: shape (N, 3), the true poses.
+        T_building_laser: true poses, shape (N, 3).
         ranges_m: shape (N, beams).
-        laser: of all scans.
-        half_view_rad: what a camera sees to either side of straight ahead.
+        laser: the laser of all scans.
+        half_view_rad: half of the camera's field of view.
 
     Returns:
         Shape (N, N), in [0, 1].
@@ -109,7 +109,7 @@ def lidar_overlap(
 
 
 def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
-    """Images with the scan before each, as they are new: by travel or by turn."""
+    """Images with the scan before each, at least a step of distance or turn apart."""
     images, stamps, scans = [], [], []
     scan = None
     for frame in merged_frames(robot, [scans_file(laser), IMAGES_FILE]):
@@ -135,5 +135,5 @@ def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
 
 
 def _half_view_rad(camera: CameraModel) -> float:
-    """To the nearer of the left and the right edge."""
+    """Angle from straight ahead to the nearer edge of the image."""
     return float(np.arctan2(min(camera.cx, camera.width - 1.0 - camera.cx) + 0.5, camera.fx))

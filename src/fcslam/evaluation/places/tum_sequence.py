@@ -1,4 +1,4 @@
-"""A TUM RGB-D sequence (Sturm et al. 2012): images with depth, and where the camera was."""
+"""Reads a TUM RGB-D sequence (Sturm et al. 2012): images, depth, and camera poses."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,25 +15,25 @@ from fcslam.records import FloatArray
 
 DEPTH_UNITS_PER_M: Final = 5000.0
 GAP_S: Final = 0.2
-"""Images farther from the nearest pose on either side are left out: these cameras turn fast."""
+"""Largest time between an image and the poses before and after it; these cameras turn fast."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """The images whose pose is known, in the order of time."""
+    """The images with a known pose, in the order of time."""
 
     images: tuple[Path, ...]
     stamps: FloatArray
     """Shape (N,), seconds."""
     depths_m: FloatArray
-    """Shape (N, H, W); 0 where it is not known."""
+    """Shape (N, H, W); 0 if unknown."""
     T_world_camera: FloatArray
     """Shape (N, 4, 4)."""
     camera: DepthCamera
 
 
 def read_sequence(folder: Path) -> Sequence:
-    """The sequence of ``associations.txt``, ``groundtruth.txt`` and ``calibration.txt``, here or in the folder above.
+    """Read ``associations.txt``, ``groundtruth.txt``, and ``calibration.txt`` in the folder or its parent.
 
     The calibration has lines ``name fx fy cx cy k1 k2 p1 p2 k3``, in pixels of the colour images; the folder's name
     begins with the camera's, perhaps after ``rgbd_dataset_``. Depth may be smaller by a whole factor.
@@ -67,13 +67,13 @@ def _lines(path: Path) -> list[str]:
 
 
 def _is_covered(stamp: float, known: FloatArray) -> bool:
-    """Whether there are poses shortly before and after."""
+    """Whether poses exist shortly before and after."""
     after = int(np.searchsorted(known, stamp))
     return 0 < after < len(known) and max(stamp - known[after - 1], known[after] - stamp) <= GAP_S
 
 
 def _poses_at(stamps: FloatArray, poses: FloatArray) -> FloatArray:
-    """Straight lines and shortest turns between the known poses."""
+    """Interpolate poses at ``stamps`` (N,), linear and slerp: shape (N, 4, 4)."""
     T = np.tile(np.eye(4), (len(stamps), 1, 1))
     T[:, :3, :3] = Slerp(poses[:, 0], Rotation.from_quat(poses[:, 4:]))(stamps).as_matrix()
     for axis in range(3):

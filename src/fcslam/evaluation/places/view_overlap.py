@@ -1,7 +1,7 @@
-"""How much two depth images show of the same surfaces, by where their camera was.
+"""Overlap of two depth images with known camera poses.
 
-Pixels of one image go through its depth, both poses and the camera's distortion into the other one; they are seen again
-where the other depth says the same.
+Pixels of one image are projected into the other by their depth, both poses and the lens distortion. A pixel is visible
+there if the depths agree.
 """
 
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from fcslam.records import FloatArray
 
 DEPTH_AGREEMENT = 0.1
-"""Two depths of one surface differ by no more than this share."""
+"""Largest relative difference of two depths of one surface."""
 STRIDE_PX = 8
-"""Every so many pixels and rows of the depth image one is looked at."""
+"""Sampling step in columns and rows of the depth image."""
 _BEYOND = 1.1
-"""The distortion's polynomial holds no further outside than this many times the corners' rays."""
+"""Validity of the distortion polynomial, as a multiple of the largest corner ray."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +32,15 @@ class DepthCamera:
 
 
 def view_overlap(depths_m: FloatArray, T_world_camera: FloatArray, camera: DepthCamera) -> FloatArray:
-    """Share of what one image shows that the other shows, the smaller of both directions, shape (N, N), in [0, 1].
+    """Share of the pixels of one image that are visible in the other, the smaller of both directions.
 
     Args:
-        depths_m: shape (N, H, W), along the optical axis; 0 where it is not known.
-        T_world_camera: shape (N, 4, 4).
-        camera: of all images.
+        depths_m: depth along the optical axis, shape (N, H, W); 0 if unknown.
+        T_world_camera: camera poses, shape (N, 4, 4).
+        camera: the camera of all images.
+
+    Returns:
+        Shape (N, N), in [0, 1].
     """
     _, height, width = depths_m.shape
     columns, rows = np.meshgrid(np.arange(0, width, STRIDE_PX), np.arange(0, height, STRIDE_PX))
@@ -64,9 +67,9 @@ def _seen_again(
     lens: FloatArray,
     limit: float,
 ) -> FloatArray:
-    """Share of the pixels of image a (row) that image b (column) sees at the same depth.
+    """Share of the pixels of image a (row) that are visible in image b (column), shape (N, N).
 
-    Of those with a depth in a that do not fall where b has none.
+    Pixels without a depth in a, or projected to a pixel without a depth in b, are ignored.
     """
     count = depths_m.shape[0]
     shares = np.zeros((count, count))
@@ -95,7 +98,7 @@ def _seen_again(
                     if there > 0.0:
                         again += abs(there - z) <= DEPTH_AGREEMENT * z
                     else:
-                        judged -= 1  # whether it is the same surface cannot be told
+                        judged -= 1  # unknown whether it is the same surface
             if judged:
                 shares[a, b] = again / judged
     return shares
@@ -103,7 +106,7 @@ def _seen_again(
 
 @njit(cache=True)
 def _distorted(x: float, y: float, lens: FloatArray, limit: float) -> tuple[float, float]:
-    """The pixel of a ray (x, y, 1); (-2, -2) if it is too far outside."""
+    """Project a ray (x, y, 1) to a pixel; (-2, -2) outside the validity of the distortion model."""
     r2 = x * x + y * y
     if r2 > limit * limit:
         return -2.0, -2.0

@@ -1,8 +1,8 @@
-"""FC-SLAM's figure 4: how well words tell a place from others while the vocabulary grows.
+"""Figure 4 of FC-SLAM: how well words distinguish places while the vocabulary grows.
 
-Places arrive in batches of 40. A probe group, as in the paper, is a target, another view of the same place, and places
-that are wrong; here there are many groups, and no target is among the places that arrive. After each batch every member
-is put into the words of that moment, and eq. (4), on the scale of [0, 1], compares the target with the others.
+Places arrive in batches of 40. As in the paper, a probe group is a target, another view of the same place, and wrong
+places. Here there are many groups, and no target is among the places that arrive. After each batch, every member is
+described in the present vocabulary, and eq. (4), scaled to [0, 1], compares the target with the others.
 """
 
 import copy
@@ -27,9 +27,11 @@ from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes, FloatArray
 
 BATCH: Final = 40
+"""Places of a batch."""
 DISTRACTORS: Final = 8
+"""Wrong places of a probe group."""
 WINDOW_BATCHES: Final = 5
-"""``windowed`` trains after so many batches."""
+"""Batches between two trainings of the strategy ``windowed``."""
 MEASURES: Final = (
     "significance",
     "relative significance",
@@ -45,7 +47,7 @@ class ProbeGroup(NamedTuple):
     target: Codes
     others: tuple[Codes, ...]
     names: tuple[str, ...]
-    """Of the others, as they arrive."""
+    """Names of the others, as in ``Arrival``."""
 
 
 class Arrival(NamedTuple):
@@ -57,21 +59,21 @@ class Arrival(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """One strategy while places arrive; U batches, G groups, W wrong places in each."""
+    """Results of one strategy while places arrive; U batches, G groups, W wrong places in each."""
 
     places: FloatArray
-    """Shape (U,): how many have arrived."""
+    """Number of places so far, shape (U,)."""
     similarities: FloatArray
-    """Shape (U, G, 1 + W): the true match first."""
+    """Similarities to the target, shape (U, G, 1 + W), the true match first."""
     words: FloatArray
-    """Shape (U,); NaN where there are none."""
+    """Number of words, shape (U,); NaN without a vocabulary."""
     seconds: FloatArray
-    """Shape (U,), to take in the batch, of one core; NaN where nothing is taken in."""
+    """CPU time to add the batch, shape (U,), seconds; NaN without an index."""
     asked: FloatArray
-    """Shape (G, 1 + W): what the index itself answers in the end, with its default scoring; empty without an index."""
+    """Similarities by the index's default scoring at the end, shape (G, 1 + W); empty without an index."""
 
     def measures(self, update: int) -> dict[str, FloatArray]:
-        """``MEASURES`` of every group after that batch, each of shape (G,)."""
+        """``MEASURES`` of every group after a batch, each of shape (G,)."""
         return group_measures(self.similarities[update])
 
     def intervals(self, update: int, seed: int) -> dict[str, Interval]:
@@ -96,9 +98,9 @@ def group_measures(similarities: FloatArray) -> dict[str, FloatArray]:
 def draw_groups(
     sets: Sequence[DescribedSet], count: int, rng: np.random.Generator
 ) -> tuple[list[ProbeGroup], list[Arrival]]:
-    """Groups from the first question of each set in turn, and the places of all sets that are no target, in order.
+    """Draw probe groups from the first question of each set in turn, and list all other places in order.
 
-    There are fewer groups if the sets have no more: a target needs a match and 8 different places.
+    A target needs a match and 8 different places, so there may be fewer than ``count`` groups.
     """
     candidates = []
     for each in sets:
@@ -142,14 +144,14 @@ def grow_vocabulary(
     seed: int,
     watch: Callable[[], None] = lambda: None,
 ) -> Growth:
-    """Let the places arrive; whole batches only. ``watch`` is called after each.
+    """Add the places in whole batches and measure after each; ``watch`` is called after each batch.
 
-    ``rebuild`` trains at every place, and all but the last tree of a batch are thrown away unseen: only that one is
-    grown here, and the time to take in the batch is counted as 40 times its time.
+    The strategy ``rebuild`` trains at every place, but only the last tree of a batch is used. Only that tree is trained
+    here, and the time of the batch is 40 times its time.
     """
     every = {Strategy.REBUILD: BATCH, Strategy.WINDOWED: WINDOW_BATCHES * BATCH}.get(strategy, config.rebuild_every)
     grown = Strategy.WINDOWED if strategy is Strategy.REBUILD else strategy
-    # Places count from 0: with this L the first training, and every one after it, comes with the last of a batch.
+    # Places count from 0: with this L, every training happens at the last place of a batch.
     timing = {"strategy": grown, "train_batch": BATCH - 2, "rebuild_every": every}
     index: PlaceIndex[str] = PlaceIndex(config.model_copy(update=timing), np.random.default_rng(seed))
     updates = len(arrivals) // BATCH
@@ -172,7 +174,7 @@ def grow_vocabulary(
 
 
 def _compile(like: PlaceIndex[str], descriptors: Codes) -> None:
-    """What only the first call costs is no place's time."""
+    """Compile all code before the measurement."""
     warm = copy.deepcopy(like)
     warm.train([descriptors])
     warm.add("", descriptors)
@@ -187,7 +189,7 @@ def _timed_add(index: PlaceIndex[str], place: Arrival) -> float:
 def fixed_growths(
     arrivals: Sequence[Arrival], groups: Sequence[ProbeGroup], training: Sequence[Codes], seed: int
 ) -> dict[str, Growth]:
-    """What does not change as places arrive: brute force, and a tree of other images if there are any."""
+    """Results of scorers that do not change: brute force, and a pretrained vocabulary if there are training images."""
     updates = len(arrivals) // BATCH
     brute = [[matching_descriptors(g.target, other) / max(1, len(g.target)) for other in g.others] for g in groups]
     fixed = {BRUTE_FORCE: _fixed(np.array(brute), updates, np.nan)}
@@ -210,13 +212,13 @@ def _counts(updates: int) -> FloatArray:
 
 
 def ahead_of(first: Growth, other: Growth, measure: str, seed: int) -> Interval:
-    """By how much a measure of ``first`` is above that of ``other`` in the end, group by group."""
+    """Mean difference of a measure, ``first`` minus ``other``, after the last batch, paired by group."""
     values = first.measures(-1)[measure] - other.measures(-1)[measure]
     return mean_interval(values, np.random.default_rng(seed))
 
 
 def growth_rows(growths: Mapping[str, Growth], seed: int) -> list[tuple[str, int, str, float, float, float]]:
-    """Strategy, places, measure, value, low and high, for a table."""
+    """Rows of a table: strategy, places, measure, value, lower and upper bound."""
     rows: list[tuple[str, int, str, float, float, float]] = []
     for name, growth in growths.items():
         for update, places in enumerate(growth.places.astype(int)):
