@@ -96,7 +96,7 @@ class Fast:
         self._nms_px = nms_px
 
     def detect(self, image: GreyImage) -> Keypoints:
-        """Corners of an image."""
+        """Corners of an image (H, W), the strongest first."""
         return _strongest(*_positions_and_responses(self._fast.detect(image)), self._nms_px)
 
 
@@ -107,7 +107,7 @@ class Harris:
         self._nms_px = nms_px
 
     def detect(self, image: GreyImage) -> Keypoints:
-        """Corners of an image."""
+        """Corners of an image (H, W), the strongest first."""
         response = cv2.cornerHarris(image.astype(np.float32) / np.float32(255.0), blockSize=4, ksize=3, k=0.04)
         rows, columns = np.nonzero(response > 0.0)
         return _strongest(np.column_stack((columns, rows)), response[rows, columns], self._nms_px)
@@ -120,7 +120,7 @@ class ShiTomasi:
         self._nms_px = nms_px
 
     def detect(self, image: GreyImage) -> Keypoints:
-        """Corners of an image."""
+        """Corners of an image (H, W), the strongest first."""
         corners, qualities = cv2.goodFeaturesToTrackWithQuality(image, _CORNERS, 1e-4, 5, None)
         if corners is None:
             return _strongest(np.empty((0, 2)), np.empty(0), self._nms_px)

@@ -87,7 +87,7 @@ def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches
 
 @njit(cache=True)
 def hamming(a: CodeWords, b: CodeWords) -> Any:
-    """Distance in bits between two codes of 4 words; for use in compiled code."""
+    """Hamming distance between two codes, shape (4,) each, in bits; for use in compiled code."""
     return popcount(a[0] ^ b[0]) + popcount(a[1] ^ b[1]) + popcount(a[2] ^ b[2]) + popcount(a[3] ^ b[3])
 
 

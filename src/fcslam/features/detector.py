@@ -139,7 +139,7 @@ class OnnxDetector:
         return ImageFeatures(found.keypoints_px, found.scores, frozen(codes, np.uint8))
 
     def detect_floats(self, image: GreyImage) -> FloatFeatures:
-        """The keypoints of ``detect`` with their logits, scaled to unit length, as descriptors.
+        """The keypoints of ``detect`` in an image (H, W), with their logits, scaled to unit length, as descriptors.
 
         A comparison with ``detect`` measures the loss by quantisation to bits.
         """

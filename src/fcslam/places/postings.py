@@ -120,7 +120,7 @@ class Postings:
         _fill(entries, len(counts), codes, (ends - blocks) * BLOCK)
 
     def forget(self, row: int) -> NDArray[np.int32]:
-        """Remove a place; returns its distinct leaves."""
+        """Remove a place; returns its distinct leaves, shape (L,)."""
         leaves = np.unique(self.leaves(row))
         _remove(self.entries, leaves, row)
         self.entries.counts[row] = -1
@@ -183,7 +183,7 @@ class Postings:
 
 
 def grown_rows(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
-    """Return ``array`` with room for ``length`` rows; the caller must not use the old array or a view of it.
+    """Grow ``array`` (N, ...) to shape (length, ...); the caller must not use the old array or a view of it.
 
     Large arrays grow in place: the system remaps their pages (mremap) instead of copying them, so that no new place
     waits for a copy of gigabytes.

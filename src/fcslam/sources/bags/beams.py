@@ -1,4 +1,4 @@
-"""Lasers whose beams vary from scan to scan, resampled to the same beams."""
+"""Resamples scans of a laser whose beams vary from scan to scan."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -11,16 +11,16 @@ _SAME_FIELD_OF_VIEW_RAD = 0.05
 
 
 class NominalBeams:
-    """The beams that most of the first scans have."""
+    """The most frequent beam geometry of the first scans."""
 
     def __init__(self, first_scans: Sequence[ScanMessage]) -> None:
         count, _ = Counter(scan.beam_count for scan in first_scans).most_common(1)[0]
         self.beams = next(scan.beams for scan in first_scans if scan.beam_count == count)
 
     def resampled(self, scan: ScanMessage) -> ScanMessage | None:
-        """The scan if it has the usual beams; if it sees about the same, its nearest range for each of them; else None.
+        """Resample a scan to the nominal beams by nearest neighbour; None if its field of view differs.
 
-        A usual beam that lies outside the scan is invalid (NaN).
+        A scan with the nominal beams is returned unchanged. A nominal beam outside the scan becomes NaN.
         """
         if scan.beams == self.beams:
             return scan
@@ -38,6 +38,6 @@ class NominalBeams:
 
 
 def _apart_rad(a: Beams, b: Beams) -> float:
-    """How far the first and the last beams lie apart."""
+    """Largest difference between the directions of the first beams and of the last beams."""
     first = a.angle_min_rad - b.angle_min_rad
     return max(abs(first), abs(first + a.span_rad - b.span_rad))

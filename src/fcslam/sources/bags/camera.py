@@ -1,4 +1,4 @@
-"""What a bag's camera says: images, as sent or encoded as PNG, and the calibration."""
+"""Camera messages of a bag: images, as sent or encoded as PNG, and the calibration."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from fcslam.sources.images import MAX_SIDE_PX, check_camera, image_suffix
 
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 _FASTEST = 1
-"""PNG's least effort: the images are compressed while the bag is read."""
+"""Fastest PNG compression level, because images are compressed while the bag is read."""
 
 
 class ImageMessage(NamedTuple):
@@ -34,12 +34,12 @@ class Calibration(NamedTuple):
     is_distorted: bool
 
     def camera(self, T_base_camera: Transform) -> CameraModel:
-        """The camera that sits there."""
+        """The camera model with this mounting."""
         return CameraModel(self.width, self.height, self.fx, self.fy, self.cx, self.cy, T_base_camera)
 
 
 def compressed_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
-    """A JPEG or PNG image as it was sent; raises ValueError when it is another kind."""
+    """A JPEG or PNG image as it was sent; raises ValueError for other formats."""
     encoded = np.asarray(content.data, dtype=np.uint8).tobytes()
     image_suffix(encoded)
     stamp, _ = header_of(content.header, bag_time_ns)
@@ -47,7 +47,7 @@ def compressed_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
 
 
 def raw_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
-    """An image of rgb8, bgr8 or mono8 as PNG, which loses nothing; raises ValueError when it is another kind."""
+    """An image of encoding rgb8, bgr8 or mono8 as lossless PNG; raises ValueError for other encodings."""
     import cv2
 
     channels, width, height, step = _CHANNELS.get(content.encoding), content.width, content.height, content.step
@@ -67,7 +67,7 @@ def raw_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
 
 
 def calibration_of(content: Any) -> Calibration:
-    """A camera's calibration; raises ValueError when the camera was never calibrated."""
+    """A camera's calibration; raises ValueError if the camera is not calibrated."""
     K = np.asarray(content.k if hasattr(content, "k") else content.K, dtype=np.float64)
     D = np.asarray(content.d if hasattr(content, "d") else content.D, dtype=np.float64)
     _, frame = header_of(content.header, 0)

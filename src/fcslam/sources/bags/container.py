@@ -1,7 +1,7 @@
-"""A bag as a stream of raw messages, whatever file or folder holds them.
+"""Reads a bag, a file or a folder, as a stream of raw messages.
 
-Of rosbags the readers are used, not the definitions that a bag carries: the few types that are read have had one
-layout for as long as there are bags, and a strange definition of another topic cannot spoil a recording.
+The message definitions in a bag are ignored. The few types that are read have never changed, and so an invalid
+definition of another topic does no harm.
 """
 
 from collections import Counter
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SCAN, ODOMETRY, TRANSFORMS = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "tf2_msgs/TFMessage"
 COMPRESSED_IMAGE, IMAGE = "sensor_msgs/CompressedImage", "sensor_msgs/Image"
 CAMERA_INFO = "sensor_msgs/CameraInfo"
-"""The types that are read."""
+"""Message types that are read."""
 
 _OLD_TRANSFORMS = "tf/tfMessage"
 _ROS1, _MCAP, _SQLITE = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
@@ -52,7 +52,7 @@ class RawMessage(NamedTuple):
 
 
 class _Reader(Protocol):
-    """What the readers of rosbags have in common."""
+    """Common interface of the readers of rosbags."""
 
     @property
     def connections(self) -> "list[Connection]": ...
@@ -73,13 +73,13 @@ def is_bag(path: Path, head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class BagFile:
-    """A bag; every pass over its messages opens it anew."""
+    """A bag; every pass over its messages opens it again."""
 
     path: Path
 
     @cached_property
     def topics(self) -> tuple[Topic, ...]:
-        """Sorted by name; a topic of two types is two of them.
+        """All topics, sorted by name; a topic with two types is listed twice.
 
         Raises:
             SourceError: the bag is empty, damaged or has no index.
@@ -91,9 +91,9 @@ class BagFile:
         return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
     def messages(self, topics: Sequence[Topic]) -> Iterator[RawMessage]:
-        """The messages of ``topics`` in the order in which they were recorded, at equal times in that of ``topics``.
+        """The messages of ``topics`` in the order of recording; at equal times in the order of ``topics``.
 
-        Memory does not depend on the bag's length, but for the index of a ROS 1 bag.
+        Memory use does not depend on the bag's length, except for the index of a ROS 1 bag.
 
         Raises:
             SourceError: the bag cannot be read to its end.
@@ -113,10 +113,10 @@ class BagFile:
                 yield RawMessage(topic, numbers[topic], bag_time_ns, payload)
 
     def decode(self, message: RawMessage) -> Any:
-        """The message as an object of rosbags.
+        """Decode a message to an object of rosbags.
 
         Raises:
-            ValueError: its bytes are no message of its type.
+            ValueError: the bytes are not a message of its type.
         """
         kind = TRANSFORMS if message.topic.type == _OLD_TRANSFORMS else message.topic.type
         name = kind.replace("/", "/msg/")
@@ -125,7 +125,7 @@ class BagFile:
             if self._is_ros1:
                 return store.deserialize_ros1(message.payload, name)
             return store.deserialize_cdr(message.payload, name)
-        except Exception as error:  # generated code that meets foreign bytes raises whatever it meets
+        except Exception as error:  # generated code raises any exception on invalid bytes
             raise ValueError("the bytes are no message of this type") from error
 
     @cached_property
@@ -141,7 +141,7 @@ class BagFile:
 
     @contextmanager
     def _opened(self) -> Iterator[_Reader]:
-        """A reader; whatever it raises becomes one clear line. rosbags' parsers raise many things on damaged files."""
+        """Open a reader and translate all errors to SourceError; rosbags raises many types on damaged files."""
         try:
             reader = _reader(self.path, self._magic)
             reader.open()
@@ -191,7 +191,7 @@ def _reader(path: Path, magic: bytes) -> _Reader:
 
 
 def _check_database(database: Path) -> None:
-    """Refuse a database that was not closed or lacks its end: SQLite would read what is there and say nothing."""
+    """Reject a database that was not closed or is truncated; SQLite would read the rest without an error."""
     journal = database.with_name(f"{database.name}-wal")
     if journal.exists() and journal.stat().st_size:
         raise SourceError(
@@ -219,7 +219,7 @@ def _type_of(connection: "Connection") -> str:
 
 @cache
 def typestore(ros1: bool) -> "Typestore":
-    """The types that are read and written, as ROS 1 or ROS 2 lays them out."""
+    """Message types that are read and written, of ROS 1 or ROS 2."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     if not ros1:

@@ -1,4 +1,4 @@
-"""What the messages of a bag say, checked: hostile or broken ones are refused with a ValueError."""
+"""Converts the messages of a bag and checks them; invalid messages raise ValueError."""
 
 from collections.abc import Iterator
 from math import degrees, inf, isfinite, pi, radians
@@ -17,7 +17,7 @@ _NANOSECONDS = 10**9
 
 
 class Beams(NamedTuple):
-    """The directions of a scan's beams; they turn to the left."""
+    """Directions of a scan's beams, counter-clockwise."""
 
     beam_count: int
     angle_min_rad: float
@@ -25,7 +25,7 @@ class Beams(NamedTuple):
 
     @property
     def span_rad(self) -> float:
-        """Between the first and the last beam."""
+        """Angle between the first and the last beam."""
         return (self.beam_count - 1) * self.angle_increment_rad
 
 
@@ -38,7 +38,7 @@ class ScanMessage(NamedTuple):
     range_min_m: float
     range_max_m: float
     raw_ranges_m: Ranges
-    """As sent, shape (beam_count,)."""
+    """Ranges as sent, metres, shape (beam_count,)."""
 
     @property
     def beam_count(self) -> int:
@@ -64,7 +64,7 @@ class StampedTransform(NamedTuple):
 
 
 def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
-    """A laser scan; one whose beams turn to the right is turned round."""
+    """Convert a laser scan; clockwise beams are reversed."""
     ranges = np.asarray(content.ranges, dtype=np.float32)
     count = len(ranges)
     first_rad, increment_rad = _angle_rad(content.angle_min), _angle_rad(content.angle_increment)
@@ -83,8 +83,9 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
 
 
 def measured_ranges(scan: ScanMessage) -> Ranges:
-    """Ranges by REP 117: at or beyond the maximum nothing was hit (inf); else what is below the minimum or no
-    number is invalid (NaN).
+    """Ranges of a scan by REP 117, metres, shape (beam_count,).
+
+    At or beyond the maximum: inf (no return). Below the minimum or not a number: NaN (invalid).
     """
     raw = scan.raw_ranges_m
     ranges: Ranges = np.where(raw >= np.float32(scan.range_max_m), np.float32(inf), raw)
@@ -93,7 +94,7 @@ def measured_ranges(scan: ScanMessage) -> Ranges:
 
 
 def odometry_of(content: Any, bag_time_ns: int) -> OdometryReading:
-    """An odometry message; the base is its child frame."""
+    """Convert an odometry message; the base is its child frame."""
     stamp, _ = header_of(content.header, bag_time_ns)
     pose = content.pose.pose
     transform = _transform(pose.position, pose.orientation)
@@ -109,19 +110,19 @@ def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
 
 
 def _angle_rad(single: float) -> float:
-    """The angle that was rounded to single precision: most lasers count in whole ten-thousandths of a degree."""
+    """Undo the rounding of an angle to single precision: most lasers have multiples of 0.0001 degrees."""
     rounded = radians(round(degrees(single), 4)) if isfinite(single) else single
     return rounded if np.float32(rounded) == np.float32(single) else float(single)
 
 
 def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
-    """Stamp and frame; a stamp that was never set is replaced by the time of recording."""
+    """Stamp and frame of a header; a zero stamp is replaced by the time of recording."""
     stamp_ns = header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
     return (stamp_ns or bag_time_ns) / _NANOSECONDS, _frame(header.frame_id)
 
 
 def _frame(name: str) -> str:
-    """Without the slash that ROS 1 used to put before it."""
+    """Frame name without the leading slash of ROS 1."""
     return name.lstrip("/")
 
 

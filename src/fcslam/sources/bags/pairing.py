@@ -1,12 +1,11 @@
-"""Scans, images and the odometry around them: each scan and each image gets the pose at its own stamp.
+"""Assigns odometry to scans and images at their own stamps.
 
-Between two readings of the odometry the pose is interpolated, the shortest way round; a scan with the very stamp of a
-reading gets that reading's pose, to the last bit. Odometry may come later than the scan: scans wait for it, in the
-recording's order. What decides is the pair of readings nearest in the recording, not in time, so that a clock that
-steps back does not mix what came before with what came after.
+Poses are interpolated between two readings; a scan with exactly the stamp of a reading gets that reading's pose.
+Odometry may come later than the scan, so scans wait for it in the order of the recording. The two readings are those
+nearest in the recording, not in time, so that a step back of the clock does not mix earlier and later readings.
 
-Beyond the first and the last reading (and where the odometry's clock steps back) a scan takes the nearest reading's
-pose if that is at most 1 s away, and else has none.
+Before the first and after the last reading, and where the odometry's clock steps back, a scan gets the pose of the
+nearest reading within 1 s, or none.
 """
 
 from collections import deque
@@ -21,11 +20,12 @@ from fcslam.sources.faults import Fault
 from fcslam.sources.pose import Pose, interpolated_pose
 
 MAX_GAP_S = 1.0
+"""Largest time between a scan and a reading outside of which it has no odometry."""
 
 _READINGS_KEPT = 1000
-"""A scan that comes later than so many readings after its stamp finds none."""
+"""Number of past readings that are searched for a scan."""
 _LONGEST_QUEUE = 1000
-"""Scans and readings that wait; beyond, the oldest scan goes on without later odometry."""
+"""Most waiting scans and readings; beyond, the oldest scan does not wait for later odometry."""
 
 
 class PosedScan(NamedTuple):
@@ -34,7 +34,7 @@ class PosedScan(NamedTuple):
     scan: ScanMessage
     T_odom_base: Pose
     fault: Fault | None
-    """What is wrong with the pose; with NO_ODOMETRY there is none, and it is the identity."""
+    """Fault of the pose; with NO_ODOMETRY the pose is the identity."""
 
 
 class PosedImage(NamedTuple):
@@ -42,7 +42,7 @@ class PosedImage(NamedTuple):
 
     image: ImageMessage
     T_odom_base: Pose | None
-    """None: there is none within 1 s."""
+    """None if there is no reading within 1 s."""
 
 
 class _PoseMatch(NamedTuple):
@@ -64,7 +64,7 @@ class _QueuedItem:
 def pair_with_odometry(
     items: Iterable[tuple[int, Message]],
 ) -> Iterator[tuple[int, Entry]]:
-    """The items in their order, each with its number, scans and images with their poses."""
+    """Yield the items in their order, each with its number; scans and images with their poses."""
     readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
     queue: deque[_QueuedItem] = deque()
     for number, item in items:
@@ -91,7 +91,7 @@ def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[
 
 
 def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, newest: OdometryReading) -> None:
-    """A new reading has come: some that wait have their pose now."""
+    """Assign poses to the waiting items that a new reading determines."""
     for waiting in queue:
         stamp = waiting.item.stamp
         if waiting.match is not None:
@@ -105,7 +105,7 @@ def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, n
 
 
 def _look_back(readings: deque[OdometryReading], stamp: float) -> _PoseMatch | None:
-    """The pose if the readings so far have it; None: wait for later ones."""
+    """The pose if the readings so far determine it; None to wait for later ones."""
     if not readings or stamp > readings[-1].stamp:
         return None
     if stamp == readings[-1].stamp:

@@ -1,8 +1,8 @@
-"""A ROS bag as a source: choose its topics, survey it once, then stream its records.
+"""Reads a ROS bag: chooses its topics, surveys it once, then streams its records.
 
-Scans come in the order in which they were recorded, with the odometry at their own header stamps (``pairing``). What
-is tolerated and what is refused is decided in ``gate``; damaged messages are skipped and counted. A robot that stands
-still is a recording like any other: here a topic says that there is odometry.
+Scans come in the order of recording, with the odometry at their own header stamps (``pairing``). ``gate`` decides which
+scans are consistent; damaged messages are skipped and counted. A robot that stands still is accepted, because a topic
+shows that there is odometry.
 """
 
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ _USUAL_BASES = ("base_footprint", "base_link")
 
 
 class _Reading(NamedTuple):
-    """How a bag is to be read."""
+    """Summary of a bag, and how to read it."""
 
     survey: Survey
     upside_down: bool
@@ -91,7 +91,7 @@ class RosBag:
 
     @cached_property
     def _reading(self) -> _Reading:
-        """How to read this bag, from one pass over all of it; refuses what cannot be mapped."""
+        """Summary from one pass over the whole bag; rejects a bag that cannot be mapped."""
         audit, tree = _audit(), TransformTree()
         scans, odometry = PathSummary(), PathSummary()
         base_frame = ""
@@ -146,7 +146,7 @@ class RosBag:
         return mounted
 
     def _camera(self, tree: TransformTree, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
-        """The camera as far as the bag says all about it; if not, it is left out and the laser goes on."""
+        """The camera with its calibration and mounting; without them it is ignored, with a note."""
         path, topic, calibration = self._stream.path, self._stream.topics.camera, self._stream.calibration
         if topic is None:
             return None, ()
@@ -176,7 +176,7 @@ def _image(posed: PosedImage, camera: CameraModel) -> CameraImage:
 
 
 def _turned(ranges_m: Ranges, upside_down: bool) -> Ranges:
-    """A laser upside down turns the other way."""
+    """Reverse the ranges (beam_count,) of a laser that is mounted upside down."""
     if upside_down:
         ranges_m = np.ascontiguousarray(ranges_m[::-1])
     ranges_m.setflags(write=False)

@@ -1,4 +1,4 @@
-"""The scans of a bag with their odometry, in the order in which they were recorded."""
+"""The scans of a bag with their odometry, in the order of recording."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -35,7 +35,7 @@ _IMAGES_TRIED = 5
 
 
 class BagStream:
-    """The chosen topics of a bag, decoded and put together."""
+    """Decodes and combines the chosen topics of a bag."""
 
     def __init__(self, path: Path, options: BagOptions) -> None:
         self.path = path
@@ -47,13 +47,13 @@ class BagStream:
         """The topics to read.
 
         Raises:
-            SourceError: the bag cannot be read, or has no such topics.
+            SourceError: the bag cannot be read, or a topic is missing.
         """
         return choose_topics(self._bag, self._options, self._field_of_view_rad, self._has_images)
 
     @cached_property
     def first_scans(self) -> list[ScanMessage]:
-        """Those that decide what is usual, at least one.
+        """The first scans, at least one, which decide the nominal beams.
 
         Raises:
             SourceError: no scan can be read.
@@ -73,7 +73,7 @@ class BagStream:
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Of the camera; None: there is no camera, or none of its calibrations can be read."""
+        """Calibration of the camera; None without a camera or a readable calibration."""
         topic = self.topics.camera_info
         for message in () if topic is None else self._bag.messages([topic]):
             try:
@@ -85,9 +85,9 @@ class BagStream:
     def entries(
         self, audit: Audit, tree: TransformTree | None = None, with_images: bool = False
     ) -> Iterator[tuple[int, Entry]]:
-        """Odometry, the scans that fit the rest and have odometry, and perhaps images, each with its message's number.
+        """Odometry, consistent scans with odometry, and images if asked, each with its message's number.
 
-        ``tree`` hears all tf on the way, if it is given.
+        ``tree`` collects all transforms, if it is given.
         """
         gate = ScanGate(self.nominal.beams.beam_count, audit)
         for number, entry in pair_with_odometry(self._items(audit, tree, with_images)):
@@ -116,7 +116,7 @@ class BagStream:
                     yield message.number, fitting
 
     def _fitting(self, item: Message, number: int, audit: Audit) -> Message | None:
-        """A scan with the usual beams, or None; what is no scan as it is."""
+        """A scan resampled to the nominal beams, or None; other messages unchanged."""
         if not isinstance(item, ScanMessage):
             return item
         scan = self.nominal.resampled(item)
@@ -125,7 +125,7 @@ class BagStream:
         return scan
 
     def _items_in(self, message: RawMessage, tree: TransformTree | None) -> list[Message]:
-        """What one message says; raises ValueError when it is broken."""
+        """Decode one message; raises ValueError if it is invalid."""
         if message.topic == self.topics.scan:
             return [scan_of(self._bag.decode(message), message.bag_time_ns)]
         if message.topic == self.topics.camera:
@@ -146,7 +146,7 @@ class BagStream:
 
     @cached_property
     def _odometry_edge(self) -> tuple[str, str]:
-        """The frames of the transform that is the odometry: the first one from a frame that is called after it."""
+        """Frames of the odometry in tf: the first transform whose parent frame contains "odom"."""
         seen: set[str] = set()
         for message in self._bag.messages(self.topics.odometry):
             try:
@@ -179,7 +179,7 @@ class BagStream:
         return image_of(self._bag.decode(message), message.bag_time_ns)
 
     def _has_images(self, topic: Topic) -> bool:
-        """Whether one of the first messages is an image that is read: depth, for one, is not."""
+        """Whether one of the first messages is a readable image; depth images are not."""
         for message in islice(self._bag.messages([topic]), _IMAGES_TRIED):
             try:
                 self._image_in(message)

@@ -1,4 +1,4 @@
-"""Which topics of a bag are read: those that the user named, or a choice by clear rules, which is told."""
+"""Chooses the topics of a bag: those that the user names, or else by fixed rules, with a note."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -23,21 +23,21 @@ _NEEDED = {
     "--camera-topic": f"{COMPRESSED_IMAGE} or {IMAGE}",
 }
 _TRUTHS = ("ground_truth", "groundtruth")
-"""In the name of a topic of odometry that no robot measured."""
+"""Parts of the name of an odometry topic that holds the ground truth."""
 
 
 class Topics(NamedTuple):
-    """What is read of a bag."""
+    """The topics of a bag that are read."""
 
     scan: Topic
     odometry: tuple[Topic, ...]
-    """One of odometry, or those that carry tf."""
+    """One topic of odometry, or all tf topics."""
     transforms: tuple[Topic, ...]
-    """All that carry tf."""
+    """All tf topics."""
     camera: Topic | None
-    """Images; None: there are none that can be read, or they are not calibrated."""
+    """Images; None without readable or calibrated images."""
     camera_info: Topic | None
-    """The calibration of these images."""
+    """Calibration of these images."""
     notes: tuple[str, ...]
 
 
@@ -47,15 +47,14 @@ def choose_topics(
     field_of_view_rad: Callable[[Topic], float],
     has_images: Callable[[Topic], bool],
 ) -> Topics:
-    """The topics to read.
+    """Choose the topics to read, by these rules in order:
 
-    Of several lasers the one with the widest field of view, to 0.01 rad, then with most messages, then the first by
-    name. Of several odometries one that is called ``odom``, then with most messages, then the first by name; one that
-    is called ground truth only if it is wanted. Of several cameras one that is calibrated, then with most messages,
-    then one whose images are compressed, then the first by name.
+    - laser: the widest field of view (to 0.01 rad), most messages, first by name;
+    - odometry: the name ``odom``, most messages, first by name; ground truth only if the user names it;
+    - camera: calibrated, most messages, compressed images, first by name.
 
     Raises:
-        SourceError: there is no such topic, or one named is not there or of another type.
+        SourceError: a required topic is missing, or a named topic is missing or of another type.
     """
     heard = [topic for topic in bag.topics if topic.message_count]
     scans = _candidates(bag, [topic for topic in heard if topic.type == SCAN], options.scan_topic, "--scan-topic")
@@ -83,7 +82,7 @@ def choose_topics(
 def _choose_camera(
     bag: BagFile, wanted: str | None, has_images: Callable[[Topic], bool]
 ) -> tuple[Topic | None, Topic | None, list[str]]:
-    """Images, their calibration, and what to say about the choice."""
+    """Topics of images and of their calibration, and notes about the choice."""
     heard = [topic for topic in bag.topics if topic.message_count]
     images = [topic for topic in heard if topic.type in (COMPRESSED_IMAGE, IMAGE)]
     cameras = [topic for topic in _candidates(bag, images, wanted, "--camera-topic") if has_images(topic)]
@@ -107,14 +106,14 @@ def _choose_camera(
 
 
 def _calibration(camera: Topic, infos: Sequence[Topic], camera_count: int) -> Topic | None:
-    """The calibration that is published beside the images, or the only one if there is only one camera."""
+    """The calibration topic beside the images, or the only one if there is only one camera."""
     name = camera.name.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
     beside = [info for info in infos if _slashed(info.name) == _slashed(name)]
     return next(iter(beside or (infos if len(infos) == camera_count == 1 else [])), None)
 
 
 def _candidates(bag: BagFile, candidates: Sequence[Topic], wanted: str | None, option: str) -> list[Topic]:
-    """The candidates, or the one of them that the user wants."""
+    """All candidates, or the one that the user names."""
     if wanted is None:
         return list(candidates)
     chosen = [topic for topic in candidates if _slashed(topic.name) == _slashed(wanted)]

@@ -1,4 +1,4 @@
-"""The tree of transforms (tf) that a bag carries, and where the laser sits by it."""
+"""The tree of transforms (tf) of a bag, and the mounting of the laser in it."""
 
 from collections.abc import Iterator
 from math import acos, atan2, isfinite, pi, sqrt
@@ -10,20 +10,20 @@ from fcslam.sources.pose import Pose
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-"""(x, y, z, w), of length 1."""
+"""Unit quaternion (x, y, z, w)."""
 
 _ROUNDING = 1e-15
-"""A quaternion whose length is 1 but for rounding stays as it is."""
+"""A quaternion whose length differs from 1 by less is not normalised."""
 _STILL = 0.01
-"""Metres or quaternion units by which a fixed transform may differ from message to message."""
+"""Largest difference between the messages of a fixed transform, in metres or quaternion units."""
 
 
 class NoTransformError(FcslamError):
-    """Two frames are not connected, or not by fixed transforms; the message says which."""
+    """Two frames are not connected by fixed transforms; the message says which."""
 
 
 class Mounting(NamedTuple):
-    """Where a laser sits on its robot, seen from above."""
+    """Mounting of a laser on its robot, seen from above."""
 
     T_base_laser: Pose
     upside_down: bool
@@ -35,7 +35,7 @@ IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
-    """Checked, with the quaternion scaled to length 1; raises ValueError when it is no sane transform."""
+    """Check a transform and normalise its quaternion; raises ValueError if it is invalid."""
     x, y, z, w = rotation
     length = sqrt(x * x + y * y + z * z + w * w)
     if not (abs(length - 1.0) < 0.1 and all(map(isfinite, translation_m))):
@@ -46,28 +46,28 @@ def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
 
 
 def planar(transform: Transform) -> Pose:
-    """The pose on the floor: x, y, and the heading of the x axis to a nanoradian, free of a quaternion's rounding."""
+    """Project to the floor: x, y, and the heading of the x axis, rounded to 1 nrad to remove rounding noise."""
     x, y, z, w = transform.rotation
     heading_rad = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return transform.translation_m[0], transform.translation_m[1], round(heading_rad, 9)
 
 
 def mounting(T_base_laser: Transform) -> Mounting:
-    """How a laser with this pose looks at the floor's plane."""
+    """Mounting of a laser with this pose: planar pose, orientation and tilt."""
     up = min(1.0, max(-1.0, rotated(T_base_laser.rotation, (0.0, 0.0, 1.0))[2]))
     lean_rad = acos(up)
     return Mounting(planar(T_base_laser), up < 0.0, min(lean_rad, pi - lean_rad))
 
 
 class TransformTree:
-    """Which frame hangs on which, as far as it was heard."""
+    """The frames and transforms seen so far."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Transform]] = {}
         self._moving: set[str] = set()
 
     def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Take one transform. The first one counts; a frame whose transform changes later is moving."""
+        """Add a transform. The first one counts; a frame whose transform changes later is moving."""
         first_parent, first = self._parents.setdefault(child, (parent, T_parent_child))
         if first is not T_parent_child and (parent != first_parent or _differ(first, T_parent_child)):
             self._moving.add(child)
@@ -95,7 +95,7 @@ class TransformTree:
         return _compose(_inverse(self._chain(up)), self._chain(down))
 
     def _above(self, frame: str) -> Iterator[str]:
-        """The frame and its ancestors; a ring of frames ends where it closes."""
+        """The frame and its ancestors; a cycle ends where it closes."""
         seen: set[str] = set()
         while frame not in seen:
             seen.add(frame)
@@ -148,7 +148,7 @@ def _product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 
 def _differ(first: Transform, second: Transform) -> bool:
-    """Whether they are further apart than noise; q and -q are one rotation."""
+    """Whether two transforms differ by more than noise; q and -q are the same rotation."""
     apart = max(abs(a - b) for a, b in zip(first.translation_m, second.translation_m, strict=True))
     alike = abs(sum(a * b for a, b in zip(first.rotation, second.rotation, strict=True)))
     return apart > _STILL or alike < 1.0 - _STILL * _STILL

@@ -1,4 +1,4 @@
-"""Sensor records written as a ROS bag."""
+"""Writes sensor records to a ROS bag."""
 
 import sqlite3
 from collections.abc import Iterable, Iterator
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _ROS1, _MCAP, _SQLITE, _FOLDER = ".bag", ".mcap", ".db3", ""
 BAG_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
-"""The kinds of bags that can be written: ROS 1, two files of ROS 2, and a folder of ROS 2."""
+"""Formats of bags that can be written: ROS 1, two file formats of ROS 2, and a folder of ROS 2."""
 
 _ODOM, _BASE, _LASER, _CAMERA, _BUILDING = "odom", "base_link", "laser", "camera_optical_frame", "building"
 _TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, "/scan": SCAN}
@@ -41,7 +41,7 @@ _IMAGE_TOPIC, _CAMERA_INFO_TOPIC, _GROUND_TRUTH_TOPIC = (
     "/ground_truth",
 )
 _TOPICS_OF_SOME = {_IMAGE_TOPIC: COMPRESSED_IMAGE, _CAMERA_INFO_TOPIC: CAMERA_INFO, _GROUND_TRUTH_TOPIC: ODOMETRY}
-"""Only where there is something to write."""
+"""Topics that are created only if there is a message."""
 _IMAGE_FORMATS = {"jpg": "jpeg", "png": "png"}
 _END_OF_TIME_S = 2**31
 _NANOSECONDS = 10**9
@@ -72,7 +72,7 @@ def write_bag(path: Path, records: Iterable[RecordedItem]) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator["_Bag"]:
-    """A bag to write to, which takes its place when it is complete."""
+    """A bag to write to, which moves to its place when it is complete."""
     from rosbags import rosbag1, rosbag2
 
     if path.suffix not in BAG_SUFFIXES:
@@ -94,7 +94,7 @@ def _opened(path: Path) -> Iterator["_Bag"]:
 
 
 class _Bag:
-    """Turns records into messages."""
+    """Converts records to messages."""
 
     def __init__(self, writer: "Writer1 | Writer2", ros1: bool) -> None:
         self._writer: Any = writer
@@ -106,7 +106,7 @@ class _Bag:
         self._latest_reading: tuple[float, ...] = ()
 
     def write(self, item: RecordedItem) -> None:
-        """Write what one record says: its odometry, and its scan or image if it is one."""
+        """Write one record: its odometry, and its scan or image."""
         stamp_ns = _nanoseconds(item.stamp)
         self._bag_time_ns = max(self._bag_time_ns + 1, stamp_ns)
         if isinstance(item, GroundTruth):
@@ -141,7 +141,7 @@ class _Bag:
         self._put(_IMAGE_TOPIC, self._make(COMPRESSED_IMAGE, header=header, format=encoding, data=data))
 
     def _mount(self, stamp_ns: int, frame: str, T_base_frame: Transform) -> None:
-        """Say once where a sensor sits."""
+        """Write the mounting of a sensor once."""
         if frame not in self._mounted:
             self._put("/tf_static", self._transforms(self._header(stamp_ns, _BASE), frame, T_base_frame))
             self._mounted.add(frame)
@@ -212,7 +212,7 @@ class _Bag:
         )
 
     def _camera_info(self, header: Any, camera: CameraModel) -> Any:
-        """Pinhole, without distortion; ROS 1 writes the matrices' names in capitals."""
+        """Pinhole model without distortion; names of matrices are capitals in ROS 1."""
         K = np.array([camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0])
         P = np.insert(K, (3, 6, 9), 0.0)
         matrices = {"D": np.zeros(5), "K": K, "R": np.eye(3).ravel(), "P": P}

@@ -1,4 +1,4 @@
-"""Log files as lines of bytes, whether compressed or not."""
+"""Reads log files, compressed or not, as lines of bytes."""
 
 import bz2
 import gzip
@@ -15,7 +15,7 @@ from typing import BinaryIO, cast
 from fcslam.errors import SourceError
 
 MAX_LINE_BYTES = 1 << 18
-"""A longer line is read in pieces, so that a file without line ends cannot fill the memory."""
+"""Longer lines are split, so that a file without line ends does not fill the memory."""
 
 _HEAD_BYTES = 1 << 16
 _BUFFER_BYTES = 1 << 17
@@ -24,7 +24,7 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
 def robot_name(path: Path) -> str:
-    """The file's name without log suffixes, fit for file names: ``intel.clf.xz`` gives ``intel``."""
+    """Name of a robot from its file, without log suffixes and unsafe characters: ``intel.clf.xz`` gives ``intel``."""
     stem = path.name or path.resolve().name
     while match := _LOG_SUFFIX.search(stem):
         stem = stem[: match.start()]
@@ -35,7 +35,7 @@ def head(path: Path) -> bytes:
     """The first 64 KiB, decompressed.
 
     Raises:
-        SourceError: the file is missing, empty or damaged, or is no file.
+        SourceError: the path is missing or not a file, or the file is empty or damaged.
     """
     with _translate_errors(path), _open(path) as stream:
         content = stream.read(_HEAD_BYTES)
@@ -45,7 +45,7 @@ def head(path: Path) -> bytes:
 
 
 def numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Lines with their numbers, counted from 1, decompressed on the way.
+    """Decompressed lines with their numbers, counted from 1.
 
     Raises:
         SourceError: the file cannot be read to its end.
@@ -55,7 +55,7 @@ def numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _open(path: Path) -> BinaryIO:
-    """Open by the first bytes: a name may lie about the compression."""
+    """Open a file by its first bytes, because its suffix may be wrong."""
     with path.open("rb") as raw:
         magic = raw.read(6)
     if magic.startswith(b"\x1f\x8b"):
@@ -68,7 +68,7 @@ def _open(path: Path) -> BinaryIO:
 
 
 def _buffered(stream: gzip.GzipFile | lzma.LZMAFile | bz2.BZ2File) -> BinaryIO:
-    """Lines of a compressed file are read several times faster through a buffer written in C."""
+    """Buffer a compressed file; lines are then read several times faster."""
     return BufferedReader(cast("BinaryIO", stream), _BUFFER_BYTES)  # type: ignore[type-var]
 
 

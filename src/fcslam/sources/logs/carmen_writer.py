@@ -1,4 +1,4 @@
-"""Scans and odometry written as a CARMEN log."""
+"""Writes scans and odometry to a CARMEN log."""
 
 import bz2
 import gzip
@@ -21,15 +21,15 @@ _HEADER = """\
 # message_name [message contents] ipc_timestamp ipc_hostname logger_timestamp
 """
 _SIMULATED = 3
-"""ROBOTLASER1's ``type`` of a laser that is none of those that CARMEN knows."""
+"""ROBOTLASER1's ``type`` of a laser that CARMEN does not know."""
 
 
 def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
     """Write ``records`` to ``path``, compressed if its suffix is .gz, .xz or .bz2; equal records give equal bytes.
 
-    Ranges are written in millimetres' precision, poses and stamps to 1e-6; no return (inf) as just above the
-    laser's maximum. A laser whose geometry readers of old logs would guess is written as FLASER, any other as
-    ROBOTLASER1. Images are left out: such a log has no place for them.
+    Ranges have millimetre precision, poses and stamps 1e-6; no return (inf) is written as a value just above the
+    laser's maximum. A laser with the default geometry of its beam count is written as FLASER, any other as ROBOTLASER1.
+    Images are dropped, because the format does not support them.
 
     Raises:
         OutputError: the file cannot be written.

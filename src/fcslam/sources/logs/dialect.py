@@ -1,4 +1,4 @@
-"""The lines that a text log is made of, whatever its dialect."""
+"""The lines of a text log, common to all dialects."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ _NUMBER_LETTERS = b"0123456789.+-eEinfatyINFATY \t"
 
 
 class StatedLaser(NamedTuple):
-    """The geometry that a scan line itself states; radians and metres."""
+    """Laser geometry that a scan line states; radians and metres."""
 
     angle_min_rad: float
     angle_increment_rad: float
@@ -49,18 +49,18 @@ Line = ScanLine | OdometryLine | ParameterLine
 
 
 LineParser = Callable[[bytes], Line | None]
-"""A line's content; None: nothing of interest. Raises ValueError for a broken line. Ranges stay text."""
+"""Parses a line; None if it is not used. Raises ValueError for a broken line. Ranges stay text."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How one kind of text log is read."""
+    """A kind of text log and its parser."""
 
     name: str
     recognises: Callable[[bytes], bool]
     """Whether a log that starts with these bytes is of this kind."""
     parser: Callable[[], LineParser]
-    """A parser for one pass over a log, told its lines in order: what a line means may depend on those before it."""
+    """Makes a parser for one pass over a log; a line may depend on the lines before it."""
     metres_per_range_unit: float = 1.0
     timed: bool = True
     """Whether the log states stamps; otherwise the parser makes them, ``UNTIMED_STEP_S`` from scan to scan."""
@@ -71,7 +71,7 @@ UNTIMED_STEP_S = 1.0
 
 
 def pose_of(tokens: list[bytes], metres_per_unit: float = 1.0) -> Pose:
-    """(x, y, theta) from three tokens; raises ValueError when they are no sane pose."""
+    """Parse (x, y, theta); raises ValueError for an implausible pose."""
     x, y, theta = map(float, tokens)
     if not (abs(x) < _MAX_COORDINATE and abs(y) < _MAX_COORDINATE and abs(theta) < _MAX_COORDINATE):
         raise ValueError("no sane pose")
@@ -79,7 +79,7 @@ def pose_of(tokens: list[bytes], metres_per_unit: float = 1.0) -> Pose:
 
 
 def stamp_of(token: bytes) -> float:
-    """Seconds; raises ValueError when it is no finite number."""
+    """Parse a stamp in seconds; raises ValueError if it is not finite."""
     stamp = float(token)
     if not isfinite(stamp):
         raise ValueError("no finite stamp")
@@ -87,7 +87,7 @@ def stamp_of(token: bytes) -> float:
 
 
 def check_beams(range_text: bytes, beam_count: int) -> None:
-    """Raise ValueError unless ``range_text`` holds ``beam_count`` words, at least two, none with foreign letters."""
+    """Raise ValueError unless ``range_text`` has ``beam_count`` numbers, at least two, by count and characters."""
     single_spaced = range_text.count(b" ") + 1 == beam_count
     if beam_count < 2 or not (single_spaced or len(range_text.split()) == beam_count):
         raise ValueError("not as many ranges as stated")

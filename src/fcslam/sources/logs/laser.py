@@ -1,6 +1,6 @@
-"""The geometry of the laser of a log, which old logs do not state.
+"""The laser geometry of a log, which old logs do not state.
 
-A scan line that states its geometry (ROBOTLASER1) is taken at its word. Otherwise the beam count decides:
+A geometry stated in a scan line (ROBOTLASER1) is used. Otherwise the beam count decides:
 
 - parameters ``laser_front_laser_resolution`` and ``laser_front_laser_fov`` where both are there and fit the count;
 - 101, 201 and 401 beams are a SICK that looks over 100 degrees, 541 and 1081 a scanner that looks over 270 degrees;
@@ -27,13 +27,13 @@ _RESOLUTION_DEG = {101: 1.0, 201: 0.5, 401: 0.25, 541: 0.5, 1081: 0.25}
 
 
 def laser_model(scan: ScanLine, parameters: Mapping[str, str], T_base_laser: Pose) -> LaserModel:
-    """The laser that ``scan`` was taken with."""
+    """The laser of ``scan``."""
     stated = scan.stated or assumed_laser(scan.beam_count, parameters)
     return LaserModel(scan.beam_count, *stated, T_base_laser)
 
 
 def assumed_laser(beam_count: int, parameters: Mapping[str, str] | None = None) -> StatedLaser:
-    """The geometry of a laser of which only the number of beams (two or more) is known."""
+    """The default geometry of a laser with ``beam_count`` (two or more) beams."""
     middle = beam_count // 2
     resolution_deg = _parameter_resolution_deg(beam_count, parameters or {})
     if resolution_deg is None:
@@ -53,7 +53,7 @@ def _parameter_resolution_deg(beam_count: int, parameters: Mapping[str, str]) ->
 
 
 def parameter(parameters: Mapping[str, str], name: str) -> float | None:
-    """A parameter's value; None when it is missing or no finite number."""
+    """A parameter's value; None if it is missing or not a finite number."""
     try:
         value = float(parameters[name])
     except (KeyError, ValueError):

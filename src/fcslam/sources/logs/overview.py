@@ -1,4 +1,4 @@
-"""What one pass over a text log shows, and whether the log can be mapped."""
+"""Summary of a text log from one pass, and whether the log can be mapped."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -13,21 +13,22 @@ from fcslam.sources.pose import Pose, relative_pose
 from fcslam.sources.source import Survey
 
 SCANS_THAT_MUST_MOVE = 10
+"""A log with at least this many scans must contain motion."""
 
 _MOUNTING_TOLERANCE = 0.01
-"""Metres or radians between two scans' words on where the laser sits."""
+"""Largest difference between the mountings of two scans, in metres or radians."""
 
 
 class LogReading(NamedTuple):
-    """How a log is to be read."""
+    """Summary of a log, and how to read it."""
 
     survey: Survey
     pose_from_odometry: bool
-    """Scans take the pose of the latest odometry message: their own never changes."""
+    """Whether scans take the pose of the latest odometry message, because their own never changes."""
 
 
 class MountingEstimate:
-    """Where the laser sits on the robot, from the two poses of every scan."""
+    """Estimates the mounting of the laser from the two poses of every scan."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -35,7 +36,7 @@ class MountingEstimate:
         self._differing = 0
 
     def add(self, scan: ScanLine) -> None:
-        """Take one scan's word."""
+        """Add one scan."""
         pose = (0.0, 0.0, 0.0)
         if scan.T_odom_laser != scan.T_odom_base:
             pose = relative_pose(scan.T_odom_base, scan.T_odom_laser)
@@ -45,10 +46,9 @@ class MountingEstimate:
             self._differing += 1
 
     def T_base_laser(self, offset_m: float) -> Pose:
-        """The pose that the scans agree on, to 0.1 mm; else ``offset_m`` ahead of the base.
+        """The mounting on which the scans agree, rounded to 0.1 mm; otherwise ``offset_m`` ahead of the base.
 
-        Scans do not agree where one of the poses was corrected and the other was not, and say nothing where the
-        same pose was written twice.
+        Scans disagree if only one of their poses was corrected. They contain no mounting if both poses are equal.
         """
         assert self._first is not None
         agreed = tuple(round(value, 4) + 0.0 for value in self._first)
@@ -58,7 +58,7 @@ class MountingEstimate:
 
 
 class Overview:
-    """Gathers what the lines of a log say together."""
+    """Collects the summary of a log line by line."""
 
     def __init__(self) -> None:
         self._scans = PathSummary()
@@ -68,7 +68,7 @@ class Overview:
         self._scan: ScanLine | None = None
 
     def add(self, line: Line) -> None:
-        """Take the next line."""
+        """Add the next line."""
         if isinstance(line, ScanLine):
             self._scans.add(line.stamp, line.T_odom_base)
             self._mounting.add(line)
@@ -80,10 +80,10 @@ class Overview:
             self._parameters[line.name] = line.value
 
     def conclude(self, path: Path, faults: Faults) -> LogReading:
-        """How to read the log at ``path``.
+        """Summarise the log at ``path`` after its last line.
 
         Raises:
-            SourceError: it cannot be mapped.
+            SourceError: the log cannot be mapped.
         """
         assert self._scan is not None
         check_consistency(path, faults, self._scans.count, self._odometry.count, self._scan.beam_count)

@@ -1,10 +1,10 @@
-"""A text log as a source: survey it once, then stream its records.
+"""Reads a text log: surveys it once, then streams its records.
 
-What is tolerated, counted and reported, and what is refused, is decided in ``gate``, and here:
+Besides the rules of ``gate``:
 
-- A dialect without stamps gets made ones, 1 s from scan to scan; every scan is counted.
-- A log of ten scans or more in which neither the scans' poses nor odometry messages ever change has no odometry:
-  refused. When only the odometry messages change, a scan takes its pose from the one before it.
+- Scans of a dialect without stamps get stamps 1 s apart, and are counted.
+- A log of ten or more scans in which neither the poses of scans nor the odometry messages ever change has no odometry
+  and is rejected. If only the odometry messages change, a scan takes the pose of the message before it.
 """
 
 from collections import Counter
@@ -31,7 +31,7 @@ _LONGEST_RANGE_M = 1e6
 
 
 class TextLog:
-    """A log of one message a line, perhaps compressed."""
+    """A log with one message per line, compressed or not."""
 
     def __init__(self, path: Path, name: str, dialect: Dialect) -> None:
         self.name = name
@@ -45,7 +45,7 @@ class TextLog:
         return self._audit.faults()
 
     def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """As in Source; the pass over the whole log is made once."""
+        """As in Source; the whole log is read once."""
         if scans == WHOLE:
             return self._reading.survey
         audit, track = Audit(), PathSummary()
@@ -72,7 +72,7 @@ class TextLog:
 
     @cached_property
     def _reading(self) -> LogReading:
-        """How to read this log, from one pass over all of it; refuses what cannot be mapped."""
+        """Summary from one pass over the whole log; rejects a log that cannot be mapped."""
         audit = Audit()
         overview = Overview()
         gate = ScanGate(self._usual_beam_count(), audit)
@@ -105,7 +105,7 @@ class TextLog:
                 yield number, line
 
     def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, ScanLine | OdometryLine]]:
-        """Scans and odometry of the range, with the poses to use; in the end ``audit`` holds this range's faults."""
+        """Scans and odometry of the range, with the poses to use; afterwards ``audit`` holds the range's faults."""
         for number, line in scan_window(self._posed(audit), scans, lambda line: isinstance(line, ScanLine), audit):
             if isinstance(line, ScanLine):
                 self._note_clock(number, audit)
@@ -129,7 +129,7 @@ class TextLog:
 
 
 def _ranges(scan: ScanLine, metres_per_unit: float, number: int, audit: Audit) -> Ranges:
-    """Ranges in metres, invalid ones NaN, shape (beam_count,); raises ValueError when one is no number."""
+    """Ranges in metres, shape (beam_count,), invalid ones NaN; raises ValueError if one is not a number."""
     values = np.array(scan.range_text.split(), dtype=np.float64) * metres_per_unit
     if not (values.min() >= 0.0 and values.max() < _LONGEST_RANGE_M):
         finite, negative = np.isfinite(values), values < 0.0
