@@ -12,6 +12,7 @@ import typer
 from fcslam.cli import app
 from fcslam.config import Settings
 from fcslam.mission import MissionConfig
+from tests.test_imports import ROOMS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "fcslam"
@@ -130,6 +131,13 @@ def test_readme_is_short_and_starts_with_the_two_commands():
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 150
     assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in lines[:30]}
+
+
+def test_the_table_of_rooms_is_in_the_order_of_imports():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = text[text.index("| room | contents |") :].partition("\n\n")[0]
+    planned = {"page", "bridges"}
+    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == [room for room in ROOMS if room not in planned]
 
 
 def test_the_algorithm_page_reads_every_equation_and_line():
