@@ -171,14 +171,16 @@ class Stopwatch:
 
 def overhead(report: common.Report, folder: Path, steps: int, count: int) -> None:
     """What a round takes beside training."""
+    from functools import partial
+
     import torch
 
-    from fcslam.federated import robot as robots
+    from fcslam.federated import client
     from fcslam.federated.client_app import build_client_app
-    from fcslam.federated.codec import network_to_weights, version_maker
+    from fcslam.federated.codec import network_to_weights, weights_version
     from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
-    from fcslam.federated.grid import InProcessGrid
-    from fcslam.federated.initial_weights import public_evaluator, read_public_images
+    from fcslam.federated.flower import InProcessGrid
+    from fcslam.federated.public_images import public_evaluation, read_public_images
     from fcslam.federated.settings import FederatedSettings
     from fcslam.learning.network import KeypointNetwork
     from fcslam.learning.settings import TrainingSettings
@@ -188,29 +190,29 @@ def overhead(report: common.Report, folder: Path, steps: int, count: int) -> Non
     training = TrainingSettings(label_copies=1)
     settings = FederatedSettings(local_steps=steps, rounds=count, judge_every=1, training=training)
     fleet = [
-        robots.RobotLearner(name, drawn(folder / name, 5, seed), folder / "labels" / name, robots.secret_noise)
+        client.RobotClient(name, drawn(folder / name, 5, seed), folder / "labels" / name, client.secret_noise)
         for seed, name in enumerate(ROBOTS)
     ]
     start = network_to_weights(KeypointNetwork("light"))
     for each in fleet:
         # Labels, and what torch does first.
-        each.learn(start, 0, "first", settings.model_copy(update={"local_steps": 1}))
-    legs, judging = Stopwatch(), Stopwatch()
-    judge = public_evaluator(read_public_images([drawn(folder / "public", 4, 99)]), "light", "cpu")
-    outside = CoordinatorHooks(version_maker("light"), judging.around(judge))
+        each.train(start, 0, "first", settings.model_copy(update={"local_steps": 1}))
+    training_time, evaluation_time = Stopwatch(), Stopwatch()
+    evaluate = public_evaluation(read_public_images([drawn(folder / "public", 4, 99)]), "light", "cpu")
+    hooks = CoordinatorHooks(partial(weights_version, encoder="light"), evaluation_time.around(evaluate))
     grid = InProcessGrid(build_client_app(lambda context: fleet[int(context.node_config["partition-id"])]), len(fleet))
-    train_leg, robots.train_leg = robots.train_leg, legs.around(robots.train_leg)
+    local_training, client.local_training = client.local_training, training_time.around(client.local_training)
     began = time.process_time()
-    Coordinator(settings, start, folder / "run", outside).run(grid)
+    Coordinator(grid, settings, start, folder / "run", hooks).run()
     total_s = time.process_time() - began
-    robots.train_leg = train_leg
-    rest_s = (total_s - legs.spent_s - judging.spent_s) / count
-    leg_s, default = legs.spent_s / count, FederatedSettings().local_steps
+    client.local_training = local_training
+    rest_s = (total_s - training_time.spent_s - evaluation_time.spent_s) / count
+    local_s, default = training_time.spent_s / count, FederatedSettings().local_steps
     report.table(f"Processor time of a round, {len(fleet)} robots, {steps} steps each, mean of {count}", COST, [
-        ("training legs", leg_s, 1.0),
-        ("the fleet around them", rest_s, rest_s / leg_s),
-        ("judging on 24 pairs", judging.spent_s / (count + 1), judging.spent_s / (count + 1) / leg_s),
-        (f"the fleet around the default {default} steps", rest_s, rest_s / leg_s * steps / default),
+        ("training legs", local_s, 1.0),
+        ("the fleet around them", rest_s, rest_s / local_s),
+        ("judging on 24 pairs", evaluation_time.spent_s / (count + 1), evaluation_time.spent_s / (count + 1) / local_s),
+        (f"the fleet around the default {default} steps", rest_s, rest_s / local_s * steps / default),
     ])  # fmt: skip
 
 

@@ -7,8 +7,8 @@ script. The cases are three logs of the SLAM benchmark as one robot, intel as th
 a simulated fleet with cameras (it needs a GL library) and a federated run of two rounds (it needs torch and Flower).
 
 The script compares all files of the run folders, and the packets that the robots sent. It leaves out configuration
-files, which hold the descriptions of the settings, and the seconds that a round took. ``--ignore-downlink`` leaves the
-metrics of the downlink out.
+files and the comments in a model card, which hold the descriptions of the settings, and the seconds that a round took.
+``--ignore-downlink`` leaves the metrics of the downlink out.
 Results of BEFORE stay in the working folder and are used again.
 """
 
@@ -101,6 +101,8 @@ def contents(place: Path, case: Case, ignore_downlink: bool) -> dict[str, str]:
         if path.name == "metrics.json" and ignore_downlink:
             rows = [row for row in json.loads(content) if not DOWNLINK.search(row["name"])]
             content = json.dumps(rows).encode()
+        if path.name == "card.md":
+            content = b"\n".join(line for line in content.splitlines() if not re.match(rb" +#", line))
         if path.name == "rounds.csv":
             rows = list(csv.DictReader(content.decode().splitlines()))
             content = json.dumps([{name: row[name] for name in row if name != "seconds"} for row in rows]).encode()

@@ -246,7 +246,9 @@ def test_a_network_matches_a_view_with_itself(robots, tmp_path):
     export_onnx(network, tmp_path / "detector.onnx")
     detector = OnnxDetector(OnnxConfig(weights=tmp_path / "detector.onnx"))
     (pair,) = held_out_pairs("north", find_images([robots["north"]])[:1], 1)
-    same = type(pair)((pair.views[0], pair.views[0]), pair.valid, pair.taught_valid, pair.taught, np.eye(3))
+    same = type(pair)(
+        (pair.views[0], pair.views[0]), pair.valid, pair.teacher_valid, pair.teacher_descriptors, np.eye(3)
+    )
     own = detect_features(detector, pair.views[0])
     correct, accuracy, again, former = measure_pair(detector, same, own)
     assert (correct, again) == (1.0, 1.0)

@@ -8,7 +8,7 @@ import numpy as np
 from fcslam.federated.client import ClientUpdate
 from fcslam.federated.client_app import build_client_app
 from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.federated.grid import InProcessGrid
+from fcslam.federated.flower import InProcessGrid
 from fcslam.federated.settings import FederatedSettings
 
 START = {
@@ -39,12 +39,12 @@ class Fake:
     figures: dict = field(default_factory=lambda: {"repeatability": 0.5, "mma_3px": 0.5})
     asked: list = field(default_factory=list)
 
-    def learn(self, weights, round_number, _run, _settings):
+    def train(self, weights, round_number, _run_id, _settings):
         self.asked.append(round_number)
         new = self.answer(weights, round_number) if self.answer else shifted(weights, self.by)
         return ClientUpdate(new, {"detector": self.by})
 
-    def judge(self, _weights, _settings):
+    def evaluate(self, _weights, _settings):
         return self.figures
 
 
@@ -71,13 +71,15 @@ def settings(**given):
 LENIENT = {"largest_change": None, "longest": None, "least_agreement": None}
 
 
-def run(robots, folder, chosen=None, grid=None, start=START, **outside):
+def run(robots, folder, chosen=None, grid=None, start=START, **given):
     reports = []
-    outside = {"version": version, "judge": lambda _weights: {"repeatability": 0.5, "mma_3px": 0.5}} | outside
-    server = Coordinator(
-        chosen or settings(),
-        start,
-        folder,
-        CoordinatorHooks(watch=lambda report, _best: reports.append(report), **outside),
+    hooks = CoordinatorHooks(
+        **{
+            "version": version,
+            "evaluate_fn": lambda _weights: {"repeatability": 0.5, "mma_3px": 0.5},
+            "on_round": lambda report, _best: reports.append(report),
+        }
+        | given
     )
-    return server.run(grid or grid_of(robots)), reports
+    coordinator = Coordinator(grid or grid_of(robots), chosen or settings(), start, folder, hooks)
+    return coordinator.run(), reports

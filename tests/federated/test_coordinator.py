@@ -106,7 +106,7 @@ def test_what_is_judged_and_released_is_a_mean_of_rounds(tmp_path):
         return {"repeatability": 0.5, "mma_3px": 0.5}
 
     chosen = settings(rounds=10, local_steps=100, smoothing=0.8)
-    state, reports = run([Fake("a", 0.1), Fake("b", 0.1)], tmp_path, chosen, judge=judge)
+    state, reports = run([Fake("a", 0.1), Fake("b", 0.1)], tmp_path, chosen, evaluate_fn=judge)
     weight, mean, expected = 0.5, 0.5, [0.5]
     for number in range(1, 11):
         weight += 0.1
@@ -141,7 +141,7 @@ def test_a_killed_server_ends_as_if_it_had_not_been(strategy, moment, tmp_path):
     judgements = []
     second = Fake("b", answer=killed if moment == "in training" else ragged(2))
     with pytest.raises(KeyboardInterrupt):
-        run([Fake("a", answer=ragged(1)), second], tmp_path / "torn", chosen, start=TRAINED, judge=watch)
+        run([Fake("a", answer=ragged(1)), second], tmp_path / "torn", chosen, start=TRAINED, evaluate_fn=watch)
     fleet = [Fake("a", answer=ragged(1)), Fake("b", answer=ragged(2))]
     resumed, late = run(fleet, tmp_path / "torn", chosen, start=TRAINED)
     assert same(whole.weights, resumed.weights)
@@ -260,7 +260,10 @@ def test_a_worse_detector_is_not_released_and_a_collapsed_one_is_undone(tmp_path
     scores = iter([0.5, 0.6, 0.55, 0.2, 0.6])
     robots = [Fake("a", answer=ragged(1))]
     state, reports = run(
-        robots, tmp_path, settings(rounds=4), judge=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+        robots,
+        tmp_path,
+        settings(rounds=4),
+        evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores)),
     )
     assert [report.released for report in reports] == [True, False, False, True]
     assert [report.returned for report in reports] == [False, False, True, False]
@@ -277,7 +280,7 @@ def test_after_a_collapse_the_mean_begins_anew_as_well(tmp_path):
         judged.append(weights)
         return dict.fromkeys(("repeatability", "mma_3px"), next(scores))
 
-    state, reports = run([Fake("a", 1.0)], tmp_path, settings(rounds=3, smoothing=0.8), judge=judge)
+    state, reports = run([Fake("a", 1.0)], tmp_path, settings(rounds=3, smoothing=0.8), evaluate_fn=judge)
     assert [report.returned for report in reports] == [False, True, True]
     assert same(state.weights, judged[1])
     assert same(state.average, judged[1])
@@ -304,7 +307,7 @@ def test_what_does_not_change_stays_to_the_last_bit_in_the_mean(tmp_path):
 def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
     scores = iter([0.9, 0.1, 0.3])
     state, reports = run(
-        [Fake("a", 0.5)], tmp_path, judge=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+        [Fake("a", 0.5)], tmp_path, evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
     )
     assert [report.returned for report in reports] == [False, False]
     assert same(state.weights, shifted(START, 1.0))
@@ -350,7 +353,7 @@ def test_epsilon_counts_what_a_server_asked_before_it_was_killed(tmp_path):
         with pytest.raises(KeyboardInterrupt):
             run([Fake("a"), Fake("b", answer=kills)], tmp_path)
     state = read_state(tmp_path / CHECKPOINT_FILE, settings(), START, version(START))
-    assert (state.rounds_done, state.asked) == (0, {"a": 3, "b": 3})
+    assert (state.rounds_done, state.times_asked) == (0, {"a": 3, "b": 3})
     _, reports = run([Fake("a"), Fake("b")], tmp_path)
     size = reports[0].bytes_up
     assert [report.bytes_down for report in reports] == [size, size], "what is sent in this round"
@@ -359,7 +362,7 @@ def test_epsilon_counts_what_a_server_asked_before_it_was_killed(tmp_path):
 def test_a_start_that_nothing_beats_stays(tmp_path):
     scores = iter([0.5, 0.4, 0.3])
     state, reports = run(
-        [Fake("a")], tmp_path, judge=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+        [Fake("a")], tmp_path, evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
     )
     assert (state.best_round, [report.released for report in reports]) == (0, [False, False])
     assert same(state.best, START)
@@ -386,7 +389,7 @@ def test_a_checkpoint_of_a_version_without_some_setting_is_told_as_such(tmp_path
     )
     run([Fake("a")], tmp_path)
     monkeypatch.undo()
-    with pytest.raises(TrainingError, match=r"is of another version of fcslam \(smoothing\)"):
+    with pytest.raises(TrainingError, match=r"comes from another version of fcslam \(smoothing\)"):
         run([Fake("a")], tmp_path)
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
     with pytest.raises(TrainingError, match="is no checkpoint"):

@@ -36,7 +36,7 @@ def joined(monkeypatch, tmp_path):
             return code
 
         monkeypatch.setattr(launch, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
-        monkeypatch.setattr(launch, "_be_node", be_node)
+        monkeypatch.setattr(launch, "_run_supernode", be_node)
         monkeypatch.setattr(launch, "_listens", lambda _address: listening(now[0]))
         code = launch.join(Address("there", 1), {"robot": "r"}, None, None, tmp_path / "log", said.append)
         return code, starts, now[0], said
@@ -82,7 +82,7 @@ def test_a_port_that_is_taken_is_told_before_anything_is_started(tmp_path, monke
     monkeypatch.setattr(launch, "FREED_S", 0.3)
     with (
         socket.create_server(("127.0.0.1", 0)) as taken,
-        pytest.raises(TrainingError, match="somebody listens there already"),
+        pytest.raises(TrainingError, match="another process listens there already"),
     ):
         serve(tmp_path, Address("127.0.0.1", taken.getsockname()[1]))
     assert not (tmp_path / "run").exists()
@@ -114,7 +114,7 @@ def test_an_ipv6_address_keeps_its_brackets_outside():
 def test_who_wants_loopback_gets_it(host, tmp_path, monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_: [(2, 1, 6, "", ("127.0.0.1", 8000))])
     monkeypatch.setattr(launch, "_listens", lambda _address: False)
-    launch._check_place(Address(host, 8000))
+    launch._check_address(Address(host, 8000))
 
 
 @pytest.mark.parametrize("host", ["no.such.name.invalid", ".lab", "x" * 64])

@@ -110,7 +110,7 @@ def test_an_odd_answer_leaves_the_others_their_round(odd, tmp_path):
 @pytest.mark.parametrize("odd", ["no metrics", "odd names", "long names", "many"])
 def test_who_judges_oddly_does_not_judge(odd, tmp_path):
     robots = [Fake("bad"), Fake("good", 0.25)]
-    state, _ = run(robots, tmp_path, grid=twisted_grid(robots, MessageType.EVALUATE, ODD[odd]), judge=None)
+    state, _ = run(robots, tmp_path, grid=twisted_grid(robots, MessageType.EVALUATE, ODD[odd]), evaluate_fn=None)
     assert state.best_scores == {"good": 0.5}
 
 

@@ -38,7 +38,9 @@ def start():
 def test_a_leg_does_its_steps_and_says_so(examples, start):
     done = []
     before = {name: tensor.clone() for name, tensor in start.items()}
-    network, losses, _ = local_training(start, examples, SMALL, LocalTrainingPlan(first=5, steps=3), CPU, done.append)
+    network, losses, _ = local_training(
+        start, examples, SMALL, LocalTrainingPlan(first_step=5, steps=3), CPU, done.append
+    )
     assert done == [1, 2, 3]
     assert not network.training
     assert {"detector", "contrastive", "triplet"} <= losses.keys()
@@ -49,9 +51,9 @@ def test_a_leg_does_its_steps_and_says_so(examples, start):
 @pytest.mark.slow
 def test_a_leg_learns(examples, start):
     longer = SMALL.model_copy(update={"pairs": 2})
-    first = local_training(start, examples, longer, LocalTrainingPlan(first=0, steps=5), CPU).losses
-    network = local_training(start, examples, longer, LocalTrainingPlan(first=0, steps=30), CPU).network
-    last = local_training(network.state_dict(), examples, longer, LocalTrainingPlan(first=30, steps=5), CPU).losses
+    first = local_training(start, examples, longer, LocalTrainingPlan(first_step=0, steps=5), CPU).losses
+    network = local_training(start, examples, longer, LocalTrainingPlan(first_step=0, steps=30), CPU).network
+    last = local_training(network.state_dict(), examples, longer, LocalTrainingPlan(first_step=30, steps=5), CPU).losses
     assert last["detector"] < 0.9 * first["detector"]
 
 
@@ -60,11 +62,13 @@ def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, s
     whole = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS + 3), CPU)
     first = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS), CPU)
     halfway = first.network.state_dict()
-    second = local_training(halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU, moments=first.moments)
+    second = local_training(
+        halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU, optimiser_state=first.optimiser_state
+    )
     forgetful = local_training(halfway, examples, SMALL, LocalTrainingPlan(RAMP_STEPS, 3), CPU)
     expected = whole.network.state_dict()
     assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
-    assert all(torch.equal(tensor, whole.moments[name]) for name, tensor in second.moments.items())
+    assert all(torch.equal(tensor, whole.optimiser_state[name]) for name, tensor in second.optimiser_state.items())
     assert any(not torch.equal(tensor, expected[name]) for name, tensor in forgetful.network.state_dict().items())
 
 
@@ -93,14 +97,14 @@ def test_the_pull_is_half_its_strength_times_the_squared_distance(start):
     network = network_from_state("light", start)
     weights = {name: value.detach().clone() for name, value in network.named_parameters()}
     pull = ProximalTerm(3.0, weights)
-    assert pull.energy(network).item() == 0.0
+    assert pull.loss(network).item() == 0.0
     count = 0
     with torch.no_grad():
         for value in network.parameters():
             value.add_(0.5)
             count += value.numel()
-    assert pull.energy(network).item() == pytest.approx(0.5 * 3.0 * 0.25 * count, rel=1e-5)
-    pull.energy(network).backward()
+    assert pull.loss(network).item() == pytest.approx(0.5 * 3.0 * 0.25 * count, rel=1e-5)
+    pull.loss(network).backward()
     assert all(torch.allclose(value.grad, torch.full_like(value, 1.5)) for value in network.parameters())
 
 
@@ -132,7 +136,7 @@ def test_codes_are_kept_to_those_of_a_former_network(examples, start):
     wanted = bits(network_from_state("light", former))
 
     def agreement(leg, state):
-        network, losses, _ = local_training(start, examples, SMALL, leg, CPU, former=state)
+        network, losses, _ = local_training(start, examples, SMALL, leg, CPU, legacy=state)
         assert ("former" in losses) is (state is not None and leg.compatible > 0.0)
         return float((bits(network) == wanted).float().mean())
 
@@ -143,7 +147,7 @@ def test_codes_are_kept_to_those_of_a_former_network(examples, start):
 
 def test_a_former_network_of_another_kind_is_refused(examples, start):
     with pytest.raises(TrainingError, match="not those of a light network"):
-        local_training(start, examples, SMALL, LocalTrainingPlan(0, 1, compatible=1.0), CPU, former={})
+        local_training(start, examples, SMALL, LocalTrainingPlan(0, 1, compatible=1.0), CPU, legacy={})
 
 
 def test_weights_that_make_training_diverge_are_said(examples, start):

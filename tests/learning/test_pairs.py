@@ -89,14 +89,14 @@ def test_points_of_a_pair_belong_together():
 def test_the_teachers_descriptors_stay_with_their_points():
     source = example()
     pair = draw_pair(source, SIZE, 64, 32, np.random.default_rng(5))
-    assert pair.taught_valid.any()
-    for told in pair.taught[pair.taught_valid]:
+    assert pair.teacher_valid.any()
+    for told in pair.teacher_descriptors[pair.teacher_valid]:
         assert (source.teacher.descriptors.astype(np.float32) == told).all(axis=1).any()
 
 
 def test_without_a_teacher_nothing_is_taught():
     pair = draw_pair(example(taught=False), SIZE, 64, 32, np.random.default_rng(5))
-    assert pair.taught.shape == (32, 0)
+    assert pair.teacher_descriptors.shape == (32, 0)
 
 
 def test_the_same_generator_draws_the_same_pair():

@@ -46,7 +46,7 @@ def test_a_run_learns(examples, tmp_path):
     longer = SMALL.model_copy(update={"steps": 40, "pairs": 2})
     figures = []
     TrainingRun(longer, "joint", tmp_path, PACE).train(
-        examples, examples[:1], watch=lambda status: figures.append(status.figures)
+        examples, examples[:1], on_progress=lambda status: figures.append(status.metrics)
     )
     first, last = ([np.mean([row[name] for row in part]) for name in ("detector", "contrastive")]
                    for part in (figures[:3], figures[-3:]))  # fmt: skip
@@ -154,7 +154,9 @@ def test_a_perfect_detector_of_unmoved_pictures_scores_one():
     image = textured(4)
     points = peaks(harris(image), 4, 100)
     (pair,) = validation_pairs([TrainingExample(image, fuse_keypoints(points, points))])
-    same = type(pair)((pair.views[0], pair.views[0]), pair.valid, pair.taught_valid, pair.taught, np.eye(3))
+    same = type(pair)(
+        (pair.views[0], pair.views[0]), pair.valid, pair.teacher_valid, pair.teacher_descriptors, np.eye(3)
+    )
     figures = validate(KeypointNetwork("light").eval(), [same], torch.device("cpu"))
     assert figures["repeatability"] == 1.0
     assert figures["mma_3px"] > 0.95

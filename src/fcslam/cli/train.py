@@ -100,7 +100,7 @@ def _watch(display: "ProgressDisplay", console: "Console") -> "StageCallback":
             print_line(console, text)
 
     def watch(stage: str, status: "TrainingProgress") -> None:
-        figures = "  ".join(f"{name} {status.figures[name]:.3f}" for name in FIGURES if name in status.figures)
+        figures = "  ".join(f"{name} {status.metrics[name]:.3f}" for name in FIGURES if name in status.metrics)
         display.show(stage, status.step, status.steps, figures)
         if figures and status.step == status.steps:
             print_once(f"{stage} {status.step}/{status.steps}  {figures}")

@@ -1,4 +1,4 @@
-"""What a federated run hands over: the released detector as ONNX files, its card, and a picture of the rounds."""
+"""The files of a finished federated run: the detector as ONNX files, its model card, and a picture of the rounds."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from fcslam.federated.settings import FederatedSettings
 from fcslam.learning.export import detector_version, export_onnx, quantise_onnx
 
 DETECTOR, INT8, CARD, PICTURE = "detector.onnx", "detector-int8.onnx", "card.md", "rounds.png"
-FIGURES: Final = {
+SHOWN_METRICS: Final = {
     "repeatability": "keypoints found again within 3 px",
     "mma_3px": "matches within 3 px, by bits",
 }
@@ -26,17 +26,17 @@ MEGABYTE: Final = 1e6
 def write_federated_artifacts(
     state: CoordinatorState, folder: Path, settings: FederatedSettings, calibration: Sequence[GreyImage], judged_on: str
 ) -> list[Path]:
-    """Write all four files; returns their paths.
+    """Write the detector in float32 and int8, the picture and the card; returns their paths.
 
     Args:
-        state: whose best weights are delivered.
-        folder: of the run, with its table of rounds.
+        state: its best weights are exported.
+        folder: of the run; contains the table of rounds.
         settings: of the run.
         calibration: images that give int8 its ranges.
-        judged_on: what the figures are of, in words.
+        judged_on: the images on which versions were evaluated, in words.
 
     Raises:
-        OutputError: one cannot be written.
+        OutputError: a file cannot be written.
         TrainingError: the table of rounds is broken.
     """
     network = weights_to_network(state.best, settings.training.encoder)
@@ -47,12 +47,14 @@ def write_federated_artifacts(
         draw_rounds(rows, folder / PICTURE)
         (folder / CARD).write_text(_card(detector_version(network), state, settings, rows, judged_on), encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written ({error}); make room and run the command again") from error
+        raise OutputError(
+            f"{folder}: cannot be written ({error}); free disk space and run the command again"
+        ) from error
     return [folder / name for name in (DETECTOR, INT8, PICTURE, CARD)]
 
 
 def draw_rounds(rows: Sequence[Row], path: Path) -> None:
-    """Three panels over the rounds: losses, figures with the released ones marked, and megabytes so far."""
+    """Draw losses, metrics with the released versions marked, and the megabytes sent so far, over the rounds."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 3.6), layout="constrained")
@@ -60,7 +62,7 @@ def draw_rounds(rows: Sequence[Row], path: Path) -> None:
     rounds = [int(row["round"]) for row in rows]
     for name in SHOWN_LOSSES:
         losses.plot(rounds, _column(rows, LOSS + name), label=name)
-    for name in FIGURES:
+    for name in SHOWN_METRICS:
         shares.plot(rounds, _column(rows, name), label=name.replace("_", " "))
     for number, row in zip(rounds, rows, strict=True):
         if row["released"] == "1":
@@ -93,14 +95,14 @@ def _column(rows: Sequence[Mapping[str, str]], name: str) -> list[float]:
 def _card(
     version: str, state: CoordinatorState, settings: FederatedSettings, rows: Sequence[Row], judged_on: str
 ) -> str:
-    asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.asked.items()))
+    asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.times_asked.items()))
     best = next((row for row in rows if int(row["round"]) == state.best_round), {})
     sent = sum(sum(_column(rows, name)) for name in ("bytes_down", "bytes_up"))
     private = f"epsilon {rows[-1]['epsilon']} at delta {settings.privacy.delta:g}" if rows else "nothing was sent"
     lines = [
         f"# Detector {version}",
         "",
-        f"Trained by {len(state.asked)} robots together, in {state.rounds_done} rounds; this is round "
+        f"Trained by {len(state.times_asked)} robots together, in {state.rounds_done} rounds; this is round "
         f"{state.best_round}. How often each was asked: {asked or 'never'}.",
         "",
         f"Began from {state.origin}. Weights sent: {sent / MEGABYTE:.1f} MB. Privacy of all that a robot has seen: "
@@ -108,7 +110,7 @@ def _card(
         "",
         f"| {judged_on} | |",
         "|---|---|",
-        *(f"| {text} | {float(best[name]):.3f} |" for name, text in FIGURES.items() if best.get(name)),
+        *(f"| {text} | {float(best[name]):.3f} |" for name, text in SHOWN_METRICS.items() if best.get(name)),
         "",
         "Settings:",
         "",

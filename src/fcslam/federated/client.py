@@ -1,4 +1,4 @@
-"""What a robot does in a round: train from the global weights on its own images, or judge weights on some of them."""
+"""A robot as a federated client: it trains on its own images from the global weights, and evaluates weights on some."""
 
 import zlib
 from collections.abc import Callable
@@ -25,127 +25,128 @@ from fcslam.learning.trainer import TrainingProgress, validation_pairs
 from fcslam.learning.validation import validate
 
 NOISE_NEEDS_PUBLIC_IMAGES: Final = (
-    "with noise for privacy no figures of a robot's own images may leave it: give --public images"
+    "with noise for privacy, no metrics of a robot's own images may leave it; give --public images"
 )
 
 NoiseSource = Callable[[int], np.random.Generator]
-"""Gives the generator of a round's noise: of the system's entropy where robots are real, seeded where they are not."""
+"""Gives the generator of a round's noise: from the system's entropy on real robots, seeded in simulations."""
 
 
 class ClientUpdate(NamedTuple):
-    """A robot's answer."""
+    """The result of a client's training in a round."""
 
     weights: dict[str, NDArray[np.float32]]
     losses: dict[str, float]
-    """Means over the steps; none with noise, which they are without."""
+    """Means over the steps; empty with privacy noise, because the losses carry none."""
 
 
 class FederatedClient(Protocol):
-    """Whoever takes part in federated training."""
+    """A participant in federated training."""
 
     @property
     def name(self) -> str:
-        """What the robot is called, in the whole fleet."""
+        """Name of the robot, unique in the fleet."""
 
-    def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> ClientUpdate:
-        """Train for a round; rounds count from 0. ``run`` names the run that they are of."""
+    def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
+        """Train for a round, counted from 0, of the run with this number."""
 
-    def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
-        """Figures of weights, by name."""
+    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+        """Metrics of the weights by name."""
 
 
 @dataclass(slots=True)
 class RobotClient:
-    """A robot with images of its own in ``folder``.
-
-    What outlives a round is kept in ``cache``: labels of the images, the memory of the optimiser, and the weights that
-    codes are to be compatible with, if they are to be.
-    """
+    """A client with its own images."""
 
     name: str
     folder: Path
+    """Contains the images."""
     cache: Path
+    """Folder for what must survive a round: labels, the optimiser's state, and the weights of the legacy detector."""
     noise: NoiseSource
     device: str = "cpu"
-    watch: Callable[[str, int], None] = lambda _robot, _steps: None
-    """Is told its name and how many steps of a round are done."""
-    gathered: TrainingImages | None = None
-    """Its images with their labels, once they are read."""
+    on_step: Callable[[str, int], None] = lambda _robot, _steps: None
+    """Called with the name and the number of steps done in a round."""
+    images: TrainingImages | None = None
+    """The images with their labels; None until they are read."""
 
-    def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> ClientUpdate:
-        """As in ``FederatedClient``; the result depends on the arguments, what is kept, the images, and the noise.
+    def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
+        """Train from the weights. The result depends on the arguments, the cache, the images and the noise.
+
+        Args:
+            weights: global weights of the round.
+            round_number: counted from 0.
+            run_id: identifies the run, for the state in the cache.
+            settings: of the run.
 
         Raises:
-            TrainingError: there are too few usable images, the weights are of another network, training diverged, or
-                the cache cannot be used.
+            TrainingError: there are too few usable images, the weights belong to another network, training diverged,
+                or the cache cannot be used.
         """
-        frozen = settings.normalisation == "frozen"
-        network = weights_to_network(weights, settings.training.encoder)
-        examples = self._examples(weights, settings).train
-        leg = LocalTrainingPlan(
-            first=round_number * settings.local_steps,
+        encoder, frozen = settings.training.encoder, settings.normalisation == "frozen"
+        network = weights_to_network(weights, encoder)
+        images = self._labelled_images(weights, settings)
+        plan = LocalTrainingPlan(
+            first_step=round_number * settings.local_steps,
             steps=settings.local_steps,
-            pull=settings.proximal if settings.strategy == "fedprox" else 0.0,
+            proximal=settings.proximal if settings.strategy == "fedprox" else 0.0,
             compatible=settings.compatible,
             frozen_statistics=frozen,
         )
-        own = settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)})
-        former = legacy_weights(self.cache, run, round_number, weights) if leg.compatible else None
-        moments = load_optimiser_state(self.cache, run, round_number)
+        legacy = legacy_weights(self.cache, run_id, round_number, weights) if plan.compatible else None
         trained = local_training(
             network.state_dict(),
-            examples,
-            own,
-            leg,
+            images.train,
+            settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)}),
+            plan,
             torch.device(self.device),
-            partial(self.watch, self.name),
-            former=None if former is None else weights_to_network(former, settings.training.encoder).state_dict(),
-            moments=moments,
+            partial(self.on_step, self.name),
+            legacy=None if legacy is None else weights_to_network(legacy, encoder).state_dict(),
+            optimiser_state=load_optimiser_state(self.cache, run_id, round_number),
         )
-        save_optimiser_state(self.cache, run, round_number, trained.moments)
-        found, names = network_to_weights(trained.network), trained_names(weights, frozen)
-        sent = privatise_update(found, weights, names, settings.privacy, self.noise(round_number))
-        return ClientUpdate(sent, {} if settings.privacy.noise_multiplier else trained.losses)
+        save_optimiser_state(self.cache, run_id, round_number, trained.optimiser_state)
+        new, names = network_to_weights(trained.network), trained_names(weights, frozen)
+        update = privatise_update(new, weights, names, settings.privacy, self.noise(round_number))
+        return ClientUpdate(update, {} if settings.privacy.noise_multiplier else trained.losses)
 
-    def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
-        """As in ``FederatedClient``, on pairs of images that were held out.
+    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+        """Repeatability and MMA at 3 px of the weights, shares in [0, 1], on pairs of images that are held out.
 
         Raises:
-            TrainingError: noise is to keep the images private, and figures are without any; or as in ``learn``.
+            TrainingError: the settings ask for privacy noise, which metrics do not carry; or as in ``train``.
         """
         if settings.privacy.noise_multiplier:
             raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
         network = weights_to_network(weights, settings.training.encoder).to(self.device)
-        held_out = self._examples(weights, settings).held_out
+        held_out = self._labelled_images(weights, settings).held_out
         found = validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
-        # What finds nothing finds nothing again: a detector that collapsed is judged, too.
+        # A detector that finds nothing has no metrics; it counts as one that finds nothing again.
         return {name: found[name] if np.isfinite(found[name]) else 0.0 for name in SCORE_METRICS}
 
-    def _examples(self, weights: Weights, settings: FederatedSettings) -> TrainingImages:
-        """The images, labelled by the first weights that ever came here, and by no later ones."""
-        if self.gathered is None:
+    def _labelled_images(self, weights: Weights, settings: FederatedSettings) -> TrainingImages:
+        """The images, labelled by the first weights that the robot ever received; the labels stay."""
+        if self.images is None:
             device = torch.device(self.device)
             labeller = keypoint_response(weights_to_network(weights, settings.training.encoder).to(device), device)
-            self.gathered = read_labelled_images(
-                find_images([self.folder]), self.cache, settings.training, labeller, None, _silent
-            )
-        return self.gathered
+            files = find_images([self.folder])
+            self.images = read_labelled_images(files, self.cache, settings.training, labeller, None, _ignore_progress)
+        return self.images
 
 
 def robot_seed(robot: str, seed: int) -> int:
-    """A robot's own seed, so that no two draw the same views."""
+    """The seed of a robot, so that two robots draw different views."""
     return int(np.random.default_rng([seed, zlib.crc32(robot.encode())]).integers(2**31))
 
 
 def seeded_noise(robot: str, seed: int) -> NoiseSource:
-    """Noise that can be repeated: for robots in one process, whose privacy is a rehearsal."""
+    """Noise that can be repeated, and so protects nobody: for robots that are simulated in one process."""
     return lambda round_number: np.random.default_rng([robot_seed(robot, seed), round_number])
 
 
 def secret_noise(_round_number: int) -> np.random.Generator:
-    """Noise that nobody can repeat."""
+    """Noise from the system's entropy, which cannot be repeated."""
     return np.random.default_rng()
 
 
-def _silent(_stage: str, _status: TrainingProgress) -> None:
+def _ignore_progress(_stage: str, _progress: TrainingProgress) -> None:
     pass

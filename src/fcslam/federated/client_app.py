@@ -1,49 +1,55 @@
-"""Flower's side of a robot: a ``ClientApp`` around whoever learns."""
+"""Wraps a federated client into Flower's ``ClientApp``."""
 
 from collections.abc import Callable
+from typing import Final
 
 from fcslam.errors import FcslamError
 from fcslam.federated.client import FederatedClient
+from fcslam.federated.codec import weights_to_record
 from fcslam.federated.flower import ClientApp, Context, Error, Message
-from fcslam.federated.messages import client_reply, read_request, weights_to_record
+from fcslam.federated.messages import client_reply, identity_reply, read_request
 
-CLIENT_ERROR = 1000
-"""Code of an error that the robot explains; Flower's own are below."""
+CLIENT_ERROR: Final = 1000
+"""Code of an error that a client explains; Flower's own codes are smaller."""
 
 Handler = Callable[[Message, FederatedClient], Message]
 
 
-def build_client_app(learner_of: Callable[[Context], FederatedClient]) -> ClientApp:
-    """The app of a robot that a Flower context stands for. What a robot cannot do it answers with a reason."""
+def build_client_app(client_of: Callable[[Context], FederatedClient]) -> ClientApp:
+    """The app that answers queries for the name, training requests and evaluation requests.
+
+    Args:
+        client_of: gives the client that a Flower context stands for.
+    """
     app = ClientApp()
 
     def handled(handler: Handler) -> Callable[[Message, Context], Message]:
         def handle(message: Message, context: Context) -> Message:
             try:
-                return handler(message, learner_of(context))
+                return handler(message, client_of(context))
             except FcslamError as error:
                 return Message(Error(CLIENT_ERROR, " ".join(str(error).split())), reply_to=message)
 
         return handle
 
-    app.query()(handled(_present))
+    app.query()(handled(_identify))
     app.train()(handled(_train))
     app.evaluate()(handled(_evaluate))
     return app
 
 
-def _present(message: Message, learner: FederatedClient) -> Message:
-    return Message(client_reply(learner.name, "", {}), reply_to=message)
+def _identify(message: Message, client: FederatedClient) -> Message:
+    return Message(identity_reply(client.name), reply_to=message)
 
 
-def _train(message: Message, learner: FederatedClient) -> Message:
-    order = read_request(message.content)
-    learned = learner.learn(order.weights, order.round_number, order.run, order.settings)
-    arrays = weights_to_record(learned.weights)
-    return Message(client_reply(learner.name, order.version, learned.losses, arrays), reply_to=message)
+def _train(message: Message, client: FederatedClient) -> Message:
+    request = read_request(message.content)
+    update = client.train(request.weights, request.round_number, request.run_id, request.settings)
+    arrays = weights_to_record(update.weights)
+    return Message(client_reply(client.name, request.version, update.losses, arrays), reply_to=message)
 
 
-def _evaluate(message: Message, learner: FederatedClient) -> Message:
-    order = read_request(message.content)
-    figures = learner.judge(order.weights, order.settings)
-    return Message(client_reply(learner.name, order.version, figures), reply_to=message)
+def _evaluate(message: Message, client: FederatedClient) -> Message:
+    request = read_request(message.content)
+    metrics = client.evaluate(request.weights, request.settings)
+    return Message(client_reply(client.name, request.version, metrics), reply_to=message)

@@ -1,6 +1,7 @@
-"""What a robot keeps from one round to the next: the first weights, and what its optimiser has learnt of gradients.
+"""What a robot keeps from round to round: the weights of the legacy detector and the state of its optimiser.
 
-Files are called by a number of the run's name and by nothing else that a server says, so they are files of the folder.
+File names contain a checksum of the run's number and nothing else that a server sends. So no server can make a robot
+write outside its folder.
 """
 
 import contextlib
@@ -17,60 +18,61 @@ from fcslam.federated.weights import Weights
 from fcslam.learning.arrays import read_arrays, write_arrays
 
 
-def legacy_weights(cache: Path, run: str, round_number: int, weights: Weights) -> Weights:
-    """The weights that the run began from, or the first that came here of a run that had begun before.
+def legacy_weights(cache: Path, run_id: str, round_number: int, weights: Weights) -> Weights:
+    """The weights of the first round of the run in which the robot took part; these ones if it is this round.
 
     Raises:
-        TrainingError: they cannot be kept.
+        TrainingError: the weights cannot be written or read.
     """
-    path = cache / f"former-{_number(run)}.npz"
-    with translate_errors(path, "the first weights cannot be kept there"):
+    path = cache / f"former-{_checksum(run_id)}.npz"
+    with translate_errors(path, "the weights of the legacy detector cannot be kept"):
         if round_number == 0 or not path.exists():
             write_arrays(path, weights)
         return read_arrays(path)
 
 
-def load_optimiser_state(cache: Path, run: str, round_number: int) -> dict[str, Tensor] | None:
-    """Those at the end of the last round before this one that the robot trained in; None if it trained in none.
+def load_optimiser_state(cache: Path, run_id: str, round_number: int) -> dict[str, Tensor] | None:
+    """The optimiser's state after the latest earlier round in which the robot trained; None if there is none.
 
     Raises:
-        TrainingError: they cannot be read.
+        TrainingError: the file cannot be read.
     """
-    earlier = [each for each in _rounds(cache, run) if each < round_number]
+    earlier = [each for each in _saved_rounds(cache, run_id) if each < round_number]
     if not earlier:
         return None
-    path = _moments_path(cache, run, max(earlier))
-    with translate_errors(path, "the optimiser's memory cannot be read"):
+    path = _state_path(cache, run_id, max(earlier))
+    with translate_errors(path, "the optimiser's state cannot be read"):
         return {name: torch.from_numpy(array) for name, array in read_arrays(path).items()}
 
 
-def save_optimiser_state(cache: Path, run: str, round_number: int, moments: Mapping[str, Tensor]) -> None:
-    """Keep them, and those before: a server that was killed may ask for the same round again.
+def save_optimiser_state(cache: Path, run_id: str, round_number: int, state: Mapping[str, Tensor]) -> None:
+    """Save the state after a round, and keep the one before: a server that was killed may repeat the round.
 
     Raises:
-        TrainingError: they cannot be kept.
+        TrainingError: the file cannot be written.
     """
-    path = _moments_path(cache, run, round_number)
-    with translate_errors(path, "the optimiser's memory cannot be kept there"):
-        write_arrays(path, {name: value.cpu().numpy() for name, value in moments.items()})
-        before = [each for each in _rounds(cache, run) if each < round_number]
-        for each in _rounds(cache, run):
+    path = _state_path(cache, run_id, round_number)
+    with translate_errors(path, "the optimiser's state cannot be kept"):
+        write_arrays(path, {name: value.cpu().numpy() for name, value in state.items()})
+        before = [each for each in _saved_rounds(cache, run_id) if each < round_number]
+        for each in _saved_rounds(cache, run_id):
             if each != round_number and each != max(before, default=None):
-                _moments_path(cache, run, each).unlink()
+                _state_path(cache, run_id, each).unlink()
 
 
-def _rounds(cache: Path, run: str) -> list[int]:
-    """Rounds whose end is kept."""
-    names = (re.fullmatch(r"moments-[0-9a-f]{8}-(\d+)", file.stem) for file in cache.glob(f"moments-{_number(run)}-*"))
+def _saved_rounds(cache: Path, run_id: str) -> list[int]:
+    """Rounds of the run whose state is saved."""
+    pattern = re.compile(r"moments-[0-9a-f]{8}-(\d+)")
+    names = (pattern.fullmatch(file.stem) for file in cache.glob(f"moments-{_checksum(run_id)}-*"))
     return [int(name[1]) for name in names if name]
 
 
-def _moments_path(cache: Path, run: str, round_number: int) -> Path:
-    return cache / f"moments-{_number(run)}-{round_number}.npz"
+def _state_path(cache: Path, run_id: str, round_number: int) -> Path:
+    return cache / f"moments-{_checksum(run_id)}-{round_number}.npz"
 
 
-def _number(run: str) -> str:
-    return f"{zlib.crc32(run.encode()):08x}"
+def _checksum(run_id: str) -> str:
+    return f"{zlib.crc32(run_id.encode()):08x}"
 
 
 @contextlib.contextmanager

@@ -1,12 +1,20 @@
-"""Weights as arrays, and as a network."""
+"""The codec: the only place that converts between networks, weights and Flower's records.
 
-from collections.abc import Callable
+    KeypointNetwork  <->  Weights (float32 arrays by name)  <->  ArrayRecord
+
+Aggregation, screening and privacy work on ``Weights``. Networks exist where something is trained or evaluated, records
+where something is sent.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
+from fcslam.federated.flower import Array, ArrayRecord
 from fcslam.federated.weights import Weights, weights_error
 from fcslam.learning.export import detector_version
 from fcslam.learning.local_training import network_from_state
@@ -15,7 +23,7 @@ from fcslam.learning.settings import Encoder
 
 
 def network_to_weights(network: KeypointNetwork) -> dict[str, NDArray[np.float32]]:
-    """Everything in a network that is no counter."""
+    """Copies of all arrays of a network except its integer counters."""
     return {
         name: tensor.detach().cpu().contiguous().numpy().copy()
         for name, tensor in network.state_dict().items()
@@ -24,19 +32,74 @@ def network_to_weights(network: KeypointNetwork) -> dict[str, NDArray[np.float32
 
 
 def weights_to_network(weights: Weights, encoder: Encoder) -> KeypointNetwork:
-    """A network of these weights, in evaluation mode.
+    """A network with these weights, in evaluation mode.
 
     Raises:
-        TrainingError: they are of another network, or not finite.
+        TrainingError: the weights belong to another network, or are not finite.
     """
     empty = KeypointNetwork(encoder)
     reason = weights_error(weights, network_to_weights(empty))
     if reason is not None:
         raise TrainingError(f"no weights of a {encoder} network: {reason}")
-    floats = {name: torch.from_numpy(np.asarray(array, order="C")) for name, array in weights.items()}
-    return network_from_state(encoder, empty.state_dict() | floats)
+    tensors = {name: torch.from_numpy(np.asarray(array, order="C")) for name, array in weights.items()}
+    return network_from_state(encoder, empty.state_dict() | tensors)
 
 
-def version_maker(encoder: Encoder) -> Callable[[Weights], str]:
-    """What names the weights of such networks."""
-    return lambda weights: detector_version(weights_to_network(weights, encoder))
+def weights_version(weights: Weights, encoder: Encoder) -> str:
+    """The detector version that a network with these weights gets, such as `light-0a1b2c3d4e5f`."""
+    return detector_version(weights_to_network(weights, encoder))
+
+
+def weights_to_record(weights: Weights) -> ArrayRecord:
+    """Serialise weights."""
+    return ArrayRecord({name: Array(np.asarray(array, order="C")) for name, array in weights.items()})
+
+
+def record_to_weights(record: object) -> dict[str, NDArray[np.float32]]:
+    """Deserialise weights. Names, shapes, types and values are not checked, see ``weights_error``.
+
+    Raises:
+        ValueError: this is no record of arrays, or one of its arrays cannot be read.
+    """
+    checked = _array_record(record)
+    try:
+        arrays = {str(name): array.numpy() for name, array in checked.items()}
+    except Exception as error:  # NumPy's parser fails in many ways on bytes that it did not write
+        raise ValueError(f"an array that cannot be read: {type(error).__name__}") from error
+    if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+        raise ValueError("an archive in place of an array")
+    return arrays
+
+
+def record_bytes(record: object) -> int:
+    """Size of the serialised arrays of a record [bytes].
+
+    Raises:
+        ValueError: this is no record of arrays.
+    """
+    return sum(len(array.data) for array in _array_record(record).values())
+
+
+@dataclass(frozen=True)
+class GlobalModel:
+    """Weights of the whole fleet, with everything that is derived from them. Each of it is derived once."""
+
+    weights: Weights
+    version: str
+    """Detector version of the weights."""
+
+    @cached_property
+    def record(self) -> ArrayRecord:
+        """The serialised weights."""
+        return weights_to_record(self.weights)
+
+    @cached_property
+    def size_bytes(self) -> int:
+        """Size of the serialised weights."""
+        return record_bytes(self.record)
+
+
+def _array_record(record: object) -> ArrayRecord:
+    if not isinstance(record, ArrayRecord):
+        raise ValueError(f"a {type(record).__name__} in place of a {ArrayRecord.__name__}")
+    return record

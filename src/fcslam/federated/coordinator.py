@@ -1,7 +1,7 @@
-"""The server's loop: ask robots, screen what they answer, merge it, judge it, keep the best, and remember all of it.
+"""Runs federated training: every round trains on the robots, aggregates, evaluates and decides.
 
-It is a function of the settings, the start and the answers: whose updates arrive first does not matter, and a server
-that was killed goes on from its last round as if it had not been.
+The result is a function of the settings, the initial weights and the replies. The order of arrival does not matter. A
+coordinator that was killed continues from its last checkpoint, with the same result.
 """
 
 import time
@@ -9,24 +9,25 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from fcslam.errors import TrainingError
 from fcslam.federated.checkpoint import CHECKPOINT_FILE, CoordinatorState, read_state, run_id, write_state
-from fcslam.federated.evaluation import Metrics, VersionComparison, combined_score, valid_metrics
-from fcslam.federated.flower import Grid, Message, MessageType, RecordDict
-from fcslam.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
-from fcslam.federated.messages import (
-    ARRAYS_KEY,
-    CONFIG_KEY,
-    record_bytes,
-    reply_metrics,
-    reply_sender,
-    request_config,
-    weights_to_record,
+from fcslam.federated.codec import GlobalModel
+from fcslam.federated.evaluation import (
+    EvaluateFn,
+    Evaluator,
+    Metrics,
+    PublicImages,
+    VersionComparison,
+    combined_score,
+    valid_metrics,
 )
+from fcslam.federated.flower import Grid, Message, MessageType, NodeSelection, RecordDict
+from fcslam.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
+from fcslam.federated.messages import ARRAYS_KEY, CONFIG_KEY, reply_metrics, reply_sender, request_config
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.registry import RobotRegistry, sample_robots
 from fcslam.federated.replies import RoundReplies, printable_line, read_replies
@@ -36,244 +37,256 @@ from fcslam.federated.strategies import Aggregator
 from fcslam.federated.weights import Weights, interpolate_weights
 from fcslam.learning.training_step import learning_rate
 
-PUBLIC: Final = ""
-"""Stands for the server where it judges itself, among the names of robots that do."""
-_CHOICE_SEED: Final = 77
-
-Evaluator = Callable[[Weights], Metrics]
+_SAMPLING_SEED: Final = 77
+"""Separates the drawing of robots from other uses of the training seed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoordinatorHooks:
-    """What the loop is given by whoever runs it."""
+    """What the coordinator calls outside itself."""
 
     version: Callable[[Weights], str]
-    """Names weights."""
-    judge: Evaluator | None = None
-    """Figures of weights on public images; without it the robots judge on images that they held out."""
-    watch: Callable[[RoundReport, Weights], None] = lambda _report, _weights: None
-    """Is told of every round that is done and kept, and the best weights so far."""
+    """Gives the detector version of weights."""
+    evaluate_fn: EvaluateFn | None = None
+    """Evaluates weights on public images; if None, the robots evaluate on images that they held out."""
+    on_round: Callable[[RoundReport, Weights], None] = lambda _report, _best: None
+    """Called after each round with its report and the best weights so far, once both are on disk."""
     wait: Callable[[str], None] | None = None
-    """Is told why a round cannot be completed, and returns when it should be tried again; None if nobody will come."""
+    """Called with the reason when a round cannot be completed; returns when to try again. If None, training fails."""
     clock: Callable[[], float] = time.monotonic
+    """Seconds since any fixed moment."""
+
+
+class Decision(NamedTuple):
+    """What becomes of the version that a round has made."""
+
+    released: bool
+    """It is the best so far and becomes the new detector."""
+    returned: bool
+    """It is so bad that training returns to the best version."""
 
 
 class Coordinator:
     """Federated training in a folder."""
 
-    def __init__(self, settings: FederatedSettings, start: Weights, folder: Path, hooks: CoordinatorHooks) -> None:
-        self._settings, self._start, self._folder, self._hooks = settings, start, folder, hooks
-        self._merger = Aggregator(settings, {})
-        self._run = run_id(settings, hooks.version(start))
+    def __init__(
+        self, grid: Grid, settings: FederatedSettings, initial: Weights, folder: Path, hooks: CoordinatorHooks
+    ) -> None:
+        self._grid, self._settings, self._folder, self._hooks = grid, settings, folder, hooks
+        self._initial = self._model(initial)
+        self._run_id = run_id(settings, self._initial.version)
+        self._robots = RobotRegistry(grid, settings.deadline_s)
+        self._aggregator = Aggregator(settings, {})
 
-    def run(self, grid: Grid) -> CoordinatorState:
-        """All rounds that are not done yet.
+    def run(self) -> CoordinatorState:
+        """Do all rounds that are not done yet.
 
         Raises:
-            TrainingError: the folder is another run's, or a round cannot be completed and nobody will come.
-            OutputError: something cannot be written; what was written before stays.
+            TrainingError: the folder belongs to another run, or a round cannot be completed and there is no ``wait``.
+            OutputError: a file cannot be written; everything written before stays.
         """
-        roster = RobotRegistry(grid, self._settings.deadline_s)
-        state = read_state(
-            self._folder / CHECKPOINT_FILE, self._settings, self._start, self._hooks.version(self._start)
-        )
-        rows: list[Row] = []
-        if state is None:
-            state = self._begin(grid, roster)
-        else:
-            rows = read_rows(self._folder / ROUNDS_FILE, state.rounds_done)
-        self._merger = Aggregator(self._settings, state.memory)
+        state, rows = self._resume()
         while state.rounds_done < self._settings.rounds:
-            state, report = self._round(grid, roster, state)
+            state, report = self._round(state)
             rows.append(report.row())
             write_rows(self._folder / ROUNDS_FILE, rows)
             write_state(self._folder / CHECKPOINT_FILE, state, self._settings)
-            self._hooks.watch(report, state.best)
+            self._hooks.on_round(report, state.best)
         return state
 
-    def _begin(self, grid: Grid, roster: RobotRegistry) -> CoordinatorState:
-        """How good the start is: what comes must not be worse."""
-        scores = {judge: combined_score(found) for judge, found in self._judge(self._start, -1, grid, roster).items()}
-        return CoordinatorState(
-            rounds_done=0,
-            weights=self._start,
-            average=self._start,
-            best=self._start,
-            best_scores=scores,
-            best_round=0,
-            memory={},
-            asked={},
-            origin=self._hooks.version(self._start),
-        )
+    def _resume(self) -> tuple[CoordinatorState, list[Row]]:
+        """The state and the table of rounds in the folder, or those of a new run."""
+        initial = self._initial
+        state = read_state(self._folder / CHECKPOINT_FILE, self._settings, initial.weights, initial.version)
+        if state is None:
+            metrics = self._measure(initial, 0)  # a version must be at least as good to be released
+            scores = {evaluator: combined_score(found) for evaluator, found in metrics.items()}
+            return CoordinatorState.at_start(initial.weights, initial.version, scores), []
+        self._aggregator = Aggregator(self._settings, state.strategy_state)
+        return state, read_rows(self._folder / ROUNDS_FILE, state.rounds_done)
 
-    def _round(
-        self, grid: Grid, roster: RobotRegistry, state: CoordinatorState
-    ) -> tuple[CoordinatorState, RoundReport]:
-        began, sent = self._hooks.clock(), Counter(state.asked)
-        answers, state = self._train(grid, roster, state)
-        while len(answers.weights) < self._settings.minimum_robots:
-            self._wait_or_end(answers.left_out)
-            answers, state = self._train(grid, roster, state)
-        weights = self._merge(answers, state)
-        number = state.rounds_done + 1
-        average = interpolate_weights(state.average, weights, self._share(number))
-        is_judged = number % self._settings.judge_every == 0 or number == self._settings.rounds
-        verdict = (
-            self._verdict(average, state, grid, roster, answers)
-            if is_judged
-            else VersionComparison({}, state.best_scores)
-        )
-        released = verdict.gain is not None and verdict.gain >= 0.0
-        # The start is no place to go back to: nothing would be learnt as long as learning costs something at first.
-        collapsed = verdict.gain is not None and verdict.gain < -self._settings.collapse
-        returned = state.best_round > 0 and collapsed
-        following = CoordinatorState(
-            rounds_done=number,
-            weights=state.best if returned else weights,
-            average=state.best if returned else average,
-            best=average if released else state.best,
-            best_scores=verdict.scores if released else verdict.best,
-            best_round=number if released else state.best_round,
-            memory={} if returned else self._merger.memory,
-            asked=state.asked,
-            origin=state.origin,
-        )
-        if returned:
-            self._merger = Aggregator(self._settings, {})
+    def _round(self, state: CoordinatorState) -> tuple[CoordinatorState, RoundReport]:
+        """One round."""
+        started, sent = self._hooks.clock(), self._model(state.weights)
+
+        replies, trained = self._train(sent, state)
+        weights = self._aggregate(replies, state)
+        candidate = self._model(self._average(weights, state))
+        comparison = self._evaluate(candidate, state, replies)
+        decision = self._decide(comparison, state)
+
+        following = self._next_state(trained, weights, candidate.weights, comparison, decision)
         privacy = self._settings.privacy
         report = RoundReport(
-            round_number=number,
-            version=self._hooks.version(average),
-            robots=tuple(sorted(answers.weights)),
-            left_out=answers.left_out,
-            losses=_means(answers.losses),
-            figures=verdict.figures,
-            score=verdict.score,
-            released=released,
-            returned=returned,
-            bytes_down=(Counter(state.asked) - sent).total() * record_bytes(weights_to_record(state.weights)),
-            bytes_up=answers.bytes_up,
-            seconds=self._hooks.clock() - began,
-            epsilon=epsilon(privacy.noise_multiplier, max(following.asked.values()), privacy.delta),
+            round_number=following.rounds_done,
+            version=candidate.version,
+            robots=tuple(sorted(replies.weights)),
+            left_out=replies.left_out,
+            losses=_means(replies.losses),
+            metrics=comparison.metrics,
+            score=comparison.score,
+            released=decision.released,
+            returned=decision.returned,
+            bytes_down=(Counter(trained.times_asked) - Counter(state.times_asked)).total() * sent.size_bytes,
+            bytes_up=replies.bytes_up,
+            seconds=self._hooks.clock() - started,
+            epsilon=epsilon(privacy.noise_multiplier, max(following.times_asked.values()), privacy.delta),
         )
         return following, report
 
-    def _train(
-        self, grid: Grid, roster: RobotRegistry, state: CoordinatorState
-    ) -> tuple[RoundReplies, CoordinatorState]:
-        """Answers that may be merged, and the state in which robots were asked for them."""
-        present = self._await(roster)
-        rng = np.random.default_rng([self._settings.training.seed, state.rounds_done, _CHOICE_SEED])
-        chosen = sample_robots(present, self._settings.participation, self._settings.minimum_robots, rng)
-        # Counted before anybody hears of it: a server that is killed now will not know what left the robots.
-        state = replace(state, asked=Counter(state.asked) + Counter(chosen))
+    def _train(self, model: GlobalModel, state: CoordinatorState) -> tuple[RoundReplies, CoordinatorState]:
+        """Have robots train from the model until enough of their updates have passed screening."""
+        replies, state = self._train_once(model, state)
+        while len(replies.weights) < self._settings.minimum_robots:
+            self._wait_or_fail(_joined(replies.left_out))
+            replies, state = self._train_once(model, state)
+        return replies, state
+
+    def _train_once(self, model: GlobalModel, state: CoordinatorState) -> tuple[RoundReplies, CoordinatorState]:
+        """One request to a sample of the robots. The state counts the robots that were asked."""
+        connected = self._connected()
+        rng = np.random.default_rng([self._settings.training.seed, state.rounds_done, _SAMPLING_SEED])
+        chosen = sample_robots(connected, self._settings.participation, self._settings.minimum_robots, rng)
+        # Counted before the request leaves: after a crash nobody could say which updates have left the robots.
+        state = replace(state, times_asked=Counter(state.times_asked) + Counter(chosen))
         write_state(self._folder / CHECKPOINT_FILE, state, self._settings)
-        version = self._hooks.version(state.weights)
-        orders = self._merger.strategy.configure_train(
+        requests = self._aggregator.strategy.configure_train(
             state.rounds_done + 1,
-            weights_to_record(state.weights),
-            request_config(version, state.rounds_done, self._run, self._settings),
-            _Nodes([present[robot] for robot in chosen]),
+            model.record,
+            request_config(model.version, state.rounds_done, self._run_id, self._settings),
+            NodeSelection([connected[robot] for robot in chosen]),
         )
-        replies = grid.send_and_receive(orders, timeout=self._settings.deadline_s)
-        answers = read_replies(replies, {present[robot]: robot for robot in chosen}, version, state.weights)
+        messages = self._grid.send_and_receive(requests, timeout=self._settings.deadline_s)
+        replies = read_replies(messages, {connected[robot]: robot for robot in chosen}, model)
         frozen = self._settings.normalisation == "frozen"
-        for robot, reason in screen(answers.weights, state.weights, self._settings.screening, frozen).items():
-            answers.leave_out(robot, reason)
-        answers.mention(
-            {f"another {robot}": "two of one name are there, one is not asked" for robot in roster.duplicates}
-        )
-        return answers, state
+        for robot, reason in screen(replies.weights, model.weights, self._settings.screening, frozen).items():
+            replies.leave_out(robot, reason)
+        duplicates = self._robots.duplicates
+        replies.add_notes({f"another {robot}": "two of one name are there, one is not asked" for robot in duplicates})
+        return replies, state
 
-    def _merge(self, answers: RoundReplies, state: CoordinatorState) -> Weights:
-        """In the order of the robots' names: sums of floats depend on it."""
-        ordered = [(answers.messages[robot], answers.weights[robot]) for robot in sorted(answers.weights)]
-        return self._merger.merge(state.rounds_done + 1, ordered, state.weights)
+    def _aggregate(self, replies: RoundReplies, state: CoordinatorState) -> Weights:
+        """The next weights. Updates are added in the order of the robots' names, as sums of floats depend on it."""
+        updates = [(replies.messages[robot], replies.weights[robot]) for robot in sorted(replies.weights)]
+        return self._aggregator.aggregate(state.rounds_done + 1, updates, state.weights)
 
-    def _share(self, number: int) -> float:
-        """How much of the mean so far stays in it: the lower the learning rate, the less noise is there to smooth."""
-        training = self._settings.client_training()
+    def _average(self, weights: Weights, state: CoordinatorState) -> Weights:
+        """The moving average of the rounds' weights, which is evaluated and released.
+
+        It smooths the noise of training. The lower the learning rate, the less noise there is, so the less is kept of
+        the earlier average. Early averages forget the initial weights, which training leaves behind quickly.
+        """
+        number, training = state.rounds_done + 1, self._settings.client_training()
         rate = learning_rate(training, number * self._settings.local_steps - 1)
-        # Early means forget the start, from which everything is still moving away.
-        most = min(self._settings.smoothing, number / (number + 9))
-        return most * min(rate / training.learning_rate, 1.0)
+        kept = min(self._settings.smoothing, number / (number + 9)) * min(rate / training.learning_rate, 1.0)
+        return interpolate_weights(state.average, weights, kept)
 
-    def _verdict(
-        self, weights: Weights, state: CoordinatorState, grid: Grid, roster: RobotRegistry, answers: RoundReplies
-    ) -> VersionComparison:
-        """How good weights are beside the best, which those judge now that have not yet."""
-        figures = self._judge(weights, state.rounds_done, grid, roster)
-        new, late = figures.keys() - state.best_scores, dict[str, Metrics]()
-        if new and self._hooks.judge is not None:
-            late = {PUBLIC: self._hooks.judge(state.best)}
-        elif new:
-            nodes = {robot: node for robot, node in roster.present().items() if robot in new}
-            late, failed = self._ask_to_judge(state.best, state.rounds_done, grid, nodes)
-            answers.mention({f"judging by {robot}": why for robot, why in failed.items()})
-        return VersionComparison(
-            figures, dict(state.best_scores) | {judge: combined_score(found) for judge, found in late.items()}
+    def _evaluate(self, model: GlobalModel, state: CoordinatorState, replies: RoundReplies) -> VersionComparison:
+        """Compare the model with the best one. Evaluators that have not measured the best one do so now."""
+        number = state.rounds_done + 1
+        if number % self._settings.judge_every != 0 and number != self._settings.rounds:
+            return VersionComparison({}, state.best_scores)
+        metrics = self._measure(model, state.rounds_done)
+        newcomers = metrics.keys() - state.best_scores.keys()
+        best: Mapping[Evaluator, Metrics] = {}
+        if newcomers and self._hooks.evaluate_fn is not None:
+            best = {PublicImages(): self._hooks.evaluate_fn(state.best)}
+        elif newcomers:
+            nodes = {robot: node for robot, node in self._robots.connected().items() if robot in newcomers}
+            best, failed = self._measure_on(nodes, self._model(state.best), state.rounds_done)
+            replies.add_notes({f"judging by {robot}": reason for robot, reason in failed.items()})
+        scores = {evaluator: combined_score(found) for evaluator, found in best.items()}
+        return VersionComparison(metrics, {**state.best_scores, **scores})
+
+    def _decide(self, comparison: VersionComparison, state: CoordinatorState) -> Decision:
+        """Release a version that is at least as good as the best one; return to the best one after a collapse."""
+        gain = comparison.gain
+        if gain is None:
+            return Decision(released=False, returned=False)
+        # Never back to the initial weights: as long as training costs something at first, nothing would be learnt.
+        return Decision(released=gain >= 0.0, returned=state.best_round > 0 and gain < -self._settings.collapse)
+
+    def _next_state(
+        self,
+        state: CoordinatorState,
+        weights: Weights,
+        average: Weights,
+        comparison: VersionComparison,
+        decision: Decision,
+    ) -> CoordinatorState:
+        """The state after the round; ``state`` is the one in which the robots were asked."""
+        number = state.rounds_done + 1
+        if decision.returned:
+            self._aggregator = Aggregator(self._settings, {})
+        return CoordinatorState(
+            rounds_done=number,
+            weights=state.best if decision.returned else weights,
+            average=state.best if decision.returned else average,
+            best=average if decision.released else state.best,
+            best_scores=comparison.scores if decision.released else comparison.best,
+            best_round=number if decision.released else state.best_round,
+            strategy_state=self._aggregator.state,
+            times_asked=state.times_asked,
+            origin=state.origin,
         )
 
-    def _judge(self, weights: Weights, round_number: int, grid: Grid, roster: RobotRegistry) -> dict[str, Metrics]:
-        """Figures by whoever judges."""
-        if self._hooks.judge is not None:
-            return {PUBLIC: self._hooks.judge(weights)}
-        found, failed = self._ask_to_judge(weights, round_number, grid, self._await(roster))
+    def _measure(self, model: GlobalModel, round_number: int) -> Mapping[Evaluator, Metrics]:
+        """Metrics of the model on public images, or else by all robots that can give them, at least one."""
+        if self._hooks.evaluate_fn is not None:
+            return {PublicImages(): self._hooks.evaluate_fn(model.weights)}
+        found, failed = self._measure_on(self._connected(), model, round_number)
         while not found:
-            self._wait_or_end(failed)
-            found, failed = self._ask_to_judge(weights, round_number, grid, self._await(roster))
+            self._wait_or_fail(_joined(failed))
+            found, failed = self._measure_on(self._connected(), model, round_number)
         return found
 
-    def _ask_to_judge(
-        self, weights: Weights, round_number: int, grid: Grid, nodes: Mapping[str, int]
-    ) -> tuple[dict[str, Metrics], dict[str, str]]:
-        """Figures of these robots, and why others gave none."""
-        version = self._hooks.version(weights)
-        config = request_config(version, round_number, self._run, self._settings)
-        letter = RecordDict({ARRAYS_KEY: weights_to_record(weights), CONFIG_KEY: config})
-        questions = [Message(letter, node, MessageType.EVALUATE) for node in nodes.values()]
+    def _measure_on(
+        self, nodes: Mapping[str, int], model: GlobalModel, round_number: int
+    ) -> tuple[dict[Evaluator, Metrics], dict[str, str]]:
+        """Metrics of the model by these robots, and the reasons why some gave none."""
+        config = request_config(model.version, round_number, self._run_id, self._settings)
+        content = RecordDict({ARRAYS_KEY: model.record, CONFIG_KEY: config})
+        requests = [Message(content, node, MessageType.EVALUATE) for node in nodes.values()]
         names = {node: robot for robot, node in nodes.items()}
-        found: dict[str, Metrics] = {}
+        found: dict[Evaluator, Metrics] = {}
         failed: dict[str, str] = {}
-        for reply in grid.send_and_receive(questions, timeout=self._settings.deadline_s):
-            robot = names.get(reply.metadata.src_node_id, "")
+        for reply in self._grid.send_and_receive(requests, timeout=self._settings.deadline_s):
+            robot = names.get(reply.metadata.src_node_id)
+            if robot is None:
+                continue
             try:
                 if reply.has_error():
                     raise ValueError(reply.error.reason or f"error {reply.error.code}")
-                figures = (
-                    valid_metrics(reply_metrics(reply.content))
-                    if reply_sender(reply.content) == (robot, version)
-                    else {}
-                )
-                if not figures:
+                is_ours = reply_sender(reply.content) == (robot, model.version)
+                metrics = valid_metrics(reply_metrics(reply.content)) if is_ours else {}
+                if not metrics:
                     raise ValueError("an answer without figures that could be")
-                found[robot] = figures
+                found[robot] = metrics
             except (ValueError, KeyError, TypeError) as error:
                 failed[robot] = printable_line(str(error))
         return found, failed
 
-    def _await(self, roster: RobotRegistry) -> dict[str, int]:
-        while len(present := roster.present()) < self._settings.minimum_robots:
-            self._wait_or_end({"": f"{len(present)} robots are there, {self._settings.minimum_robots} needed"})
-        return present
+    def _connected(self) -> dict[str, int]:
+        """Node numbers by robot, as soon as enough robots are connected."""
+        while len(connected := self._robots.connected()) < self._settings.minimum_robots:
+            self._wait_or_fail(f"{len(connected)} robots are there, {self._settings.minimum_robots} needed")
+        return connected
 
-    def _wait_or_end(self, reasons: Mapping[str, str]) -> None:
-        why = "; ".join(f"{robot}: {reason}".removeprefix(": ") for robot, reason in sorted(reasons.items()))
+    def _wait_or_fail(self, reason: str) -> None:
         if self._hooks.wait is None:
-            raise TrainingError(f"no round can be completed: {why or 'nobody answered'}")
-        self._hooks.wait(why or "nobody answered")
+            raise TrainingError(f"no round can be completed: {reason}")
+        self._hooks.wait(reason)
+
+    def _model(self, weights: Weights) -> GlobalModel:
+        return GlobalModel(weights, self._hooks.version(weights))
 
 
-class _Nodes:
-    """As much of a grid as a strategy looks at: the nodes that it may ask."""
-
-    def __init__(self, nodes: list[int]) -> None:
-        self._nodes = nodes
-
-    def get_node_ids(self) -> list[int]:
-        return self._nodes
+def _joined(reasons: Mapping[str, str]) -> str:
+    """Reasons by robot as one text."""
+    return "; ".join(f"{robot}: {reason}" for robot, reason in sorted(reasons.items())) or "nobody answered"
 
 
 def _means(rows: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Mean of each loss over the robots."""
     names = dict.fromkeys(name for row in rows.values() for name in row)
     return {name: float(np.mean([row[name] for row in rows.values() if name in row])) for name in names}

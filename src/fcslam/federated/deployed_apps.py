@@ -1,4 +1,4 @@
-"""What runs inside Flower's own processes: the server's app beside a SuperLink, a robot's beside its SuperNode."""
+"""The apps inside Flower's own processes: the server's beside a SuperLink, a robot's beside its SuperNode."""
 
 import json
 import time
@@ -16,18 +16,19 @@ from fcslam.storage.files import write_file
 
 STATUS_FILE: Final = "status.json"
 WAIT_S: Final = 5.0
+"""Time after which a round is tried again that could not be completed."""
 
 
-def encode_job(task: FederatedJob, device: str) -> str:
-    """A task as a line that ``decode_job`` understands."""
-    paths = {"output": str(task.output.resolve()), "public": [str(path.resolve()) for path in task.public]}
-    start = None if task.start is None else str(task.start.resolve())
-    settings = task.settings.model_dump(mode="json")
+def encode_job(job: FederatedJob, device: str) -> str:
+    """A job and the device to work on as one line of text."""
+    paths = {"output": str(job.output.resolve()), "public": [str(path.resolve()) for path in job.public]}
+    start = None if job.start is None else str(job.start.resolve())
+    settings = job.settings.model_dump(mode="json")
     return json.dumps({**paths, "start": start, "settings": settings, "device": device})
 
 
 def decode_job(text: str) -> tuple[FederatedJob, str]:
-    """A task and the device to work on."""
+    """The job and the device of ``encode_job``."""
     content = json.loads(text)
     start = None if content["start"] is None else Path(content["start"])
     settings = FederatedSettings.model_validate(content["settings"])
@@ -36,10 +37,15 @@ def decode_job(text: str) -> tuple[FederatedJob, str]:
 
 
 def write_status(folder: Path, state: str, text: str) -> None:
-    """Say in the run folder how the server fares, for who started it and cannot see it.
+    """Write the server's state into the run folder, where the process that started it can read it.
+
+    Args:
+        folder: of the run.
+        state: `running`, `waiting`, `done` or `failed`.
+        text: the reason for `waiting` and `failed`.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     path = folder / STATUS_FILE
     try:
@@ -49,7 +55,7 @@ def write_status(folder: Path, state: str, text: str) -> None:
 
 
 def read_status(folder: Path) -> tuple[str, str]:
-    """What ``write_status`` wrote last: `running`, `waiting`, `done` or `failed`, and more in words."""
+    """State and text of ``write_status``; `running` if there is no file yet."""
     try:
         content = json.loads((folder / STATUS_FILE).read_text(encoding="utf-8"))
         return str(content["state"]), str(content["text"])
@@ -57,29 +63,29 @@ def read_status(folder: Path) -> tuple[str, str]:
         return "running", ""
 
 
-server = ServerApp()
-"""Named in the app that the SuperLink is given."""
+server_app = ServerApp()
+"""The app of the server; ``launch`` names it to the SuperLink."""
 
 
-@server.main()
-def serve(grid: Grid, context: Context) -> None:
-    """Run the task in the run's configuration; all that goes wrong is said in its folder."""
-    task, device = decode_job(str(context.run_config["task"]))
+@server_app.main()
+def run_server(grid: Grid, context: Context) -> None:
+    """Run the job in the run's configuration, and write every outcome into its folder."""
+    job, device = decode_job(str(context.run_config["task"]))
 
     def wait(reason: str) -> None:
-        write_status(task.output, "waiting", reason)
+        write_status(job.output, "waiting", reason)
         time.sleep(WAIT_S)
-        write_status(task.output, "running", "")
+        write_status(job.output, "running", "")
 
     try:
-        run_job(task, ExecutionOptions(device=device), ProgressCallbacks(), grid, wait)
-        write_status(task.output, "done", "")
+        run_job(job, ExecutionOptions(device=device), ProgressCallbacks(), grid, wait)
+        write_status(job.output, "done", "")
     except FcslamError as error:
-        write_status(task.output, "failed", str(error))
+        write_status(job.output, "failed", str(error))
         raise
 
 
-def _robot_of(context: Context) -> RobotClient:
+def _client_of(context: Context) -> RobotClient:
     config: dict[str, Any] = context.node_config
     name = str(config["robot"])
     seed = config.get("noise-seed")
@@ -87,5 +93,5 @@ def _robot_of(context: Context) -> RobotClient:
     return RobotClient(name, Path(str(config["images"])), Path(str(config["labels"])), noise, str(config["device"]))
 
 
-robot = build_client_app(_robot_of)
-"""Named in the app that every SuperNode runs."""
+robot_app = build_client_app(_client_of)
+"""The app of every robot; ``launch`` names it to the SuperLink, which sends it to the SuperNodes."""

@@ -1,62 +1,78 @@
-"""Which of two versions of the detector is better, by whoever judged both."""
+"""Compares a version of the detector with the best one so far, by every evaluator that measured both."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from fcslam.federated.weights import Weights
+
 SCORE_METRICS: Final = ("repeatability", "mma_3px")
+LOWEST_SCORE: Final = -1.0
+"""Score of a version with an unknown metric: lower than that of any version whose metrics are known."""
 
 Metrics = Mapping[str, float]
+"""Values by name; those in ``SCORE_METRICS`` are shares in [0, 1]."""
+EvaluateFn = Callable[[Weights], Metrics]
+"""Evaluation by the coordinator itself, on public images; Flower's ``evaluate_fn``."""
 
 
-def combined_score(figures: Metrics) -> float:
-    """What versions of the detector are compared by: the mean of repeatability and MMA; -1 where one is not known."""
-    values = [figures.get(name, np.nan) for name in SCORE_METRICS]
-    return float(np.mean(values)) if np.isfinite(values).all() else -1.0
+@dataclass(frozen=True, slots=True)
+class PublicImages:
+    """The evaluator that is no robot: the coordinator, on public images."""
 
 
-def valid_metrics(figures: Metrics) -> dict[str, float]:
-    """What a robot may say of a version: both shares, or nothing."""
-    found = {name: figures[name] for name in SCORE_METRICS if 0.0 <= figures.get(name, np.nan) <= 1.0}
+Evaluator = str | PublicImages
+"""Who measured a version: a robot, by its name, on images that it held out, or the coordinator."""
+
+
+def combined_score(metrics: Metrics) -> float:
+    """The score by which versions are compared: the mean of repeatability and MMA, in [0, 1]."""
+    values = [metrics.get(name, np.nan) for name in SCORE_METRICS]
+    return float(np.mean(values)) if np.isfinite(values).all() else LOWEST_SCORE
+
+
+def valid_metrics(metrics: Metrics) -> dict[str, float]:
+    """The metrics of a robot's evaluation that count: both shares, or none if one is missing or outside [0, 1]."""
+    found = {name: metrics[name] for name in SCORE_METRICS if 0.0 <= metrics.get(name, np.nan) <= 1.0}
     return found if len(found) == len(SCORE_METRICS) else {}
 
 
 @dataclass(frozen=True, slots=True)
 class VersionComparison:
-    """On a version, beside the best one so far."""
+    """A version beside the best one so far."""
 
-    by_evaluator: Mapping[str, Metrics]
-    """Figures of the version; none where it is not judged."""
-    best: Mapping[str, float]
-    """Scores of the best, by all who ever judged it."""
+    by_evaluator: Mapping[Evaluator, Metrics]
+    """Metrics of the version; empty if it was not evaluated in this round."""
+    best: Mapping[Evaluator, float]
+    """Scores of the best version, by everyone who ever evaluated it."""
 
     @property
-    def scores(self) -> dict[str, float]:
-        """The version's, by who judged it."""
-        return {judge: combined_score(figures) for judge, figures in self.by_evaluator.items()}
+    def scores(self) -> dict[Evaluator, float]:
+        """Scores of the version by evaluator."""
+        return {evaluator: combined_score(metrics) for evaluator, metrics in self.by_evaluator.items()}
 
     @property
     def score(self) -> float:
-        """The median; NaN if nobody judged."""
+        """Median of the scores; NaN if the version was not evaluated."""
         return float(np.median(list(self.scores.values()))) if self.by_evaluator else math.nan
 
     @property
-    def figures(self) -> dict[str, float]:
-        """Medians of each."""
-        names = dict.fromkeys(name for figures in self.by_evaluator.values() for name in figures)
+    def metrics(self) -> dict[str, float]:
+        """Median of each metric over the evaluators."""
         rows = self.by_evaluator.values()
+        names = dict.fromkeys(name for row in rows for name in row)
         return {name: float(np.median([row[name] for row in rows if name in row])) for name in names}
 
     @property
     def gain(self) -> float | None:
-        """How much better it is than the best: the median over those who judged both; None if nobody did.
+        """Gain over the best version: median over the evaluators of both versions; None if there are none.
 
-        Robots hold out other images and have other figures: who comes and goes must not make a version better or
-        worse. Of several, one that lies does not decide.
+        Robots hold out different images, so their scores differ in level. Only differences at the same robot are
+        compared: robots that join or leave do not change the gain. The median ignores a minority of false scores.
         """
         scores = self.scores
-        both = sorted(scores.keys() & self.best.keys())
-        return float(np.median([scores[judge] - self.best[judge] for judge in both])) if both else None
+        gains = [score - self.best[evaluator] for evaluator, score in scores.items() if evaluator in self.best]
+        return float(np.median(gains)) if gains else None

@@ -1,4 +1,4 @@
-"""What happened in every round: rounds.csv, written as a whole after each."""
+"""The table of rounds, rounds.csv. It is rewritten as a whole after each round."""
 
 import csv
 import io
@@ -13,41 +13,44 @@ from fcslam.storage.files import write_file
 
 ROUNDS_FILE: Final = "rounds.csv"
 LOSS: Final = "loss_"
-"""What the columns of losses begin with."""
+"""Prefix of the columns of losses."""
 
 Row = dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class RoundReport:
-    """One round."""
+    """The outcome of a round. The columns of the table have the same names."""
 
     round_number: int
-    """From 1; 0 is the start."""
+    """From 1."""
     version: str
-    """Of the mean of weights after it, which is what may be judged and released."""
+    """Detector version of the moving average of weights after the round, which is evaluated and released."""
     robots: tuple[str, ...] = ()
-    """Whose updates counted."""
+    """Robots whose updates were aggregated."""
     left_out: Mapping[str, str] = field(default_factory=dict)
-    """Why the others' did not."""
+    """Reasons by robot why other updates were not, and other problems of the round by what they concern."""
     losses: Mapping[str, float] = field(default_factory=dict)
     """Means over robots and steps."""
-    figures: Mapping[str, float] = field(default_factory=dict)
-    """Of the validation, if there was one."""
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    """Of the evaluation; empty if there was none."""
     score: float = math.nan
+    """By which versions are compared, in [0, 1]; NaN if there was no evaluation."""
     released: bool = False
-    """Whether that mean is the best so far: the new version of the detector."""
+    """The version is the best so far and becomes the new detector."""
     returned: bool = False
-    """Whether it was so bad that the fleet goes on from the best one."""
+    """The version was so bad that training returned to the best one."""
     bytes_down: int = 0
+    """Size of the weights that were sent to all robots."""
     bytes_up: int = 0
-    """Weights to and from all robots."""
+    """Size of the weights that all robots sent."""
     seconds: float = 0.0
+    """Duration of the round."""
     epsilon: float = math.inf
-    """What the robot that was asked most often has given away so far at most, see ``privacy``."""
+    """Privacy loss of the robot that was asked most often, over all rounds so far; see ``privacy``."""
 
     def row(self) -> Row:
-        """As a line of the table."""
+        """The cells of the table by column."""
         return {
             "round": str(self.round_number),
             "version": self.version,
@@ -61,12 +64,12 @@ class RoundReport:
             "robots": " | ".join(self.robots),
             "left_out": " | ".join(f"{robot}: {reason}" for robot, reason in sorted(self.left_out.items())),
             **{f"{LOSS}{name}": f"{value:.6g}" for name, value in self.losses.items()},
-            **{name: f"{value:.6g}" for name, value in self.figures.items()},
+            **{name: f"{value:.6g}" for name, value in self.metrics.items()},
         }
 
 
 def read_rows(path: Path, last: int) -> list[Row]:
-    """Lines up to round ``last``; none if there is no file.
+    """Rows up to round ``last``; none if there is no file.
 
     Raises:
         TrainingError: the file is no table of rounds.
@@ -77,14 +80,14 @@ def read_rows(path: Path, last: int) -> list[Row]:
         with path.open(newline="", encoding="utf-8") as file:
             return [row for row in csv.DictReader(file) if int(row["round"]) <= last]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise TrainingError(f"{path}: is no table of rounds ({error}); take it away") from error
+        raise TrainingError(f"{path}: is no table of rounds ({error}); remove it") from error
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write all lines, in one piece, and the folder if there is none.
+    """Replace the table atomically; its folder is created if it does not exist.
 
     Raises:
-        OutputError: they cannot be written; the file that was there stays.
+        OutputError: the table cannot be written; the old one stays.
     """
     content = io.StringIO()
     names = dict.fromkeys(name for row in rows for name in row)
@@ -95,4 +98,6 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, content.getvalue())
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); make room and run the same command again") from error
+        raise OutputError(
+            f"{path}: cannot be written ({error}); free disk space and run the same command again"
+        ) from error

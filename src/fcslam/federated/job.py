@@ -1,7 +1,8 @@
-"""A federated run from its start to what it hands over, whatever carries the messages."""
+"""A federated training job on the server, from the initial weights to the exported detector, over any transport."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -9,16 +10,12 @@ from fcslam.config import dump
 from fcslam.errors import OutputError, TrainingError
 from fcslam.federated.artifacts import DETECTOR, write_federated_artifacts
 from fcslam.federated.client import NOISE_NEEDS_PUBLIC_IMAGES
-from fcslam.federated.codec import version_maker, weights_to_network
+from fcslam.federated.codec import weights_to_network, weights_version
 from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import Grid
 from fcslam.federated.history import RoundReport
-from fcslam.federated.initial_weights import (
-    calibration_images,
-    prepare_initial_weights,
-    public_evaluator,
-    read_public_images,
-)
+from fcslam.federated.initial_weights import prepare_initial_weights
+from fcslam.federated.public_images import calibration_images, public_evaluation, read_public_images
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 from fcslam.learning.export import export_onnx
@@ -30,62 +27,77 @@ CONFIG_FILE: Final = "config.yaml"
 
 @dataclass(frozen=True, slots=True)
 class FederatedJob:
-    """What is asked of the server."""
+    """What the server is asked to do."""
 
     output: Path
+    """Folder of the run; a run in it is continued."""
     settings: FederatedSettings
     start: Path | None = None
-    """A checkpoint or a released detector to begin from; None for synthetic shapes."""
+    """Checkpoint or exported detector to start from; None for a detector trained on synthetic shapes."""
     public: Sequence[Path] = ()
-    """Folders of images that the server may look at."""
+    """Folders of images that the server may read; without any, the robots evaluate."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProgressCallbacks:
-    """Who is told what."""
+    """Functions that are called as training advances."""
 
-    stage: StageCallback = lambda _stage, _status: None
+    stage: StageCallback = lambda _stage, _progress: None
+    """With the stage before the rounds, and its progress."""
     steps: Callable[[str, int], None] = lambda _robot, _steps: None
+    """With a robot's name and the steps that it has done in the round."""
     rounds: Callable[[RoundReport], None] = lambda _report: None
+    """With the report of a round."""
 
 
 def run_job(
-    task: FederatedJob,
-    pace: ExecutionOptions,
-    watches: ProgressCallbacks,
+    job: FederatedJob,
+    options: ExecutionOptions,
+    callbacks: ProgressCallbacks,
     grid: Grid,
     wait: Callable[[str], None] | None = None,
 ) -> list[Path]:
-    """Run or resume; returns the files that were made. ``wait`` is as in ``CoordinatorHooks``.
+    """Run a job, or continue it.
+
+    Args:
+        job: what to do.
+        options: where and how to compute.
+        callbacks: receive the progress.
+        grid: carries the messages to the robots.
+        wait: as in ``CoordinatorHooks``.
+
+    Returns:
+        The files for the user: the detector in float32 and int8, the picture of the rounds, and the model card.
 
     Raises:
-        TrainingError: something given is unusable, no robot can train, or the output is another run's.
-        OutputError: something cannot be written.
+        TrainingError: an input is unusable, no robot can train, or the output folder belongs to another run.
+        OutputError: a file cannot be written.
     """
-    if task.settings.privacy.noise_multiplier and not task.public:
+    if job.settings.privacy.noise_multiplier and not job.public:
         raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
-    images = read_public_images(task.public)
-    _write_config(task, task.output / CONFIG_FILE)
-    start = prepare_initial_weights(task.start, task.output, task.settings, pace, watches.stage, images)
-    encoder = task.settings.training.encoder
+    images = read_public_images(job.public)
+    _write_config(job, job.output / CONFIG_FILE)
+    initial = prepare_initial_weights(job.start, job.output, job.settings, options, callbacks.stage, images)
+    encoder = job.settings.training.encoder
 
-    def watch(report: RoundReport, best: Weights) -> None:
+    def on_round(report: RoundReport, best: Weights) -> None:
         if report.released:
-            export_onnx(weights_to_network(best, encoder), task.output / DETECTOR)
-        watches.rounds(report)
+            export_onnx(weights_to_network(best, encoder), job.output / DETECTOR)
+        callbacks.rounds(report)
 
-    outside = CoordinatorHooks(version_maker(encoder), public_evaluator(images, encoder, pace.device), watch, wait)
-    state = Coordinator(task.settings, start, task.output, outside).run(grid)
-    _write_config(task, task.output / CONFIG_FILE, again=True)
+    version = partial(weights_version, encoder=encoder)
+    hooks = CoordinatorHooks(version, public_evaluation(images, encoder, options.device), on_round, wait)
+    state = Coordinator(grid, job.settings, initial, job.output, hooks).run()
+    _write_config(job, job.output / CONFIG_FILE, again=True)
     judged_on = "on pairs of public images" if images else "on pairs of images held out by the robots, their median"
-    return write_federated_artifacts(state, task.output, task.settings, calibration_images(images), judged_on)
+    return write_federated_artifacts(state, job.output, job.settings, calibration_images(images), judged_on)
 
 
-def _write_config(task: FederatedJob, path: Path, again: bool = False) -> None:
-    """At the start, unless an earlier run's is there, and at the end."""
+def _write_config(job: FederatedJob, path: Path, again: bool = False) -> None:
+    """Write the settings at the end, and at the start unless an earlier start has written them."""
     try:
-        task.output.mkdir(parents=True, exist_ok=True)
+        job.output.mkdir(parents=True, exist_ok=True)
         if again or not path.exists():
-            path.write_text(dump(task.settings), encoding="utf-8")
+            path.write_text(dump(job.settings), encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{task.output}: cannot be used as the output folder ({error})") from error
+        raise OutputError(f"{job.output}: cannot be used as the output folder ({error})") from error

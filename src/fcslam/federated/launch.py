@@ -1,9 +1,8 @@
-"""Start Flower's daemons for a fleet on several machines, with our apps in them."""
+"""Starts Flower's daemons for a fleet on several machines, with the apps of fcslam in them."""
 
 import contextlib
 import ctypes
 import ipaddress
-import json
 import math
 import os
 import signal
@@ -17,146 +16,121 @@ from pathlib import Path
 from typing import IO, Final
 
 from fcslam.errors import OutputError, TrainingError
+from fcslam.federated import flower
 from fcslam.federated.deployed_apps import encode_job, read_status, write_status
-from fcslam.federated.flower import QUIET
+from fcslam.federated.flower import LOOPBACK
 from fcslam.federated.job import FederatedJob
 from fcslam.federated.tls import Address, Certificates, check_own_certificate, check_server_certificate
 
-LINK: Final = "fleet"
 START_S: Final = 180.0
+"""Time for a SuperLink to listen; on a busy machine Flower's processes take minutes to start."""
 GRACE_S: Final = 90.0
-"""A server that has just started does not know its robots' keys yet: it refuses them for a moment."""
+"""A server that has just started does not know its robots' keys yet and refuses them for a moment."""
 RETRY_S: Final = 3.0
+"""Time between two attempts to reach or to join a server."""
 FREED_S: Final = 15.0
-"""A server that was killed leaves its port within that time."""
+"""Time in which the system frees the port of a server that was killed."""
+STOP_S: Final = 10.0
+"""Time for a daemon to end after each signal."""
 LOG_FILE: Final = "flower.log"
-LOOPBACK: Final = "127.0.0.1"
 PR_SET_PDEATHSIG: Final = 1
-"""Of Linux; Flower's own children watch their parents themselves."""
-
-_APP: Final = """[build-system]
-requires = ["hatchling"]
-build-backend = "hatchling.build"
-
-[project]
-name = "fcslam-fleet"
-version = "0.1.0"
-description = "Federated training of fcslam's detector"
-license = { file = "LICENSE" }
-dependencies = ["flwr>=1.41.0,<2.0"]
-
-[tool.flwr.app]
-publisher = "fcslam"
-fab-format-version = 1
-flwr-version-target = "1.41.0"
-
-[tool.flwr.app.components]
-serverapp = "fcslam_fleet.apps:server"
-clientapp = "fcslam_fleet.apps:robot"
-
-[tool.flwr.app.config]
-task = %s
-"""
+"""Option of Linux's ``prctl``: the signal for a process whose parent ends. Flower's own children watch theirs."""
 
 
 def serve(
-    task: FederatedJob,
+    job: FederatedJob,
     device: str,
     address: Address,
     certificates: Certificates | None,
     robot_keys: Sequence[Path],
-    say: Callable[[], None],
+    on_poll: Callable[[], None],
 ) -> None:
-    """Start a SuperLink, let robots with these public keys join, train, and stop it.
+    """Start a SuperLink, let the robots with these keys join, train, and stop it.
 
     Args:
-        task: what is asked.
-        device: what the server judges on.
+        job: what to train.
+        device: torch's name of the device on which the server evaluates.
         address: to listen on.
-        certificates: None for a network that nobody else is on: neither encrypted nor authenticated.
-        robot_keys: public keys of the robots that may join.
-        say: called about every second, to look at the run folder.
+        certificates: of this machine; None, on a private network only, for no encryption and no authentication.
+        robot_keys: files of the public keys of the robots that may join.
+        on_poll: called about every second; the run folder shows the progress.
 
     Raises:
-        TrainingError: certificates do not fit, the address is taken or out of the robots' reach, Flower does not
-            start, or the training failed; the message says why.
+        TrainingError: the certificates do not fit, the address is taken or the robots cannot reach it, Flower does not
+            start, or the training failed.
         OutputError: the run folder cannot be written.
     """
     if certificates is not None:
         check_own_certificate(certificates, address.host)
-    _check_place(address)
-    with tempfile.TemporaryDirectory() as place, _log(task.output / LOG_FILE) as log:
-        write_status(task.output, "running", "")
-        home = Path(place)
-        environment = _environment(home / "home")
-        _write_app(home, encode_job(task, device), address, certificates)
-        security = ["--insecure"] if certificates is None else [*certificates.options(), "--enable-supernode-auth"]
-        where = ["--host", address.host, "--port", str(address.port)]
-        with _daemon(["flower-superlink", *security, *where], environment, log) as link:
+    _check_address(address)
+    with tempfile.TemporaryDirectory() as place, _log(job.output / LOG_FILE) as log:
+        write_status(job.output, "running", "")
+        home, app = Path(place) / "home", Path(place) / "app"
+        flower.write_connection(home, address, certificates)
+        apps = "fcslam.federated.deployed_apps"
+        flower.write_app(app, f"{apps}:server_app", f"{apps}:robot_app", {"task": encode_job(job, device)})
+        environment = _environment(home)
+        with _daemon(flower.superlink_command(address, certificates), environment, log) as link:
             _wait_for(address, link)
             for key in robot_keys:
-                _flwr(["supernode", "register", str(key.resolve()), LINK], environment)
-            with _daemon(["flwr", "run", str(home / "app"), LINK, "--stream"], environment, log) as run:
-                while run.poll() is None and read_status(task.output)[0] not in ("done", "failed"):
-                    say()
+                _run_command(flower.register_command(key), environment)
+            with _daemon(flower.run_command(app), environment, log) as run:
+                while run.poll() is None and read_status(job.output)[0] not in ("done", "failed"):
+                    on_poll()
                     time.sleep(1.0)
                     if link.poll() is not None:
-                        raise TrainingError(f"Flower's SuperLink ended; see {task.output / LOG_FILE}")
-        say()
-    state, text = read_status(task.output)
+                        raise TrainingError(f"Flower's SuperLink ended; see {job.output / LOG_FILE}")
+        on_poll()
+    state, text = read_status(job.output)
     if state != "done":
-        raise TrainingError(text or f"Flower's run ended; see {task.output / LOG_FILE}")
+        raise TrainingError(text or f"Flower's run ended; see {job.output / LOG_FILE}")
 
 
 def join(
     address: Address,
-    robot: Mapping[str, str],
+    node_config: Mapping[str, str],
     certificates: Certificates | None,
     private_key: Path | None,
     log_file: Path,
-    say: Callable[[str], None],
+    on_wait: Callable[[str], None],
 ) -> int:
-    """Be a robot's SuperNode until interrupted; the exit code of one that the server does not take.
-
-    A server that is not there, or gone, is waited for.
+    """Run a robot's SuperNode until it is interrupted. It waits for a server that is not there, or gone.
 
     Args:
         address: of the server.
-        robot: its configuration, see ``deployed``.
-        certificates: of this machine, as Flower's processes on it talk over TLS as well; None as in ``serve``.
-        private_key: of a key pair whose public half the server has.
-        log_file: for what Flower says.
-        say: told what is waited for.
+        node_config: configuration of the robot, see ``deployed_apps``.
+        certificates: of this machine, on which Flower's processes use TLS as well; None as in ``serve``.
+        private_key: file of the private key whose public key the server has.
+        log_file: receives what Flower prints.
+        on_wait: called with the reason while the robot waits.
+
+    Returns:
+        0 after an interrupt, else the exit code of a SuperNode that the server does not accept.
 
     Raises:
-        TrainingError: certificates do not fit.
+        TrainingError: the certificates do not fit.
         OutputError: the folder of ``log_file`` cannot be written.
     """
-    security = ["--insecure"]
     if certificates is not None:
         check_own_certificate(certificates, LOOPBACK)
-        security = ["--root-certificates", str(certificates.ca.resolve()), *certificates.options()]
-    if private_key is not None:
-        security += ["--auth-supernode-private-key", str(private_key.resolve())]
-    config = " ".join(f"{name}={json.dumps(value)}" for name, value in robot.items())
-    command = ["flower-supernode", *security, "--superlink", str(address), "--host", LOOPBACK, "--node-config", config]
+    command = flower.supernode_command(address, node_config, certificates, private_key)
     refused_since = math.inf
     while True:
-        _await(address, say)
+        _await_server(address, on_wait)
         if certificates is not None:
             check_server_certificate(address, certificates.ca)
-        began = time.monotonic()
-        code = _be_node([*command, "--port", str(free_port())], log_file)
+        started = time.monotonic()
+        code = _run_supernode([*command, "--port", str(free_port())], log_file)
         if code == 0:
             return code
-        taken = time.monotonic() - began > GRACE_S
-        refused_since = math.inf if taken else min(refused_since, began)
+        was_accepted = time.monotonic() - started > GRACE_S
+        refused_since = math.inf if was_accepted else min(refused_since, started)
         if time.monotonic() - refused_since > GRACE_S:
             return code
         time.sleep(RETRY_S)
 
 
-def _be_node(command: Sequence[str], log_file: Path) -> int:
+def _run_supernode(command: Sequence[str], log_file: Path) -> int:
     with (
         tempfile.TemporaryDirectory() as home,
         _log(log_file) as log,
@@ -165,10 +139,9 @@ def _be_node(command: Sequence[str], log_file: Path) -> int:
         return node.wait()
 
 
-def _await(address: Address, say: Callable[[str], None]) -> None:
-    """Return when somebody listens there."""
+def _await_server(address: Address, on_wait: Callable[[str], None]) -> None:
     while not _listens(address):
-        say(f"nobody listens at {address}")
+        on_wait(f"nobody listens at {address}")
         time.sleep(RETRY_S)
 
 
@@ -179,29 +152,10 @@ def _listens(address: Address) -> bool:
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens on."""
+    """A port of this machine on which no process listens."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
-
-
-def _write_app(home: Path, task: str, address: Address, certificates: Certificates | None) -> None:
-    package = home / "app" / "fcslam_fleet"
-    package.mkdir(parents=True)
-    (home / "home").mkdir()
-    (home / "app" / "pyproject.toml").write_text(_APP % json.dumps(task), encoding="utf-8")
-    (home / "app" / "LICENSE").write_text("Apache-2.0\n", encoding="utf-8")
-    (package / "__init__.py").write_text('"""fcslam\'s apps, which are installed on every machine."""\n')
-    # Flower looks for assignments in the text.
-    apps = "from fcslam.federated import deployed\n\nrobot = deployed.robot\nserver = deployed.server\n"
-    (package / "apps.py").write_text(apps, encoding="utf-8")
-    trust = (
-        "insecure = true"
-        if certificates is None
-        else f"root-certificates = {json.dumps(str(certificates.ca.resolve()))}"
-    )
-    connection = f'[superlink]\ndefault = "{LINK}"\n[superlink.{LINK}]\naddress = "{address}"\n{trust}\n'
-    (home / "home" / "config.toml").write_text(connection, encoding="utf-8")
 
 
 def _wait_for(address: Address, link: "subprocess.Popen[bytes]") -> None:
@@ -213,35 +167,34 @@ def _wait_for(address: Address, link: "subprocess.Popen[bytes]") -> None:
     raise TrainingError(f"{address}: Flower's SuperLink does not listen there; is the port free?")
 
 
-def _flwr(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-    command = [*_program("flwr"), *arguments]
-    done = subprocess.run(command, env=dict(environment), capture_output=True, text=True, check=False)
+def _run_command(command: Sequence[str], environment: Mapping[str, str]) -> None:
+    done = subprocess.run(_installed(command), env=dict(environment), capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        said = " ".join((done.stdout + done.stderr).split())
-        raise TrainingError(f"flwr {' '.join(arguments[:2])} {arguments[2]}: {said[-300:]}")
+        output = " ".join((done.stdout + done.stderr).split())
+        raise TrainingError(f"{' '.join(command[:4])}: {output[-300:]}")
 
 
 def _environment(home: Path) -> dict[str, str]:
-    """For Flower's daemons: they start one another by name, whether or not this Python's commands are on the path."""
+    """Flower's daemons start one another by name, so this Python's commands must be on the path."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)))
-    return {**os.environ, **QUIET, "FLWR_HOME": str(home), "PATH": path}
+    return {**os.environ, **flower.daemon_environment(home), "PATH": path}
 
 
-def _program(name: str) -> list[str]:
-    """Flower's command that belongs to this very Python."""
-    beside = Path(sys.executable).with_name(name)
-    if not beside.is_file():
-        raise TrainingError(f"{name}: is not installed beside {sys.executable}; pip install 'fcslam[federated]'")
-    return [str(beside)]
+def _installed(command: Sequence[str]) -> list[str]:
+    """The command with the full path of the program that belongs to this Python."""
+    program = Path(sys.executable).with_name(command[0])
+    if not program.is_file():
+        raise TrainingError(f"{command[0]}: is not installed beside {sys.executable}; pip install 'fcslam[federated]'")
+    return [str(program), *command[1:]]
 
 
 @contextlib.contextmanager
 def _daemon(
     command: Sequence[str], environment: Mapping[str, str], log: IO[bytes]
 ) -> "Iterator[subprocess.Popen[bytes]]":
-    """A process in a session of its own, which ends with the block and takes its children with it."""
+    """A process in a session of its own; when the block ends, it and its children are stopped."""
     process = subprocess.Popen(
-        [*_program(command[0]), *command[1:]],
+        _installed(command),
         env=dict(environment),
         stdout=log,
         stderr=log,
@@ -255,34 +208,34 @@ def _daemon(
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, number)
             with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(10.0)
+                process.wait(STOP_S)
 
 
 def _die_with_parent() -> None:
-    """A daemon whose starter is killed outright ends as well; else it would keep the port, or train on unseen."""
+    """Let the daemon end with a parent that is killed; else it would keep the port, or train on unseen."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _check_place(address: Address) -> None:
-    """A SuperLink that is not ours would be given the robots' keys; one on loopback would be found by none of them."""
+def _check_address(address: Address) -> None:
+    """Refuse an address at which another server would be given the robots' keys, or that robots cannot reach."""
     try:
         found = {str(entry[4][0]) for entry in socket.getaddrinfo(address.host, address.port)}
     except (OSError, UnicodeError) as error:
         raise TrainingError(f"{address}: this machine knows no such name ({error})") from error
-    if not _means_loopback(address.host) and all(map(_is_loopback, found)):
+    if not _names_loopback(address.host) and all(map(_is_loopback, found)):
         raise TrainingError(
-            f"{address}: on this machine that name means {min(found)}, where no other machine gets to; "
-            "let it mean the address that robots know, in /etc/hosts for instance"
+            f"{address}: on this machine that name means {min(found)}, which other machines cannot reach; "
+            "let it mean the address that the robots use, for instance in /etc/hosts"
         )
     end = time.monotonic() + FREED_S
     while _listens(address):
         if time.monotonic() > end:
-            raise TrainingError(f"{address}: somebody listens there already; end that, or choose another port")
+            raise TrainingError(f"{address}: another process listens there already; stop it or choose another port")
         time.sleep(0.2)
 
 
-def _means_loopback(host: str) -> bool:
-    """Whether that is what who wrote it wants; 127.1 is an address, too."""
+def _names_loopback(host: str) -> bool:
+    """Whether the user asks for loopback or gives a literal address, of which 127.1 is one too."""
     return host.lower().startswith("localhost") or host.strip("0123456789.") == "" or ":" in host
 
 
@@ -292,7 +245,7 @@ def _is_loopback(address: str) -> bool:
 
 @contextlib.contextmanager
 def _log(path: Path) -> Iterator[IO[bytes]]:
-    """A file to be written on, with its folder."""
+    """Open a file for appending, and make its folder."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("ab")

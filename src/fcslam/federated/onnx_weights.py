@@ -1,4 +1,4 @@
-"""A released detector as something to train on from: its ONNX file read back as weights."""
+"""Reads the weights of an exported detector back from its ONNX file, so that training can continue from it."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,26 +18,26 @@ from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import Encoder
 
 SUFFIX: Final = ".onnx"
-VARIANCE: Final = 1.0 - 1e-5
-"""With it batch normalisation, which adds 1e-5, changes nothing."""
-LEAST_DEVIATION: Final = 2.0**-8
-"""Of a channel that says the same everywhere; its square has to be more than the 1e-5."""
+UNIT_VARIANCE: Final = 1.0 - 1e-5
+"""With this variance batch normalisation, which adds 1e-5 to it, does not scale."""
+MIN_DEVIATION: Final = 2.0**-8
+"""Standard deviation assumed for a constant channel; its square must exceed the 1e-5."""
 
 
 def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
-    """Weights of a network that gives what the float32 file gives.
+    """Weights of a network that computes the same as a float32 file.
 
     The export folded each batch normalisation into the convolution before it. Read back, the normalisation only holds
     the shift, so the network computes the same function. Before training, call ``with_batch_statistics``.
 
     Raises:
-        TrainingError: the file is no detector in float32, or of another encoder.
+        TrainingError: the file is no detector in float32, or has another encoder.
     """
     import onnx
 
     try:
         graph = onnx.load(str(path)).graph
-    except Exception as error:  # of protobuf, of the system, of onnx
+    except Exception as error:  # errors of protobuf, of the system and of onnx
         raise TrainingError(f"{path}: is no ONNX file ({error})") from error
     weights = network_to_weights(KeypointNetwork(encoder))
     arrays = {array.name: np.array(onnx.numpy_helper.to_array(array)) for array in graph.initializer}
@@ -46,24 +46,24 @@ def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.floa
         found = [arrays[name] for name in node.input[1:] if name in arrays]
         module = _module(node.name)
         if node.op_type == "Conv" and found and f"{module}.weight" in weights:
-            given |= _unfolded(module, found[0], found[1:], weights)
+            given |= _unfold(module, found[0], found[1:], weights)
     missing = sorted(name for name in weights if name not in given)
     if missing:
         raise TrainingError(f"{path}: holds no {missing[0]} of a {encoder} detector in float32")
-    # A network of the right names and shapes, and finite, or refused.
+    # Through a network, which checks names, shapes and values.
     return network_to_weights(weights_to_network({name: given[name] for name in weights}, encoder))
 
 
 def _module(node: str) -> str:
-    """What a convolution is called in the network: `/network/body/joint/joint.0/joint.0.0/Conv` is `body.joint.0.0`."""
+    """The network's name for a convolution: `body.joint.0.0` for `/network/body/joint/joint.0/joint.0.0/Conv`."""
     parts = node.split("/")
     return ".".join(parts[2:3] + parts[3:-1][-1:])
 
 
-def _unfolded(
+def _unfold(
     module: str, kernel: NDArray[Any], bias: list[NDArray[Any]], weights: Mapping[str, NDArray[np.float32]]
 ) -> dict[str, NDArray[Any]]:
-    """A convolution of the file as the arrays of the convolution and of the normalisation after it."""
+    """The arrays of a convolution of the file, and of the normalisation that was folded into it."""
     arrays = {f"{module}.weight": kernel}
     if not bias:
         return arrays
@@ -75,26 +75,26 @@ def _unfolded(
         f"{norm}.weight": ones,
         f"{norm}.bias": bias[0],
         f"{norm}.running_mean": np.zeros_like(ones),
-        f"{norm}.running_var": VARIANCE * ones,
+        f"{norm}.running_var": UNIT_VARIANCE * ones,
     }
 
 
 def with_batch_statistics(
     weights: Weights, encoder: Encoder, images: Sequence[GreyImage]
 ) -> dict[str, NDArray[np.float32]]:
-    """The same function, its batch normalisations by what these images are within the network.
+    """The weights of the same function, with batch statistics measured on images.
 
-    Training normalises by each batch: a network whose normalisations changed nothing would be another one from the
-    first step on. The more these images resemble a robot's, the closer it stays; any are far better than none.
+    Training normalises by the statistics of each batch. A network that was trained without normalisation would change
+    its function in the first step. The more the images resemble those of a robot, the smaller is this change.
     """
     network = weights_to_network(weights, encoder)
     norms = {name: module for name, module in network.named_modules() if isinstance(module, nn.BatchNorm2d)}
-    sums = _sums_before(norms, network, images)
+    sums = _input_sums(norms, network, images)
     given = dict(weights)
     for name, norm in norms.items():
         count, total, squares = sums[name]
         mean = total / count
-        deviation = (squares / count - mean.square()).clamp(min=0.0).sqrt().clamp(min=LEAST_DEVIATION)
+        deviation = (squares / count - mean.square()).clamp(min=0.0).sqrt().clamp(min=MIN_DEVIATION)
         before = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
         arrays = {
             "weight": before * deviation,
@@ -107,13 +107,13 @@ def with_batch_statistics(
 
 
 @torch.inference_mode()
-def _sums_before(
+def _input_sums(
     norms: Mapping[str, nn.BatchNorm2d], network: KeypointNetwork, images: Sequence[GreyImage]
 ) -> dict[str, tuple[int, Tensor, Tensor]]:
-    """By normalisation: how many values of a channel come to it, their sums (C,) and the sums of their squares (C,)."""
+    """By normalisation: number of input values of a channel, their sums (C,) and the sums of their squares (C,)."""
     found: dict[str, tuple[int, Tensor, Tensor]] = {}
 
-    def watch(name: str) -> Any:
+    def hook(name: str) -> Any:
         def add(_module: nn.Module, inputs: tuple[Tensor]) -> None:
             values = inputs[0].double()
             count, total, squares = found.get(name, (0, torch.zeros(()), torch.zeros(())))
@@ -123,7 +123,7 @@ def _sums_before(
         return add
 
     for name, norm in norms.items():
-        norm.register_forward_pre_hook(watch(name))
+        norm.register_forward_pre_hook(hook(name))
     for image in images:
         height, width = (side // CELL_PX * CELL_PX for side in image.shape)
         network(torch.from_numpy(image[:height, :width])[None, None].float() / 255.0)

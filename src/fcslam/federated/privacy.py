@@ -1,8 +1,8 @@
-"""Differential privacy at the robot: its update is shortened and blurred before it leaves, and what that promises.
+"""Differential privacy at the robot: the Gaussian mechanism, applied before an update leaves the robot.
 
-The mechanism is Gaussian, and what it protects is everything that a robot has seen: two robots with any other images
-would send updates that differ by at most twice the clip norm. Whoever reads the network, the server included, cannot
-tell which was sent but for epsilon and delta. Nobody's sampling is kept secret, so none makes the promise stronger.
+It protects all images of a robot together. With any other images the robot would send an update that differs by at
+most twice the clip norm. So whoever reads the weights, including the server, can tell two such sets of images apart
+only as far as epsilon and delta allow. The sampling of robots is public, so it does not strengthen the guarantee.
 """
 
 import math
@@ -16,13 +16,13 @@ from fcslam.federated.settings import PrivacySettings
 from fcslam.federated.weights import FloatVector, Weights, apply_update, update_vector
 
 ORDERS: Final = tuple(1.0 + 10.0**exponent for exponent in np.linspace(-3.0, 4.0, 701))
-"""Of the Renyi divergence; the best one is taken."""
+"""Orders of the Renyi divergence; epsilon is the lowest bound over all of them."""
 _SENSITIVITY: Final = 2.0
-"""Largest distance of two clipped updates, in clip norms."""
+"""Largest distance between two clipped updates [clip norms]."""
 
 
 def clip_update(update: FloatVector, clip_norm: float) -> FloatVector:
-    """The update (N,), shortened to the clip norm if it is longer."""
+    """The update (N,), scaled down to the clip norm if its Euclidean norm is larger."""
     length = float(np.linalg.norm(update))
     return update * (clip_norm / length) if length > clip_norm else update
 
@@ -30,9 +30,14 @@ def clip_update(update: FloatVector, clip_norm: float) -> FloatVector:
 def privatise_update(
     new: Weights, old: Weights, names: Collection[str], settings: PrivacySettings, rng: np.random.Generator
 ) -> dict[str, NDArray[np.float32]]:
-    """Weights that may leave the robot: the arrays of these names are clipped and blurred, the others those of ``old``.
+    """The weights that leave the robot.
 
-    Without a noise multiplier they are ``new``.
+    Args:
+        new: weights after training.
+        old: weights before training.
+        names: arrays that were trained; all others are taken from ``old``.
+        settings: clip norm and noise; with a noise multiplier of 0 the result is ``new``.
+        rng: source of the noise.
     """
     if settings.noise_multiplier == 0.0:
         return dict(new)
@@ -42,18 +47,18 @@ def privatise_update(
 
 
 def epsilon(noise_multiplier: float, rounds: int, delta: float) -> float:
-    """What ``rounds`` updates of one robot give away of its images; infinite without noise, 0 without rounds.
+    """Privacy loss of a robot after ``rounds`` updates; infinite without noise, 0 without rounds.
 
-    Renyi divergence of Gaussians (Mironov 2017, prop. 7), added up over the rounds, turned into (epsilon, delta) by
-    theorem 21 of Balle et al. 2020.
+    The Renyi divergence of Gaussians (Mironov 2017, prop. 7) is summed over the rounds and converted to (epsilon,
+    delta) by theorem 21 of Balle et al. 2020.
     """
     if rounds == 0:
         return 0.0
     if noise_multiplier == 0.0:
         return math.inf
-    a_round = 0.5 * (_SENSITIVITY / noise_multiplier) ** 2
+    per_round = 0.5 * (_SENSITIVITY / noise_multiplier) ** 2
     bounds = [
-        rounds * a_round * order + math.log1p(-1.0 / order) - (math.log(delta) + math.log(order)) / (order - 1.0)
+        rounds * per_round * order + math.log1p(-1.0 / order) - (math.log(delta) + math.log(order)) / (order - 1.0)
         for order in ORDERS
     ]
     return max(float(min(bounds)), 0.0)

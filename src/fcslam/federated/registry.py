@@ -1,4 +1,4 @@
-"""Which robot is behind which of Flower's nodes: their numbers are drawn anew whenever a robot joins, names stay."""
+"""Maps Flower's nodes to robots. Flower gives a robot a new node number whenever it joins; its name stays."""
 
 from collections.abc import Iterable, Sequence
 
@@ -9,18 +9,18 @@ from fcslam.federated.messages import reply_sender
 
 
 class RobotRegistry:
-    """Asks every node once for its name."""
+    """The robots that are connected, by name; each node is asked for its name once."""
 
     def __init__(self, grid: Grid, deadline_s: float) -> None:
         self._grid, self._deadline_s = grid, deadline_s
         self._names: dict[int, str] = {}
         self.duplicates: tuple[str, ...] = ()
-        """Names that more than one of those present had when last looked."""
+        """Names that more than one node had at the last call of ``connected``."""
 
-    def present(self) -> dict[str, int]:
-        """Nodes by the names of the robots that are there now, in the names' order; of two with one name, the first."""
+    def connected(self) -> dict[str, int]:
+        """Node numbers of the connected robots by name, sorted by name; of two with one name, the lower number."""
         nodes = sorted(self._grid.get_node_ids())
-        self._meet([node for node in nodes if node not in self._names])
+        self._identify([node for node in nodes if node not in self._names])
         found: dict[str, int] = {}
         duplicates: dict[str, int] = {}
         for name, node in sorted((self._names[node], node) for node in nodes if node in self._names):
@@ -28,11 +28,11 @@ class RobotRegistry:
         self.duplicates = tuple(duplicates)
         return found
 
-    def _meet(self, nodes: Sequence[int]) -> None:
+    def _identify(self, nodes: Sequence[int]) -> None:
         if not nodes:
             return
-        questions = [Message(RecordDict({}), node, MessageType.QUERY) for node in nodes]
-        for reply in self._grid.send_and_receive(questions, timeout=self._deadline_s):
+        queries = [Message(RecordDict({}), node, MessageType.QUERY) for node in nodes]
+        for reply in self._grid.send_and_receive(queries, timeout=self._deadline_s):
             if reply.has_error():
                 continue
             try:
@@ -41,8 +41,18 @@ class RobotRegistry:
                 continue
 
 
-def sample_robots(names: Iterable[str], share: float, fewest: int, rng: np.random.Generator) -> list[str]:
-    """Some of the robots, in the order of their names: a share of them, and no fewer than ``fewest`` if there are."""
+def sample_robots(names: Iterable[str], fraction: float, minimum: int, rng: np.random.Generator) -> list[str]:
+    """Draw robots for a round.
+
+    Args:
+        names: of the connected robots.
+        fraction: share of them to draw, in (0, 1].
+        minimum: number of robots to draw at least, as far as so many are connected.
+        rng: source of randomness.
+
+    Returns:
+        Names in alphabetical order.
+    """
     everyone = sorted(names)
-    count = min(max(int(np.ceil(share * len(everyone))), fewest), len(everyone))
+    count = min(max(int(np.ceil(fraction * len(everyone))), minimum), len(everyone))
     return [everyone[index] for index in sorted(rng.choice(len(everyone), count, replace=False))]

@@ -1,4 +1,7 @@
-"""Which updates of a round may be averaged: sound, of a plausible length, and not against all others."""
+"""Screening: decides which updates of a round are aggregated.
+
+An update must fit the network, have a plausible length, and not oppose the other updates.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,31 +12,35 @@ from fcslam.federated.weights import FloatVector, Weights, trained_names, update
 
 
 def screen(
-    answers: Mapping[str, Weights], asked: Weights, settings: ScreeningSettings, frozen: bool = False
+    updates: Mapping[str, Weights], sent: Weights, settings: ScreeningSettings, frozen: bool = False
 ) -> dict[str, str]:
-    """Reasons by robot for every answer that is refused; ``asked`` are the weights that all began from.
+    """The reasons why updates are refused, by robot.
 
-    With ``frozen`` batch statistics are to come back as they were sent.
+    Batch statistics change many times as much as parameters, and depend on the light at each robot. So the length of
+    their change is checked separately, and its direction is not checked.
 
-    Batch statistics move many times as far as what is trained, and each robot's lie where its own light puts them:
-    their length is looked at by itself, and their direction not at all.
+    Args:
+        updates: weights after training, by robot.
+        sent: weights that all robots trained from.
+        settings: the thresholds.
+        frozen: batch statistics must come back unchanged.
     """
-    refused = {robot: reason for robot, weights in answers.items() if (reason := weights_error(weights, asked))}
-    parameters = trained_names(asked, frozen_statistics=True)
-    statistics = [name for name in asked if name not in set(parameters)]
-    for robot in [robot for robot in answers if frozen and robot not in refused]:
-        if any(not np.array_equal(answers[robot][name], asked[name]) for name in statistics):
+    refused = {robot: reason for robot, weights in updates.items() if (reason := weights_error(weights, sent))}
+    parameters = trained_names(sent, frozen_statistics=True)
+    statistics = [name for name in sent if name not in set(parameters)]
+    for robot in [robot for robot in updates if frozen and robot not in refused]:
+        if any(not np.array_equal(updates[robot][name], sent[name]) for name in statistics):
             refused[robot] = "batch statistics that were to stay as they are have changed"
     for names in (parameters, statistics):
-        rest = _updates(answers, asked, names, refused)
-        refused |= _too_long(rest, float(np.linalg.norm(_vector(asked, names))), settings)
-    return refused | _against_the_others(_updates(answers, asked, parameters, refused), settings)
+        rest = _vectors(updates, sent, names, refused)
+        refused |= _too_long(rest, float(np.linalg.norm(_vector(sent, names))), settings)
+    return refused | _disagreeing(_vectors(updates, sent, parameters, refused), settings)
 
 
-def _updates(
-    answers: Mapping[str, Weights], asked: Weights, names: Sequence[str], refused: Mapping[str, str]
+def _vectors(
+    updates: Mapping[str, Weights], sent: Weights, names: Sequence[str], refused: Mapping[str, str]
 ) -> dict[str, FloatVector]:
-    return {robot: update_vector(answers[robot], asked, names) for robot in answers if robot not in refused}
+    return {robot: update_vector(updates[robot], sent, names) for robot in updates if robot not in refused}
 
 
 def _vector(weights: Weights, names: Sequence[str]) -> FloatVector:
@@ -55,7 +62,7 @@ def _too_long(updates: Mapping[str, FloatVector], size: float, settings: Screeni
     }
 
 
-def _against_the_others(updates: Mapping[str, FloatVector], settings: ScreeningSettings) -> dict[str, str]:
+def _disagreeing(updates: Mapping[str, FloatVector], settings: ScreeningSettings) -> dict[str, str]:
     if settings.least_agreement is None or len(updates) < settings.quorum:
         return {}
     found = {robot: agreement(update, [each for other, each in updates.items() if other != robot])
@@ -68,7 +75,7 @@ def _against_the_others(updates: Mapping[str, FloatVector], settings: ScreeningS
 
 
 def agreement(update: FloatVector, others: Sequence[FloatVector]) -> float:
-    """Cosine of an update (N,) with the median of others, coordinate by coordinate; 0 if either is zero."""
+    """Cosine between an update (N,) and the coordinate-wise median of other updates; 0 if either is zero."""
     median = np.median(np.stack(others), axis=0)
     length = float(np.linalg.norm(update) * np.linalg.norm(median))
     return float(update @ median) / length if length > 0.0 else 0.0

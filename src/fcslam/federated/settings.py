@@ -1,4 +1,4 @@
-"""How a fleet trains together."""
+"""Settings of federated training."""
 
 from typing import Literal, Self
 
@@ -12,77 +12,119 @@ Normalisation = Literal["averaged", "frozen"]
 
 
 class ScreeningSettings(Settings):
-    """Which updates are refused, beside those that are malformed or not finite."""
+    """Thresholds above which an update is refused; malformed and non-finite updates are always refused."""
 
     largest_change: float | None = Field(
-        default=1.0, gt=0.0, description="an update's length, in lengths of the weights; null for any"
+        default=1.0,
+        gt=0.0,
+        description="largest norm of an update, as a multiple of the norm of the weights; null for no limit",
     )
     longest: float | None = Field(
-        default=3.0, gt=1.0, description="its length, in medians of the round's lengths; null for any"
+        default=3.0,
+        gt=1.0,
+        description="largest norm of an update, as a multiple of the median norm in the round; null for no limit",
     )
     least_agreement: float | None = Field(
-        default=-0.03, ge=-1.0, le=1.0, description="its cosine with the median of the others; null for any"
+        default=-0.03,
+        ge=-1.0,
+        le=1.0,
+        description="least cosine between an update and the median of the other updates; null for no limit",
     )
-    quorum: int = Field(default=4, ge=3, description="updates from which on they are compared with one another")
+    quorum: int = Field(
+        default=4, ge=3, description="fewest updates in a round for which they are compared with one another"
+    )
 
 
 class PrivacySettings(Settings):
-    """Noise that a robot adds to its update before it leaves."""
+    """Differential privacy: noise that a robot adds to its update before the update leaves it."""
 
-    clip_norm: float = Field(default=1.0, gt=0.0, description="updates longer than this are shortened to it")
-    noise_multiplier: float = Field(default=0.0, ge=0.0, description="standard deviation in clip norms; 0 is neither")
-    delta: float = Field(default=1e-5, gt=0.0, lt=1.0, description="chance that epsilon does not hold")
+    clip_norm: float = Field(
+        default=1.0, gt=0.0, description="largest norm of an update; longer updates are scaled down to it"
+    )
+    noise_multiplier: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="standard deviation of the noise, as a multiple of clip_norm; 0 for neither clipping nor noise",
+    )
+    delta: float = Field(
+        default=1e-5, gt=0.0, lt=1.0, description="probability with which the privacy loss may exceed epsilon"
+    )
 
 
 class FederatedSettings(Settings):
-    """One federated training run."""
+    """Settings of a federated training run."""
 
-    rounds: int = Field(default=200, ge=1, description="rounds of local training and aggregation")
-    local_steps: int = Field(default=10, ge=1, description="optimiser steps of a robot in a round")
+    rounds: int = Field(default=200, ge=1, description="number of rounds of local training and aggregation")
+    local_steps: int = Field(default=10, ge=1, description="optimiser steps of each robot in a round")
     judge_every: int = Field(
-        default=5, ge=1, description="rounds from one judged version to the next; these and the last may be released"
+        default=5,
+        ge=1,
+        description="rounds between two evaluations; only evaluated versions and the last one can be released",
     )
-    strategy: StrategyName = Field(default="fedavg", description="how updates become one, by Flower's class")
-    participation: float = Field(default=1.0, gt=0.0, le=1.0, description="share of the robots asked in a round")
-    minimum_robots: int = Field(default=1, ge=1, description="updates without which a round does not count")
-    deadline_s: float = Field(default=3600.0, gt=0.0, description="robots that answer later are left out of a round")
-    proximal: float = Field(default=0.01, ge=0.0, description="strength of FedProx's pull to the global weights")
+    strategy: StrategyName = Field(default="fedavg", description="Flower strategy that aggregates the updates")
+    participation: float = Field(
+        default=1.0, gt=0.0, le=1.0, description="share of the connected robots that train in a round"
+    )
+    minimum_robots: int = Field(default=1, ge=1, description="fewest updates for which a round counts")
+    deadline_s: float = Field(
+        default=3600.0, gt=0.0, description="time for a robot's reply [s]; later replies are left out of the round"
+    )
+    proximal: float = Field(
+        default=0.01,
+        ge=0.0,
+        description="strength of FedProx's proximal term, which holds robots to the global weights",
+    )
     compatible: float = Field(
-        default=0.0, ge=0.0, description="how strongly codes are kept to those of the first weights; 0 is not at all"
+        default=0.0,
+        ge=0.0,
+        description="weight of the loss that keeps descriptors compatible with those of the initial weights; 0 for off",
     )
     server_momentum: float = Field(
         default=0.5,
         ge=0.0,
         lt=1.0,
-        description="Nesterov's, between rounds; 1 - 1/N of N robots at most; 0 is none; not for fedadam, krum",
+        description="share of Nesterov's momentum kept between rounds, at most 1 - 1/N for N robots; 0 for off; "
+        "fedadam and krum do not use it",
     )
     smoothing: float = Field(
         default=0.8,
         ge=0.0,
         lt=1.0,
-        description="share of the mean of earlier rounds in what is judged and released; falls with the learning rate",
+        description="share of earlier rounds in the moving average that is evaluated and released; "
+        "decreases with the learning rate",
     )
-    server_rate: float = Field(default=0.003, gt=0.0, description="learning rate of FedAdam")
-    trimmed: float = Field(default=0.2, ge=0.0, lt=0.5, description="share that FedTrimmedAvg cuts at either end")
-    malicious: int = Field(default=1, ge=0, description="poisoned robots that Krum reckons with")
+    server_rate: float = Field(default=0.003, gt=0.0, description="server learning rate of FedAdam")
+    trimmed: float = Field(
+        default=0.2, ge=0.0, lt=0.5, description="share of the updates that FedTrimmedAvg removes at each end"
+    )
+    malicious: int = Field(default=1, ge=0, description="number of poisoned robots that Krum must tolerate")
     normalisation: Normalisation = Field(
-        default="averaged", description="batch statistics: averaged like weights, or frozen as they were at the start"
+        default="averaged",
+        description="batch statistics: averaged over the robots like weights, or frozen at their initial values",
     )
     collapse: float = Field(
-        default=0.15, gt=0.0, le=1.0, description="drop of the score below the best that takes the fleet back to it"
+        default=0.15,
+        gt=0.0,
+        le=1.0,
+        description="drop of the score below that of the best version from which training returns to the best one",
     )
-    screening: ScreeningSettings = Field(default_factory=ScreeningSettings, description="which updates are refused")
-    privacy: PrivacySettings = Field(default_factory=PrivacySettings, description="noise on what leaves a robot")
+    screening: ScreeningSettings = Field(
+        default_factory=ScreeningSettings, description="thresholds above which an update is refused"
+    )
+    privacy: PrivacySettings = Field(
+        default_factory=PrivacySettings, description="differential privacy of the robots' images"
+    )
     training: TrainingSettings = Field(
-        default_factory=TrainingSettings, description="of a robot; its steps are rounds times local_steps"
+        default_factory=TrainingSettings,
+        description="training on each robot; its steps are replaced by rounds times local_steps",
     )
 
     @model_validator(mode="after")
     def _variances_stay_positive(self) -> Self:
         if self.normalisation == "averaged" and (self.strategy == "fedadam" or self.privacy.noise_multiplier > 0.0):
-            raise ValueError("FedAdam and noise may turn variances negative: they need normalisation: frozen")
+            raise ValueError("FedAdam and noise can make variances negative; set normalisation to frozen")
         return self
 
     def client_training(self) -> TrainingSettings:
-        """The training settings with the steps of the whole run."""
+        """The training settings of a robot, with the steps of the whole run."""
         return self.training.model_copy(update={"steps": self.rounds * self.local_steps})

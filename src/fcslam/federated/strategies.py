@@ -1,4 +1,4 @@
-"""How updates become one: Flower's strategies, momentum between rounds, and what of both has to outlive a restart."""
+"""Aggregation: Flower's strategies, momentum between rounds, and the state of both that must survive a restart."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
+from fcslam.federated.codec import record_to_weights, weights_to_record
 from fcslam.federated.flower import (
     FedAdam,
     FedAvg,
@@ -17,87 +18,99 @@ from fcslam.federated.flower import (
     Message,
     MetricRecord,
     RecordDict,
+    restore_moments,
+    strategy_moments,
 )
-from fcslam.federated.messages import (
-    ARRAYS_KEY,
-    CONFIG_KEY,
-    EXAMPLES_KEY,
-    METRICS_KEY,
-    record_to_weights,
-    weights_to_record,
-)
+from fcslam.federated.messages import ARRAYS_KEY, CONFIG_KEY, EXAMPLES_KEY, METRICS_KEY
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, trained_names, weights_error
 
-_MOMENTS: Final = ("m_t", "v_t")
-"""FedAdam's memory, by its attributes' names."""
 _MOMENTUM: Final = "momentum"
 
 
 class Aggregator:
-    """One of Flower's strategies, and what it is to remember of earlier rounds."""
+    """One of Flower's strategies with momentum between rounds.
 
-    def __init__(self, settings: FederatedSettings, memory: Mapping[str, NDArray[Any]]) -> None:
+    Args:
+        settings: choose the strategy and the momentum.
+        state: the ``state`` of an earlier aggregator to continue; empty for a new run.
+    """
+
+    def __init__(self, settings: FederatedSettings, state: Mapping[str, NDArray[Any]]) -> None:
         self.strategy = create_strategy(settings)
-        self._most = settings.server_momentum
-        for moment in _MOMENTS:
-            if part := _part(memory, moment):
-                setattr(self.strategy, moment, part)
-        # FedAdam has its own, and Krum's choice is one robot's update, as noisy as any.
+        restore_moments(self.strategy, {name: _group(state, name) for name in strategy_moments(self.strategy)})
+        self._largest_momentum = settings.server_momentum
+        # FedAdam has its own momentum. Krum selects one robot's update, which is too noisy to be followed further.
         without = settings.strategy in ("fedadam", "krum") or settings.server_momentum == 0.0
-        self._momentum = None if without else _part(memory, _MOMENTUM)
+        self._momentum = None if without else _group(state, _MOMENTUM)
 
     @property
-    def memory(self) -> dict[str, NDArray[Any]]:
-        """What another one needs to go on as this one would, as arrays by name."""
-        parts = {moment: getattr(self.strategy, moment, None) or {} for moment in _MOMENTS}
-        parts[_MOMENTUM] = self._momentum or {}
-        return {f"{part}/{name}": np.asarray(array) for part, arrays in parts.items() for name, array in arrays.items()}
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Arrays with which another aggregator continues as this one would, by name."""
+        groups = {**strategy_moments(self.strategy), _MOMENTUM: self._momentum or {}}
+        return {
+            f"{group}/{name}": np.asarray(array) for group, arrays in groups.items() for name, array in arrays.items()
+        }
 
-    def merge(self, round_number: int, answers: Sequence[tuple[Message, Weights]], old: Weights) -> Weights:
-        """The next weights, from robots' answers to ``old`` ones.
+    def aggregate(self, round_number: int, updates: Sequence[tuple[Message, Weights]], old: Weights) -> Weights:
+        """The next global weights.
+
+        Args:
+            round_number: from 1, as Flower counts.
+            updates: the robots' replies, with the weights in them; these have passed screening.
+            old: the weights from which the robots trained.
 
         Raises:
-            TrainingError: they are unusable.
+            TrainingError: the strategy gives weights that are not finite or do not fit the network.
         """
         messages = []
-        for message, weights in answers:
-            # All did the same number of steps, so all weigh the same, whatever a robot would like to weigh.
+        for message, weights in updates:
+            # Every robot did the same number of steps, so every update has the same weight, whatever the robot says.
             metrics = MetricRecord({EXAMPLES_KEY: 1.0})
+            # Serialised again, so that the strategy reads exactly the arrays that were screened.
             message.content = RecordDict({ARRAYS_KEY: weights_to_record(weights), METRICS_KEY: metrics})
             messages.append(message)
         record, _ = self.strategy.aggregate_train(round_number, messages)
-        merged = {name: np.asarray(array, np.float32) for name, array in record_to_weights(record).items()}
-        reason, onward = weights_error(merged, old), merged
+        aggregated = {name: np.asarray(array, np.float32) for name, array in record_to_weights(record).items()}
+        reason, following = weights_error(aggregated, old), aggregated
         if reason is None and self._momentum is not None:
-            # As far as all robots would have come one after another, at most.
-            share = min(self._most, 1.0 - 1.0 / len(answers))
-            onward, self._momentum = apply_server_momentum(merged, old, self._momentum, share)
-            reason = weights_error(onward, old)
+            # Limited to the way that the robots would have gone if they had trained one after another.
+            share = min(self._largest_momentum, 1.0 - 1.0 / len(updates))
+            following, self._momentum = apply_server_momentum(aggregated, old, self._momentum, share)
+            reason = weights_error(following, old)
         if reason is not None:
             raise TrainingError(f"round {round_number}: the strategy gave unusable weights: {reason}")
-        return {name: onward[name] for name in old}
+        return {name: following[name] for name in old}
 
 
 def apply_server_momentum(
-    merged: Weights, old: Weights, momentum: Mapping[str, NDArray[np.float32]], share: float
+    aggregated: Weights, old: Weights, momentum: Mapping[str, NDArray[np.float32]], share: float
 ) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]]:
-    """Weights beyond the ``merged`` ones by Nesterov's momentum, and the momentum for the next round.
+    """Continue beyond the aggregated weights by Nesterov's momentum, as in Douillard et al. 2023 (DiLoCo).
 
     A mean of updates is less noisy than each of them and can be followed further: m <- share m + u,
-    w <- w + u + share m with u = ``merged`` - ``old``, as in Douillard et al. 2023 (DiLoCo). Batch statistics are
-    taken as merged: they are measured and not learnt, and variances may not turn negative.
+    w <- w + u + share m with u = ``aggregated`` - ``old``. Batch statistics are taken as aggregated: they are measured
+    and not trained, and variances must not become negative.
+
+    Args:
+        aggregated: mean of the robots' weights.
+        old: weights from which the robots trained.
+        momentum: of the last round; empty before the first.
+        share: of the momentum that is kept, in [0, 1).
+
+    Returns:
+        The next weights, and the momentum for the next round.
     """
-    onward, following = {name: merged[name] for name in old}, {}
+    following, next_momentum = {name: aggregated[name] for name in old}, {}
     for name in trained_names(old, frozen_statistics=True):
-        update = merged[name] - old[name]
-        following[name] = np.asarray(update + share * momentum[name] if momentum else update, np.float32)
-        onward[name] = np.asarray(merged[name] + share * following[name], np.float32)
-    return onward, following
+        update = aggregated[name] - old[name]
+        next_momentum[name] = np.asarray(update + share * momentum[name] if momentum else update, np.float32)
+        following[name] = np.asarray(aggregated[name] + share * next_momentum[name], np.float32)
+    return following, next_momentum
 
 
 def create_strategy(settings: FederatedSettings) -> FedAvg:
-    """The strategy of these settings; it asks every robot it sees, so whoever runs it shows it those to ask."""
+    """Flower's strategy for these settings. It asks all nodes that it is shown; the coordinator selects them."""
     everyone: dict[str, Any] = {
         "fraction_train": 1.0,
         "min_train_nodes": 1,
@@ -122,5 +135,5 @@ def create_strategy(settings: FederatedSettings) -> FedAvg:
             return Krum(num_malicious_nodes=settings.malicious, **everyone)
 
 
-def _part(memory: Mapping[str, NDArray[Any]], part: str) -> dict[str, NDArray[Any]]:
-    return {name.removeprefix(f"{part}/"): array for name, array in memory.items() if name.startswith(f"{part}/")}
+def _group(state: Mapping[str, NDArray[Any]], group: str) -> dict[str, NDArray[Any]]:
+    return {name.removeprefix(f"{group}/"): array for name, array in state.items() if name.startswith(f"{group}/")}

@@ -1,4 +1,4 @@
-"""Whether certificates fit, asked before Flower is started: its processes try again and again and say little."""
+"""Checks certificates before Flower starts: its processes retry without end and do not say what is wrong."""
 
 import contextlib
 import socket
@@ -10,9 +10,10 @@ from typing import Final
 from fcslam.errors import TrainingError
 from fcslam.wire.keys import no_passphrase
 
-PATIENCE_S: Final = 10.0
-FLIGHTS: Final = 8
-"""A handshake is over after so many turns."""
+TIMEOUT_S: Final = 10.0
+"""Time for a handshake with the server."""
+MAX_FLIGHTS: Final = 8
+"""A TLS handshake takes fewer turns of both sides than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,18 +21,15 @@ class Certificates:
     """PEM files of one machine."""
 
     ca: Path
+    """Certificate of the authority that signed all machines' certificates."""
     certificate: Path
     key: Path
-
-    def options(self) -> list[str]:
-        """For Flower's daemons."""
-        files = ("--ssl-ca-certfile", self.ca), ("--ssl-certfile", self.certificate), ("--ssl-keyfile", self.key)
-        return [word for option, file in files for word in (option, str(file.resolve()))]
+    """Private key of ``certificate``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the server listens."""
+    """Address on which the server listens."""
 
     host: str
     port: int
@@ -41,11 +39,11 @@ class Address:
 
 
 def check_own_certificate(certificates: Certificates, host: str) -> None:
-    """Let this machine shake hands with itself, in memory.
+    """Check this machine's certificate by a handshake with itself, in memory.
 
     Raises:
-        TrainingError: the key is not the certificate's, the authority did not sign it or it has expired, or it does
-            not name ``host``.
+        TrainingError: the key does not belong to the certificate, the authority did not sign it, it has expired, or it
+            does not name ``host``.
     """
     outgoing, incoming = ssl.MemoryBIO(), ssl.MemoryBIO()
     try:
@@ -53,12 +51,12 @@ def check_own_certificate(certificates: Certificates, host: str) -> None:
         server.load_cert_chain(certificates.certificate, certificates.key, no_passphrase)
     except (ssl.SSLError, OSError) as error:
         raise TrainingError(
-            f"{certificates.key}: is no key of {certificates.certificate} ({_reason(error)}); give both of one pair"
+            f"{certificates.key}: is not the key of {certificates.certificate} ({_reason(error)}); give its key"
         ) from error
     there = server.wrap_bio(outgoing, incoming, server_side=True)
-    here = _trusting(certificates.ca).wrap_bio(incoming, outgoing, server_hostname=host)
+    here = _client_context(certificates.ca).wrap_bio(incoming, outgoing, server_hostname=host)
     try:
-        for side in [here, there] * FLIGHTS:
+        for side in [here, there] * MAX_FLIGHTS:
             with contextlib.suppress(ssl.SSLWantReadError):
                 side.do_handshake()
     except ssl.SSLError as error:
@@ -69,31 +67,30 @@ def check_own_certificate(certificates: Certificates, host: str) -> None:
 
 
 def check_server_certificate(address: Address, ca: Path) -> None:
-    """Shake hands with the server, if it is there already.
+    """Check the server's certificate by a handshake, if the server is there already.
 
     Raises:
-        TrainingError: somebody listens there, but with a certificate that the authority did not sign for this name,
-            or without any.
+        TrainingError: the server has no certificate, or one that the authority did not sign for this name.
     """
-    context = _trusting(ca)
+    context = _client_context(ca)
     try:
         with (
-            socket.create_connection((address.host, address.port), timeout=PATIENCE_S) as connection,
+            socket.create_connection((address.host, address.port), timeout=TIMEOUT_S) as connection,
             context.wrap_socket(connection, server_hostname=address.host),
         ):
             return
     except (ssl.SSLEOFError, ssl.SSLZeroReturnError):
-        return  # it hung up: that says nothing of its certificate
+        return  # the server closed the connection, which says nothing about its certificate
     except ssl.SSLError as error:
         raise TrainingError(
             f"{address}: the server's certificate does not fit {ca} and this name ({_reason(error)}); "
             "ask for the authority that signed it"
         ) from error
     except OSError:
-        return  # it may come later
+        return  # the server may start later
 
 
-def _trusting(ca: Path) -> ssl.SSLContext:
+def _client_context(ca: Path) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
         context.load_verify_locations(ca)
@@ -103,6 +100,6 @@ def _trusting(ca: Path) -> ssl.SSLContext:
 
 
 def _reason(error: OSError) -> str:
-    """In a few words."""
+    """The cause in a few words."""
     words = getattr(error, "verify_message", "") or getattr(error, "reason", "") or str(error)
     return " ".join(str(words).lower().replace("_", " ").split())

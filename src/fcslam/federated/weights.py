@@ -1,4 +1,4 @@
-"""Weights as they travel: float32 arrays by name, in one order."""
+"""Weights of a network as float32 arrays by name, and arithmetic on them."""
 
 from collections.abc import Collection, Mapping
 
@@ -6,25 +6,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 Weights = Mapping[str, NDArray[np.float32]]
+"""Arrays by their names in the network, in the network's order; integer counters are left out."""
 FloatVector = NDArray[np.float64]
 
 STATISTICS = ("running_mean", "running_var")
-"""How the names of batch normalisation's statistics end."""
+"""Suffixes of the names of batch normalisation's statistics."""
 
 
 def trained_names(weights: Weights, frozen_statistics: bool) -> list[str]:
-    """Names of the arrays that training changes."""
+    """Names of the arrays that training changes: all, or all but the batch statistics if these are frozen."""
     return [name for name in weights if not (frozen_statistics and name.endswith(STATISTICS))]
 
 
 def update_vector(new: Weights, old: Weights, names: Collection[str]) -> FloatVector:
-    """All differences of the arrays of these names, one after another, shape (N,)."""
+    """The differences ``new`` - ``old`` of the named arrays, concatenated in the order of the names, shape (N,)."""
     parts = [(new[name].astype(np.float64) - old[name]).ravel() for name in names]
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def apply_update(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str, NDArray[np.float32]]:
-    """``old`` with ``update`` (N,) added to the arrays of these names."""
+    """``old`` with ``update`` (N,) of ``update_vector`` added to the named arrays."""
     arrays = {name: array.copy() for name, array in old.items()}
     begin = 0
     for name in names:
@@ -36,13 +37,13 @@ def apply_update(old: Weights, update: FloatVector, names: Collection[str]) -> d
 
 
 def interpolate_weights(old: Weights, new: Weights, share: float) -> dict[str, NDArray[np.float32]]:
-    """A ``share`` of old weights and the rest of new ones."""
-    # Not a sum of products: what is equal in both is to stay as it is, to the last bit.
+    """The weighted mean ``share`` * ``old`` + (1 - ``share``) * ``new``."""
+    # Computed as a difference and not as a sum of products, so that equal values stay equal to the last bit.
     return {name: np.asarray(new[name] + share * (old[name] - new[name]), np.float32) for name in old}
 
 
 def weights_error(new: Weights, old: Weights) -> str | None:
-    """Why ``new`` cannot be weights of the network that ``old`` are of, in words; None if it can."""
+    """The reason why ``new`` cannot be weights of the same network as ``old``; None if it can."""
     if new.keys() != old.keys():
         odd = sorted(new.keys() ^ old.keys())
         return f"other arrays than asked for ({odd[0]}{', ...' if len(odd) > 1 else ''})"

@@ -1,1 +1,1 @@
-"""Training of the detector: a network that finds keypoints and gives each a code of 256 bits."""
+"""Training of the detector: a network that finds keypoints and gives each a descriptor of 256 bits, its code."""

@@ -1,4 +1,4 @@
-"""Named arrays in a file: `.npz` without pickle, replaced in one piece."""
+"""Named arrays in `.npz` files: without pickle, written atomically."""
 
 import io
 import zlib
@@ -14,10 +14,10 @@ from fcslam.storage.files import write_file
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a file and its folders; whatever happens, ``path`` holds all of the old file or all of the new one.
+    """Write a file atomically; its folder is created if it does not exist.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     content = io.BytesIO()
@@ -29,8 +29,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Every array of a file.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no such file.
+        OSError: the file cannot be read.
+        ValueError: the file is no archive of arrays, or is broken.
     """
     content = io.BytesIO(path.read_bytes())
     try:

@@ -1,4 +1,4 @@
-"""What a finished training run hands over: the detector as ONNX files, its card, its training curve."""
+"""The files of a finished training run: the detector as ONNX files, its model card, its training curve."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages
 from fcslam.learning.trainer import PROGRESS_FILE
 
-FIGURES = {
+SHOWN_METRICS = {
     "repeatability": "keypoints found again within 3 px",
     "mma_3px": "matches within 3 px, by bits",
     "shift_repeatability": "keypoints found again within 1 px after a shift by 1 to 7 px",
@@ -26,7 +26,7 @@ def write_training_artifacts(
     """Write `detector.onnx`, `detector-int8.onnx`, `training.png` and `card.md`; returns their paths.
 
     Raises:
-        OutputError: one cannot be written.
+        OutputError: a file cannot be written.
     """
     floating, small = folder / "detector.onnx", folder / "detector-int8.onnx"
     export_onnx(network, floating)
@@ -35,10 +35,12 @@ def write_training_artifacts(
     curves = read_curves(folder / "joint" / PROGRESS_FILE, "joint")
     try:
         draw_curves(curves, picture)
-        latest = {name: curves[name][1][-1] for name in FIGURES if name in curves}
+        latest = {name: curves[name][1][-1] for name in SHOWN_METRICS if name in curves}
         card.write_text(_card(detector_version(network), settings, images, teacher, latest), encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written ({error}); make room and run the command again") from error
+        raise OutputError(
+            f"{folder}: cannot be written ({error}); free disk space and run the command again"
+        ) from error
     return [floating, small, picture, card]
 
 
@@ -55,7 +57,7 @@ def _card(
         "",
         "| on pairs of held-out images, 320 x 240, warped and lit at random | |",
         "|---|---|",
-        *(f"| {FIGURES[name]} | {value:.3f} |" for name, value in figures.items()),
+        *(f"| {SHOWN_METRICS[name]} | {value:.3f} |" for name, value in figures.items()),
         "",
         "Settings:",
         "",

@@ -1,4 +1,4 @@
-"""Batches of pairs, drawn ahead in threads. A batch is a function of the seed and its step alone."""
+"""Batches of view pairs, prepared ahead in threads. A batch depends on the seed and its step alone."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.settings import TrainingSettings
 
 TEACHER_POINTS = 192
-"""Points of the teacher in a pair."""
+"""Most points of the teacher that are used in a pair."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,23 +21,23 @@ class TrainingBatch:
     """B pairs; the first B images are first views, the others second views."""
 
     images: Tensor
-    """Shape (2B, 1, H, W)."""
+    """Shape (2B, 1, H, W), grey in [0, 1]."""
     targets: Tensor
-    """Shape (2B, H, W)."""
+    """Shape (2B, H, W): weight of a keypoint at each pixel, in [0, 1]."""
     seen: Tensor
-    """Shape (2B, H, W), bool."""
+    """Shape (2B, H, W), bool: whether a pixel shows the image."""
     points: Tensor
     """Shape (2B, N, 2) [px]; 0 where not valid."""
     valid: Tensor
-    """Shape (B, N), bool."""
-    taught_points: Tensor
+    """Shape (B, N), bool: whether both views show a point."""
+    teacher_points: Tensor
     """Shape (2B, M, 2) [px]; 0 where not valid."""
-    taught_valid: Tensor
-    """Shape (B, M), bool."""
-    taught: Tensor
-    """Shape (B, M, D)."""
+    teacher_valid: Tensor
+    """Shape (B, M), bool: whether both views show a point of the teacher."""
+    teacher_descriptors: Tensor
+    """Shape (B, M, D); D is 0 without a teacher."""
     homographies: Tensor
-    """Shape (B, 3, 3): take pixels of the first view to pixels of the second."""
+    """Shape (B, 3, 3): map pixels of the first view to pixels of the second."""
 
     def to(self, device: torch.device) -> "TrainingBatch":
         """The batch on another device."""
@@ -47,7 +47,7 @@ class TrainingBatch:
 
 
 def draw_batch(examples: Sequence[TrainingExample], settings: TrainingSettings, step: int) -> TrainingBatch:
-    """The batch of a step."""
+    """The batch of this step."""
     pairs = []
     for index in range(settings.pairs):
         rng = np.random.default_rng([settings.seed, step, index])
@@ -57,7 +57,7 @@ def draw_batch(examples: Sequence[TrainingExample], settings: TrainingSettings, 
 
 
 def collate(pairs: Sequence[ViewPair]) -> TrainingBatch:
-    """Pairs as one batch."""
+    """Stack pairs into a batch."""
     views = [pair.views[side] for side in (0, 1) for pair in pairs]
 
     def stack(arrays: Sequence[np.ndarray]) -> Tensor:
@@ -69,9 +69,9 @@ def collate(pairs: Sequence[ViewPair]) -> TrainingBatch:
         seen=stack([view.valid for view in views]),
         points=stack([view.points for view in views]),
         valid=stack([pair.valid for pair in pairs]),
-        taught_points=stack([view.taught for view in views]),
-        taught_valid=stack([pair.taught_valid for pair in pairs]),
-        taught=stack([pair.taught for pair in pairs]),
+        teacher_points=stack([view.teacher_points for view in views]),
+        teacher_valid=stack([pair.teacher_valid for pair in pairs]),
+        teacher_descriptors=stack([pair.teacher_descriptors for pair in pairs]),
         homographies=stack([pair.homography.astype(np.float32) for pair in pairs]),
     )
 
@@ -79,7 +79,7 @@ def collate(pairs: Sequence[ViewPair]) -> TrainingBatch:
 def batch_stream(
     examples: Sequence[TrainingExample], settings: TrainingSettings, first: int, ahead: int, threads: int
 ) -> Iterator[tuple[int, TrainingBatch]]:
-    """Batches from step ``first`` on, in order, up to ``ahead`` of them prepared by ``threads`` threads."""
+    """Step numbers and batches from step ``first``, in order; ``threads`` threads prepare up to ``ahead`` of them."""
     with ThreadPoolExecutor(threads) as pool:
         waiting: deque[Future[TrainingBatch]] = deque()
         asked = first

@@ -1,4 +1,4 @@
-"""Checkpoints: one `.npz` file without pickle, replaced in one piece, so that the last good one is always there."""
+"""Checkpoints of training: `.npz` files without pickle, written atomically, so the last good one always stays."""
 
 import json
 from dataclasses import dataclass
@@ -13,31 +13,32 @@ from fcslam.errors import OutputError, TrainingError
 from fcslam.learning.arrays import read_arrays, write_arrays
 
 FORMAT = 1
+"""Version of the file format."""
 _HEADER = "header"
 
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """Where a training run stands."""
+    """The state of a training run."""
 
     stage: str
     step: int
     """Steps done."""
     settings: dict[str, Any]
-    """Of the run; another run's checkpoint is refused."""
+    """Of the run; a run with other settings does not continue from this checkpoint."""
     tensors: dict[str, Tensor]
-    """Everything by name: network, average, optimiser."""
+    """All tensors of network, averaged network and optimiser, by name."""
 
     def part(self, prefix: str) -> dict[str, Tensor]:
-        """The tensors whose names begin with ``prefix``, by what follows it."""
+        """The tensors whose names begin with ``prefix``, by the rest of their names."""
         return {name.removeprefix(prefix): each for name, each in self.tensors.items() if name.startswith(prefix)}
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write beside the last checkpoint, then take its place.
+    """Replace the checkpoint atomically.
 
     Raises:
-        OutputError: it cannot be written, for want of room, say; the last one stays.
+        OutputError: the file cannot be written, for instance because the disk is full; the last checkpoint stays.
     """
     header = {
         "format": FORMAT,
@@ -50,14 +51,16 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     try:
         write_arrays(path, arrays)
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); make room and run the same command again") from error
+        raise OutputError(
+            f"{path}: cannot be written ({error}); free disk space and run the same command again"
+        ) from error
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint.
 
     Raises:
-        TrainingError: the file is no checkpoint, or of another format.
+        TrainingError: the file is no checkpoint, or has another format.
     """
     try:
         arrays = read_arrays(path)
@@ -67,5 +70,5 @@ def read_checkpoint(path: Path) -> Checkpoint:
             return Checkpoint(header["stage"], header["step"], header["settings"], tensors)
         found = header["format"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise TrainingError(f"{path}: is no checkpoint of a training run ({error}); take it away") from error
-    raise TrainingError(f"{path}: has format {found}, expected {FORMAT}; train anew in another folder")
+        raise TrainingError(f"{path}: is no checkpoint of a training run ({error}); remove it") from error
+    raise TrainingError(f"{path}: has format {found}, expected {FORMAT}; start again in another folder")

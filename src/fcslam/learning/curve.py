@@ -1,4 +1,4 @@
-"""The training curve: how losses fell and figures rose, from the log of a run."""
+"""The training curve: losses and metrics over the steps, from the log of a run."""
 
 import csv
 from pathlib import Path
@@ -15,7 +15,7 @@ Curves = dict[str, tuple[list[int], list[float]]]
 
 
 def read_curves(path: Path, stage: str) -> Curves:
-    """Curves of a stage from its log; of steps that were done twice, the later count.
+    """Curves of a stage from its log; of a step that was repeated, the later values count.
 
     Raises:
         TrainingError: the file is no log of a training run.
@@ -32,7 +32,7 @@ def read_curves(path: Path, stage: str) -> Curves:
 
 
 def draw_curves(curves: Curves, path: Path) -> None:
-    """Three panels: losses, shares on held-out images, and the distance of codes."""
+    """Draw three panels: losses, metrics on held-out images, and the distance between codes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 3.6), layout="constrained")

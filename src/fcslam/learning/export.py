@@ -1,8 +1,8 @@
-"""A trained network as ONNX files: in float32, and in int8 for processors without a GPU.
+"""Exports a trained network to ONNX: in float32, and in int8 for processors without a GPU.
 
 Input `image` float32 (1, 1, H, W), grey in [0, 1], H and W any multiples of 8. Outputs `scores` float32 (1, H, W) and
 `logits` float32 (1, 256, H/8, W/8), cell (r, c) centred at the pixel (8 c + 3.5, 8 r + 3.5). Metadata: `fcslam_format`,
-and `fcslam_version`, which is another one for other weights, and stamps every descriptor.
+and `fcslam_version`, which differs for other weights; every descriptor carries it.
 """
 
 import contextlib
@@ -29,11 +29,13 @@ from fcslam.storage.files import write_file
 OPSET: Final = 17
 CALIBRATION_IMAGES: Final = 64
 FEWEST_INPUTS: Final = 8
+"""Convolutions with fewer input channels than this are faster in float32 than in int8."""
 TRACED_SIZE: Final = (240, 320)
+"""Height and width of the image with which the network is traced [px]; the file takes other sizes too."""
 
 
 class ExportedNetwork(nn.Module):
-    """A network with the outputs of the file."""
+    """A network whose outputs are those of the file."""
 
     def __init__(self, network: KeypointNetwork) -> None:
         super().__init__()
@@ -46,7 +48,7 @@ class ExportedNetwork(nn.Module):
 
 
 def detector_version(network: KeypointNetwork) -> str:
-    """A name of exactly these weights, such as `light-0a1b2c3d4e5f`."""
+    """The version of a detector with exactly these weights, such as `light-0a1b2c3d4e5f`."""
     digest = hashlib.sha256()
     for name, tensor in sorted(network.state_dict().items()):
         digest.update(name.encode())
@@ -58,7 +60,7 @@ def export_onnx(network: KeypointNetwork, path: Path) -> None:
     """Write the float32 file.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     import onnx
 
@@ -80,13 +82,18 @@ def export_onnx(network: KeypointNetwork, path: Path) -> None:
 
 
 def quantise_onnx(source: Path, path: Path, images: Sequence[GreyImage]) -> None:
-    """Write the int8 file of a float32 one, with the ranges that ``images`` give its activations.
+    """Write the int8 file of a float32 file.
 
-    The two last convolutions stay in float, as what they give is compared with each other, and so do those with so few
-    inputs that int8 would slow them down.
+    The last convolutions stay in float32, because their outputs are compared with one another. So do convolutions with
+    so few inputs that int8 would slow them down.
+
+    Args:
+        source: the float32 file.
+        path: the int8 file.
+        images: determine the ranges of the activations.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     import onnx
 
@@ -112,7 +119,7 @@ def quantise_onnx(source: Path, path: Path, images: Sequence[GreyImage]) -> None
 
 
 class _Calibration:
-    """Feeds images to the quantiser, one after another."""
+    """Gives images to the quantiser, one after another."""
 
     def __init__(self, images: Sequence[GreyImage]) -> None:
         self._images = iter(images)
@@ -127,7 +134,7 @@ class _Calibration:
 
 
 def _left_in_float(graph: Any) -> list[str]:
-    """Names of the convolutions that no other one comes after, of those with few inputs, and of those nobody trains."""
+    """Names of the convolutions that no other follows, of those with few inputs, and of those with fixed kernels."""
     inputs = {array.name: array.dims[1] for array in graph.graph.initializer if len(array.dims) == 4}
     consumers: dict[str, list[Any]] = {}
     for node in graph.graph.node:
@@ -145,7 +152,7 @@ def _left_in_float(graph: Any) -> list[str]:
 
 
 def _write(graph: Any, version: str, path: Path) -> None:
-    """Stamp a graph and write it in one piece."""
+    """Add the metadata to a graph and write it atomically."""
     import onnx
 
     del graph.metadata_props[:]
@@ -155,12 +162,12 @@ def _write(graph: Any, version: str, path: Path) -> None:
     try:
         write_file(path, graph.SerializeToString(deterministic=True))
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
+        raise OutputError(f"{path}: cannot be written ({error}); free disk space or choose another folder") from error
 
 
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
-    """Without the exporters' remarks on their own future."""
+    """Suppress the exporters' deprecation warnings."""
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

@@ -1,7 +1,7 @@
-"""Homographic adaptation (DeTone et al. 2018): a detector's answer averaged over many warped copies of an image.
+"""Homographic adaptation (DeTone et al. 2018): averages a detector's response over many warped copies of an image.
 
-What is found again from other viewpoints adds up; what was chance fades. Any detector will do that gives a response at
-every pixel: the network itself, or Harris's measure, which on planes is found again best of all.
+Points that are found from many viewpoints keep a strong response, chance detections do not. It works with any detector
+that gives a response at every pixel: the network itself, or Harris's measure, the most repeatable one on planes.
 """
 
 from collections.abc import Callable
@@ -19,18 +19,18 @@ from fcslam.metrics.homography import inverse
 from fcslam.records import FloatArray
 
 Response = NDArray[np.float32]
-"""Shape (height, width): how much of a keypoint is at each pixel."""
+"""Shape (height, width): strength of a keypoint at each pixel."""
 
 HARRIS_BLOCK_PX: Final = 4
 HARRIS_K: Final = 0.04
 BORDER_PX: Final = 4
-"""Nothing is a keypoint so close to the rim."""
+"""Pixels closer to the border than this are no keypoints."""
 
 
 def adapt(
     detector: Callable[[GreyImage], Response], image: GreyImage, copies: int, rng: np.random.Generator
 ) -> Response:
-    """Mean response of ``detector`` over the image itself and ``copies`` warped ones, where these see it."""
+    """Mean response of ``detector`` over the image and ``copies`` warped copies that show a pixel."""
     size = (image.shape[1], image.shape[0])
     total = detector(image).astype(np.float32)
     count = np.ones(image.shape, np.float32)
@@ -46,14 +46,14 @@ def adapt(
 
 
 def harris(image: GreyImage) -> Response:
-    """Harris's corner measure (Harris and Stephens 1988); its root, so that strong contrast does not drown the rest."""
+    """Square root of Harris's corner measure (Harris and Stephens 1988); the root limits strong contrast."""
     measure = np.asarray(cv2.cornerHarris(image, HARRIS_BLOCK_PX, 3, HARRIS_K), np.float32)
     response: Response = np.sqrt(np.maximum(measure, np.float32(0.0)))
     return response
 
 
 def peaks(response: Response, nms_px: float, most: int) -> Points:
-    """The strongest local maxima, shape (N, 2), to a fraction of a pixel, strongest first."""
+    """The strongest local maxima, shape (N, 2) [px] with sub-pixel accuracy, strongest first."""
     within = np.zeros_like(response)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     within[inner] = response[inner]

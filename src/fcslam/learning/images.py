@@ -1,4 +1,4 @@
-"""Images to train on: any folder tree of them."""
+"""Training images, from any folder tree."""
 
 import zlib
 from collections.abc import Sequence
@@ -16,11 +16,12 @@ from fcslam.features.files import read_grey
 SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 SMALLEST_SIDE_PX: Final = 96
 LARGEST_SIDE_PX: Final = 640
-"""Larger images are shrunk to this: a robot's camera has no more, and fine grain there is noise."""
+"""Larger images are scaled down to this, the resolution of a robot's camera; finer detail is mostly noise."""
 FEWEST_CORNERS: Final = 60
 CORNER_CONTRAST: Final = 15
-"""Frames with fewer corners of this contrast (bare wall) teach nothing."""
+"""Least contrast of a corner [grey levels]. Images with fewer corners, such as bare walls, are not used."""
 HELD_OUT_SHARE: Final = 0.04
+"""Share of the images that are kept for validation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +30,14 @@ class ImageFile:
 
     path: Path
     name: str
-    """Path from the folder that was given, which it begins with; the same wherever that folder lies."""
+    """Path relative to the parent of the given folder, so it is the same wherever that folder lies."""
 
 
 def find_images(roots: Sequence[Path]) -> list[ImageFile]:
-    """Every image file in the folder trees, in order of their names.
+    """All image files in the folder trees, sorted by name.
 
     Raises:
-        TrainingError: a root is no folder, holds no image, or has the name of another one.
+        TrainingError: a root is no folder or holds no image, or two roots have the same name and the same files.
     """
     found: dict[str, ImageFile] = {}
     for root in roots:
@@ -54,7 +55,7 @@ def find_images(roots: Sequence[Path]) -> list[ImageFile]:
 
 
 def read_image(path: Path) -> GreyImage | None:
-    """An image in grey levels, its longer side at most ``LARGEST_SIDE_PX``; None if the file is no image."""
+    """Read an image in grey levels, scaled down to ``LARGEST_SIDE_PX``; None if the file is no image."""
     try:
         image = read_grey(path)
     except FeatureError:
@@ -66,7 +67,7 @@ def read_image(path: Path) -> GreyImage | None:
 
 
 def is_usable(image: GreyImage) -> bool:
-    """Whether an image is large enough and shows enough to learn from."""
+    """Whether an image is large enough and has enough corners for training."""
     if min(image.shape) < SMALLEST_SIDE_PX:
         return False
     return len(cv2.FastFeatureDetector.create(threshold=CORNER_CONTRAST).detect(image)) >= FEWEST_CORNERS

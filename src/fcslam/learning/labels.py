@@ -1,4 +1,4 @@
-"""Labels of an image: keypoints with how good each is, and what a teacher says of some points."""
+"""Labels of an image: keypoints with their quality, and a teacher's descriptors of some points."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +12,10 @@ from fcslam.errors import TrainingError
 from fcslam.learning.arrays import read_arrays, write_arrays
 
 SAME_POINT_PX: Final = 3.0
-"""Points of two detectors this close are one."""
+"""Points of two detectors that are closer than this are the same point."""
 MOST_POINTS: Final = 800
 WORST_QUALITY: Final = 0.1
+"""Quality of the last of ``MOST_POINTS`` points; the first has 1."""
 
 Points = NDArray[np.float32]
 """Shape (N, 2): x, y in pixels."""
@@ -22,7 +23,7 @@ Points = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Teacher:
-    """A teacher's answer for one image."""
+    """A teacher's keypoints and descriptors in one image."""
 
     keypoints: Points
     """Strongest first."""
@@ -36,13 +37,17 @@ class Labels:
 
     keypoints: Points
     quality: NDArray[np.float32]
-    """Shape (N,): in (0, 1], 1 for the best of the image."""
+    """Shape (N,): in (0, 1], 1 for the best keypoint of the image."""
 
 
 def fuse_keypoints(first: Points, second: Points) -> Labels:
-    """Two detectors' keypoints, each strongest first, as one set ranked by the mean of both ranks.
+    """Fuse the keypoints of two detectors into one set, ranked by the mean of both ranks.
 
-    A point that only one of them found ranks last with the other. Points both found lie midway.
+    A point that both detectors found lies midway between theirs. One that a single detector found ranks last with the
+    other.
+
+    Args:
+        first, second: shape (N, 2) [px], strongest first.
     """
     ranks = [1.0 - np.arange(len(points)) / MOST_POINTS for points in (first, second)]
     if min(len(first), len(second)) == 0:
@@ -51,21 +56,21 @@ def fuse_keypoints(first: Points, second: Points) -> Labels:
         distances, nearest = cKDTree(second).query(first, distance_upper_bound=SAME_POINT_PX)
         both = np.isfinite(distances)
         partner = np.where(both, nearest, 0)
-        alone = np.ones(len(second), np.bool_)
-        alone[partner[both]] = False
+        unmatched = np.ones(len(second), np.bool_)
+        unmatched[partner[both]] = False
         middle = np.where(both[:, None], 0.5 * (first + second[partner]), first)
-        points = np.concatenate((middle, second[alone]))
-        score = np.concatenate((ranks[0] + np.where(both, ranks[1][partner], 0.0), ranks[1][alone])) / 2.0
+        points = np.concatenate((middle, second[unmatched]))
+        score = np.concatenate((ranks[0] + np.where(both, ranks[1][partner], 0.0), ranks[1][unmatched])) / 2.0
     kept = _suppress(points, score)[:MOST_POINTS]
     quality = 1.0 - (1.0 - WORST_QUALITY) * np.arange(len(kept)) / MOST_POINTS
     return Labels(points[kept].astype(np.float32), quality.astype(np.float32))
 
 
 def read_teacher(path: Path) -> Teacher:
-    """A teacher's answer from its file, made by a script of the user's (see docs/training.md).
+    """Read a teacher's file, which a script of the user has made (see docs/training.md).
 
     Raises:
-        TrainingError: there is no such file, or it does not hold what it should.
+        TrainingError: the file does not exist, or lacks an array, or the arrays do not fit together.
     """
     try:
         arrays = read_arrays(path)
@@ -81,16 +86,16 @@ def read_teacher(path: Path) -> Teacher:
 
 
 def write_labels(path: Path, labels: Labels, key: int) -> None:
-    """Keep labels for the next run; ``key`` tells the image they belong to.
+    """Write labels for later runs; ``key`` identifies the image.
 
     Raises:
-        OSError: they cannot be written.
+        OSError: the file cannot be written.
     """
     write_arrays(path, {"keypoints": labels.keypoints, "quality": labels.quality, "key": np.array(key)})
 
 
 def read_labels(path: Path, key: int) -> Labels | None:
-    """Labels kept for this very image, if there are."""
+    """The labels of the image with this key; None if the file does not hold them."""
     try:
         arrays = read_arrays(path)
         return Labels(arrays["keypoints"], arrays["quality"]) if int(arrays["key"]) == key else None
@@ -99,7 +104,7 @@ def read_labels(path: Path, key: int) -> Labels | None:
 
 
 def _suppress(points: Points, score: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of the points, best first, that have no better one close by."""
+    """Indices of the points that have no better point within ``SAME_POINT_PX``, best first."""
     order = np.argsort(-score, kind="stable")
     rank = np.empty(len(points), np.int64)
     rank[order] = np.arange(len(points))

@@ -1,4 +1,4 @@
-"""A leg of a training run that another machine began: some steps from given weights, and back go the new ones."""
+"""Local training: a client's part of a federated round. It trains some steps from given weights."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,96 +16,107 @@ from fcslam.learning.training_step import (
     LegacyDetector,
     ProximalTerm,
     create_optimiser,
+    get_optimiser_state,
     learning_rate,
-    optimiser_state,
     restore_optimiser_state,
     training_step,
 )
 
 RAMP_STEPS: Final = 10
-"""An optimiser that knows no gradients yet steps by their signs alone; its rate rises over so many steps."""
+"""Steps over which the learning rate rises of a new optimiser: without moments, Adam only follows gradients' signs."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocalTrainingPlan:
-    """Which steps of the whole run, and how."""
+    """The steps of the whole run that are done now, and how."""
 
-    first: int
+    first_step: int
+    """Counted from 0 over the whole run."""
     steps: int
-    pull: float = 0.0
-    """Strength of a spring to the weights at the start."""
+    proximal: float = 0.0
+    """Strength of FedProx's proximal term; 0 for none."""
     compatible: float = 0.0
-    """How strongly codes are kept to those of a former network, if there is one."""
+    """Weight of the loss that keeps codes compatible with those of a legacy detector; 0 for none."""
     frozen_statistics: bool = False
-    """Whether batch normalisation uses the means and variances it came with, and leaves them as they are."""
+    """Batch normalisation uses the means and variances that it has, and does not change them."""
 
 
 class LocalTrainingResult(NamedTuple):
-    """What a leg gives."""
+    """The result of local training."""
 
     network: KeypointNetwork
     losses: dict[str, float]
     """Means over the steps."""
-    moments: dict[str, Tensor]
-    """What the optimiser has learnt of gradients."""
+    optimiser_state: dict[str, Tensor]
+    """With which a later local training continues."""
 
 
 def local_training(
     start: Mapping[str, Tensor],
     examples: Sequence[TrainingExample],
     settings: TrainingSettings,
-    leg: LocalTrainingPlan,
+    plan: LocalTrainingPlan,
     device: torch.device,
-    watch: Callable[[int], None] = lambda _steps: None,
-    former: Mapping[str, Tensor] | None = None,
-    moments: Mapping[str, Tensor] | None = None,
+    on_step: Callable[[int], None] = lambda _steps: None,
+    legacy: Mapping[str, Tensor] | None = None,
+    optimiser_state: Mapping[str, Tensor] | None = None,
 ) -> LocalTrainingResult:
-    """Train from ``start`` (a network's state), with an optimiser that goes on from the ``moments`` of an earlier leg.
+    """Train for some steps. The result depends on the arguments alone.
 
-    The result depends on the arguments alone. ``settings.steps`` are those of the whole run: the rate falls towards
-    its end. ``watch`` is told how many steps are done. ``former`` is the state of the network that made codes which are
-    still in use.
+    Args:
+        start: state of a network, which is not changed.
+        examples: to train on.
+        settings: of the whole run; the learning rate falls towards the end of its steps.
+        plan: which steps are done, and how.
+        device: to train on.
+        on_step: called with the number of steps done.
+        legacy: state of the network whose codes are still in use.
+        optimiser_state: result of an earlier local training, to continue it.
 
     Raises:
-        TrainingError: ``start``, ``former`` or ``moments`` does not fit the network, or training diverged.
+        TrainingError: ``start``, ``legacy`` or ``optimiser_state`` does not fit the network, or training diverged.
     """
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     network.train()
-    if leg.frozen_statistics:
+    if plan.frozen_statistics:
         freeze_statistics(network)
-    pull = None
-    if leg.pull > 0.0:
-        pull = ProximalTerm(leg.pull, {name: value.detach().clone() for name, value in network.named_parameters()})
-    keeper = None
-    if former is not None and leg.compatible > 0.0:
-        keeper = LegacyDetector(leg.compatible, network_from_state(settings.encoder, former).to(device))
+    proximal = None
+    if plan.proximal > 0.0:
+        weights = {name: value.detach().clone() for name, value in network.named_parameters()}
+        proximal = ProximalTerm(plan.proximal, weights)
+    legacy_detector = None
+    if legacy is not None and plan.compatible > 0.0:
+        legacy_detector = LegacyDetector(plan.compatible, network_from_state(settings.encoder, legacy).to(device))
     optimiser = create_optimiser(network)
-    if moments is not None:
+    if optimiser_state is not None:
         try:
-            restore_optimiser_state(optimiser, moments)
+            restore_optimiser_state(optimiser, optimiser_state)
         except (KeyError, ValueError) as error:
-            raise TrainingError(f"the optimiser cannot go on ({error})") from error
+            raise TrainingError(f"the optimiser cannot continue ({error})") from error
     sums: dict[str, float] = {}
-    ends = settings.model_copy(update={"steps": leg.first + leg.steps})
-    for step, batch in batch_stream(examples, ends, leg.first, ahead=2, threads=1):
-        done = step - leg.first + 1
-        rate = learning_rate(settings, step) * (min(done / RAMP_STEPS, 1.0) if moments is None else 1.0)
-        parts = training_step(network, optimiser, batch.to(device), settings, step, rate, pull=pull, former=keeper)
-        for name, part in parts.items():
-            sums[name] = sums.get(name, 0.0) + float(part)
-        watch(done)
+    until = settings.model_copy(update={"steps": plan.first_step + plan.steps})
+    for step, batch in batch_stream(examples, until, plan.first_step, ahead=2, threads=1):
+        done = step - plan.first_step + 1
+        rate = learning_rate(settings, step) * (min(done / RAMP_STEPS, 1.0) if optimiser_state is None else 1.0)
+        losses = training_step(
+            network, optimiser, batch.to(device), settings, step, rate, proximal=proximal, legacy=legacy_detector
+        )
+        for name, loss in losses.items():
+            sums[name] = sums.get(name, 0.0) + float(loss)
+        on_step(done)
     network.eval()
-    learnt = optimiser_state(optimiser)
-    if not all(bool(torch.isfinite(value).all()) for value in learnt.values()):
-        raise TrainingError("training diverged in the last step; lower the learning rate")  # who went on would, too
-    return LocalTrainingResult(network, {name: total / leg.steps for name, total in sums.items()}, learnt)
+    state = get_optimiser_state(optimiser)
+    if not all(bool(torch.isfinite(value).all()) for value in state.values()):
+        # Checked here, because whatever continues from this state would diverge.
+        raise TrainingError("training diverged in the last step; lower the learning rate")
+    return LocalTrainingResult(network, {name: total / plan.steps for name, total in sums.items()}, state)
 
 
 def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:
     """A network in this state, in evaluation mode.
 
     Raises:
-        TrainingError: the state is of another network.
+        TrainingError: the state belongs to another network.
     """
     network = KeypointNetwork(encoder)
     try:
@@ -117,7 +128,7 @@ def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> Keypoin
 
 
 def freeze_statistics(network: nn.Module) -> None:
-    """Let batch normalisation neither look at the batch nor learn from it; its scale and shift stay trainable."""
+    """Let batch normalisation neither use nor change batch statistics; its scale and shift stay trainable."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.eval()

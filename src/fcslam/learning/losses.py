@@ -1,4 +1,4 @@
-"""What training minimises: the paper's triplet loss of binary codes, eqs. (1)-(3), and what stands beside it.
+"""The losses of training: the paper's triplet loss of binary codes, eqs. (1)-(3), and others beside it.
 
 Codes are rows: logits (..., N, 256). ``candidates`` (..., N, N) says which codes of the other image may be compared
 with a point: those that are valid, and neither its match nor too close to it. All losses are means, so that they do
@@ -13,12 +13,15 @@ from fcslam.features.dense import CELL_PX
 from fcslam.learning.network import cell_log_probabilities
 
 ROUNDING = 0.01
-"""Keeps the slope of the square root finite where two codes are equal."""
+"""Keeps the gradient of the square root finite where two codes are equal."""
 AGREEMENT_WINDOW_PX = 16
+"""Side of the windows in which keypoint maps are compared."""
 _FAR = 1e4
+"""Distance that excludes a code from the hardest negatives; codes are at most 16 apart."""
 _FAINT = 1e-4
 """Mean square of a keypoint map below which a window counts as empty."""
 _WHOLE = 0.999
+"""Least valid share of a window that counts as valid throughout, up to rounding."""
 
 
 def binary_activation(logits: Tensor) -> Tensor:
@@ -30,7 +33,7 @@ def binary_activation(logits: Tensor) -> Tensor:
 def code_distances(a: Tensor, b: Tensor, rounding: float = ROUNDING) -> Tensor:
     """Eq. (3): Euclidean distances of codes (..., N, D) and (..., M, D) of zeros and ones, shape (..., N, M).
 
-    It is the root of the Hamming distance; ``rounding`` is added under the root, 0 for the paper to the letter.
+    It is the root of the Hamming distance. ``rounding`` is added under the root; it is 0 in the paper.
     """
     hamming = a.square().sum(-1)[..., :, None] + b.square().sum(-1)[..., None, :] - 2.0 * a @ b.transpose(-1, -2)
     return (hamming.clamp(min=0.0) + rounding).sqrt()
@@ -43,7 +46,7 @@ def triplet_loss(distances: Tensor, candidates: Tensor, valid: Tensor, margin: f
         distances: (..., N, N); the diagonal holds d(c, p).
         candidates: (..., N, N) bool: pairs that may be d(c, n).
         valid: (..., N) bool: points that count.
-        margin: what the negative has to be farther by.
+        margin: by which the negative must be farther away than the match.
     """
     positive = distances.diagonal(dim1=-2, dim2=-1)
     others = distances.masked_fill(~candidates, _FAR)
@@ -75,13 +78,13 @@ def distillation_loss(logits: Tensor, teacher: Tensor, valid: Tensor) -> Tensor:
 
 
 def detector_loss(point_logits: Tensor, targets: Tensor, valid: Tensor) -> Tensor:
-    """Cross entropy over the 64 places of each cell and none of them.
+    """Cross entropy over the 65 classes of a cell: a keypoint at one of its 64 pixels, or none.
 
     Args:
         point_logits: (B, H, W).
-        targets: (B, H, W), how much of a keypoint is at each pixel; what a cell lacks to 1 is "none", what it has
-            over 1 is shared out.
-        valid: (B, H, W) bool; a cell counts if all of it does.
+        targets: (B, H, W), weight of a keypoint at each pixel. If the weights of a cell sum to less than 1, the rest is
+            "none"; if to more, they are scaled to 1.
+        valid: (B, H, W) bool; a cell counts if all its pixels are valid.
     """
     log_places, log_none = cell_log_probabilities(point_logits)
     wanted = F.pixel_unshuffle(targets.unsqueeze(1), CELL_PX)
@@ -106,6 +109,6 @@ def agreement_loss(first: Tensor, second: Tensor, valid: Tensor) -> Tensor:
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of the values that count; 0 if none does."""
+    """Mean of the values where the mask is set; 0 if it is nowhere."""
     weight = mask.to(values.dtype)
     return (values * weight).sum() / weight.sum().clamp(min=1.0)

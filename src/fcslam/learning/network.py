@@ -1,12 +1,13 @@
-"""The network: where keypoints are, and 256 logits whose signs are their descriptors.
+"""The network: it finds keypoints and gives 256 logits for each, whose signs are the bits of its descriptor.
 
-Two encoders behind one class. `vgg` is the paper's: convolutions in pairs, pooled three times, a detector head of 65
-channels for each cell of 8 x 8 pixels (64 places and "none") that sub-pixel convolution lays out to full size. `light`
-has a tenth of its work: strided convolutions, context from 1/16, and a detector head at half resolution whose sub-pixel
-step is 2 x 2, refined at full resolution, so that a point is found wherever it lies and not once a cell.
+One class has two encoders. `vgg` is that of the paper: pairs of convolutions, three poolings, and a detector head with
+65 channels for each cell of 8 x 8 pixels (64 positions and "none"), which sub-pixel convolution rearranges to full
+resolution. `light` needs a tenth of the computation: strided convolutions, context from 1/16 of the resolution, and a
+detector head at half resolution with a sub-pixel step of 2 x 2. It is refined at full resolution and can find several
+keypoints in a cell.
 
-All resampling is symmetric about the middle of a pixel block, so cell (r, c) of the logits is centred at the pixel
-(8 c + 3.5, 8 r + 3.5), where (0, 0) is the centre of the first one.
+All resampling is symmetric about the centre of a pixel block. So cell (r, c) of the logits is centred at the pixel
+(8 c + 3.5, 8 r + 3.5), where (0, 0) is the centre of the first pixel.
 """
 
 from typing import NamedTuple
@@ -20,14 +21,14 @@ from fcslam.features.dense import CELL_PX
 from fcslam.learning.settings import Encoder
 
 _CONTRAST_FLOOR = 1e-4
-"""Variance of grey levels in [0, 1] below which an image counts as blank and is not stretched."""
+"""Variance of grey levels in [0, 1] below which an image counts as blank and its contrast is not increased."""
 
 
 class Maps(NamedTuple):
-    """What the network says about a batch of images."""
+    """Output of the network for a batch of images."""
 
     point_logits: Tensor
-    """Shape (B, H, W): log odds that a keypoint is at a pixel, against none being there."""
+    """Shape (B, H, W): log odds of a keypoint at a pixel."""
     code_logits: Tensor
     """Shape (B, 256, H/8, W/8): positive where a bit is set."""
 
@@ -44,7 +45,7 @@ class KeypointNetwork(nn.Module):
         """Maps of a batch.
 
         Raises:
-            ValueError: a side is no multiple of 8.
+            ValueError: height or width is no multiple of 8.
         """
         if image.shape[-1] % CELL_PX or image.shape[-2] % CELL_PX:
             raise ValueError(f"sides must be multiples of {CELL_PX}, not {tuple(image.shape[-2:])}")
@@ -59,9 +60,11 @@ class KeypointNetwork(nn.Module):
 
 
 class LightBody(nn.Module):
-    """About 1.9 GMAC at 640 x 480; strides of 2 by kernels of 4, which keep blocks centred and alias less than 3.
+    """The encoder `light`: about 1.9 GMAC at 640 x 480 pixels.
 
-    Widths are multiples of 16 or what fills them up: processors with vectors of 16 floats compute that many anyway.
+    Strides of 2 have kernels of 4, which keep blocks centred and alias less than kernels of 3.
+
+    Most widths are multiples of 16, because processors with vectors of 16 floats compute that many channels anyway.
     """
 
     def __init__(self) -> None:
@@ -77,11 +80,11 @@ class LightBody(nn.Module):
         self.context_eighth = nn.Conv2d(64, 16, 1)
         self.context_quarter = nn.Conv2d(32, 16, 1)
         self.point_head = nn.Sequential(_convolution(16, 16), nn.Conv2d(16, 4, 1))
-        # What is found at half resolution depends on whether it lies on an even pixel; these layers see every pixel.
+        # Detection at half resolution depends on whether a point lies on an even pixel; these layers see every pixel.
         self.refine = nn.Sequential(
-            _convolution(2, 16), _separable(16), _separable(16), _each_alone(16), nn.Conv2d(16, 1, 1)
+            _convolution(2, 16), _separable(16), _separable(16), _depthwise(16), nn.Conv2d(16, 1, 1)
         )
-        nn.init.zeros_(self.refine[-1].weight)  # begins as no change
+        nn.init.zeros_(self.refine[-1].weight)  # the refinement starts as the identity
 
     def forward(self, image: Tensor) -> Maps:
         """As in ``KeypointNetwork``."""
@@ -120,13 +123,13 @@ class VggBody(nn.Module):
 
 
 def cell_probabilities(point_logits: Tensor) -> Tensor:
-    """Softmax over the 64 places of each cell and none of them; (B, H, W) to (B, H, W)."""
+    """Probability of a keypoint at every pixel (B, H, W): a softmax over each cell's 64 positions and "none"."""
     log_places, _ = cell_log_probabilities(point_logits)
     return F.pixel_shuffle(log_places.exp(), CELL_PX).squeeze(1)
 
 
 def cell_log_probabilities(point_logits: Tensor) -> tuple[Tensor, Tensor]:
-    """Logarithms of a cell's probabilities: of its places (B, 64, H/8, W/8) and of none (B, H/8, W/8)."""
+    """Log probabilities of a cell: of its 64 positions (B, 64, H/8, W/8) and of "none" (B, H/8, W/8)."""
     places = F.pixel_unshuffle(point_logits.unsqueeze(1), CELL_PX)
     none = torch.zeros_like(places[:, :1])
     logs = torch.cat((places, none), dim=1).log_softmax(dim=1)
@@ -134,7 +137,7 @@ def cell_log_probabilities(point_logits: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def sample_codes(code_logits: Tensor, points_px: Tensor) -> Tensor:
-    """Logits at points, interpolated before any sign is taken.
+    """Logits at points, interpolated linearly.
 
     Args:
         code_logits: shape (B, 256, H/8, W/8).
@@ -151,9 +154,9 @@ def sample_codes(code_logits: Tensor, points_px: Tensor) -> Tensor:
 
 
 def smoothed(maps: Tensor) -> Tensor:
-    """Maps (B, 1, H, W) without what alternates from pixel to pixel: it would tell even pixels from odd ones.
+    """Maps (B, 1, H, W) after a binomial filter of 3 x 3, which removes patterns that alternate from pixel to pixel.
 
-    A binomial filter of 3 x 3 as sums of neighbours, which a processor does much faster than a convolution.
+    It is computed as sums of neighbours, which is much faster on a processor than a convolution.
     """
     sums = F.pad(maps, (1, 1, 1, 1), mode="replicate")
     for _ in range(2):
@@ -168,12 +171,12 @@ def _convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) ->
 
 
 def _separable(channels: int) -> nn.Sequential:
-    """A convolution in two steps: each channel alone, then all at each pixel."""
+    """A depthwise separable convolution with batch normalisation."""
     mix = nn.Conv2d(channels, channels, 1, bias=False)
-    return nn.Sequential(_each_alone(channels), mix, nn.BatchNorm2d(channels), nn.ReLU(inplace=True))
+    return nn.Sequential(_depthwise(channels), mix, nn.BatchNorm2d(channels), nn.ReLU(inplace=True))
 
 
-def _each_alone(channels: int) -> nn.Conv2d:
+def _depthwise(channels: int) -> nn.Conv2d:
     return nn.Conv2d(channels, channels, 3, padding=1, groups=channels, bias=False)
 
 

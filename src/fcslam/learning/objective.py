@@ -13,11 +13,12 @@ from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.network import Maps, sample_codes
 from fcslam.learning.settings import Encoder, LossSettings
 
-APART_PX = 8.0
-"""Points this close to a match are no negatives: their codes should be alike."""
+MIN_NEGATIVE_DISTANCE_PX = 8.0
+"""Points closer to a match than this are no negatives, because their codes should be similar."""
 TEACHER_SHARPNESS = 2.0
-"""A bit the teacher is one standard deviation sure of is 1 with 88 %."""
+"""Logit of a bit per standard deviation of its projection: one standard deviation gives a probability of 88 %."""
 _SEEN = 0.999
+"""Least interpolated visibility of a pixel that counts as visible: all four neighbours are, up to rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +31,11 @@ class TeacherBits:
     """Shape (D, 256); its outputs have unit variance on the training set."""
 
     def to(self, device: torch.device) -> "TeacherBits":
-        """The same on another device."""
+        """The projection on another device."""
         return TeacherBits(self.mean.to(device), self.projection.to(device))
 
     def probabilities(self, descriptors: Tensor) -> Tensor:
-        """How likely each bit is 1, for descriptors (..., D)."""
+        """Probability that each bit is 1, shape (..., 256), for descriptors (..., D)."""
         return torch.sigmoid(TEACHER_SHARPNESS * ((descriptors - self.mean) @ self.projection))
 
 
@@ -46,16 +47,16 @@ def objective(
     grid_shift: tuple[int, int],
     bits: TeacherBits | None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The sum to minimise and its parts by name.
+    """The sum to minimise, and the losses in it by name.
 
     Args:
-        maps: what the network says of ``batch.images``.
-        batch: what is true.
-        weights: of the parts.
-        progress: share of the training that is behind, in [0, 1].
-        grid_shift: rows and columns by which the detector's cells are shifted, 0 to 7: a network that may find a point
-            anywhere must not learn one grid of cells.
-        bits: the teacher's, if there is one.
+        maps: output of the network for ``batch.images``.
+        batch: images and ground truth.
+        weights: of the losses.
+        progress: share of the training that is done, in [0, 1].
+        grid_shift: rows and columns by which the detector's cells are shifted, 0 to 7, so that the network does not
+            learn one grid of cells.
+        bits: the teacher's, if there is a teacher.
     """
     logits = sample_codes(maps.code_logits.float(), batch.points)
     first, second = logits.chunk(2)
@@ -74,16 +75,16 @@ def objective(
     }
     factors = {name: getattr(weights, name) for name in parts}
     if bits is not None:
-        taught = sample_codes(maps.code_logits.float(), batch.taught_points)
-        wanted = bits.probabilities(batch.taught).repeat(2, 1, 1)
-        parts["distillation"] = losses.distillation_loss(taught, wanted, batch.taught_valid.repeat(2, 1))
+        logits = sample_codes(maps.code_logits.float(), batch.teacher_points)
+        wanted = bits.probabilities(batch.teacher_descriptors).repeat(2, 1, 1)
+        parts["distillation"] = losses.distillation_loss(logits, wanted, batch.teacher_valid.repeat(2, 1))
         factors["distillation"] = weights.distillation * 0.25**progress
     total = sum((factors[name] * part for name, part in parts.items()), start=torch.zeros_like(parts["detector"]))
     return total, parts
 
 
 def views_aligned(maps: Tensor, batch: TrainingBatch) -> tuple[Tensor, Tensor, Tensor]:
-    """Maps (2B, H, W) of the first views, of the second ones as the first ones' pixels see them, and where both see."""
+    """Split maps (2B, H, W) into first views, second views warped onto them, and where both show the image (bool)."""
     first, second = maps.chunk(2)
     seen_first, seen_second = batch.seen.chunk(2)
     height, width = maps.shape[-2:]
@@ -99,14 +100,21 @@ def views_aligned(maps: Tensor, batch: TrainingBatch) -> tuple[Tensor, Tensor, T
 
 
 def negatives(points: Tensor, valid: Tensor) -> Tensor:
-    """Which points (B, N) may be compared as different ones: both valid, and far apart in both views; (B, N, N)."""
+    """Which pairs of points are negatives, shape (B, N, N), bool: both valid, and far apart in both views.
+
+    Args:
+        points: shape (2B, N, 2) [px], first views before second views.
+        valid: shape (B, N), bool.
+    """
     first, second = points.chunk(2)
-    apart = (torch.cdist(first, first) > APART_PX) & (torch.cdist(second, second) > APART_PX)
+    apart = (torch.cdist(first, first) > MIN_NEGATIVE_DISTANCE_PX) & (
+        torch.cdist(second, second) > MIN_NEGATIVE_DISTANCE_PX
+    )
     return apart & valid[:, :, None] & valid[:, None, :]
 
 
 def shift_grid(maps: tuple[Tensor, ...], shift: tuple[int, int]) -> tuple[Tensor, ...]:
-    """Maps (B, H, W) without their first rows and columns, cut to whole cells."""
+    """Maps (B, H, W) without the first rows and columns, cropped to whole cells."""
     row, column = shift
     height = (maps[0].shape[-2] - row) // CELL_PX * CELL_PX
     width = (maps[0].shape[-1] - column) // CELL_PX * CELL_PX
@@ -114,7 +122,7 @@ def shift_grid(maps: tuple[Tensor, ...], shift: tuple[int, int]) -> tuple[Tensor
 
 
 def grid_shift(encoder: Encoder, seed: int, step: int) -> tuple[int, int]:
-    """Shift of the cells at a step; the paper's head has one grid, the other none."""
+    """Rows and columns by which cells are shifted at a step; `vgg` as in the paper has one fixed grid of cells."""
     if encoder == "vgg":
         return 0, 0
     mixed = (seed * 7919 + step * 104729) % CELL_PX**2
@@ -122,7 +130,7 @@ def grid_shift(encoder: Encoder, seed: int, step: int) -> tuple[int, int]:
 
 
 def teacher_bits(descriptors: Tensor, seed: int) -> TeacherBits:
-    """Random projections of descriptors (N, D), orthogonal in blocks, centred and scaled to unit variance."""
+    """Random projections fitted to descriptors (N, D): orthogonal in blocks, centred, outputs of unit variance."""
     size = descriptors.shape[1]
     generator = torch.Generator().manual_seed(seed)
     blocks = []

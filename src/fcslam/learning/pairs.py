@@ -22,17 +22,16 @@ from fcslam.metrics.homography import Mask, inverse, warp
 from fcslam.records import FloatArray
 
 BORDER_PX: Final = 4
-"""Points so close to the rim of a view do not count."""
+"""Points closer to the border of a view than this are not used."""
 GRID_SHARE: Final = 0.35
-"""Points of a pair that are drawn anywhere instead of at keypoints: every pixel has to have a code."""
-
+"""Share of a pair's points that are drawn anywhere and not at keypoints: every pixel needs a code."""
 SHIFT_SHARE: Final = 0.3
-"""Pairs whose views differ by a shift by whole pixels, and in light."""
+"""Share of the pairs whose views differ by a shift of whole pixels, and in light."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingExample:
-    """An image with what is known of it."""
+    """An image with its labels."""
 
     image: GreyImage
     labels: Labels
@@ -46,13 +45,13 @@ class AugmentedView:
     image: NDArray[np.float32]
     """Shape (H, W), in [0, 1]."""
     targets: NDArray[np.float32]
-    """Shape (H, W): how much of a keypoint is at each pixel."""
+    """Shape (H, W): weight of a keypoint at each pixel, in [0, 1]."""
     valid: Mask
     """Shape (H, W): whether a pixel shows the image."""
     points: NDArray[np.float32]
-    """Shape (N, 2): where this view sees the points of the pair [px]."""
-    taught: NDArray[np.float32]
-    """Shape (M, 2): where it sees the teacher's points [px]."""
+    """Shape (N, 2): points of the pair in this view [px]."""
+    teacher_points: NDArray[np.float32]
+    """Shape (M, 2): points of the teacher in this view [px]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,36 +60,46 @@ class ViewPair:
 
     views: tuple[AugmentedView, AugmentedView]
     valid: Mask
-    """Shape (N,): whether both views see a point."""
-    taught_valid: Mask
-    """Shape (M,): whether both views see a point of the teacher."""
-    taught: NDArray[np.float32]
-    """Shape (M, D): the teacher's descriptors; D is 0 without one."""
+    """Shape (N,): whether both views show a point."""
+    teacher_valid: Mask
+    """Shape (M,): whether both views show a point of the teacher."""
+    teacher_descriptors: NDArray[np.float32]
+    """Shape (M, D); D is 0 without a teacher."""
     homography: FloatArray
-    """Shape (3, 3): takes pixels of the first view to pixels of the second."""
+    """Shape (3, 3): maps pixels of the first view to pixels of the second."""
 
 
-def draw_pair(example: TrainingExample, size: Size, points: int, taught: int, rng: np.random.Generator) -> ViewPair:
-    """A pair of views of this size with ``points`` points, ``taught`` of the teacher's among its own."""
+def draw_pair(
+    example: TrainingExample, size: Size, points: int, teacher_points: int, rng: np.random.Generator
+) -> ViewPair:
+    """Draw a pair of views.
+
+    Args:
+        example: image and labels.
+        size: width and height of a view [px].
+        points: number of points, N.
+        teacher_points: number of points of the teacher, M.
+        rng: source of randomness.
+    """
     image = example.image
     window = random_view(image, size, rng)
     homographies = [random_change(size, rng) @ window for _ in range(2)]
     if rng.random() < SHIFT_SHARE:
         homographies[1] = random_shift(rng) @ homographies[0]
     chosen = _choose(example, homographies, size, points, rng)
-    told, descriptors = _choose_taught(example.teacher, homographies, size, taught, rng)
-    views = [_view(example, homography, size, chosen, told, rng) for homography in homographies]
+    taught, descriptors = _choose_teacher_points(example.teacher, homographies, size, teacher_points, rng)
+    views = [_view(example, homography, size, chosen, taught, rng) for homography in homographies]
     return ViewPair(
         (views[0], views[1]),
         _in_both(views[0].points, views[1].points, size) & well_inside(chosen, (image.shape[1], image.shape[0]), 0.0),
-        _in_both(views[0].taught, views[1].taught, size),
+        _in_both(views[0].teacher_points, views[1].teacher_points, size),
         descriptors,
         homographies[1] @ inverse(homographies[0]),
     )
 
 
 def splat_points(points: FloatArray, weight: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
-    """Weights of points (N, 2) shared out among the four pixels around each, shape (height, width)."""
+    """Distribute the weights (N,) of points (N, 2) [px] over the four pixels around each, shape (height, width)."""
     padded = np.zeros((size[1] + 1, size[0] + 1), np.float32)
     here = well_inside(points, size, 0.0)
     low = np.floor(points[here]).astype(np.int64)
@@ -107,7 +116,7 @@ def _view(
     homography: FloatArray,
     size: Size,
     chosen: FloatArray,
-    told: FloatArray,
+    taught: FloatArray,
     rng: np.random.Generator,
 ) -> AugmentedView:
     keypoints = warp(homography, example.labels.keypoints.astype(np.float64))
@@ -116,25 +125,25 @@ def _view(
         splat_points(keypoints, example.labels.quality, size),
         visible_mask((example.image.shape[0], example.image.shape[1]), homography, size),
         warp(homography, chosen).astype(np.float32),
-        warp(homography, told).astype(np.float32),
+        warp(homography, taught).astype(np.float32),
     )
 
 
 def _choose(
     example: TrainingExample, homographies: list[FloatArray], size: Size, count: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Points (count, 2) of the image: keypoints that both views see, the better the likelier, and others anywhere."""
+    """Points (count, 2) of the image [px]: keypoints in both views, drawn by their quality, and others anywhere."""
     keypoints = example.labels.keypoints.astype(np.float64)
     usable = np.flatnonzero(_in_both(warp(homographies[0], keypoints), warp(homographies[1], keypoints), size))
     wanted = min(len(usable), round((1.0 - GRID_SHARE) * count))
-    # Gumbel's trick: the largest of noise plus log weight are a draw without replacement.
+    # Gumbel's trick: the largest sums of log weight and noise are a weighted draw without replacement.
     appeal = np.log(example.labels.quality[usable]) + rng.gumbel(size=len(usable))
     best = usable[np.argsort(-appeal)[:wanted]]
     anywhere = rng.uniform(0.0, 1.0, (count - wanted, 2)) * [size[0] - 1.0, size[1] - 1.0]
     return np.concatenate((keypoints[best], warp(inverse(homographies[0]), anywhere)))
 
 
-def _choose_taught(
+def _choose_teacher_points(
     teacher: Teacher | None, homographies: list[FloatArray], size: Size, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, NDArray[np.float32]]:
     if teacher is None:

@@ -1,8 +1,8 @@
-"""From a folder of images to a trained network: shapes, labels, joint training. Each stage resumes where it stopped.
+"""From a folder of images to a trained network: shapes, labels, joint training. Each stage can be resumed.
 
-Without a teacher, a detector first learns corners on synthetic shapes, and labels the images by homographic
-adaptation, together with Harris's measure. With one, its keypoints take that detector's place, and its descriptors say
-which bits are wanted.
+Without a teacher, a detector first learns corners on synthetic shapes. It then labels the images by homographic
+adaptation, together with Harris's measure. With a teacher, the teacher's keypoints replace those of this detector, and
+its descriptors determine the wanted bits.
 """
 
 import zlib
@@ -31,29 +31,32 @@ from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, Training
 
 LABEL_NMS_PX: Final = 4.0
 DESCRIPTORS_OF_AN_IMAGE: Final = 32
+"""Descriptors of each image to which the projection of a teacher's descriptors is fitted."""
 FEWEST_IMAGES: Final = 2
 SHAPE_COUNT: Final = 1_000_000
+"""Number of different synthetic shapes, more than any training draws."""
 HELD_OUT_SHAPES: Final = 32
 SHAPE_SIDE_PX: Final = 240
 SHAPE_LOSSES: Final = LossSettings(triplet=0.0, contrastive=0.0, distillation=0.0, balance=0.0)
+"""Only the keypoint maps are trained on shapes: descriptors would learn nothing useful there."""
 
 StageCallback = Callable[[str, TrainingProgress], None]
-"""Is told the stage and where it stands."""
+"""Called with the name of a stage and its progress."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingImages:
-    """What there is to learn from."""
+    """The usable images with their labels."""
 
     train: list[TrainingExample]
     held_out: list[TrainingExample]
-    """Not trained on, unless there are too few images to hold any out."""
+    """For validation; if no image is held out, the first training image."""
     skipped: int
-    """Files that are no images, too small or too bare."""
+    """Number of files that are no images, too small, or have too few corners."""
 
 
 class SyntheticShapes(Sequence[TrainingExample]):
-    """Endless synthetic shapes; the same number gives the same picture."""
+    """Synthetic shapes; the same index always gives the same picture."""
 
     def __init__(self, first: int, count: int) -> None:
         self._first, self._count = first, count
@@ -76,25 +79,39 @@ def train_detector(
     roots: Sequence[Path],
     folder: Path,
     settings: TrainingSettings,
-    pace: ExecutionOptions,
+    options: ExecutionOptions,
     teacher: Path | None,
-    watch: StageCallback,
+    on_progress: StageCallback,
 ) -> tuple[KeypointNetwork, TrainingImages]:
-    """Train on every image below ``roots``; all that is made goes into ``folder``.
+    """Train on every image below ``roots``.
+
+    Args:
+        roots: folders of images.
+        folder: for all files of the run; a run in it is continued.
+        settings: of the run.
+        options: where and how to compute.
+        teacher: folder of a teacher's files; None without a teacher.
+        on_progress: called after every step.
+
+    Returns:
+        The trained network, and the images that it was trained on.
 
     Raises:
-        TrainingError: no usable image, a teacher's file is missing or broken, or ``folder`` holds another run.
-        OutputError: something cannot be written; what was written before stays.
+        TrainingError: there is no usable image, a teacher's file is missing or broken, or ``folder`` belongs to another
+            run.
+        OutputError: a file cannot be written; everything written before stays.
     """
     files = find_images(roots)
     start: dict[str, Tensor] | None = None
     detector: Callable[[GreyImage], Response] | None = None
     if teacher is None:
-        first = train_on_shapes(folder / "shapes", settings, pace, watch)
-        start, detector = first.state_dict(), keypoint_response(first, torch.device(pace.device))
-    images = read_labelled_images(files, folder / "labels", settings, detector, teacher, watch)
-    run = TrainingRun(settings, "joint", _made(folder / "joint"), pace, start)
-    return run.train(images.train, images.held_out, _bits(images.train, settings.seed), partial(watch, "joint")), images
+        first = train_on_shapes(folder / "shapes", settings, options, on_progress)
+        start, detector = first.state_dict(), keypoint_response(first, torch.device(options.device))
+    images = read_labelled_images(files, folder / "labels", settings, detector, teacher, on_progress)
+    run = TrainingRun(settings, "joint", _created(folder / "joint"), options, start)
+    return run.train(
+        images.train, images.held_out, _teacher_bits(images.train, settings.seed), partial(on_progress, "joint")
+    ), images
 
 
 def read_labelled_images(
@@ -103,12 +120,20 @@ def read_labelled_images(
     settings: TrainingSettings,
     detector: Callable[[GreyImage], Response] | None,
     teacher: Path | None,
-    watch: StageCallback,
+    on_progress: StageCallback,
 ) -> TrainingImages:
-    """Read the images and label those that have no labels in ``cache`` yet.
+    """Read images, and label those that have no labels in ``cache`` yet.
+
+    Args:
+        files: of the images.
+        cache: folder of the labels.
+        settings: of the run.
+        detector: gives the response by which images are labelled, beside Harris's measure; None for that alone.
+        teacher: folder of a teacher's files, whose keypoints replace the detector's; None without a teacher.
+        on_progress: called after every image.
 
     Raises:
-        TrainingError: too few can be used, or a teacher's file is missing or broken.
+        TrainingError: too few images are usable, or a teacher's file is missing or broken.
         OutputError: labels cannot be written.
     """
     train: list[TrainingExample] = []
@@ -116,16 +141,16 @@ def read_labelled_images(
     for index, file in enumerate(files):
         image = read_image(file.path)
         if image is not None and is_usable(image):
-            taught = None if teacher is None else read_teacher(teacher / f"{file.name}.npz")
+            teacher_of_image = None if teacher is None else read_teacher(teacher / f"{file.name}.npz")
             place = cache / f"{file.name}.npz"
             (held_out if is_held_out(file.name) else train).append(
-                TrainingExample(image, _labels(image, place, settings, detector, taught), taught)
+                TrainingExample(image, _labels(image, place, settings, detector, teacher_of_image), teacher_of_image)
             )
-        watch("labels", TrainingProgress(index + 1, len(files), {}))
+        on_progress("labels", TrainingProgress(index + 1, len(files), {}))
     if len(train) < FEWEST_IMAGES:
         raise TrainingError(
             f"only {len(train)} of {len(files)} image files can be trained on: the others are no images, "
-            "smaller than 96 px or bare; give more"
+            "smaller than 96 px or have too few corners; give more images"
         )
     return TrainingImages(train, held_out or train[:1], len(files) - len(train) - len(held_out))
 
@@ -137,7 +162,7 @@ def _labels(
     detector: Callable[[GreyImage], Response] | None,
     teacher: Teacher | None,
 ) -> Labels:
-    """Labels of an image, from the cache if they were made from these very pixels."""
+    """Labels of an image, from the cache if they were made from the same pixels."""
     key = zlib.crc32(image.tobytes())
     known = read_labels(place, key)
     if known is not None:
@@ -154,28 +179,36 @@ def _labels(
     try:
         write_labels(place, labels, key)
     except OSError as error:
-        raise OutputError(f"{place}: cannot be written ({error}); make room and run the same command again") from error
+        raise OutputError(
+            f"{place}: cannot be written ({error}); free disk space and run the same command again"
+        ) from error
     return labels
 
 
 def train_on_shapes(
-    folder: Path, settings: TrainingSettings, pace: ExecutionOptions, watch: StageCallback
+    folder: Path, settings: TrainingSettings, options: ExecutionOptions, on_progress: StageCallback
 ) -> KeypointNetwork:
-    """A detector of corners of synthetic shapes, whose codes mean nothing yet; resumes in ``folder``.
+    """Train a detector of the corners of synthetic shapes; its descriptors are not trained yet.
+
+    Args:
+        folder: for the files of this stage, which is continued if it is in there.
+        settings: of the run.
+        options: where and how to compute.
+        on_progress: called after every step.
 
     Raises:
-        TrainingError: ``folder`` holds another run.
-        OutputError: something cannot be written.
+        TrainingError: ``folder`` belongs to another run.
+        OutputError: a file cannot be written.
     """
     shapes = settings.model_copy(update={"steps": settings.shape_steps, "loss": SHAPE_LOSSES})
-    run = TrainingRun(shapes, "shapes", _made(folder), pace)
+    run = TrainingRun(shapes, "shapes", _created(folder), options)
     return run.train(
-        SyntheticShapes(0, SHAPE_COUNT), SyntheticShapes(1, HELD_OUT_SHAPES), watch=partial(watch, "shapes")
+        SyntheticShapes(0, SHAPE_COUNT), SyntheticShapes(1, HELD_OUT_SHAPES), on_progress=partial(on_progress, "shapes")
     )
 
 
-def _bits(examples: Sequence[TrainingExample], seed: int) -> TeacherBits | None:
-    """A teacher's bits, fitted to some of its descriptors of each image."""
+def _teacher_bits(examples: Sequence[TrainingExample], seed: int) -> TeacherBits | None:
+    """The projection of a teacher's descriptors to bits, fitted to some descriptors of each image."""
     taught = [example.teacher.descriptors for example in examples if example.teacher is not None]
     if not taught:
         return None
@@ -184,7 +217,7 @@ def _bits(examples: Sequence[TrainingExample], seed: int) -> TeacherBits | None:
 
 
 def keypoint_response(network: KeypointNetwork, device: torch.device) -> Callable[[GreyImage], Response]:
-    """A network as what labels images, on its device."""
+    """The network's keypoint response, shape (height, width), as a function of an image."""
 
     @torch.inference_mode()
     def detector(image: GreyImage) -> Response:
@@ -194,11 +227,11 @@ def keypoint_response(network: KeypointNetwork, device: torch.device) -> Callabl
         response[:height, :width] = network.scores(network(batch))[0].cpu().numpy()
         return response
 
-    answer: Callable[[GreyImage], Response] = detector
-    return answer
+    response_of: Callable[[GreyImage], Response] = detector
+    return response_of
 
 
-def _made(folder: Path) -> Path:
+def _created(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

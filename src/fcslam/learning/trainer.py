@@ -1,6 +1,6 @@
-"""The training loop: draw pairs, step, average, look now and then how good the network is, keep a checkpoint.
+"""The training loop: it draws pairs, does steps, averages the network, validates it and writes checkpoints.
 
-A step depends on the seed, its number and the state before it, so an interrupted run goes on as if it had not been.
+A step depends on the seed, its number and the state before it. So a run that was interrupted gives the same result.
 """
 
 import csv
@@ -23,60 +23,69 @@ from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import (
     create_optimiser,
+    get_optimiser_state,
     learning_rate,
-    optimiser_state,
     restore_optimiser_state,
     training_step,
 )
 from fcslam.learning.validation import collapse_warnings, validate
 
 AVERAGE_DECAY: Final = 0.999
+"""Share of the averaged network that a step keeps; early steps keep less, so that it forgets the initial network."""
 VALIDATION_PAIRS: Final = 24
 VALIDATION_VIEW: Final = (320, 240)
+"""Width and height of a view [px]."""
+VALIDATION_POINTS: Final = 16
+"""Points of a validation pair; validation does not use them, but drawing them is part of the random sequence."""
 VALIDATION_SEED: Final = 2026
 CHECKPOINT_FILE: Final = "checkpoint.npz"
 PROGRESS_FILE: Final = "progress.csv"
 NETWORK, AVERAGE, OPTIMISER = "network/", "average/", "optimiser/"
-"""How names of tensors in a checkpoint begin."""
+"""Prefixes of the names of tensors in a checkpoint."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExecutionOptions:
-    """How often what happens, and on what; none of it changes the result."""
+    """Where training computes, and how often it reports. None of this changes the result on one device."""
 
     validate_every: int = 500
+    """Steps between two validations."""
     checkpoint_every_s: float = 120.0
+    """Time between two checkpoints."""
     log_every: int = 50
+    """Steps between two rows of losses in the log."""
     threads: int = 1
+    """Threads that prepare batches."""
     device: str = "cpu"
+    """Name of a device in torch."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingProgress:
-    """Where a stage stands."""
+    """Progress of a stage of training."""
 
     step: int
     """Steps done."""
     steps: int
-    figures: Mapping[str, float]
-    """The latest losses and validation figures."""
+    metrics: Mapping[str, float]
+    """The latest losses and validation metrics."""
     collapse_warnings: tuple[str, ...] = ()
-    """What the latest validation found wrong with the codes."""
+    """Warnings of the latest validation."""
 
 
 class TrainingRun:
-    """One stage of training in a folder: resumes where its checkpoint stands."""
+    """One stage of training in a folder. It continues from the checkpoint there."""
 
     def __init__(
         self,
         settings: TrainingSettings,
         stage: str,
         folder: Path,
-        pace: ExecutionOptions,
+        options: ExecutionOptions,
         start: dict[str, Tensor] | None = None,
     ) -> None:
-        self.settings, self.stage, self.folder, self.pace = settings, stage, folder, pace
-        self.device = torch.device(pace.device)
+        self.settings, self.stage, self.folder, self.options = settings, stage, folder, options
+        self.device = torch.device(options.device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
             network = KeypointNetwork(settings.encoder)
@@ -95,41 +104,43 @@ class TrainingRun:
         examples: Sequence[TrainingExample],
         held_out: Sequence[TrainingExample],
         bits: TeacherBits | None = None,
-        watch: Callable[[TrainingProgress], None] = lambda _status: None,
+        on_progress: Callable[[TrainingProgress], None] = lambda _progress: None,
     ) -> KeypointNetwork:
         """Train to the last step; returns the averaged network.
 
         Args:
             examples: to train on.
             held_out: to validate on.
-            bits: a teacher's, if the examples have one.
-            watch: is told after every step.
+            bits: a teacher's, if the examples have a teacher.
+            on_progress: called after every step.
 
         Raises:
-            TrainingError: the folder's checkpoint is another run's, or training diverged.
+            TrainingError: the folder's checkpoint belongs to another run, or training diverged.
             OutputError: a checkpoint or the log cannot be written.
         """
         self._resume()
         bits = None if bits is None else bits.to(self.device)
         views = validation_pairs(held_out)
-        figures: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         warnings: tuple[str, ...] = ()
-        for step, batch in batch_stream(examples, self.settings, self.step, 4 * self.pace.threads, self.pace.threads):
+        for step, batch in batch_stream(
+            examples, self.settings, self.step, 4 * self.options.threads, self.options.threads
+        ):
             parts = self._step(step, batch.to(self.device), bits)
             self.step = step + 1
             last = self.step == self.settings.steps
-            if self.step % self.pace.log_every == 0 or last:
+            if self.step % self.options.log_every == 0 or last:
                 losses = {name: float(part) for name, part in parts.items()}
-                figures |= losses
+                metrics |= losses
                 self._log(losses)
-            if self.step % self.pace.validate_every == 0 or last:
+            if self.step % self.options.validate_every == 0 or last:
                 found = validate(self.average, views, self.device)
-                figures |= found
+                metrics |= found
                 warnings = tuple(collapse_warnings(found))
                 self._log(found | {"alarms": float(len(warnings))})
-            if last or time.monotonic() - self._saved > self.pace.checkpoint_every_s:
+            if last or time.monotonic() - self._saved > self.options.checkpoint_every_s:
                 self._save()
-            watch(TrainingProgress(self.step, self.settings.steps, dict(figures), warnings))
+            on_progress(TrainingProgress(self.step, self.settings.steps, dict(metrics), warnings))
         trained: KeypointNetwork = self.average
         return trained
 
@@ -156,7 +167,7 @@ class TrainingRun:
         checkpoint = read_checkpoint(path)
         fixed = self.settings.model_dump(mode="json") | {"steps": checkpoint.settings.get("steps")}
         if checkpoint.settings != fixed or checkpoint.stage != self.stage:
-            raise TrainingError(f"{path}: is of a run with other settings; give them again, or another --output")
+            raise TrainingError(f"{path}: belongs to a run with other settings; give the same or another --output")
         try:
             self._load(checkpoint)
         except (KeyError, RuntimeError, ValueError) as error:
@@ -171,12 +182,12 @@ class TrainingRun:
     def _save(self) -> None:
         tensors = {f"{NETWORK}{name}": value for name, value in self.network.state_dict().items()}
         tensors |= {f"{AVERAGE}{name}": value for name, value in self.average.state_dict().items()}
-        tensors |= {f"{OPTIMISER}{name}": value for name, value in optimiser_state(self.optimiser).items()}
+        tensors |= {f"{OPTIMISER}{name}": value for name, value in get_optimiser_state(self.optimiser).items()}
         settings = self.settings.model_dump(mode="json")
         write_checkpoint(self.folder / CHECKPOINT_FILE, Checkpoint(self.stage, self.step, settings, tensors))
         self._saved = time.monotonic()
 
-    def _log(self, figures: Mapping[str, float]) -> None:
+    def _log(self, metrics: Mapping[str, float]) -> None:
         path = self.folder / PROGRESS_FILE
         try:
             new = not path.exists()
@@ -184,16 +195,18 @@ class TrainingRun:
                 rows = csv.writer(file)
                 if new:
                     rows.writerow(("stage", "step", "name", "value"))
-                rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in figures.items())
+                rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
         except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error}); make room and run the command again") from error
+            raise OutputError(
+                f"{path}: cannot be written ({error}); free disk space and run the command again"
+            ) from error
 
 
 def trained_network(path: Path) -> KeypointNetwork:
-    """The averaged network of a checkpoint, which is what a run hands over, ready to be used.
+    """The averaged network of a checkpoint, the result of its run, in evaluation mode.
 
     Raises:
-        TrainingError: the file is no checkpoint, or of another network than this version has.
+        TrainingError: the file is no checkpoint, or belongs to a network that this version does not have.
     """
     checkpoint = read_checkpoint(path)
     try:
@@ -206,10 +219,10 @@ def trained_network(path: Path) -> KeypointNetwork:
 
 
 def validation_pairs(held_out: Sequence[TrainingExample]) -> list[ViewPair]:
-    """The same pairs each time, from images spread over those held out."""
+    """Pairs of views of held-out images, spread over all of them; always the same."""
     pairs = []
     for index in range(min(VALIDATION_PAIRS, len(held_out))):
         rng = np.random.default_rng([VALIDATION_SEED, index])
         example = held_out[index * len(held_out) // min(VALIDATION_PAIRS, len(held_out))]
-        pairs.append(draw_pair(example, VALIDATION_VIEW, 16, 0, rng))
+        pairs.append(draw_pair(example, VALIDATION_VIEW, VALIDATION_POINTS, 0, rng))
     return pairs

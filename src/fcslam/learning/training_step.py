@@ -1,4 +1,4 @@
-"""One step of training: forward, losses, backward, update."""
+"""One step of training: forward pass, losses, backward pass, update."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,62 +15,68 @@ from fcslam.learning.objective import TeacherBits, grid_shift, objective
 from fcslam.learning.settings import TrainingSettings
 
 CLIP_NORM: Final = 1.0
+"""Gradients with a larger norm are scaled down to it, so that one odd batch does not undo many steps."""
 WEIGHT_DECAY: Final = 1e-4
 WARM_UP_STEPS: Final = 300
+"""Longest warm-up of the learning rate; short runs use a tenth of their steps."""
 LAST_RATE: Final = 1e-5
+"""Learning rate at the end of training, and the lowest one."""
 DECAY_SHARE: Final = 0.3
+"""Share of the steps, at the end, over which the learning rate falls."""
+CODE_SHARPNESS: Final = 2.0
+"""Factor from a code's logit to the log odds of its bit, for both detectors."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProximalTerm:
-    """A spring back to given weights: strength / 2 times the squared distance is added to what is minimised."""
+    """FedProx's proximal term: half the strength times the squared distance from given weights."""
 
     strength: float
     weights: Mapping[str, Tensor]
     """By the parameters' names."""
 
-    def energy(self, network: KeypointNetwork) -> Tensor:
-        """What is added now."""
+    def loss(self, network: KeypointNetwork) -> Tensor:
+        """The term for the present weights of the network."""
         terms = [(value - self.weights[name]).square().sum() for name, value in network.named_parameters()]
         return 0.5 * self.strength * torch.stack(terms).sum()
 
 
 @dataclass(frozen=True, slots=True)
 class LegacyDetector:
-    """A former network whose codes are still in use: points should get codes that match those it gives them."""
+    """An earlier detector whose codes are still in use, so the codes of the trained one should match them."""
 
     strength: float
     network: KeypointNetwork
     """In evaluation mode, on the device of the one that is trained."""
 
     def loss(self, maps: Maps, batch: TrainingBatch) -> Tensor:
-        """Cross entropy of the bits at the batch's points against the former network's bits there."""
+        """Cross entropy of the bits at the batch's points against the legacy detector's bits there."""
         with torch.no_grad(), torch.autocast(batch.images.device.type, torch.bfloat16):
-            before = self.network(batch.images.contiguous(memory_format=torch.channels_last))
-        wanted = torch.sigmoid(2.0 * sample_codes(before.code_logits.float(), batch.points))
-        now = 2.0 * sample_codes(maps.code_logits.float(), batch.points)
-        return distillation_loss(now, wanted, batch.valid.repeat(2, 1))
+            legacy = self.network(batch.images.contiguous(memory_format=torch.channels_last))
+        wanted = torch.sigmoid(CODE_SHARPNESS * sample_codes(legacy.code_logits.float(), batch.points))
+        logits = CODE_SHARPNESS * sample_codes(maps.code_logits.float(), batch.points)
+        return distillation_loss(logits, wanted, batch.valid.repeat(2, 1))
 
 
 def create_optimiser(network: KeypointNetwork) -> torch.optim.Optimizer:
-    """An optimiser without a memory yet; ``training_step`` sets its rate."""
+    """An optimiser without moments; ``training_step`` sets its learning rate."""
     return torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
 
 
-def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """What an optimiser has learnt of gradients, by the parameters' numbers."""
+def get_optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """The optimiser's step counts and moments as tensors, by parameter number and name."""
     states = optimiser.state_dict()["state"]
     return {f"{index}/{name}": value for index, entries in states.items() for name, value in entries.items()}
 
 
-def restore_optimiser_state(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
-    """Let a new optimiser go on with what another one had learnt.
+def restore_optimiser_state(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Let a new optimiser continue from the tensors of ``get_optimiser_state``.
 
     Raises:
-        ValueError: they are of another network.
+        ValueError: the tensors belong to another network.
     """
     state: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in moments.items():
+    for name, tensor in tensors.items():
         index, key = name.split("/")
         state.setdefault(int(index), {})[key] = tensor
     shapes = [tuple(value.shape) for group in optimiser.param_groups for value in group["params"]]
@@ -78,7 +84,7 @@ def restore_optimiser_state(optimiser: torch.optim.Optimizer, moments: Mapping[s
         found = {key: tuple(value.shape) for key, value in entries.items()}
         shape = shapes[number] if 0 <= number < len(shapes) else None
         if found != {"step": (), "exp_avg": shape, "exp_avg_sq": shape}:
-            raise ValueError("an optimiser's memory of other parameters")
+            raise ValueError("the optimiser's state belongs to other parameters")
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
@@ -90,38 +96,52 @@ def training_step(
     step: int,
     rate: float,
     bits: TeacherBits | None = None,
-    pull: ProximalTerm | None = None,
-    former: LegacyDetector | None = None,
+    proximal: ProximalTerm | None = None,
+    legacy: LegacyDetector | None = None,
 ) -> dict[str, Tensor]:
-    """One step in place, with batch, network and optimiser on one device; returns the losses by name.
+    """Do one step in place; batch, network and optimiser are on one device.
+
+    Args:
+        network: in training mode.
+        optimiser: of the network's parameters.
+        batch: of this step.
+        settings: of the whole run.
+        step: number of the step in the whole run, from 0.
+        rate: learning rate.
+        bits: the teacher's, if there is a teacher.
+        proximal: added to the objective.
+        legacy: the detector whose codes are still in use, if there is one.
+
+    Returns:
+        The losses by name.
 
     Raises:
-        TrainingError: the losses are no longer finite; nothing was changed in this step.
+        TrainingError: the losses are not finite; the step changed nothing.
     """
     for group in optimiser.param_groups:
         group["lr"] = rate
     with torch.autocast(batch.images.device.type, torch.bfloat16):
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))
     shift = grid_shift(settings.encoder, settings.seed, step)
-    total, parts = objective(maps, batch, settings.loss, step / settings.steps, shift, bits)
-    if pull is not None:
-        total = total + pull.energy(network)
-    if former is not None:
-        parts["former"] = former.loss(maps, batch)
-        total = total + former.strength * parts["former"]
+    total, losses = objective(maps, batch, settings.loss, step / settings.steps, shift, bits)
+    if proximal is not None:
+        total = total + proximal.loss(network)
+    if legacy is not None:
+        losses["former"] = legacy.loss(maps, batch)
+        total = total + legacy.strength * losses["former"]
     if not torch.isfinite(total):
         raise TrainingError(f"training diverged at step {step}; lower the learning rate")
     optimiser.zero_grad(set_to_none=True)
     total.backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)
     optimiser.step()
-    return {name: part.detach() for name, part in parts.items()}
+    return {name: loss.detach() for name, loss in losses.items()}
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
-    """Linear warm-up, a plateau, and a straight way down over the last part.
+    """Learning rate of a step: a linear warm-up, a plateau, and a linear decay over the last steps.
 
-    On the plateau it does not depend on how many steps there will be, so a run may be made longer.
+    On the plateau it does not depend on the number of steps, so a run can be made longer.
     """
     warm = min(WARM_UP_STEPS, settings.steps // 10)
     rise = (step + 1) / max(warm, 1)

@@ -1,4 +1,4 @@
-"""What a network can do, on pairs from images it never trained on; and whether its codes collapse."""
+"""Validation of a network on pairs of images that it was not trained on, and checks for collapsing codes."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -19,19 +19,21 @@ from fcslam.records import Codes, FloatArray
 
 NMS_PX: Final = 4.0
 LEAST_SCORE: Final = 0.001
+"""Probability below which a pixel is no keypoint."""
 ROLLED_RIM_PX: Final = 12.0
-"""What was rolled in at one side is seen by points so close to it."""
+"""Points closer to the border than this are affected by the pixels that were rolled in."""
 MOST_POINTS: Final = 300
 SHIFTS: Final = ((1, 0), (0, 2), (3, 3), (4, 1), (5, 0), (2, 6), (7, 7))
+"""Rows and columns of the shifts, within a cell of 8 x 8 pixels."""
 LEAST_SPREAD_BITS: Final = 0.3 * CODE_BITS
-"""Codes of different points closer than this on average (a half of all bits would be chance) are collapsing."""
+"""Codes of different points that differ in fewer bits on average are collapsing; chance gives a half of all bits."""
 LARGEST_BIAS: Final = 0.25
-"""A mean bit farther from a half than this carries little."""
+"""Bits whose mean is farther from a half than this carry little information."""
 
 
 @torch.inference_mode()
 def detect(network: KeypointNetwork, image: Tensor, most: int = MOST_POINTS) -> tuple[FloatArray, Codes]:
-    """Keypoints (N, 2) [px] of one image (1, 1, H, W), strongest first, and their codes (N, 32), as on a robot."""
+    """Keypoints (N, 2) [px] of one image (1, 1, H, W), strongest first, and their codes (N, 32)."""
     maps = network(image)
     points, _ = find_peaks(network.scores(maps)[0].cpu().numpy(), LEAST_SCORE, NMS_PX, most)
     return points.astype(np.float64), sample_codes(maps.code_logits[0].cpu().numpy(), points)
@@ -40,9 +42,17 @@ def detect(network: KeypointNetwork, image: Tensor, most: int = MOST_POINTS) -> 
 def validate(
     network: KeypointNetwork, pairs: Sequence[ViewPair], device: torch.device, shifts: bool = True
 ) -> dict[str, float]:
-    """Means over pairs: repeatability, MMA at 3 px by bits, shift, bits' bias and spread.
+    """Metrics of a network, means over the pairs.
 
-    Without ``shifts`` the third is left out: it takes four times as long as all others.
+    Args:
+        network: to validate.
+        pairs: views of images that the network was not trained on.
+        device: of the network.
+        shifts: also measure repeatability after shifts, which takes four times as long as all other metrics.
+
+    Returns:
+        ``repeatability``, ``mma_3px`` and ``shift_repeatability`` in [0, 1]; ``bit_bias``, the mean distance of a bit's
+        mean from a half, in [0, 0.5]; ``code_spread_bits``, the mean distance between codes in a view [bits].
     """
     training = network.training
     network.eval()
@@ -52,7 +62,7 @@ def validate(
 
 
 def collapse_warnings(figures: dict[str, float]) -> list[str]:
-    """What is wrong with the codes, in words; empty while they are sound."""
+    """Warnings of collapsing codes; empty if there is nothing to report."""
     found = []
     if figures["code_spread_bits"] < LEAST_SPREAD_BITS:
         found.append(f"codes collapse: those of different points differ in {figures['code_spread_bits']:.0f} bits")
@@ -62,7 +72,7 @@ def collapse_warnings(figures: dict[str, float]) -> list[str]:
 
 
 def shift_repeatability(network: KeypointNetwork, image: Tensor, most: int = MOST_POINTS) -> float:
-    """Share of the best points found within 1 px again after the image was rolled by 1 to 7 px; NaN without any."""
+    """Share of the strongest points found again within 1 px after rolling the image by 1 to 7 px; NaN without any."""
     points, _ = detect(network, image, most)
     size = (image.shape[-1], image.shape[-2])
     shares = []
@@ -95,6 +105,6 @@ def _validate_pair(network: KeypointNetwork, pair: ViewPair, device: torch.devic
 
 
 def _mean(values: Sequence[float]) -> float:
-    """Mean of the values that are numbers; NaN if none is."""
+    """Mean of the values that are not NaN; NaN if all are."""
     numbers = [value for value in values if not np.isnan(value)]
     return sum(numbers) / len(numbers) if numbers else float("nan")

@@ -1,4 +1,4 @@
-"""Random homographies and random light: how one image becomes two views of the same thing."""
+"""Random homographies and random lighting, which make two views of one image."""
 
 from typing import Final
 
@@ -12,19 +12,19 @@ from fcslam.metrics.homography import Mask
 from fcslam.records import FloatArray
 
 SCALE_SPREAD: Final = 0.7
-"""Two views of a pair differ by exp(+-this) in scale at most."""
+"""The scales of two views of a pair differ by at most the factor exp of this."""
 TILT: Final = 0.12
-"""How far a corner of a view moves, in sides of the view."""
+"""Largest displacement of a corner of a view, as a share of the view's side."""
 SMALL_TURN_RAD: Final = 0.2
-"""Standard deviation of a view's turn."""
+"""Standard deviation of a view's rotation."""
 ANY_TURN_SHARE: Final = 0.1
-"""Views that are turned by any angle: robots roll little, but held and mounted cameras do."""
-
+"""Share of views that are rotated by any angle: robots roll little, but cameras may be mounted at any angle."""
 LARGEST_SHIFT_PX: Final = 15
+"""Largest shift of a pair whose views differ by a shift, almost two cells of the network."""
 
 
 def random_view(image: GreyImage, size: Size, rng: np.random.Generator) -> FloatArray:
-    """A window somewhere in the image: homography (3, 3) that takes pixels of the image to pixels of the window."""
+    """A random window of the image: homography (3, 3) that maps pixels of the image to pixels of the window."""
     whole, wanted = np.array(image.shape[::-1], np.float64), np.array(size, np.float64)
     zoom = min(np.exp(rng.uniform(np.log(0.7), np.log(1.5))), 1.15 * float((whole / wanted).min()))
     x, y = rng.uniform(0.0, np.maximum(whole - zoom * wanted, 0.0))
@@ -32,7 +32,7 @@ def random_view(image: GreyImage, size: Size, rng: np.random.Generator) -> Float
 
 
 def random_change(size: Size, rng: np.random.Generator) -> FloatArray:
-    """Homography (3, 3) of a view of this size onto itself: turned, scaled, shifted, tilted about its middle."""
+    """Homography (3, 3) of a view of this size onto itself: rotation, scale, shift and tilt about its centre."""
     sides = np.array(size, np.float64)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (sides - 1.0)
     middle = 0.5 * (sides - 1.0)
@@ -47,19 +47,19 @@ def random_change(size: Size, rng: np.random.Generator) -> FloatArray:
 
 
 def random_shift(rng: np.random.Generator) -> FloatArray:
-    """A shift by whole pixels, as homography (3, 3): a network with strides must be taught that it changes nothing."""
+    """A shift by whole pixels, as homography (3, 3): a network with strides must learn that it changes nothing."""
     x, y = rng.integers(-LARGEST_SHIFT_PX, LARGEST_SHIFT_PX + 1, 2)
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
 def warp_image(image: GreyImage, homography: FloatArray, size: Size) -> GreyImage:
-    """The view of this size; beyond the image it is mirrored, so that its border is no edge."""
+    """The view of this size, as uint8; beyond its border the image is mirrored, so that the border is no edge."""
     warped = cv2.warpPerspective(image, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     return np.asarray(warped, np.uint8)
 
 
 def visible_mask(shape: tuple[int, int], homography: FloatArray, size: Size, border: int = 2) -> NDArray[np.bool_]:
-    """Which pixels (height, width) of a view show the image of this shape, ``border`` pixels of it left out."""
+    """Which pixels (height, width) of a view show the image of this shape without ``border`` pixels at its border."""
     own = np.zeros(shape, np.uint8)
     own[border:-border, border:-border] = 1
     warped = cv2.warpPerspective(own, homography, size, flags=cv2.INTER_NEAREST)
@@ -67,13 +67,13 @@ def visible_mask(shape: tuple[int, int], homography: FloatArray, size: Size, bor
 
 
 def well_inside(points: FloatArray, size: Size, border: float) -> Mask:
-    """Whether points (N, 2) are in an image, ``border`` pixels from its rim."""
+    """Whether points (N, 2) lie in an image of this size, at least ``border`` pixels from its border; shape (N,)."""
     low, high = border, np.array(size, np.float64) - 1.0 - border
     return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
 
 
 def relight(image: GreyImage, rng: np.random.Generator) -> NDArray[np.float32]:
-    """The image under other light, by another lens and sensor: float32 in [0, 1]."""
+    """The image with another lighting, lens and sensor, at random: float32 in [0, 1]."""
     changed = image.astype(np.float32) / 255.0
     if rng.random() < 0.5:
         changed = changed ** np.float32(np.exp(rng.uniform(np.log(0.45), np.log(2.2))))
@@ -91,7 +91,7 @@ def relight(image: GreyImage, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def _shade(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """A soft-edged shadow or beam of light in the form of an ellipse."""
+    """Add a shadow or a beam of light: an ellipse with soft edges."""
     height, width = image.shape
     mask = np.zeros(image.shape, np.float32)
     centre = (int(rng.integers(width)), int(rng.integers(height)))
@@ -102,7 +102,7 @@ def _shade(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.f
 
 
 def _blur(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Out of focus, or moved while the shutter was open."""
+    """Blur as if out of focus, or by motion."""
     if rng.random() < 0.5:
         return np.asarray(cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.4, 1.6))), np.float32)
     length, angle = int(rng.integers(2, 4)), rng.uniform(0, np.pi)

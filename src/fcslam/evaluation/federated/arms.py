@@ -1,7 +1,8 @@
-"""The arms of a study of federated training: the same start and number of samples, trained in different places."""
+"""The arms of a study of federated training. All start from the same weights; they differ in where they train."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,10 +12,9 @@ from fcslam.config import Settings, parse
 from fcslam.evaluation.federated.poison import Poison, PoisonedClient
 from fcslam.federated.client import FederatedClient, RobotClient, seeded_noise
 from fcslam.federated.client_app import build_client_app
-from fcslam.federated.codec import version_maker, weights_to_network
+from fcslam.federated.codec import weights_to_network, weights_version
 from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.federated.flower import Context
-from fcslam.federated.grid import InProcessGrid
+from fcslam.federated.flower import Context, InProcessGrid
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 from fcslam.learning.network import KeypointNetwork
@@ -24,26 +24,35 @@ from fcslam.learning.stages import TrainingImages
 from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
 
 START: Final = "start"
-"""What all begin from, as it is."""
+"""The initial weights without training."""
 CENTRAL: Final = "central"
+"""One network on the images of all robots."""
 LOCAL: Final = "local"
+"""Each robot on its own images, with as many steps as all robots of the fleet have together."""
 ALONE: Final = "alone"
-"""Local training that is no longer than a robot's in a fleet."""
+"""Each robot on its own images, with as many steps as it has in the fleet."""
 
 
 class Arm(Settings):
-    """One way to train."""
+    """One way to train the fleet."""
 
-    together: bool = Field(default=True, description="false: in one place, as many steps as a robot of the fleet does")
-    settings: dict[str, Any] = Field(default_factory=dict, description="federated settings that differ")
-    poison: Poison | None = Field(default=None, description="what the last robot does to its updates")
-    seeds: int | None = Field(default=None, ge=1, description="so many of the study's seeds; null for all")
+    together: bool = Field(
+        default=True,
+        description="true: federated training; false: central training with as many steps as one robot of the fleet",
+    )
+    settings: dict[str, Any] = Field(
+        default_factory=dict, description="federated settings of this arm that differ from those of the study"
+    )
+    poison: Poison | None = Field(default=None, description="how the last robot falsifies updates; null for not")
+    seeds: int | None = Field(
+        default=None, ge=1, description="number of the study's seeds for which this arm is trained; null for all"
+    )
 
     def federated(self, common: FederatedSettings, seed: int) -> FederatedSettings:
         """The settings of this arm.
 
         Raises:
-            ConfigError: what differs is no setting.
+            ConfigError: ``settings`` names something that is no setting.
         """
         content = common.model_dump() | self.settings
         content["training"] = dict(content["training"]) | {"seed": seed}
@@ -52,78 +61,82 @@ class Arm(Settings):
 
 @dataclass(frozen=True, slots=True)
 class SeedContext:
-    """What all arms of one seed share."""
+    """What all arms share that are trained with one seed."""
 
     settings: FederatedSettings
     seed: int
     start: Weights
     images: Mapping[str, TrainingImages]
-    """By robot."""
+    """Training images by robot."""
     folder: Path
-    pace: ExecutionOptions
-    watch: Callable[[str, int, int], None]
-    """Is told who trains, the steps or rounds done, and all of them."""
+    options: ExecutionOptions
+    on_progress: Callable[[str, int, int], None]
+    """Called with the name of what trains, the steps or rounds done, and their total."""
 
 
-def train_central(ground: SeedContext) -> list[KeypointNetwork]:
-    """One network, on all images in one place."""
-    return [_train_alone(ground, CENTRAL, _everything(ground), _of_robots(ground, len(ground.images)))]
+def train_central(context: SeedContext) -> list[KeypointNetwork]:
+    """Train one network on the images of all robots."""
+    return [
+        _train_centrally(context, CENTRAL, _all_examples(context), _training_settings(context, len(context.images)))
+    ]
 
 
-def train_locally(ground: SeedContext, name: str) -> list[KeypointNetwork]:
-    """A network for each robot, on its images alone: with as many samples as all of them saw together, or its share."""
-    training = _of_robots(ground, len(ground.images) if name == LOCAL else 1)
-    return [_train_alone(ground, f"{name}-{robot}", images.train, training) for robot, images in ground.images.items()]
+def train_locally(context: SeedContext, name: str) -> list[KeypointNetwork]:
+    """Train a network for each robot on its own images, for the arm ``LOCAL`` or ``ALONE``."""
+    training = _training_settings(context, len(context.images) if name == LOCAL else 1)
+    return [
+        _train_centrally(context, f"{name}-{robot}", images.train, training) for robot, images in context.images.items()
+    ]
 
 
-def train_arm(ground: SeedContext, name: str, arm: Arm) -> list[KeypointNetwork]:
-    """One network, in one place, or by federated training in one process: what that would release at its end."""
-    settings, place = arm.federated(ground.settings, ground.seed), ground.folder / name
+def train_arm(context: SeedContext, name: str, arm: Arm) -> list[KeypointNetwork]:
+    """Train the network of an arm; of federated training it is the one that could be released at its end."""
+    settings, folder = arm.federated(context.settings, context.seed), context.folder / name
     if not arm.together:
-        return [_train_alone(ground, name, _everything(ground), settings.client_training())]
-    learners: list[FederatedClient] = [
+        return [_train_centrally(context, name, _all_examples(context), settings.client_training())]
+    clients: list[FederatedClient] = [
         RobotClient(
-            robot, Path(robot), place / robot, seeded_noise(robot, ground.seed), ground.pace.device, gathered=own
+            robot, Path(robot), folder / robot, seeded_noise(robot, context.seed), context.options.device, images=own
         )
-        for robot, own in ground.images.items()
+        for robot, own in context.images.items()
     ]
     if arm.poison is not None:
-        learners[-1] = PoisonedClient(learners[-1], arm.poison)
+        clients[-1] = PoisonedClient(clients[-1], arm.poison)
 
-    def learner_of(context: Context) -> FederatedClient:
-        return learners[int(context.node_config["partition-id"])]
+    def client_of(flower_context: Context) -> FederatedClient:
+        return clients[int(flower_context.node_config["partition-id"])]
 
-    outside = CoordinatorHooks(
-        version_maker(settings.training.encoder),
-        # No version is compared with another one: the last one counts, as in the other arms.
-        judge=lambda _weights: {},
-        watch=lambda report, _best: ground.watch(name, report.round_number, settings.rounds),
+    hooks = CoordinatorHooks(
+        partial(weights_version, encoder=settings.training.encoder),
+        # Without metrics no version is better than another: the last one counts, as in the other arms.
+        evaluate_fn=lambda _weights: {},
+        on_round=lambda report, _best: context.on_progress(name, report.round_number, settings.rounds),
     )
-    server = Coordinator(settings, ground.start, place, outside)
-    state = server.run(InProcessGrid(build_client_app(learner_of), len(learners)))
+    grid = InProcessGrid(build_client_app(client_of), len(clients))
+    state = Coordinator(grid, settings, context.start, folder, hooks).run()
     return [weights_to_network(state.average, settings.training.encoder)]
 
 
-def _everything(ground: SeedContext) -> list[TrainingExample]:
-    return [example for images in ground.images.values() for example in images.train]
+def _all_examples(context: SeedContext) -> list[TrainingExample]:
+    return [example for images in context.images.values() for example in images.train]
 
 
-def _of_robots(ground: SeedContext, shares: int) -> TrainingSettings:
-    """With ``shares`` times the steps of a robot."""
-    training = ground.settings.client_training()
-    return training.model_copy(update={"steps": training.steps * shares, "seed": ground.seed})
+def _training_settings(context: SeedContext, shares: int) -> TrainingSettings:
+    """Training settings with ``shares`` times the steps of a robot in the fleet."""
+    training = context.settings.client_training()
+    return training.model_copy(update={"steps": training.steps * shares, "seed": context.seed})
 
 
-def _train_alone(
-    ground: SeedContext, name: str, examples: list[TrainingExample], training: TrainingSettings
+def _train_centrally(
+    context: SeedContext, name: str, examples: list[TrainingExample], training: TrainingSettings
 ) -> KeypointNetwork:
-    """By the central trainer."""
-    state = weights_to_network(ground.start, training.encoder).state_dict()
-    folder = ground.folder / name
+    """Train with the trainer of central training."""
+    state = weights_to_network(context.start, training.encoder).state_dict()
+    folder = context.folder / name
     folder.mkdir(parents=True, exist_ok=True)
-    quiet = replace(ground.pace, validate_every=training.steps, log_every=max(training.steps // 20, 1))
+    quiet = replace(context.options, validate_every=training.steps, log_every=max(training.steps // 20, 1))
 
-    def watch(status: TrainingProgress) -> None:
-        ground.watch(name, status.step, status.steps)
+    def on_progress(progress: TrainingProgress) -> None:
+        context.on_progress(name, progress.step, progress.steps)
 
-    return TrainingRun(training, "joint", folder, quiet, state).train(examples, examples[:1], watch=watch)
+    return TrainingRun(training, "joint", folder, quiet, state).train(examples, examples[:1], on_progress=on_progress)

@@ -1,4 +1,4 @@
-"""What networks of a study of federated training are measured on: pairs of views of images that nobody trained on."""
+"""The test pairs of a study of federated training, and the measures of a network on them."""
 
 import zlib
 from collections.abc import Sequence
@@ -17,15 +17,17 @@ from fcslam.metrics.repeatability import in_common_view, repeatability
 from fcslam.records import Codes, FloatArray
 
 MEASURES: Final = ("homography_3px", "mma_3px", "repeatability", "mma_3px_former")
+"""Shares in [0, 1]; the last one matches codes of the initial network with codes of the measured one."""
 WITHIN_PX: Final = 3.0
 VIEW: Final = (320, 240)
+"""Width and height of a view [px]."""
 PAIR_SEED: Final = 414
 MOST_POINTS: Final = 300
-"""The best of so many that each view sees are looked for again."""
+"""Keypoints of each view that are used, the strongest ones."""
 
 
 class DetectedFeatures(NamedTuple):
-    """What a detector finds in a view."""
+    """Keypoints of a view with their codes."""
 
     points: FloatArray
     """Shape (N, 2) [px]."""
@@ -34,14 +36,14 @@ class DetectedFeatures(NamedTuple):
 
 
 def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[ViewPair]:
-    """Pairs of views of a robot's images; always the same.
+    """Pairs of views of a robot's images that no arm trains on; always the same.
 
     Raises:
         EvaluationError: none of the images is usable.
     """
     images = [image for file in files if (image := read_image(file.path)) is not None and is_usable(image)]
     if not images:
-        raise EvaluationError(f"{robot}: no usable image is among the {len(files)} that are held out to test on")
+        raise EvaluationError(f"{robot}: none of its {len(files)} test images is usable; give more images")
     unlabelled = Labels(np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
     pairs = []
     for index in range(count):
@@ -51,28 +53,32 @@ def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[V
 
 
 def detect_features(detector: FeatureDetector, view: AugmentedView) -> DetectedFeatures:
-    """What a detector finds, of 8 bits a pixel as a camera gives them."""
+    """Detect features in a view, with 8 bits a pixel as from a camera."""
     found = detector.detect(np.rint(255.0 * view.image).astype(np.uint8))
     return DetectedFeatures(found.keypoints_px.astype(np.float64), found.descriptors)
 
 
 def measure_pair(
-    detector: FeatureDetector, pair: ViewPair, former: DetectedFeatures
+    detector: FeatureDetector, pair: ViewPair, legacy: DetectedFeatures
 ) -> tuple[float, float, float, float]:
-    """``MEASURES`` of one pair: homography right to 3 px at the corners or not, MMA at 3 px, repeatability, former MMA.
+    """``MEASURES`` of one pair: homography correct to 3 px at its corners (0 or 1), MMA, repeatability, legacy MMA.
 
-    The last is that of the codes which a ``former`` detector gave the first view and this one gives the second.
-    Where nothing is matched MMA is 0, or a detector that finds nothing would look good.
+    Without matches MMA is 0, so that a detector that finds nothing does not look good.
+
+    Args:
+        detector: to measure.
+        pair: two views.
+        legacy: what the initial network detects in the first view, for the legacy MMA.
     """
     first, second = (detect_features(detector, view) for view in pair.views)
     matched = _matched(first, second, pair)
     error = corner_error(estimate_homography(*matched), pair.homography, VIEW)
     again = repeatability(first.points, second.points, pair.homography, VIEW, MOST_POINTS).repeatability
-    return float(error <= WITHIN_PX), _accuracy(matched, pair), again, _accuracy(_matched(former, second, pair), pair)
+    return float(error <= WITHIN_PX), _accuracy(matched, pair), again, _accuracy(_matched(legacy, second, pair), pair)
 
 
 def _matched(first: DetectedFeatures, second: DetectedFeatures, pair: ViewPair) -> tuple[FloatArray, FloatArray]:
-    """Points (N, 2) of both views whose codes are each other's nearest, among those that both see."""
+    """Points (N, 2) [px] of both views whose codes are mutual nearest neighbours, among the points in both views."""
     here = in_common_view(first.points, pair.homography, VIEW)
     there = in_common_view(second.points, inverse(pair.homography), VIEW)
     matches = mutual_matches(first.codes[here], second.codes[there]).pairs

@@ -1,4 +1,4 @@
-"""Robots that mean harm, for studies and tests of how well a fleet bears them."""
+"""Poisoned clients, for studies and tests of how well a fleet tolerates them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,25 +11,26 @@ from fcslam.federated.weights import Weights, apply_update, trained_names, updat
 
 Poison = Literal["flipped", "scaled", "reversed", "random", "nan"]
 SCALE = 10.0
+"""Factor of scaled and of reversed updates: large enough to dominate a mean of a few robots."""
 
 
 @dataclass(frozen=True, slots=True)
 class PoisonedClient:
-    """Trains like another robot, and spoils its update before it leaves."""
+    """Trains like another client, and falsifies its update before it leaves."""
 
-    learner: FederatedClient
+    client: FederatedClient
     poison: Poison
 
     @property
     def name(self) -> str:
-        """As the other robot."""
-        return self.learner.name
+        """Name of the other client."""
+        return self.client.name
 
-    def learn(self, weights: Weights, round_number: int, run: str, settings: FederatedSettings) -> ClientUpdate:
+    def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
         """As in ``FederatedClient``."""
-        learned = self.learner.learn(weights, round_number, run, settings)
+        trained = self.client.train(weights, round_number, run_id, settings)
         names = trained_names(weights, frozen_statistics=True)
-        update = update_vector(learned.weights, weights, names)
+        update = update_vector(trained.weights, weights, names)
         match self.poison:
             case "flipped":
                 update = -update
@@ -41,8 +42,8 @@ class PoisonedClient:
                 update = np.random.default_rng([settings.training.seed, round_number]).permutation(update)
             case "nan":
                 update = np.full_like(update, np.nan)
-        return ClientUpdate(apply_update(weights, update, names), learned.losses)
+        return ClientUpdate(apply_update(weights, update, names), trained.losses)
 
-    def judge(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
+    def evaluate(self, weights: Weights, settings: FederatedSettings) -> dict[str, float]:
         """As in ``FederatedClient``."""
-        return self.learner.judge(weights, settings)
+        return self.client.evaluate(weights, settings)

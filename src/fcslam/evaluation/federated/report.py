@@ -1,4 +1,4 @@
-"""What a study of federated training found: gaps to central training, with intervals, and the robot worst off."""
+"""The report of a study of federated training: gaps to central training with intervals, and the worst robot."""
 
 import csv
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ class ArmReport:
     measure: str
     mean: float
     gap: Interval
-    """Central, or what else it is compared to, minus this arm on the same pairs and seeds, means over seeds first: the
-    paired bootstrap interval."""
+    """The reference arm, central by default, minus this arm: the paired bootstrap interval over the same pairs and
+    seeds, averaged over the seeds first."""
     closed: float
-    """(arm - local) / (central - local); NaN where central is not clearly better than local, or local is unknown."""
+    """(arm - local) / (central - local); NaN if central is not significantly better than local, or local is unknown."""
     closed_alone: float
-    """The same with robots that train alone for no longer than in the fleet."""
+    """The same with the arm ``ALONE`` in place of ``LOCAL``."""
     worst_robot: str
     worst_gap: float
     """The gap on that robot's pairs."""
@@ -40,20 +40,26 @@ class ArmReport:
     """The mean of each seed."""
 
 
-def report(findings: StudyResults, seed: int = 1, against: str = CENTRAL) -> list[ArmReport]:
-    """Every arm by every measure, compared to the arm ``against``, which has no fewer seeds than any."""
+def report(results: StudyResults, seed: int = 1, against: str = CENTRAL) -> list[ArmReport]:
+    """Report every arm by every measure.
+
+    Args:
+        results: of the study.
+        seed: of the bootstrap.
+        against: the reference arm, which has at least as many seeds as any other.
+    """
     return [
-        _report(findings, arm, index, against, np.random.default_rng(seed))
+        _report(results, arm, index, against, np.random.default_rng(seed))
         for index in range(len(MEASURES))
-        for arm in findings.measured
+        for arm in results.measured
     ]
 
 
 def write_report(reports: list[ArmReport], path: Path) -> None:
-    """As a CSV file.
+    """Write the report as a CSV file.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
@@ -68,18 +74,18 @@ def write_report(reports: list[ArmReport], path: Path) -> None:
         raise OutputError(f"{path}: cannot be written ({error})") from error
 
 
-def _report(findings: StudyResults, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
-    seeds = len(findings.measured[arm])
-    values, reference, central = (_by_pair(findings.measured[name][:seeds], index) for name in (arm, against, CENTRAL))
+def _report(results: StudyResults, arm: str, index: int, against: str, rng: np.random.Generator) -> ArmReport:
+    seeds = len(results.measured[arm])
+    values, reference, central = (_by_pair(results.measured[name][:seeds], index) for name in (arm, against, CENTRAL))
     gap = mean_interval(reference - values, rng)
     closed, closed_alone = (
-        _closed(values, _by_pair(findings.measured[own][:seeds], index), central, rng)
-        if own in findings.measured
+        _closed(values, _by_pair(results.measured[own][:seeds], index), central, rng)
+        if own in results.measured
         else np.nan
         for own in (LOCAL, ALONE)
     )
-    owners = np.array(findings.owners)
-    gaps = [float(np.nanmean((reference - values)[owners == robot])) for robot in range(len(findings.robots))]
+    owners = np.array(results.owners)
+    gaps = [float(np.nanmean((reference - values)[owners == robot])) for robot in range(len(results.robots))]
     worst = int(np.argmax(gaps))
     return ArmReport(
         arm=arm,
@@ -88,9 +94,9 @@ def _report(findings: StudyResults, arm: str, index: int, against: str, rng: np.
         gap=gap,
         closed=closed,
         closed_alone=closed_alone,
-        worst_robot=findings.robots[worst],
+        worst_robot=results.robots[worst],
         worst_gap=gaps[worst],
-        seeds=tuple(float(np.nanmean(each[..., index])) for each in findings.measured[arm]),
+        seeds=tuple(float(np.nanmean(each[..., index])) for each in results.measured[arm]),
     )
 
 
@@ -100,7 +106,7 @@ def _closed(values: FloatArray, low: FloatArray, high: FloatArray, rng: np.rando
 
 
 def _by_pair(measured: FloatArray, index: int) -> FloatArray:
-    """One measure of every pair, mean over seeds and networks, shape (pairs,); NaN where it is not known."""
+    """One measure of every pair, mean over seeds and networks, shape (pairs,); NaN where it is unknown."""
     values = measured[..., index]
     known = np.isfinite(values)
     counts = known.sum(axis=(0, 1))

@@ -1,9 +1,8 @@
-"""Is training together as good as training in one place? Central, federated and local-only training, compared.
+"""Compares central, federated and local-only training.
 
-All begin from the same weights, and every network that is compared saw the same number of samples. Each is exported and
-measured on the same pairs of views of images that nobody trained on; robots' own networks share them out. Whatever is
-finished is kept, so a study can be interrupted. What is compared first, central, local and the first arm, is trained
-first. Several processes may work on one study.
+All arms start from the same weights, and the networks that are compared saw the same number of samples. Each network is
+exported and measured on the same pairs of views, of images that no arm trains on; the robots' own networks divide the
+pairs among them. Finished results are kept, so a study can be interrupted, and several processes can work on one study.
 """
 
 import fcntl
@@ -55,76 +54,85 @@ from fcslam.learning.trainer import ExecutionOptions, TrainingProgress
 from fcslam.records import FloatArray
 
 TEST_SHARE: Final = 0.25
-"""Images of each robot that nobody trains on, chosen by their names, with those that training validates on."""
+"""Share of each robot's images that no arm trains on, chosen by their names."""
 STUDY_FILE: Final = "study.yaml"
 
 
 class StudySettings(Settings):
-    """A study."""
+    """Settings of a study."""
 
-    federated: FederatedSettings = Field(default_factory=FederatedSettings, description="of every arm")
+    federated: FederatedSettings = Field(
+        default_factory=FederatedSettings, description="federated settings of every arm"
+    )
     start: Path | None = Field(
-        default=None, description="checkpoint or detector.onnx that all begin from; without one, synthetic shapes"
+        default=None,
+        description="checkpoint or detector.onnx from which all arms start; null for training on synthetic shapes",
     )
-    arms: dict[str, Arm] = Field(default_factory=lambda: {"federated": Arm()}, description="by name")
-    seeds: int = Field(default=3, ge=1, description="each trains anew, from the same start")
+    arms: dict[str, Arm] = Field(default_factory=lambda: {"federated": Arm()}, description="federated arms by name")
+    seeds: int = Field(default=3, ge=1, description="number of repetitions of each arm, from the same start")
     local_seeds: int | None = Field(
-        default=None, ge=0, description="so many of them for robots' own networks, which cost most; 0 is none, null all"
+        default=None,
+        ge=0,
+        description="repetitions of the arms local and alone, which cost most; 0 for none, null for all seeds",
     )
-    pairs: int = Field(default=500, ge=1, description="pairs of views, shared out among the robots' held-out images")
-    images: int = Field(default=400, ge=4, description="at most so many image files of a robot")
-    trained: int = Field(default=400, ge=2, description="of those not tested on, at most so many are trained on")
+    pairs: int = Field(default=500, ge=1, description="pairs of views in the test, divided evenly among the robots")
+    images: int = Field(default=400, ge=4, description="most image files of a robot, for training and test")
+    trained: int = Field(default=400, ge=2, description="most image files of a robot that are trained on")
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What is compared, on what, where."""
+    """A study: what is compared, on which images, and where."""
 
     robots: Mapping[str, Path]
     """Folders of images by name."""
     folder: Path
     settings: StudySettings
-    pace: ExecutionOptions
-    watch: Callable[[str, int, int], None]
-    """Is told what is done, how much of it, and of how much."""
+    options: ExecutionOptions
+    on_progress: Callable[[str, int, int], None]
+    """Called with what is being done, the amount done, and its total."""
 
 
 @dataclass(frozen=True, slots=True)
 class StudyResults:
-    """Everything that was measured."""
+    """The measurements of a study."""
 
     robots: tuple[str, ...]
     owners: tuple[int, ...]
-    """For each pair the number of the robot whose image it is."""
+    """For each pair the index in ``robots`` of the robot whose image it shows."""
     measured: Mapping[str, FloatArray]
-    """By arm: shape (seeds, networks, pairs, measures). ``local`` and ``alone`` have a network for each robot, all the
-    others one; a pair is shown to one of them only, the rest have NaN there. An arm may have fewer seeds than central,
-    and robots' own networks may be missing.
+    """By arm: shape (seeds, networks, pairs, measures). The arms ``local`` and ``alone`` have a network for each robot,
+    all others one. Each pair is measured with one network only; the others have NaN there. An arm may have fewer seeds
+    than central, and ``local`` and ``alone`` may be missing.
     """
 
 
 def run_study(study: Study) -> StudyResults:
-    """Train and measure whatever is not yet measured.
+    """Train and measure everything that is not measured yet.
 
     Raises:
-        EvaluationError: the folder is another study's, or an arm has a name that cannot be.
+        EvaluationError: the folder belongs to another study, or an arm has a reserved or malformed name.
         TrainingError: a robot has too few images.
-        OutputError: something cannot be written.
+        OutputError: a file cannot be written.
     """
     for name in study.settings.arms:
         if name.split("-")[0] in (START, CENTRAL, LOCAL, ALONE) or not name.replace("-", "").isalnum():
-            raise EvaluationError(f"{name}: an arm of a study needs another name")
-    with _locked(study.folder / "study.lock", patient=True):  # who begins at the same time reads all of it
+            raise EvaluationError(
+                f"{name}: an arm's name has letters, digits and hyphens, and is none of the built-in arms"
+            )
+    with _locked(
+        study.folder / "study.lock", wait=True
+    ):  # a process that starts at the same time reads a complete file
         _claim(study)
     share = -(-study.settings.pairs // len(study.robots))
     pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]
     files = _files_of_arms(study)
     missing = [(name, seed, file) for name, places in files.items() for seed, file in enumerate(places, start=1)]
     common: SharedInputs | None = None
-    # What another process is at is left to it; when there is nothing else to do it is waited for, or taken over.
-    for patient in (False, True):
+    # First what no other process works on. Then wait for the others, and take over what they leave unfinished.
+    for wait in (False, True):
         for name, seed, file in missing:
-            with _locked(file.with_suffix(".lock"), patient) as mine:
+            with _locked(file.with_suffix(".lock"), wait) as mine:
                 if mine and not file.exists():
                     common = common or _shared_inputs(study, pairs)
                     networks = _trained(_seed_context(study, common, seed), name, study.settings.arms)
@@ -135,7 +143,7 @@ def run_study(study: Study) -> StudyResults:
 
 
 def _files_of_arms(study: Study) -> dict[str, list[Path]]:
-    """Where what is measured of each arm is kept, by seed."""
+    """Files of the measurements of each arm, by seed."""
     settings = study.settings
     own = settings.seeds if settings.local_seeds is None else min(settings.local_seeds, settings.seeds)
     seeds = {START: 1, CENTRAL: settings.seeds, LOCAL: own, ALONE: own}
@@ -148,14 +156,14 @@ def _files_of_arms(study: Study) -> dict[str, list[Path]]:
 
 
 @contextmanager
-def _locked(path: Path, patient: bool) -> Iterator[bool]:
-    """Whether no other process is in here with the same file; if ``patient``, it is waited for."""
+def _locked(path: Path, wait: bool) -> Iterator[bool]:
+    """Whether this process has the lock of the file; ``wait`` for it, or give up if another process has it."""
     mine = True
     with ExitStack() as stack:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = stack.enter_context(path.open("w", encoding="utf-8"))
-            fcntl.flock(file, fcntl.LOCK_EX if patient else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             mine = False
         except OSError as error:
@@ -163,16 +171,16 @@ def _locked(path: Path, patient: bool) -> Iterator[bool]:
         yield mine
 
 
-def _trained(ground: SeedContext, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:
+def _trained(context: SeedContext, name: str, arms: Mapping[str, Arm]) -> list[KeypointNetwork]:
     if name == START:
-        return [weights_to_network(ground.start, ground.settings.training.encoder)]
+        return [weights_to_network(context.start, context.settings.training.encoder)]
     if name == CENTRAL:
-        return train_central(ground)
-    return train_arm(ground, name, arms[name]) if name in arms else train_locally(ground, name)
+        return train_central(context)
+    return train_arm(context, name, arms[name]) if name in arms else train_locally(context, name)
 
 
 def _claim(study: Study) -> None:
-    """Make the folder this study's, or see that it is; arms and seeds may be added to a study."""
+    """Claim the folder for this study, or check that it belongs to it; arms and seeds may be added to a study."""
     robots = "".join(f"# {robot}: {folder.resolve()}\n" for robot, folder in study.robots.items())
     settings, path = study.settings, study.folder / STUDY_FILE
     try:
@@ -185,7 +193,7 @@ def _claim(study: Study) -> None:
             same = {name: known.arms[name].model_copy(update={"seeds": arm.seeds}) for name, arm in before.arms.items()}
             changed = same != before.arms
             if changed or known != settings or not path.read_text(encoding="utf-8").startswith(robots):
-                raise EvaluationError(f"{path}: is of another study; name another folder")
+                raise EvaluationError(f"{path}: belongs to another study; give another folder")
         path.write_text(robots + dump(settings), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{study.folder}: cannot be used as the output folder ({error})") from error
@@ -197,40 +205,42 @@ class SharedInputs:
 
     start: Weights
     images: Mapping[str, TrainingImages]
-    """By robot, labelled by the start."""
-    former: Sequence[DetectedFeatures]
-    """What the start finds in the first view of each pair."""
+    """Training images by robot, labelled by the initial network."""
+    legacy: Sequence[DetectedFeatures]
+    """What the initial network detects in the first view of each pair."""
 
 
 def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:
     training = study.settings.federated.client_training()
 
-    def watch(stage: str, status: TrainingProgress) -> None:
-        study.watch(stage, status.step, status.steps)
+    def on_progress(stage: str, progress: TrainingProgress) -> None:
+        study.on_progress(stage, progress.step, progress.steps)
 
-    device = torch.device(study.pace.device)
+    device = torch.device(study.options.device)
     images: dict[str, TrainingImages] = {}
-    with _locked(study.folder / "common.lock", patient=True):
-        start = prepare_initial_weights(study.settings.start, study.folder, study.settings.federated, study.pace, watch)
+    with _locked(study.folder / "common.lock", wait=True):
+        start = prepare_initial_weights(
+            study.settings.start, study.folder, study.settings.federated, study.options, on_progress
+        )
         network = weights_to_network(start, training.encoder)
         labeller = keypoint_response(network.to(device), device)
         for robot in study.robots:
             files = _files(study, robot)[0]
-            images[robot] = read_labelled_images(files, study.folder / "labels", training, labeller, None, watch)
+            images[robot] = read_labelled_images(files, study.folder / "labels", training, labeller, None, on_progress)
     detector = _detector(network)
     return SharedInputs(start, images, [detect_features(detector, pair.views[0]) for pair in pairs])
 
 
 def _seed_context(study: Study, common: SharedInputs, seed: int) -> SeedContext:
-    def told(name: str, done: int, of: int) -> None:
-        study.watch(f"{name}, seed {seed}", done, of)
+    def on_progress(name: str, done: int, total: int) -> None:
+        study.on_progress(f"{name}, seed {seed}", done, total)
 
     folder = study.folder / f"seed{seed}"
-    return SeedContext(study.settings.federated, seed, common.start, common.images, folder, study.pace, told)
+    return SeedContext(study.settings.federated, seed, common.start, common.images, folder, study.options, on_progress)
 
 
 def _files(study: Study, robot: str) -> tuple[list[ImageFile], list[ImageFile]]:
-    """A robot's image files, to train and to test on, spread over all it has."""
+    """A robot's image files for training and for the test, spread evenly over all of its files."""
     some = _spread(find_images([study.robots[robot]]), study.settings.images)
     tests = [file for file in some if zlib.crc32(file.name.encode()) < TEST_SHARE * 2**32]
     return _spread([file for file in some if file not in tests], study.settings.trained), tests
@@ -244,18 +254,18 @@ def _spread(files: Sequence[ImageFile], most: int) -> list[ImageFile]:
 def _measured(
     networks: Sequence[KeypointNetwork], pairs: Sequence[ViewPair], common: SharedInputs, seed: int, study: Study
 ) -> FloatArray:
-    """Shape (networks, pairs, measures): several networks take turns, so that all together cost what one does."""
+    """Measure networks on the pairs, shape (networks, pairs, measures). Several networks take turns, pair by pair."""
     detectors = [_detector(network) for network in networks]
     measures = np.full((len(detectors), len(pairs), len(MEASURES)), np.nan)
     for index, pair in enumerate(pairs):
         turn = (index + seed) % len(detectors)
-        measures[turn, index] = measure_pair(detectors[turn], pair, common.former[index])
-        study.watch("measuring", index + 1, len(pairs))
+        measures[turn, index] = measure_pair(detectors[turn], pair, common.legacy[index])
+        study.on_progress("measuring", index + 1, len(pairs))
     return measures
 
 
 def _detector(network: KeypointNetwork) -> OnnxDetector:
-    """A network as robots run it, exported."""
+    """The exported network, as robots run it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "detector.onnx"
         export_onnx(network, path)
