@@ -11,20 +11,26 @@ from numpy.typing import ArrayLike
 from fcslam.geometry.se2 import Array
 
 _DEGENERATE = 1e-12
-"""Squared spread of points, relative to their squared coordinates, below which they are one point."""
+"""Squared spread of points, relative to their squared coordinates, below which they count as one point."""
 
 
 def rotation_eq5(alpha_rad: float) -> Array:
-    """The paper's homogeneous rotation, shape (3, 3); with its signs it turns by ``-alpha_rad``."""
+    """Homogeneous rotation matrix of the paper, shape (3, 3); with its signs it rotates by ``-alpha_rad``."""
     cos, sin = np.cos(alpha_rad), np.sin(alpha_rad)
     return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])  # eq. (5)
 
 
 def two_point_alignment(points_a: ArrayLike, points_b: ArrayLike) -> Array:
-    """``T_a_b`` from two matched points, the paper's eqs. (5) and (6) in their corrected form.
+    """Compute ``T_a_b`` from two matched points by eqs. (5) and (6) of FC-SLAM in their corrected form.
 
-    Points are (2, 2), metres: row k of both is the same place in a (the paper's x') and in b (its x). Where the two
-    pairs are not equally far apart, the midpoints coincide.
+    If the distances of the two points differ in a and b, the midpoints coincide.
+
+    Args:
+        points_a: shape (2, 2), metres, in the coordinate frame a (the paper's x').
+        points_b: the same points in the coordinate frame b (the paper's x), shape (2, 2), metres.
+
+    Returns:
+        ``T_a_b``, shape (3,), metres and radians.
 
     Raises:
         ValueError: the points have another shape, are not finite, or the two of one frame coincide.
@@ -45,14 +51,22 @@ def two_point_alignment(points_a: ArrayLike, points_b: ArrayLike) -> Array:
 
 
 def n_point_alignment(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLike | None = None) -> Array:
-    """Least-squares ``T_a_b`` over matched points, in closed form.
+    """Compute the least-squares ``T_a_b`` over matched points in closed form.
 
     Minimises ``sum w |a - T_a_b b|^2`` (Umeyama 1991 without scale; in the plane the rotation is the angle of one
-    complex sum). Points are (..., N, 2), weights (..., N) and not negative; the result is (..., 3). Where the points
-    determine no rotation (all coincide, fewer than two with weight) the pose is NaN.
+    complex sum).
+
+    Args:
+        points_a: shape (..., N, 2), metres, in the coordinate frame a.
+        points_b: the same points in the coordinate frame b, shape (..., N, 2), metres.
+        weights: not negative, shape (..., N); None: all are 1.
+
+    Returns:
+        Poses, shape (..., 3), metres and radians; NaN if the points determine no rotation (all coincide, or fewer than
+        two have a weight).
 
     Raises:
-        ValueError: the shapes do not belong together, or a weight is negative.
+        ValueError: the shapes do not fit, or a weight is negative.
     """
     a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
     if a.shape != b.shape or a.ndim < 2 or a.shape[-1] != 2:

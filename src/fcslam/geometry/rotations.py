@@ -1,4 +1,4 @@
-"""Rotations of three dimensions, which only mountings of sensors need."""
+"""Rotations in three dimensions, for the mounting of sensors."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from fcslam.geometry.se2 import Array
 
 
 def rotation_matrix(quaternion: tuple[float, float, float, float]) -> Array:
-    """The matrix (3, 3) of a quaternion (x, y, z, w) of length 1."""
+    """Rotation matrix, shape (3, 3), of a unit quaternion (x, y, z, w)."""
     x, y, z, w = quaternion
     return np.array(
         [

@@ -2,7 +2,7 @@
 
 A pose is ``(x, y, theta)`` in metres and radians, shape (..., 3), float64. ``T_a_b`` takes coordinates in b to a,
 so ``compose(T_a_b, T_b_c)`` is ``T_a_c``. Every function broadcasts over the leading dimensions. Single poses, the
-common case in the hot loops, take a shorter way: numpy's overhead would be twenty times the arithmetic.
+common case in the hot loops, have their own code path: numpy's overhead is twenty times the arithmetic.
 """
 
 import math
@@ -53,7 +53,7 @@ def between(T_a_b: ArrayLike, T_a_c: ArrayLike) -> Array:
 
 
 def transform(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
-    """Points (..., N, 2) given in b, in the coordinates of a; the pose has shape (..., 3)."""
+    """Transform points (..., N, 2) from b to a, metres; the pose has shape (..., 3)."""
     pose, points = np.asarray(T_a_b, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
     cos, sin = np.cos(pose[..., 2:3]), np.sin(pose[..., 2:3])
     x = pose[..., 0:1] + cos * points[..., 0] - sin * points[..., 1]

@@ -1,11 +1,10 @@
-"""Pose graphs as text: g2o (2D) in and out, TORO in; plain or gzip by the file's name.
+"""Pose graphs as text files: reads g2o (2D) and TORO, writes g2o; plain or gzip by the name of the file.
 
     VERTEX_SE2 id x y theta                     VERTEX2 id x y theta                    (TORO)
     EDGE_SE2 i j x y theta xx xy xt yy yt tt    EDGE2 i j x y theta xx xy yy tt xt yt   (TORO)
     FIX id ...
 
-The formats do not say which edges may be false: the first between two consecutive ids is read as odometry, all others
-as closures.
+The formats do not mark closures: the first edge between two consecutive ids is odometry, all others are closures.
 """
 
 import gzip
@@ -21,42 +20,42 @@ from fcslam.errors import InputError
 from fcslam.graph.pose_graph import Edge, PoseGraph
 
 _MAXIMUM_BYTES = 1 << 30
-"""Unpacked; a longer file is refused (gzip bombs)."""
+"""Largest unpacked file, against gzip bombs."""
 
 _MAXIMUM_LINE = 4096
 
 _EDGE_ORDER = {"EDGE_SE2": (0, 1, 2, 1, 3, 4, 2, 4, 5), "EDGE2": (0, 1, 4, 1, 2, 5, 4, 5, 3)}
-"""Where each entry of the information matrix (row by row) stands among the line's six."""
+"""Index of each entry of the information matrix (row by row) among the six numbers of a line."""
 
 _VERTICES = ("VERTEX_SE2", "VERTEX2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class G2oGraph:
-    """A pose graph with the ids that its variables have in the file."""
+    """A pose graph with the ids of its variables in the file."""
 
     graph: PoseGraph
     ids: tuple[int, ...]
-    """Of variable k, rising."""
+    """Id of each variable, ascending."""
     fixed: tuple[int, ...] = ()
-    """Ids that FIX lines name."""
+    """Ids in FIX lines."""
 
 
 @dataclass(slots=True)
 class _Content:
     poses: dict[int, list[float]] = field(default_factory=dict)
     edges: list[tuple[int, Edge]] = field(default_factory=list)
-    """With their line numbers; ``i`` and ``j`` are still ids."""
+    """Line number and edge; ``i`` and ``j`` are ids."""
     fixed: list[int] = field(default_factory=list)
 
 
 def read_g2o(path: Path) -> G2oGraph:
     """Read a g2o or TORO file, ``.gz`` or plain; unknown tags are refused, ``#`` starts a comment.
 
-    A file of edges alone has its variables at zero (see ``initialization.initialize``).
+    Without vertex lines, all variables are at zero (see ``initialization.initialize``).
 
     Raises:
-        InputError: the file cannot be read or is not such a graph; the message names file and line.
+        InputError: the file cannot be read or is not a pose graph; the message names file and line.
     """
     content = _Content()
     for number, line in _lines(path):
@@ -71,12 +70,15 @@ def read_g2o(path: Path) -> G2oGraph:
 
 
 def g2o_text(graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence[int] = ()) -> str:
-    """A graph as g2o; reading it again gives the same numbers, bit by bit.
+    """A graph as g2o text; reading it again gives the same numbers, bit by bit.
 
-    ``ids``: of variable k, by default k; ``fixed``: ids to name in FIX lines.
+    Args:
+        graph: the pose graph.
+        ids: id of each variable; None: its number.
+        fixed: ids for FIX lines.
 
     Raises:
-        ValueError: there is not one id for each variable, or two are equal.
+        ValueError: the number of ids is not that of the variables, or two ids are equal.
     """
     names = range(len(graph)) if ids is None else ids
     if len(names) != len(graph) or len(set(names)) != len(names):
@@ -91,7 +93,7 @@ def g2o_text(graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence
 
 
 def write_g2o(path: Path, graph: PoseGraph, ids: Sequence[int] | None = None, fixed: Sequence[int] = ()) -> None:
-    """Write ``g2o_text`` to a file, compressed if its name ends in .gz."""
+    """Write ``g2o_text`` to a file, compressed if its name ends in ``.gz``."""
     data = g2o_text(graph, ids, fixed).encode("ascii")
     path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
 

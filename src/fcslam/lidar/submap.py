@@ -144,7 +144,7 @@ class Agreement:
     normal_tensor: FloatArray
     """Sum of J J^T over the explained points, J = (n_x, n_y, lever / LEVER_M), shape (3, 3).
 
-    Its smallest eigenvalue says how well the match is fixed: along a corridor, or turning in a round room, it is not.
+    Its smallest eigenvalue is small if the match is not fixed: along a corridor, or in heading in a round room.
     """
 
     @property

@@ -13,9 +13,9 @@ from fcslam.wire.messages import UPLINK, PacketKind
 REVEALS: Mapping[str, str] = MappingProxyType(
     {
         "Packet.version": "nothing of the robot",
-        "Packet.robot": "which robot speaks",
+        "Packet.robot": "which robot it is",
         "Packet.epoch": "how often it was started",
-        "Packet.sequence": "how much it has said",
+        "Packet.sequence": "how many packets it has sent",
         "Packet.time": "when it drove, by its own clock",
         "Hello.beam_count": "which LiDAR it has",
         "Hello.angle_min_rad": "which LiDAR it has, and how it is mounted",
