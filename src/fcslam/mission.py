@@ -30,25 +30,25 @@ from fcslam.wire.transport import InMemoryTransport
 
 
 class MissionConfig(Settings):
-    """Everything that can be set; one default for all recordings."""
+    """All settings; the defaults serve all recordings."""
 
-    seed: int = Field(default=0, ge=0, description="of the one random generator; the same seed gives the same run")
-    robot: RobotConfig = Field(default=RobotConfig(), description="what runs on a robot")
-    fleet: FleetConfig = Field(default=FleetConfig(), description="what runs in the cloud")
+    seed: int = Field(default=0, ge=0, description="seed of the random generator; the same seed gives the same run")
+    robot: RobotConfig = Field(default=RobotConfig(), description="settings of the robots")
+    fleet: FleetConfig = Field(default=FleetConfig(), description="settings of the cloud")
     map: OccupancyConfig = Field(default=OccupancyConfig(), description="the occupancy grid")
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a mission is."""
+    """Progress of a mission."""
 
     scans: int
     keyscans: int
     recorded_s: float
-    """Time that the recordings have played, of all robots together."""
+    """Recorded time so far, summed over the robots, in seconds."""
     closures: dict[str, int]
     fusing: bool = False
-    """All is recorded and sent; the cloud decides and fuses."""
+    """Whether all packets are sent, and the cloud decides and fuses."""
 
 
 Watch = Callable[[Progress], None]
@@ -77,7 +77,7 @@ def run_mission(
         reply = transport.send(encode(packet))
         if reply.refusal:
             raise FcslamError(f"{packet.robot}: the cloud refused a packet: {reply.refusal}")
-    meter.tell(fusing=True)
+    meter.report(fusing=True)
     scans = (Metric("scans", meter.scans, "1"), Metric("recorded_time", meter.recorded_s, "s"))
     tracks = {
         session_name(robot.robot, epoch): _track(poses) for robot in robots for epoch, poses in enumerate(robot.tracks)
@@ -87,7 +87,7 @@ def run_mission(
 
 
 def _packets(source: Source, robot: RobotFrontend, meter: "_Meter") -> Iterator[Packet]:
-    """What one robot sends over its whole recording."""
+    """The packets that one robot sends over its recording."""
     for record in source.records():
         packets = robot.process(record)
         if isinstance(record, LaserScan):
@@ -97,7 +97,7 @@ def _packets(source: Source, robot: RobotFrontend, meter: "_Meter") -> Iterator[
 
 
 class _Meter:
-    """Counts scans, keyscans and recorded time, and tells the watcher now and then."""
+    """Counts scans, keyscans and recorded time, and reports the progress."""
 
     EVERY = 50
 
@@ -119,10 +119,10 @@ class _Meter:
         self.scans += 1
         self.keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
         if self.scans % self.EVERY == 0:
-            self.tell()
+            self.report()
 
-    def tell(self, fusing: bool = False) -> None:
-        """Where the mission is now."""
+    def report(self, fusing: bool = False) -> None:
+        """Report the progress now."""
         closures = self._fleet.closure_counts()
         self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing))
 

@@ -1,4 +1,4 @@
-"""Every closure that was ever considered, how far it came and why."""
+"""The log of all closures that were considered, with their status and its reason."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,17 +13,17 @@ class ClosureEntry:
 
     closure: LoopClosure
     independent: bool
-    """Whether it is evidence of how two robots' maps lie: not where that was known and only borne out."""
+    """Whether it is evidence for the relative pose of two maps: not if the joint map predicted it."""
     edge: int | None = None
     vetoed: bool = False
 
     @property
     def is_between(self) -> bool:
-        """Whether it ties two robots, not two moments of one."""
+        """Whether it connects two robots."""
         return self.closure.i.robot != self.closure.j.robot
 
     def set(self, status: ClosureStatus, reason: str) -> None:
-        """Move on to another status."""
+        """Change the status."""
         self.closure = replace(self.closure, status=status, reason=reason)
 
 
@@ -33,11 +33,11 @@ class ClosureLog:
     def __init__(self) -> None:
         self._entries: list[ClosureEntry] = []
         self._between: dict[frozenset[str], list[ClosureEntry]] = {}
-        """Entries between two robots, by these: a large fleet asks for its pairs again and again."""
+        """Entries by pair of robots, because every place queries its pairs."""
         self._ties: dict[str, list[ClosureEntry]] = {}
-        """Entries between each robot and others, without mere candidates: those never become more."""
+        """Verified entries between each robot and others; a candidate never changes its status."""
         self._confirmed: set[tuple[frozenset[KeyscanId], Channel]] = set()
-        """Pairs of places between which geometry has confirmed a closure, with its channel."""
+        """Pairs of places with a verified closure, and its channel."""
 
     def __iter__(self) -> Iterator[ClosureEntry]:
         return iter(self._entries)
@@ -46,11 +46,14 @@ class ClosureLog:
         return len(self._entries)
 
     def confirms(self, match: PlaceMatch) -> bool:
-        """Whether geometry has confirmed these two places before: described anew they are no second witness."""
+        """Whether a closure between these two places was verified before.
+
+        The same places seen by another detector are no independent evidence.
+        """
         return (frozenset((match.i, match.j)), match.channel) in self._confirmed
 
     def add(self, match: PlaceMatch) -> ClosureEntry:
-        """Book a match as verified or, if geometry does not confirm it, as a candidate."""
+        """Add a match, as verified or, if its verification failed, as a candidate."""
         status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
         if match.M:
             self._confirmed.add((frozenset((match.i, match.j)), match.channel))
@@ -67,7 +70,7 @@ class ClosureLog:
         return entry
 
     def add_local(self, constraint: Constraint, edge: int) -> ClosureEntry:
-        """Book a closure that a robot found within its own map; it holds until the joint graph contradicts it."""
+        """Add a closure that a robot found within its own map; it is accepted until the joint graph contradicts it."""
         i, j = KeyscanId(constraint.robot, constraint.i), KeyscanId(constraint.robot, constraint.j)
         closure = LoopClosure(
             i, j, Channel.LIDAR, 0.0, constraint.T_i_j, constraint.information, ClosureStatus.ACCEPTED,
@@ -78,7 +81,7 @@ class ClosureLog:
         return entry
 
     def evidence(self, a: str, b: str) -> list[ClosureEntry]:
-        """What geometry confirms between two robots without having known how they lie, and nobody vetoed."""
+        """The verified closures between two robots that the joint map did not predict and no veto excludes."""
         return [
             entry
             for entry in self._between.get(frozenset((a, b)), ())
@@ -86,6 +89,6 @@ class ClosureLog:
         ]
 
     def ties(self, robot: str) -> Iterator[ClosureEntry]:
-        """What is accepted between a robot and others, the newest first."""
+        """The accepted closures between a robot and others, newest first."""
         entries = reversed(self._ties.get(robot, ()))
         return (entry for entry in entries if entry.closure.status is ClosureStatus.ACCEPTED)

@@ -1,4 +1,4 @@
-"""How several robots' maps become one: what can be chosen by name. Loads nothing, for the command line's help."""
+"""The ways to fuse maps, by name. This module imports nothing heavy, for the command line's help."""
 
 from enum import StrEnum
 
@@ -9,6 +9,6 @@ class FusionStrategy(StrEnum):
     JOINT = "joint"
     """All robots in one robust pose graph, every closure decided by all evidence."""
     N_POINT = "n_point"
-    """Rigid maps, each pair laid on one another by all their matched points, least squares."""
+    """Rigid maps, each pair aligned by all matched points in the least-squares sense."""
     TWO_POINT = "two_point"
-    """Rigid maps, each pair laid on one another by their first two matched points: the paper's, eqs. (5)-(6)."""
+    """Rigid maps, each pair aligned by its first two matched points: the paper's eqs. (5)-(6)."""

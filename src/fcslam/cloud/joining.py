@@ -1,4 +1,4 @@
-"""What the closures between two robots say together: the cloud's evidence in the graph's terms."""
+"""Whether the closures between two robots join their maps: the cloud's entries in the terms of the graph."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ from fcslam.records import FloatArray
 def decide_join(
     entries: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
 ) -> ClusterDecision:
-    """The dominant cluster among the closures of two robots, on the trajectories as they are estimated now."""
+    """The dominant cluster among the closures of two robots, by the current estimate of their trajectories."""
     a, b = (graph.path(robot, settings) for robot in robots)
     informative = [entry.closure.informative for entry in entries]
     return cluster.decide_cluster(a, b, _closures(entries, robots[0]), informative, settings)
@@ -24,18 +24,18 @@ def decide_join(
 def first_estimate(
     members: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
 ) -> FloatArray:
-    """T_a_b of the two robots' maps, from the two matched places that lie farthest apart."""
+    """T_a_b (3,) of the two robots' maps, from the two matched places that are farthest apart, eqs. (5)-(6)."""
     a, b = (graph.path(robot, settings) for robot in robots)
     return cluster.relative_frame(a, b, _closures(members, robots[0]))
 
 
 def _closures(entries: Sequence[ClosureEntry], robot_a: str) -> Closures:
-    """The closures seen from one robot."""
-    told = [entry.closure for entry in entries]
+    """The closures as measurements from robot a to the other."""
+    found = [entry.closure for entry in entries]
     closures = Closures(
-        np.array([closure.i.number for closure in told], dtype=np.int64),
-        np.array([closure.j.number for closure in told], dtype=np.int64),
-        np.array([closure.T_i_j for closure in told]).reshape(-1, 3),
-        np.array([closure.information for closure in told]).reshape(-1, 3, 3),
+        np.array([closure.i.number for closure in found], dtype=np.int64),
+        np.array([closure.j.number for closure in found], dtype=np.int64),
+        np.array([closure.T_i_j for closure in found]).reshape(-1, 3),
+        np.array([closure.information for closure in found]).reshape(-1, 3, 3),
     )
-    return closures.reversed(np.array([closure.i.robot != robot_a for closure in told], dtype=bool))
+    return closures.reversed(np.array([closure.i.robot != robot_a for closure in found], dtype=bool))

@@ -31,11 +31,11 @@ class JointGraph:
         return self._variables[keyscan.robot][keyscan.number]
 
     def keyscan_count(self, robot: str) -> int:
-        """Keyscans of the robot that hang in the graph."""
+        """Number of the robot's keyscans in the graph."""
         return len(self._variables.get(robot, ()))
 
     def pose(self, keyscan: KeyscanId) -> FloatArray:
-        """T_map_base of the keyscan in its robot's present map."""
+        """T_map_base (3,) of the keyscan in its robot's current map."""
         pose: FloatArray = self._poses[self.variable(keyscan)]
         return pose
 
@@ -45,12 +45,12 @@ class JointGraph:
         return trajectory
 
     def path(self, robot: str, settings: DriftSettings) -> Trajectory:
-        """The robot's trajectory as consistency sees it, with the drift that its odometry claims."""
+        """The robot's trajectory with the covariance of its odometry, for consistency checks."""
         steps = np.array(self._step_covariance[robot]).reshape(-1, 3, 3)
         return build_trajectory(self.trajectory(robot), settings, steps)
 
     def chain(self, robot: str, first: int = 0, last: int | None = None) -> FloatArray:
-        """T_odom_base of keyscans first to last (inclusive): the robot's motions alone, before any correction."""
+        """T_odom_base (N, 3) of keyscans first to last (inclusive), by the robot's motions without any closure."""
         end = None if last is None else last + 1
         return np.array(self._chains[robot][first:end])
 
@@ -84,11 +84,11 @@ class JointGraph:
         return self.graph.add_edge(Edge(self.variable(i), self.variable(j), T_i_j, information, robust=True))
 
     def innovation(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray) -> FloatArray:
-        """How far a measurement lies from the estimate, (x, y, theta)."""
+        """Difference of a measurement T_i_j (3,) and the estimate: (x, y, theta), in metres and radians."""
         return se2.between(se2.between(self.pose(i), self.pose(j)), T_i_j)
 
     def move(self, robots: Sequence[str], T_new_old: FloatArray) -> None:
-        """Put the robots of one map into another map's frame."""
+        """Move the robots of one map into another map's coordinate frame."""
         for robot in robots:
             variables = self._variables[robot]
             self._poses[variables] = se2.compose(T_new_old, self._poses[variables])
@@ -98,7 +98,7 @@ class JointGraph:
         return self._unsolved >= closures
 
     def count(self, edge: int, *, holds: bool) -> None:
-        """From now on solve with the closure, or without it."""
+        """Include the closure in the next solves, or exclude it."""
         (self._left_out.discard if holds else self._left_out.add)(edge)
 
     def optimize(self) -> None:
@@ -109,12 +109,12 @@ class JointGraph:
         self.take(optimize(self.graph, start, loss=Loss.CAUCHY, kept=kept, factors=self._factors).poses)
 
     def take(self, poses: FloatArray) -> None:
-        """Take over a solution (N, 3)."""
+        """Replace the estimate by a solution, shape (N, 3)."""
         self._poses[: len(poses)] = poses
         self._unsolved = 0
 
     def held(self, T_map_base: Mapping[str, FloatArray], left_out: Container[int | None]) -> PoseGraph:
-        """All robots at poses (N, 3), with the constraints that are not left out: what a run leaves behind."""
+        """All robots at poses (N, 3), with the constraints that are not left out: the graph of a finished run."""
         poses = np.zeros((len(self.graph), 3))
         for robot, variables in self._variables.items():
             poses[variables] = T_map_base[robot]

@@ -1,4 +1,4 @@
-"""Every closure decided anew from all evidence: what a joint map rests on, and what has to go."""
+"""Re-evaluation: decide every closure from all evidence, independent of earlier decisions."""
 
 from collections.abc import Iterable
 
@@ -16,9 +16,9 @@ VETOED = "vetoed by hand"
 
 
 def reevaluate(graph: JointGraph, closures: ClosureLog, settings: ConsistencySettings) -> Fusion:
-    """Solve from the evidence alone; the graph takes the poses over, every entry learns its status.
+    """Solve the joint graph from all evidence; update the poses of the graph and the status of every entry.
 
-    No earlier estimate, join or verdict plays a part: what joined two maps once and is outvoted now is revoked.
+    No earlier estimate, join or decision plays a part: a closure that joined two maps and is outvoted now is revoked.
     """
     entries = [entry for entry in closures if entry.closure.status is not ClosureStatus.CANDIDATE]
     _enter(graph, (entry for entry in entries if entry.edge is None))
@@ -42,7 +42,7 @@ def reevaluate(graph: JointGraph, closures: ClosureLog, settings: ConsistencySet
 
 
 def _enter(graph: JointGraph, entries: Iterable[ClosureEntry]) -> None:
-    """Give closures that nothing rested on so far an edge, which counts for nothing yet."""
+    """Add edges for closures that have none; they do not count yet."""
     for entry in entries:
         closure = entry.closure
         entry.edge = graph.close(closure.i, closure.j, closure.T_i_j, closure.information)
@@ -60,7 +60,7 @@ def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
 
 
 def _decide(entry: ClosureEntry, holds: bool, apart: str) -> None:
-    """The entry's status; ``apart`` says why its robots share no map, if they do not."""
+    """Set the entry's status; ``apart`` is the reason why its robots share no map, or empty."""
     accepted_before = entry.closure.status is ClosureStatus.ACCEPTED
     if entry.vetoed:
         entry.set(ClosureStatus.REVOKED, VETOED)
@@ -73,7 +73,7 @@ def _decide(entry: ClosureEntry, holds: bool, apart: str) -> None:
 
 
 def _reasons(solution: JointSolution, robots: list[str]) -> dict[frozenset[str], str]:
-    """Why the cluster of two robots is not enough, where it is not."""
+    """By pair of robots, why their closures do not join their maps."""
     return {
         frozenset((robots[link.a], robots[link.b])): link.decision.reason
         for link in solution.links

@@ -1,4 +1,4 @@
-"""A fleet's result as a run: trajectories, closures, maps and numbers, ready to be written as a folder."""
+"""A fleet's result as a run: trajectories, closures, maps and metrics."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from fcslam.wire.messages import PacketKind
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A robot's scans, each hung on a keyscan."""
+    """A robot's scans, each with a fixed offset to a keyscan."""
 
     stamps: FloatArray
     """Shape (N,)."""
@@ -32,13 +32,13 @@ class Track:
     T_keyscan_base: FloatArray
     """Pose of each scan in its keyscan's base, shape (N, 3)."""
 
-    def laid_on(self, T_keyscans: FloatArray) -> FloatArray:
-        """Poses (N, 3) of all scans, those of the keyscans (K, 3) being given."""
+    def on_keyscans(self, T_keyscans: FloatArray) -> FloatArray:
+        """Poses (N, 3) of all scans, given the poses (K, 3) of the keyscans."""
         return se2.compose(T_keyscans[self.keyscans], self.T_keyscan_base)
 
 
 def keyscan_track(robot: MappedRobot) -> Track:
-    """What the cloud knows of a robot's scans: the keyscans alone."""
+    """The track that the cloud knows: the keyscans, without the scans between them."""
     count = len(robot.stamps)
     return Track(robot.stamps, np.arange(count), np.zeros((count, 3)))
 
@@ -51,11 +51,11 @@ def run_of(
     grid: OccupancyConfig,
     with_local_maps: bool = True,
 ) -> Run:
-    """Collect what the run folder holds; ``tracks`` has every robot of the result, and orders them."""
+    """Collect the contents of a run folder; ``tracks`` holds every robot of the result and gives their order."""
     mapped = {robot.robot: robot for robot in result.robots}
     trajectories = {
         name: RobotTrajectory(
-            name, mapped[name].map_index, frozen(track.stamps), frozen(track.laid_on(mapped[name].T_map_base))
+            name, mapped[name].map_index, frozen(track.stamps), frozen(track.on_keyscans(mapped[name].T_map_base))
         )
         for name, track in tracks.items()
     }
@@ -102,13 +102,13 @@ def _link_metrics(link: str, traffic: Mapping[str, Traffic], tracks: Mapping[str
 
 
 def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> LocalMap:
-    """What the robot would have mapped had it been alone."""
+    """The robot's own map, made without other robots."""
     fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.laser}, grid)
     name = f"{robot.robot}.pgm"
     return LocalMap(
         robot.robot,
         frozen(track.stamps),
-        frozen(track.laid_on(robot.T_local_base)),
+        frozen(track.on_keyscans(robot.T_local_base)),
         pgm_bytes(fused),
         map_yaml(fused, name),
     )
@@ -132,7 +132,7 @@ def _map_files(result: FleetResult, trajectories: Sequence[RobotTrajectory], gri
         drawn = {t.robot: t.T_map_base for t in trajectories if t.map_index == k}
         files[f"{stem}.pgm"] = pgm_bytes(fused)
         files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
-        files[f"{stem}.png"] = map_png(fused, drawn, _meetings(result.closures, members))
+        files[f"{stem}.png"] = map_png(fused, drawn, _drawn_closures(result.closures, members))
     return files
 
 
@@ -143,7 +143,7 @@ def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> Occup
     return fuse(keyscans, poses, {robot.robot: robot.laser for robot in members}, grid)
 
 
-def _meetings(closures: Sequence[LoopClosure], members: Sequence[MappedRobot]) -> list[DrawnClosure]:
+def _drawn_closures(closures: Sequence[LoopClosure], members: Sequence[MappedRobot]) -> list[DrawnClosure]:
     """Accepted closures between robots, as lines of the picture."""
     poses = {robot.robot: robot.T_map_base for robot in members}
     return [

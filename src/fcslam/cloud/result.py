@@ -1,4 +1,4 @@
-"""What a fleet's packets say in the end: every closure decided, every robot placed."""
+"""The result of a fleet: all closures decided, all robots placed in maps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ class MappedRobot:
     stamps: FloatArray
     """Of its keyscans, shape (N,)."""
     keyscans: tuple[Keyscan, ...]
-    """Those that the map is made of, ascending; places with many newer ones around them have let go of theirs."""
+    """The keyscans that make the map, ascending; keyscans of forgotten places are released."""
     T_map_base: FloatArray
     """Of each stamp, in the frame of its map, shape (N, 3)."""
     T_local_base: FloatArray
-    """Of each stamp, in the robot's own map, which its own measurements alone made, shape (N, 3); the origin is its
+    """Of each stamp, in the robot's own map, made without other robots, shape (N, 3); the origin is its
     first keyscan."""
     laser: LaserModel
 
@@ -38,19 +38,19 @@ class MappedRobot:
 
 @dataclass(frozen=True, slots=True)
 class FleetResult:
-    """Poses, closures with their verdicts, corrections, and the graph behind them."""
+    """Poses, decided closures, corrections and the pose graph."""
 
     robots: tuple[MappedRobot, ...]
     closures: tuple[LoopClosure, ...]
     """Between robots and within them."""
     corrections: tuple[Correction, ...]
     graph: PoseGraph
-    """All keyscans at their optimised poses, with the constraints that hold."""
+    """All keyscans at their optimised poses, with the accepted constraints."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fusion:
-    """Who shares a map, where everybody is, and what that rests on."""
+    """Which robots share a map, their poses, and the closures behind them."""
 
     maps: Sequence[Sequence[str]]
     """Robots of each map, maps and robots in the order in which they started."""
@@ -59,7 +59,7 @@ class Fusion:
     T_local_base: Mapping[str, FloatArray]
     """Every robot's keyscans in its own map, shape (N, 3)."""
     closures: tuple[LoopClosure, ...]
-    """In the order in which they were found, with their verdicts."""
+    """In the order in which they were found, decided."""
 
 
 def map_indices(maps: Sequence[Sequence[str]]) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Map fusion to the letter of the paper (FC-SLAM, section III.C): rigid maps laid on one another by matched points.
+"""Map fusion to the letter of the paper (FC-SLAM, section III.C): rigid maps aligned by matched points.
 
 "When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
 translation between the two, eqs. (5) and (6). No closure is doubted and nothing is optimised: a false match turns a
@@ -6,7 +6,7 @@ whole map, and the drift within the robots' maps stays. ``n_point`` is the same 
 squares sense. Both are here to be compared with the joint graph.
 
 The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
-closure knows better: the matched point is the position of its keyscan j, which ``T_i_j`` tells in the other map, too.
+closure is more precise: the matched point is the position of its keyscan j, and ``T_i_j`` gives it in the other map.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from fcslam.records import ClosureStatus, FloatArray, LoopClosure, frozen
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Match:
-    """One point that two robots know, (2,) in the own map of each."""
+    """One point seen by two robots, shape (2,) in the own map of each."""
 
     entry: ClosureEntry
     robots: tuple[str, str]
@@ -46,8 +46,8 @@ def fuse_rigidly(closures: ClosureLog, T_local_base: Mapping[str, FloatArray], s
     """Every robot's own map (N, 3) moved as a whole, into the frame of the robot of its map that started first.
 
     ``T_local_base`` has the robots in the order in which they started. Whatever geometry verified between two robots
-    and nobody vetoed is a match, closures that the joint map predicted included. Those that the relation of two maps
-    rests on end accepted, the others verified; closures within robots keep their verdict.
+    and no veto excludes is a match, including closures that the joint map predicted. The closures that align two maps
+    are accepted, the others stay verified; closures within robots keep their status.
     """
     order = list(T_local_base)
     matches = [_match(entry, T_local_base, order) for entry in closures if _is_valid(entry)]
@@ -77,7 +77,7 @@ def _match(entry: ClosureEntry, T_local_base: Mapping[str, FloatArray], order: S
 
 
 def _links(matches: Sequence[_Match], strategy: FusionStrategy) -> _Links:
-    """Of every two robots the matches that lay their maps on one another; pairs in the order in which they had two."""
+    """The matches that align the maps of each pair of robots; pairs in the order in which they had two."""
     known: dict[tuple[str, str], list[_Match]] = {}
     first_two: dict[tuple[str, str], Sequence[_Match]] = {}
     for match in matches:
@@ -90,7 +90,7 @@ def _links(matches: Sequence[_Match], strategy: FusionStrategy) -> _Links:
 
 
 def _relation(matches: Sequence[_Match], strategy: FusionStrategy) -> FloatArray:
-    """T_a_b of two robots' own maps; NaN where the points contradict each other so much that no rotation is better."""
+    """T_a_b (3,) of two robots' own maps; NaN if the points contradict each other so much that no rotation is best."""
     # A robot may claim to be so far away that its two points are one to a computer.
     align = two_point_alignment if strategy is FusionStrategy.TWO_POINT else n_point_alignment
     try:
@@ -120,7 +120,7 @@ def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], fra
 
 
 def _closure(entry: ClosureEntry, used: Mapping[ClosureEntry, str], strategy: FusionStrategy) -> LoopClosure:
-    """The closure with its verdict."""
+    """The closure with its final status."""
     if not _is_valid(entry):
         return entry.closure
     reason = used.get(entry)

@@ -1,7 +1,7 @@
-"""Sessions: what a robot sends from one start to the next, with odometry that began at zero.
+"""Sessions: the packets of a robot from one start to the next; its odometry starts at zero.
 
-Each is a robot of its own to the cloud: it hangs on the robot's earlier sessions by closures alone, as on any other
-robot. It is named after the robot and the epoch, ``robot`` for epoch 0 and ``robot+1``, ``robot+2`` after it.
+To the cloud each session is a robot: only closures connect it to the robot's earlier sessions, as to any other robot.
+It is named after the robot and the epoch: ``robot`` for epoch 0 and ``robot+1``, ``robot+2`` after it.
 """
 
 import re
@@ -25,13 +25,13 @@ def robot_of(session: str) -> str:
 
 
 def robot_and_epoch(session: str) -> tuple[str, int]:
-    """What ``session_name`` made the name of."""
+    """Robot and epoch of a session's name: the inverse of ``session_name``."""
     named = _SESSION.fullmatch(session)
     return (named[1], int(named[2])) if named else (session, 0)
 
 
 def check_robot(robot: str) -> None:
-    """Refuse a robot that is called like a session of another one.
+    """Refuse a robot whose name is that of another robot's session.
 
     Raises:
         PacketError: its name ends in ``+`` and digits.
@@ -42,7 +42,7 @@ def check_robot(robot: str) -> None:
 
 
 def in_session(packet: Packet) -> Packet:
-    """The packet as its session's: the robot's name in it is the session's.
+    """The packet with the session's name in place of the robot's.
 
     Raises:
         PacketError: the robot is called like a session of another one.

@@ -1,4 +1,4 @@
-"""What the cloud is set to; a mission keeps it, so that it can be made again from its packets."""
+"""The settings of the cloud; a mission stores them, so that its result can be computed again from its packets."""
 
 from pydantic import Field
 
@@ -10,28 +10,46 @@ from fcslam.places.matcher import MatcherConfig
 
 
 class FleetConfig(Settings):
-    """The cloud's part."""
+    """Settings of the fleet."""
 
-    join_maps: bool = Field(default=True, description="look for places that several robots saw")
+    join_maps: bool = Field(
+        default=True, description="join maps of robots that saw the same places; false keeps one map for each robot"
+    )
     fusion: FusionStrategy = Field(
         default=FusionStrategy.JOINT,
-        description="joint: one robust graph; two_point, n_point: rigid maps laid on one another by matched points",
+        description="how maps are fused: joint (one robust graph), rigid maps aligned by two_point or n_point",
     )
-    sight_m: float = Field(default=6.0, gt=0, description="in a joint map, places this near are compared")
+    sight_m: float = Field(
+        default=6.0, gt=0, description="largest distance, in metres, at which places in the same map are compared"
+    )
     near_visits: int = Field(
-        default=2, ge=0, description="so many visits of each robot, in other sessions, are compared with one place"
+        default=2, ge=0, description="number of earlier visits of each robot that are compared with a new place"
     )
-    surprise_m: float = Field(default=0.5, gt=0, description="a closure this far off the joint map needs a cluster")
-    surprise_rad: float = Field(default=0.1, gt=0, description="or turned this much")
-    solve_every: int = Field(default=40, gt=0, description="closures between two quick solves")
-    submaps_kept: int = Field(default=300, gt=1, description="submaps held ready for comparison; others are rebuilt")
-    matcher: MatcherConfig = Field(default=MatcherConfig(), description="place matching")
-    consistency: ConsistencySettings = Field(default=ConsistencySettings(), description="pairwise consistency")
+    surprise_m: float = Field(
+        default=0.5,
+        gt=0,
+        description="a closure that differs from the joint map by this much, in metres, needs a cluster of closures",
+    )
+    surprise_rad: float = Field(
+        default=0.1,
+        gt=0,
+        description="a closure that differs from the joint map by this much, in radians, needs a cluster of closures",
+    )
+    solve_every: int = Field(
+        default=40, gt=0, description="number of new closures after which the joint graph is solved"
+    )
+    submaps_kept: int = Field(
+        default=300, gt=1, description="number of submaps in the cache; others are rebuilt from their keyscans"
+    )
+    matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
+    consistency: ConsistencySettings = Field(
+        default=ConsistencySettings(), description="pairwise consistency of closures, and the rule for joining maps"
+    )
 
 
 class CloudConfig(Settings):
-    """The cloud's part of a configuration."""
+    """Settings of the cloud: the part of a configuration that a mission stores."""
 
-    seed: int = Field(default=0, ge=0, description="of the one random generator; the same seed gives the same run")
-    fleet: FleetConfig = Field(default=FleetConfig(), description="what runs in the cloud")
+    seed: int = Field(default=0, ge=0, description="seed of the random generator; the same seed gives the same run")
+    fleet: FleetConfig = Field(default=FleetConfig(), description="settings of the fleet")
     map: OccupancyConfig = Field(default=OccupancyConfig(), description="the occupancy grid")

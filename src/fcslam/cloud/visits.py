@@ -1,4 +1,4 @@
-"""Where a robot was near: of each time it came by the nearest place."""
+"""Visits of a robot to the surroundings of a point: the nearest place of each."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ import numpy as np
 from fcslam.records import FloatArray, KeyscanId
 
 Visit = tuple[float, KeyscanId]
-"""How far away its nearest place is, in metres, and which one that is."""
+"""Distance of the nearest place, in metres, and its keyscan."""
 
 
 def visits_near(places: Sequence[KeyscanId], T_map_place: FloatArray, xy: FloatArray, within_m: float) -> list[Visit]:

@@ -3,7 +3,7 @@
 ca.pem, ca.key          the authority; robots and viewers get ca.pem
 cloud.pem, cloud.key    the cloud's certificate
 tokens.yaml             name, role and SHA-256 of every token: for the cloud
-tokens/<name>           the token itself: for whoever is named
+tokens/<name>           the token itself: for its holder
 robots/<name>.pem, .key a robot's certificate, instead of a token
 """
 
@@ -25,7 +25,7 @@ from fcslam.service.http.authentication import Role, TokenEntry, TokensFile, rea
 from fcslam.storage.files import write_file
 
 AUTHORITY_DAYS, LEAF_DAYS = 3650, 397
-"""Clients believe no server certificate that holds for longer."""
+"""Longest validity of a server certificate that clients accept."""
 TOKEN_BYTES = 32
 
 Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
@@ -33,7 +33,7 @@ Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
 def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Role], now: datetime.datetime) -> None:
     """Make what is missing: the authority and tokens that are there stay; certificates of the cloud and of the robots
-    in ``names`` are made anew.
+    in ``names`` are replaced.
 
     Raises:
         OutputError: the folder cannot be used, or what is in it cannot be read.
@@ -49,7 +49,7 @@ def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Rol
             _make_leaf(folder / "robots" / name, name, ExtendedKeyUsageOID.CLIENT_AUTH, (), authority, now)
         _add_tokens(folder, names)
     except (OSError, ValueError) as error:
-        raise OutputError(f"{folder}: cannot keep credentials there ({error}); name a new folder") from error
+        raise OutputError(f"{folder}: cannot write credentials ({error}); name a new folder") from error
 
 
 def _authority(folder: Path, now: datetime.datetime) -> Authority:

@@ -1,4 +1,4 @@
-"""Networks that robots may fetch, and which of them they are told to take."""
+"""Detectors (ONNX networks) that robots may download, and the announced version of each channel."""
 
 import tempfile
 import threading
@@ -9,25 +9,25 @@ from fcslam.records import Channel, DetectorFile
 
 LONGEST_FILE_BYTES = 64 * 2**20
 STAGING = ".staging"
-"""How folders are called of networks that are not taken in yet."""
+"""Prefix of folders with networks that are not checked yet."""
 _ANNOUNCED = "announced"
-"""Beside the files of a channel: the version that robots are told of."""
+"""File that names a channel's announced version."""
 
 
-class DetectorShelf:
+class DetectorStore:
     """One folder: ``<channel>/<version>.onnx``."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
         self._lock = threading.Lock()
         self._announced = {
-            channel: describe_detector_file(self.path(channel, told.read_text(encoding="utf-8")))
+            channel: describe_detector_file(self.path(channel, announced.read_text(encoding="utf-8")))
             for channel in Channel
-            if (told := root / channel / _ANNOUNCED).is_file()
+            if (announced := root / channel / _ANNOUNCED).is_file()
         }
 
     def path(self, channel: Channel, version: str) -> Path:
-        """Where the file of a version is, if it is there."""
+        """Path of a version's file, which may not exist."""
         return self._root / channel / f"{version}.onnx"
 
     def versions(self) -> list[tuple[str, str]]:
@@ -37,12 +37,12 @@ class DetectorShelf:
         ]
 
     def announced(self) -> dict[Channel, DetectorFile]:
-        """What robots are told to take, by channel."""
+        """The announced detectors, by channel."""
         with self._lock:
             return dict(self._announced)
 
     def announce(self, content: bytes) -> DetectorFile:
-        """Take in a network's file and tell robots of it from now on.
+        """Add a network and announce it to the robots.
 
         Raises:
             FeatureError: it is no network that this fcslam runs.

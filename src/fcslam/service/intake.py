@@ -24,7 +24,7 @@ MOST_EARLY = 20_000
 FURTHEST_AHEAD = 20_000
 """How far a packet's number may be ahead of the first missing packet of its session."""
 RETRY_AFTER_S = 2
-"""What the service asks of a robot whose packets it cannot take now."""
+"""Seconds that a robot waits before it sends refused packets again."""
 
 
 class BusyError(FcslamError):
@@ -32,11 +32,11 @@ class BusyError(FcslamError):
 
 
 class LeaseError(FcslamError):
-    """Another agent speaks for this robot."""
+    """Another agent holds this robot's lease."""
 
 
 class RefusedPacketError(FcslamError):
-    """One packet of a batch is refused for good; those before it are stored."""
+    """A packet of a batch is refused; those before it are stored."""
 
     def __init__(self, message: str, index: int) -> None:
         super().__init__(message)
@@ -45,7 +45,7 @@ class RefusedPacketError(FcslamError):
 
 @dataclass(frozen=True, slots=True)
 class IntakeReply:
-    """What goes back to a robot."""
+    """The reply to a batch."""
 
     batch: bytes
     """Acknowledgements and, if they are news, a correction and detectors."""

@@ -1,4 +1,4 @@
-"""Where a service keeps its missions.
+"""The folder of a service's missions.
 
 detectors/<channel>/<version>.onnx   networks that robots may fetch
 missions/<name>/mission.sqlite       what was received: all that must not be lost
@@ -30,12 +30,12 @@ class MissionFolder:
 
     @property
     def store(self) -> Path:
-        """The file that holds what was received."""
+        """The mission store's file."""
         return self.path / "mission.sqlite"
 
     @property
     def live(self) -> Path:
-        """The run folder of what is believed now: a link, so it is the old one or the new one, and always whole."""
+        """The run folder of the current estimate: a link that is replaced atomically."""
         return self.path / "live"
 
     @property
@@ -44,11 +44,11 @@ class MissionFolder:
         return self.path / "worker.lock"
 
     def run(self, name: str) -> Path:
-        """A run folder that was asked for."""
+        """The run folder of a requested result."""
         return self.path / "runs" / name
 
     def publish(self, run: Run) -> None:
-        """Make ``run`` the live one; the one before stays for those who are still reading it.
+        """Make ``run`` the live one; the previous one stays for readers that have it open.
 
         Raises:
             OutputError: it cannot be written.

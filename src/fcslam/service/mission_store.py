@@ -88,9 +88,9 @@ class Finalization:
     arrivals: int
     vetoes: int
     run: str | None
-    """Name of the run folder, once it is there."""
+    """Name of the run folder; None until it is written."""
     failure: str | None
-    """Why there will be none."""
+    """Why it failed."""
 
 
 class MissionStore:
@@ -101,7 +101,7 @@ class MissionStore:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a mission, or begin one where there is no file.
+        """Open a mission, or create one if there is no file.
 
         Raises:
             StoreError: the file is no mission of this version, or cannot be used.
@@ -109,7 +109,7 @@ class MissionStore:
         self._database = Database(path, _SCHEMA, _VERSION)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._database.close()
 
     def put(self, packets: Sequence[StoredPacket], received_s: float) -> int:
@@ -123,7 +123,7 @@ class MissionStore:
             packet = packets[conflict]
             raise PacketConflictError(
                 f"{packet.robot}: packet {packet.sequence} of epoch {packet.epoch} was stored before with "
-                "other content; start the robot anew, in a new epoch",
+                "other content; restart the robot in a new epoch",
                 conflict,
             )
         return new
@@ -134,7 +134,7 @@ class MissionStore:
         return [(arrival, _packet(*row)) for arrival, *row in self._database.rows(statement, (after, limit))]
 
     def packet(self, robot: str, epoch: int, sequence: int) -> StoredPacket:
-        """A packet that is stored."""
+        """A stored packet."""
         statement = f"SELECT {_COLUMNS} FROM packets WHERE robot = ? AND epoch = ? AND sequence = ?"
         (row,) = self._database.rows(statement, (robot, epoch, sequence))
         return _packet(*row)
@@ -173,7 +173,7 @@ class MissionStore:
         )
 
     def newest_hello(self, robot: str, epoch: int) -> bytes | None:
-        """What the session said last of its detectors."""
+        """The session's newest hello, encoded."""
         where = "robot = ? AND epoch = ? AND kind = 'hello' AND refusal IS NULL"
         statement = f"SELECT data FROM packets WHERE {where} ORDER BY sequence DESC LIMIT 1"
         hello: bytes | None = self._database.value(statement, (robot, epoch))
@@ -189,7 +189,7 @@ class MissionStore:
                     _write_correction(database, correction)
 
     def applied(self) -> int:
-        """How many packets took effect, restarts notwithstanding."""
+        """How many packets took effect, before restarts too."""
         return int(self.fact(APPLIED) or 0)
 
     def correction(self, robot: str, epoch: int) -> SessionCorrection | None:
@@ -197,7 +197,7 @@ class MissionStore:
         return _read_correction(self._database.rows, robot, epoch)
 
     def veto(self, veto: Veto) -> None:
-        """Keep a veto."""
+        """Store a veto."""
         row = (veto.robot_i, veto.robot_j, *(veto.stamps or (None, None)))
         with self._database.transaction() as database:
             database.execute("INSERT INTO vetoes (robot_i, robot_j, stamp_i, stamp_j) VALUES (?, ?, ?, ?)", row)
@@ -208,7 +208,7 @@ class MissionStore:
         return [Veto(i, j, None if stamp_i is None else (stamp_i, stamp_j)) for i, j, stamp_i, stamp_j in rows]
 
     def ask_to_finalize(self) -> int:
-        """Ask for the result of all packets that arrived; returns the number of the request."""
+        """Request the result of all packets that arrived; returns the number of the request."""
         with self._database.transaction() as database:
             database.execute(
                 "INSERT INTO finalizations (arrivals, vetoes)"
@@ -224,26 +224,26 @@ class MissionStore:
         ]
 
     def finalization(self, number: int) -> Finalization:
-        """One request, which is there."""
+        """One request, which exists."""
         return next(asked for asked in self.finalizations() if asked.number == number)
 
     def answer(self, number: int, run: str | None, failure: str | None = None) -> None:
-        """What came of a request."""
+        """Store the outcome of a request."""
         with self._database.transaction() as database:
             database.execute("UPDATE finalizations SET run = ?, failure = ? WHERE number = ?", (run, failure, number))
 
     def fact(self, name: str) -> str | None:
-        """Something else to be remembered of the mission; None if it never was."""
+        """A stored fact about the mission; None if there is none."""
         value: str | None = self._database.value("SELECT value FROM facts WHERE name = ?", (name,))
         return value
 
     def remember(self, name: str, value: str) -> None:
-        """Keep a fact, in the place of what it was before."""
+        """Store or replace a fact."""
         with self._database.transaction() as database:
             _remember(database, name, value)
 
     def traffic(self) -> Ledger:
-        """Packets that count, and the bytes of those that were refused."""
+        """Traffic of accepted packets by label, and of refused ones."""
         columns, groups = "robot, kind, channel, refusal IS NULL", "robot, kind, channel, refusal IS NULL"
         statement = f"SELECT {columns}, count(*), sum(length(data)) FROM packets GROUP BY {groups}"
         accepted: dict[Label, Traffic] = {}
@@ -283,7 +283,7 @@ class MissionStore:
 
 
 def check_mission(path: Path) -> None:
-    """Refuse a file that is no exported mission.
+    """Refuse a file that is not an exported mission.
 
     Raises:
         StoreError: it is not what ``MissionStore.export`` writes.
@@ -310,7 +310,7 @@ def _remember(database: sqlite3.Connection, name: str, value: str) -> None:
 
 
 def _put(database: sqlite3.Connection, packets: Sequence[StoredPacket], received_s: float) -> tuple[int, int | None]:
-    """How many packets are new, and the index of the first that has another one's number: there it stops."""
+    """How many packets are new, and the index of the first conflicting packet, where it stops."""
     conflict, new = None, 0
     for index, packet in enumerate(packets):
         if _insert(database, packet, received_s):

@@ -1,4 +1,4 @@
-"""The missions of one service: one is open, the others rest."""
+"""The missions of one service, of which one is open."""
 
 import fcntl
 import shutil
@@ -8,7 +8,7 @@ from typing import IO
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import ServiceError
-from fcslam.service.detectors import STAGING, DetectorShelf
+from fcslam.service.detectors import STAGING, DetectorStore
 from fcslam.service.intake import Intake
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, MissionStore
@@ -18,20 +18,20 @@ from fcslam.storage.files import replacing, write_file
 from fcslam.wire.checks import check_name
 
 FIRST = "mission"
-"""Name of the mission that is open when there was none."""
+"""Name of a new service's first mission."""
 IMPORT, EXPORT = ".import", ".export"
-"""How folders are called of missions on their way in and out."""
+"""Prefixes of temporary folders of imported and exported missions."""
 
 Launch = Callable[[MissionFolder], RunningWorker]
 """Starts the worker of a mission."""
 
 
 class OpenMission:
-    """A mission that takes packets in and has a worker."""
+    """A mission with an intake and a worker."""
 
     def __init__(
         self, folder: MissionFolder, config: CloudConfig, clock: Callable[[], float],
-        wall_clock: Callable[[], float], launch: Launch, detectors: DetectorShelf,
+        wall_clock: Callable[[], float], launch: Launch, detectors: DetectorStore,
     ) -> None:  # fmt: skip
         self.folder = folder
         self.store = MissionStore(folder.store)
@@ -41,19 +41,19 @@ class OpenMission:
         self.worker = launch(folder)
 
     def close(self) -> None:
-        """Stop the worker, then let go of the file."""
+        """Stop the worker, then close the store."""
         self.worker.stop()
         self.store.close()
 
 
 class Missions:
-    """All missions below one folder, which no other service may use."""
+    """All missions below one folder, which this service locks."""
 
     def __init__(
         self, root: Path, config: CloudConfig, clock: Callable[[], float], wall_clock: Callable[[], float],
         launch: Launch,
     ) -> None:  # fmt: skip
-        """Open the mission that was open last, or a first one.
+        """Open the mission that was open last, or create the first one.
 
         Raises:
             ServiceError: the folder cannot be used, or another service uses it.
@@ -63,7 +63,7 @@ class Missions:
         self._config, self._clock, self._wall_clock, self._launch = config, clock, wall_clock, launch
         self._lock = _locked(root)
         _sweep(root)
-        self.detectors = DetectorShelf(root / "detectors")
+        self.detectors = DetectorStore(root / "detectors")
         named = self._open_file.read_text(encoding="utf-8").strip() if self._open_file.exists() else FIRST
         self.open_mission = self._opened(named)
 
@@ -82,17 +82,17 @@ class Missions:
         return MissionFolder(self.root / "missions" / name)
 
     def create(self, name: str) -> None:
-        """Begin a mission and open it.
+        """Create a mission and open it.
 
         Raises:
             ServiceError: there is one of this name.
         """
         if self.folder(name).store.exists():
-            raise ServiceError(f"mission '{name}' is there already; open it or choose another name")
+            raise ServiceError(f"mission '{name}' exists; open it or choose another name")
         self.open(name, create=True)
 
     def open(self, name: str, create: bool = False) -> None:
-        """Let robots' packets go to this mission from now on; the one that is open now rests, as it is.
+        """Open a mission: robots' packets go to it from now on. The mission that was open is closed.
 
         Raises:
             ServiceError: there is none of this name.
@@ -125,7 +125,7 @@ class Missions:
             store.close()
 
     def take_in(self, name: str, path: Path) -> None:
-        """Make a mission of a file that ``export`` wrote and ``check_mission`` passed; the open one stays open.
+        """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open.
 
         Raises:
             ServiceError: there is one of this name.
@@ -133,14 +133,14 @@ class Missions:
         """
         folder = self.folder(name)
         if folder.store.exists():
-            raise ServiceError(f"mission '{name}' is there already; choose another name")
+            raise ServiceError(f"mission '{name}' exists; choose another name")
         with translate_errors(folder.store):
             folder.path.mkdir(parents=True, exist_ok=True)
             with replacing(folder.store) as unfinished:
                 shutil.copyfile(path, unfinished)
 
     def close(self) -> None:
-        """Stop the open mission and let others use the folder."""
+        """Close the open mission and unlock the folder."""
         self.open_mission.close()
         self._lock.close()
 
@@ -163,7 +163,7 @@ class Missions:
 
 
 def _sweep(root: Path) -> None:
-    """Remove what a service left half done that was killed; nobody else uses the folder."""
+    """Remove unfinished files of a service that was killed; the folder is locked."""
     left = [*root.glob(f"{IMPORT}*"), *root.glob(f"{EXPORT}*"), *(root / "detectors").glob(f"{STAGING}*")]
     for path in left:
         shutil.rmtree(path, ignore_errors=True)

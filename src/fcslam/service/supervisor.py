@@ -14,13 +14,13 @@ from fcslam.service.mission_folder import MissionFolder
 
 LONGEST_PAUSE_S = 30.0
 STEADY_S = 60.0
-"""A worker that lived so long did not die of what it found at its start."""
+"""Seconds after which a worker's crash is not blamed on its start."""
 
 READY = "ready"
-"""The event by which a worker says that it waits for packets now; it is for the supervisor alone."""
+"""The event by which a worker reports that it is ready; the supervisor does not pass it on."""
 
 Listen = Callable[[str, int], None]
-"""Is told of a worker's events; from a thread of its own."""
+"""Called with a worker's events, on a separate thread."""
 
 
 class RunningWorker(Protocol):
@@ -28,7 +28,7 @@ class RunningWorker(Protocol):
 
     @property
     def pid(self) -> int | None:
-        """Of its process; None while there is none."""
+        """Process id; None while there is no process."""
 
     @property
     def starts(self) -> int:
@@ -36,13 +36,13 @@ class RunningWorker(Protocol):
 
     @property
     def is_ready(self) -> bool:
-        """Whether it runs and has all its code at hand."""
+        """Whether it runs and has compiled its code."""
 
     def ring(self) -> None:
-        """Tell it that there is something to do."""
+        """Notify the worker of new packets or requests."""
 
     def stop(self) -> None:
-        """Let it end what it is doing, and wait for that."""
+        """Stop the worker after its current step, and wait."""
 
 
 _log = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ class Supervisor:
 
     @property
     def pid(self) -> int | None:
-        """Of the worker; None while there is none."""
+        """Process id of the worker; None while there is none."""
         process = self._process
         return process.pid if process is not None and process.poll() is None else None
 
@@ -79,11 +79,11 @@ class Supervisor:
 
     @property
     def is_ready(self) -> bool:
-        """Whether the worker runs and has said that it is ready."""
+        """Whether the worker runs and reported that it is ready."""
         return self._is_ready and self.pid is not None
 
     def ring(self) -> None:
-        """Tell the worker that there is something to do."""
+        """Notify the worker of new packets or requests."""
         with self._lock:
             if self._process is not None and self._process.stdin is not None:
                 # One that is gone is followed by one that looks for itself, and one that has not read its rings yet
@@ -92,7 +92,7 @@ class Supervisor:
                     self._process.stdin.write(b"\n")
 
     def stop(self) -> None:
-        """Let the worker end what it is doing, and wait for that; one that is not ready yet does nothing."""
+        """Stop the worker after its current step, and wait; a worker that still compiles stops at once."""
         self._stopping.set()
         with self._lock:
             self._end_input()
@@ -113,7 +113,7 @@ class Supervisor:
             self._stopping.wait(pause_s)
 
     def _watch_one(self) -> int:
-        """Start a worker and pass on what it says, until it ends."""
+        """Start a worker and pass on its events until it ends."""
         # Unbuffered: what a dead worker did not read must not turn up when the pipe is closed.
         with subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0) as process:
             assert process.stdin is not None
@@ -134,14 +134,14 @@ class Supervisor:
 
     def _pass_on(self, line: bytes) -> None:
         try:
-            told = json.loads(line)
-            event, number = str(told["event"]), int(told["number"])
+            message = json.loads(line)
+            event, number = str(message["event"]), int(message["number"])
             if event == READY:
                 self._is_ready = True
             else:
                 self._listen(event, number)
         except (ValueError, TypeError, KeyError):
-            _log.error("the worker says what nobody understands: %.200r", line)
+            _log.error("unreadable event of the worker: %.200r", line)
 
     def _end_input(self) -> None:
         if self._process is not None and self._process.stdin is not None:

@@ -47,13 +47,13 @@ _CLOSURE_AFTER = 15
 
 
 def warm_up_decoding() -> None:
-    """Make ready to take packets in: what the service does with them."""
+    """Compile what the intake needs: decoding."""
     for data in _packets():
         decode(data)
 
 
 def warm_up_fleet() -> None:
-    """Make ready for all that the worker does: decode, match, verify, solve, decide, map."""
+    """Compile what the worker needs: decode, match, verify, solve, decide, map."""
     vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
     cloud = Cloud(FleetConfig(matcher=MatcherConfig(small_fleet=0, vocabulary=vocabulary)), seed=0)
     for data in _packets():

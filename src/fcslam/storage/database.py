@@ -20,7 +20,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    """What a thread wants to be written."""
+    """Work that waits for a transaction."""
 
     work: Callable[[sqlite3.Connection], Any]
     result: Any = None
@@ -29,15 +29,15 @@ class _Waiting:
 
 
 class Database:
-    """A file that several processes and threads may use. Within a process one writer waits for the other, but nobody
-    who reads waits for a writer.
+    """A file that several processes and threads may use. Within a process, writers wait for each other; readers never
+    wait.
 
     Raises:
         StoreError: from every method: the disk is full or broken, and nothing has changed.
     """
 
     def __init__(self, path: Path, schema: str, version: int, *, exclusive: bool = False) -> None:
-        """Open the file; one that is not there yet is made by ``schema``.
+        """Open the file, or create it with ``schema``.
 
         Args:
             path: the file.
@@ -58,7 +58,7 @@ class Database:
                 self._connection = self._reading = _connected(path, *pragmas, timeout_s=0.0)
                 self._reading_lock = self._lock
             else:
-                # What is acknowledged must outlast a loss of power: FULL.
+                # FULL: acknowledged packets must survive a loss of power.
                 self._connection = _connected(path, "journal_mode=WAL", "synchronous=FULL")
                 # A commit takes as long as the disk does. A second connection lets readers see the state before it.
                 self._reading = _connected(path, "query_only=ON")
@@ -77,7 +77,7 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """What is executed in the block happens as a whole and is on disk afterwards, or does not happen at all."""
+        """Execute the block as one durable transaction."""
         with self._lock, translate_errors(self._path):
             self._connection.execute("BEGIN IMMEDIATE")
             try:
@@ -88,8 +88,8 @@ class Database:
                     self._connection.execute("ROLLBACK")
 
     def share(self, work: Callable[[sqlite3.Connection], _Result]) -> _Result:
-        """As ``transaction`` with ``work`` in the block, but shared by all threads that would wait for the disk: one
-        commit is enough for them. Of works that share one transaction all happen or none.
+        """Run ``work`` in a transaction that is shared by all threads that wait for the disk, so that one commit serves
+        them all. If one work fails, none of them takes effect.
         """
         mine = _Waiting(work)
         self._waiting.append(mine)
@@ -108,7 +108,7 @@ class Database:
                 together = self._taken()  # only now: with those who came while this waited for another writer
                 for one in together:
                     one.result = one.work(connection)
-        except BaseException as error:  # what ends this thread must not leave the others without an answer
+        except BaseException as error:  # an error in this thread must reach the threads that share its transaction
             together = together or self._taken()
             for one in together:
                 one.failure = error
@@ -130,13 +130,13 @@ class Database:
         return rows[0][0] if rows else None
 
     def export(self, path: Path) -> None:
-        """Write all as one new file, as it was at one moment; it is whole or not there.
+        """Write a snapshot of the database as one new file, atomically.
 
         Raises:
             StoreError: there is a file already, or it cannot be written.
         """
         staging = path.with_name(f".{path.name}.partial")
-        # A connection of its own: it takes long, and in write-ahead mode keeps nobody waiting.
+        # A separate connection: in write-ahead mode a long read blocks no writer.
         with (
             translate_errors(path),
             closing(sqlite3.connect(self._path, timeout=BUSY_S, isolation_level=None)) as connection,
@@ -151,7 +151,7 @@ class Database:
 
 
 def check_file(path: Path, schema: str, version: int) -> None:
-    """Refuse a file from elsewhere that ``Database`` did not make; it is not changed, and nothing in it is run.
+    """Refuse a file of unknown origin that ``Database`` did not create; it is not changed and none of its code runs.
 
     Raises:
         StoreError: it is broken, or has other tables than those of ``schema``, or anything else.
@@ -182,7 +182,7 @@ def _make(connection: sqlite3.Connection, schema: str, version: int) -> None:
 
 
 def _shape(connection: sqlite3.Connection) -> tuple[int, list[tuple[Any, ...]]]:
-    """Version, and everything that is not data."""
+    """Version and schema."""
     parts = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema ORDER BY type, name").fetchall()
     return connection.execute("PRAGMA user_version").fetchone()[0], parts
 

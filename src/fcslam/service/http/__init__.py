@@ -1,1 +1,1 @@
-"""The cloud over HTTP: what robots, viewers and administrators may ask, and of whom it is believed."""
+"""The service over HTTP: routes for robots, viewers and administrators, and their authentication."""

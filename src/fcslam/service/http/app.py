@@ -13,7 +13,7 @@ from fcslam.service.http.event_stream import event_router
 from fcslam.service.http.missions import file_router, mission_router
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
-from fcslam.service.http.prometheus import Measures
+from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.http.robots import detector_router, robot_router
 from fcslam.service.http.state import ServiceState
 from fcslam.service.http.viewers import fleet_router, map_router
@@ -66,7 +66,7 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
 class _RefusalCounter:
     """Counts answers that refuse. Plain ASGI: a middleware of Starlette's own base runs a task for every request."""
 
-    def __init__(self, app: ASGIApp, measures: Measures) -> None:
+    def __init__(self, app: ASGIApp, measures: ServiceMetrics) -> None:
         self._app, self._measures = app, measures
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -1,4 +1,4 @@
-"""Who may ask for what: by bearer tokens, of which the service knows the SHA-256 only, or by a robot's certificate."""
+"""Authentication by bearer tokens, of which the service stores the SHA-256 only, or by a robot's certificate."""
 
 import hashlib
 import hmac
@@ -39,7 +39,7 @@ class Identity(NamedTuple):
 class TokenEntry(Settings):
     """One token."""
 
-    name: str = Field(pattern=f"^{NAME.pattern}$", description="of a robot, or of whoever has it")
+    name: str = Field(pattern=f"^{NAME.pattern}$", description="of the robot or person that holds the token")
     role: Role = Field(description="robot, viewer or admin")
     sha256: str = Field(pattern="^[0-9a-f]{64}$", description="of the token, in hexadecimal")
 
@@ -54,12 +54,12 @@ class Authenticator:
     """Tells who has a token."""
 
     def __init__(self, tokens: Sequence[TokenEntry] | None) -> None:
-        """None: nobody is asked for a token, and everybody may do everything."""
+        """None: no authentication; every client may do everything."""
         self._tokens = tokens
 
     @property
     def is_open(self) -> bool:
-        """Whether nobody is asked for a token."""
+        """Whether authentication is off."""
         return self._tokens is None
 
     def who(self, authorization: str | None, certificate: str | None = None) -> Identity | None:
@@ -70,7 +70,7 @@ class Authenticator:
         return self._by_token(authorization) if authorization or certificate is None else _by_name(certificate)
 
     def _by_token(self, authorization: str | None) -> Identity | None:
-        """Takes as long for each."""
+        """Constant time, so that timing reveals nothing."""
         scheme, _, token = (authorization or "").partition(" ")
         digest = hashlib.sha256(token.strip().encode("utf-8", "surrogateescape")).hexdigest()
         found = None
@@ -81,7 +81,7 @@ class Authenticator:
 
 
 def _by_name(certificate: str) -> Identity | None:
-    """The robot that a certificate's common name names."""
+    """The robot named by a certificate's common name."""
     try:
         names = x509.Name.from_rfc4514_string(certificate).get_attributes_for_oid(NameOID.COMMON_NAME)
         name = str(names[0].value) if len(names) == 1 else ""

@@ -1,4 +1,4 @@
-"""What decides about the open mission."""
+"""Decisions about the open mission: results, vetoes, detectors."""
 
 import asyncio
 from typing import Annotated
@@ -23,11 +23,14 @@ SessionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
 
 class NewVeto(Settings):
-    """Two keyscans, or two robots, that did not see the same place."""
+    """A veto: two keyscans, or two robots, did not see the same place."""
 
     robot_i: SessionName
     robot_j: SessionName
-    stamps: tuple[float, float] | None = Field(None, description="of the two keyscans; without, all of both robots")
+    stamps: tuple[float, float] | None = Field(
+        None,
+        description="stamps of the two keyscans in seconds; without them, all closures of both robots",
+    )
 
 
 def decision_router(state: ServiceState) -> APIRouter:
@@ -38,7 +41,7 @@ def decision_router(state: ServiceState) -> APIRouter:
 
     @router.post("/finalize", responses=refusals(500))
     async def finalize() -> Finalized:
-        """The result of what has come in without a gap, as a run folder of the service; answers when it is there."""
+        """Write the result of all packets that arrived as a run folder of the service; the response waits for it."""
         mission = state.mission
         number = await run_in_threadpool(mission.store.ask_to_finalize)
         mission.worker.ring()
@@ -53,7 +56,7 @@ def decision_router(state: ServiceState) -> APIRouter:
 
     @router.post("/vetoes", status_code=201, openapi_extra=json_body(NewVeto), responses=refusals(400, 404, 413))
     async def veto(request: Request) -> VetoCount:
-        """From now on these closures count for nothing."""
+        """Exclude closures from now on."""
         return await run_in_threadpool(_veto, state, await read_json(request, NewVeto))
 
     @router.post(
@@ -63,7 +66,7 @@ def decision_router(state: ServiceState) -> APIRouter:
         responses=refusals(400, 413),
     )
     async def announce_detector(request: Request) -> DetectorVersion:
-        """Take in a network (ONNX) and tell every robot of it that has a camera and another one."""
+        """Add a network (ONNX) and announce it to every robot that has a camera and uses another one."""
         content = await read_body(request, LONGEST_FILE_BYTES)
         file = await run_in_threadpool(state.detectors.announce, content)
         return DetectorVersion(channel=file.channel, version=file.version)
@@ -71,12 +74,12 @@ def decision_router(state: ServiceState) -> APIRouter:
     return router
 
 
-def _veto(state: ServiceState, told: NewVeto) -> VetoCount:
+def _veto(state: ServiceState, veto: NewVeto) -> VetoCount:
     mission = state.mission
     known = {robot.robot for robot in mission.intake.sessions()}
-    unknown = [name for name in (told.robot_i, told.robot_j) if robot_of(name) not in known]
+    unknown = [name for name in (veto.robot_i, veto.robot_j) if robot_of(name) not in known]
     if unknown:
         raise HTTPException(404, f"there is no robot '{unknown[0]}'; there are {', '.join(sorted(known))}")
-    mission.store.veto(Veto(told.robot_i, told.robot_j, told.stamps))
+    mission.store.veto(Veto(veto.robot_i, veto.robot_j, veto.stamps))
     mission.worker.ring()
     return VetoCount(vetoes=len(mission.store.vetoes()))

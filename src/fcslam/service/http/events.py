@@ -1,4 +1,4 @@
-"""What happens in the cloud, for whoever watches: the newest of each kind, and then all that follows."""
+"""Events of the cloud for subscribers: the newest of each kind first, then all new ones."""
 
 import asyncio
 import threading
@@ -6,12 +6,12 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 
 WAITING = 100
-"""Events that a slow watcher may be behind; then it loses the oldest."""
+"""Largest backlog of a slow subscriber, in events; it loses the oldest ones beyond."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something happened."""
+    """One event."""
 
     kind: str
     number: int
@@ -26,7 +26,7 @@ class EventStream:
         self._watchers: dict[asyncio.Queue[Event], asyncio.AbstractEventLoop] = {}
 
     def publish(self, kind: str, number: int) -> None:
-        """Tell all watchers."""
+        """Send an event to all subscribers."""
         event = Event(kind, number)
         with self._lock:
             self._newest[kind] = event
@@ -34,7 +34,7 @@ class EventStream:
                 loop.call_soon_threadsafe(_put, queue, event)
 
     async def watch(self) -> AsyncIterator[Event]:
-        """The newest event of each kind, then each that comes."""
+        """Yield the newest event of each kind, then each new event."""
         queue: asyncio.Queue[Event] = asyncio.Queue(WAITING)
         with self._lock:
             for event in self._newest.values():

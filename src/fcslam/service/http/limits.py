@@ -1,4 +1,4 @@
-"""How much one robot may ask for."""
+"""Rate and size limits of requests."""
 
 import threading
 from collections.abc import Callable
@@ -11,29 +11,29 @@ from pydantic import BaseModel, ValidationError
 from fcslam.service.http.responses import content
 
 BYTES_PER_S = 8.0 * 2**20
-"""A thousand times what a robot sends while it drives: so fast it may send what an outage kept back."""
+"""Bytes per second of one robot: a thousand times its rate while it drives, for the backlog after an outage."""
 BURST_BYTES = 32.0 * 2**20
 REQUEST_BYTES = 16.0 * 2**10
-"""What a request costs besides its bytes."""
+"""Cost of a request besides its bytes, in bytes."""
 LONGEST_JSON_BYTES = 64 * 2**10
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
 class RateLimit:
-    """A bucket for each robot, which requests empty and time fills. Any thread may ask."""
+    """A token bucket for each robot. Any thread may call."""
 
     def __init__(
         self, clock: Callable[[], float], bytes_per_s: float = BYTES_PER_S, burst: float = BURST_BYTES
     ) -> None:
         self._clock, self._rate, self._burst = clock, bytes_per_s, burst
         self._level: dict[str, tuple[float, float]] = {}
-        """What is left in each bucket, and when that was."""
+        """Level of each bucket and its time."""
         self._lock = threading.Lock()
 
     @property
     def largest(self) -> int:
-        """Bytes that a request may have at all."""
+        """Largest request, in bytes."""
         return int(self._burst - REQUEST_BYTES)
 
     def wait_s(self, robot: str, size: int) -> float:
@@ -76,5 +76,5 @@ async def read_json(request: Request, model: type[_Model]) -> _Model:
 
 
 def json_body(model: type[BaseModel]) -> dict[str, Any]:
-    """What OpenAPI is told of a body that ``read_json`` reads."""
+    """The OpenAPI description of a body that ``read_json`` reads."""
     return {"requestBody": {"required": True, **content("application/json", model=model.model_json_schema())}}

@@ -1,4 +1,4 @@
-"""Missions: begin, open, take away, bring in."""
+"""Routes of missions: create, open, export, import."""
 
 import tempfile
 from collections.abc import AsyncIterator
@@ -31,7 +31,7 @@ MissionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
 
 class NewMission(Settings):
-    """A mission to begin."""
+    """A mission to create."""
 
     name: MissionName
 
@@ -54,7 +54,7 @@ def mission_router(state: ServiceState) -> APIRouter:
         responses=refusals(400, 409, 413, 507),
     )
     async def create_mission(request: Request) -> MissionList:
-        """Begin a mission and open it."""
+        """Create a mission and open it."""
         mission = await read_json(request, NewMission)
         async with state.changing:
             await run_in_threadpool(state.missions.create, mission.name)
@@ -62,7 +62,7 @@ def mission_router(state: ServiceState) -> APIRouter:
 
     @router.post("/missions/{name}/open", dependencies=as_admin, responses=refusals(400, 404, 507))
     async def open_mission(name: Name) -> MissionList:
-        """Let robots' packets go to this mission from now on."""
+        """Open a mission; robots' packets go to it from now on."""
         if name not in state.missions.names:
             raise HTTPException(404, f"there is no mission '{name}'")
         async with state.changing:
@@ -83,14 +83,14 @@ def file_router(state: ServiceState) -> APIRouter:
         responses=refusals(400, 409, 413, 507),
     )
     async def import_mission(request: Request, name: Annotated[MissionName, Query()]) -> MissionList:
-        """Make a mission of a file that an export gave; the open one stays open."""
+        """Import an exported mission; the open one stays open."""
         with tempfile.TemporaryDirectory(dir=state.missions.root, prefix=IMPORT) as folder:
             path = Path(folder) / "mission.sqlite"
             await _receive(request, path)
             try:
                 await run_in_threadpool(check_mission, path)
             except StoreError as error:
-                raise HTTPException(400, f"what was sent is no exported mission ({error})") from error
+                raise HTTPException(400, f"the body is not an exported mission ({error})") from error
             async with state.changing:
                 await run_in_threadpool(state.missions.take_in, name, path)
         return _missions(state)

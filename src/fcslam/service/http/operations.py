@@ -1,4 +1,4 @@
-"""What keeps a service running asks: is it well, and how much does it do."""
+"""Routes for operators: health and metrics."""
 
 from fastapi import APIRouter, HTTPException
 from fastapi.responses import Response
@@ -11,12 +11,12 @@ from fcslam.service.http.state import ServiceState
 
 
 def operations_router(state: ServiceState) -> APIRouter:
-    """Health, for everybody; measures, for viewers."""
+    """Health for everybody, metrics for viewers."""
     router = APIRouter(tags=["operations"])
 
     @router.get("/healthz", responses=refusals(503))
     def get_health() -> Health:
-        """200 while packets are taken in and the worker is ready for them, 503 otherwise."""
+        """200 while the service takes packets and the worker is ready, 503 otherwise."""
         try:
             state.mission.store.applied()
         except StoreError as error:
@@ -24,9 +24,9 @@ def operations_router(state: ServiceState) -> APIRouter:
         if state.closing:
             raise HTTPException(503, "the service is stopping")
         if state.mission.worker.pid is None:
-            raise HTTPException(503, "packets are taken in, but the worker is down")
+            raise HTTPException(503, "the service takes packets, but the worker is down")
         if not state.mission.worker.is_ready:
-            raise HTTPException(503, "packets are taken in, but the worker is starting")
+            raise HTTPException(503, "the service takes packets, but the worker is starting")
         return Health()
 
     @router.get(
@@ -36,7 +36,7 @@ def operations_router(state: ServiceState) -> APIRouter:
         responses={**refusals(401, 403, 503, 507), 200: content("text/plain")},
     )
     def get_metrics() -> Response:
-        """Measures in Prometheus's text format."""
+        """Metrics in the Prometheus text format."""
         return Response(state.measures.text(state.mission), media_type=CONTENT_TYPE_LATEST)
 
     return router

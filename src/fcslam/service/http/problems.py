@@ -22,16 +22,16 @@ STATUS: dict[type[FcslamError], int] = {
     ServiceError: 409,
     FeatureError: 400,
 }
-"""Of what goes wrong below HTTP; the nearest class of an error counts."""
+"""HTTP status by exception class; the most derived class counts."""
 
 
 def problem(status: int, error: str, headers: Mapping[str, str] | None = None, **more: object) -> JSONResponse:
-    """The answer to a request that is refused."""
+    """The response to a refused request."""
     return JSONResponse({"error": " ".join(error.split()), **more}, status, headers)
 
 
 def add_handlers(app: FastAPI) -> None:
-    """Let errors become answers."""
+    """Turn exceptions into responses."""
     app.add_exception_handler(FcslamError, _on_fcslam_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
@@ -69,5 +69,5 @@ def _on_validation_error(_: Request, error: Exception) -> JSONResponse:
 
 
 def _on_anything_else(_: Request, error: Exception) -> JSONResponse:
-    """A fault of the service: it is in the log, and nobody else is shown how it is made."""
+    """A fault of the service: the log holds the details, the response does not."""
     return problem(500, f"the service failed on it ({type(error).__name__}); its log says more")

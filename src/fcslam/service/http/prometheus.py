@@ -1,4 +1,4 @@
-"""Numbers for Prometheus."""
+"""Metrics for Prometheus."""
 
 import threading
 from collections import defaultdict
@@ -14,11 +14,11 @@ from fcslam.wire.ledger import Traffic
 from fcslam.wire.packets import read_label
 
 _AT_ONCE = 10_000
-"""Packets counted while nobody else may use the mission's file."""
+"""Packets counted in one query of the store."""
 
 
-class Measures:
-    """Counts what is answered and refused; asks the mission for the rest when it is asked itself."""
+class ServiceMetrics:
+    """Counts replies and refusals; reads everything else from the mission on request."""
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
@@ -35,16 +35,16 @@ class Measures:
         self._registry.register(self._uplink)
 
     def answer(self, robot: str, batch: bytes) -> None:
-        """A batch was taken in and answered by this one."""
+        """Count the bytes of a reply."""
         for data in read_batch(batch):
             self._answered.labels(robot, read_label(data).kind).inc(len(data))
 
     def refuse(self, status: int) -> None:
-        """A request was refused."""
+        """Count a refused request."""
         self._refused.labels(str(status)).inc()
 
     def text(self, mission: OpenMission) -> bytes:
-        """All measures in Prometheus's text format."""
+        """All metrics in the Prometheus text format."""
         ready = mission.intake.ready_count()
         self._packets.set(ready)
         self._queue.set(ready - mission.store.applied())
@@ -56,7 +56,7 @@ class Measures:
 
 
 class _Uplink(Collector):
-    """What robots sent, by the missions' files: it goes on where it was when the service starts again."""
+    """Uplink by the missions' stores; it continues after a restart of the service."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -66,7 +66,7 @@ class _Uplink(Collector):
         """By mission, robot, kind and channel; without a kind are packets that could not be read."""
 
     def follow(self, mission: OpenMission) -> None:
-        """Count what came in since the last time; all of it, the first time."""
+        """Count the packets that arrived since the last call."""
         name = mission.folder.name
         with self._lock:
             while groups := mission.store.traffic_since(self._counted.get(name, 0), _AT_ONCE):

@@ -1,4 +1,4 @@
-"""What the service answers, as OpenAPI describes it: nothing else is ever sent."""
+"""The responses of the service, as OpenAPI describes them."""
 
 from typing import Annotated, Any, Literal
 
@@ -30,7 +30,7 @@ class Health(Settings):
 
 
 class PacketRefusal(Settings):
-    """A packet that counts for nothing; its number is used up."""
+    """A refused packet; its number is used up."""
 
     epoch: int
     sequence: int
@@ -38,12 +38,12 @@ class PacketRefusal(Settings):
 
 
 class RobotState(Settings):
-    """Where a robot that starts again goes on."""
+    """Where a robot continues after a restart."""
 
     robot: str
-    epoch: int | None = Field(description="the newest that is known")
+    epoch: int | None = Field(description="newest epoch of the robot")
     next: dict[str, int] = Field(description="by epoch, number of the first packet that is missing")
-    correction: int = Field(description="version of the newest one; -1: none")
+    correction: int = Field(description="version of the newest correction; -1: none")
     map: int | None
     refused: list[PacketRefusal]
 
@@ -53,14 +53,14 @@ class FleetSummary(Settings):
 
     mission: str
     packets: int
-    applied: int = Field(description="packets that have taken effect")
-    waiting: int = Field(description="packets after one that is missing")
+    applied: int = Field(description="packets that took effect")
+    waiting: int = Field(description="packets that wait for an earlier one")
     robots: list[str]
     maps: int
     metrics: dict[str, float | None]
 
 
-class RobotSession(Settings):
+class SessionSummary(Settings):
     """One start of a robot with odometry at zero."""
 
     robot: str
@@ -72,8 +72,8 @@ class RobotSession(Settings):
     keyscans: int
     T_map_base: Pose | None
     T_map_odom: Pose | None
-    correction: int = Field(description="version of the newest one; -1: none")
-    quality: float = Field(description="how well others bear it out, in [0, 1]; 0: nobody does")
+    correction: int = Field(description="version of the newest correction; -1: none")
+    quality: float = Field(description="how well other sessions support the pose, in [0, 1]; 0: no support")
     last_heard_s: float | None = Field(description="seconds since the robot's last batch")
 
 
@@ -81,11 +81,11 @@ class RobotSummary(Settings):
     """One robot's sessions, and packets of it that were refused."""
 
     robot: str
-    sessions: list[RobotSession]
+    sessions: list[SessionSummary]
     refused: list[PacketRefusal]
 
 
-class Closure(Settings):
+class ClosureSummary(Settings):
     """As in closures.csv."""
 
     robot_i: str
@@ -107,14 +107,14 @@ class MapSummary(Settings):
 
 
 class DetectorVersion(Settings):
-    """A network that robots may fetch."""
+    """A detector that robots may download."""
 
     channel: Channel
     version: str
 
 
 class DetectorSummary(DetectorVersion):
-    """And whether they are told to."""
+    """A detector, and whether it is announced."""
 
     announced: bool
 
@@ -158,11 +158,11 @@ _REFUSALS: dict[int, dict[str, Any]] = {
 
 
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What OpenAPI is told of these answers."""
+    """The OpenAPI description of refusals."""
     return {status: {"model": Problem, **_REFUSALS[status]} for status in statuses}
 
 
 def content(*media_types: str, model: dict[str, Any] | None = None) -> dict[str, Any]:
-    """What OpenAPI is told of a body or an answer: bytes, if no schema is given."""
+    """The OpenAPI description of a body; bytes if no schema is given."""
     schema = model or {"type": "string", "format": "binary"}
     return {"content": {media_type: {"schema": schema} for media_type in media_types}}

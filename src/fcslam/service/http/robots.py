@@ -1,4 +1,4 @@
-"""What robots ask."""
+"""Routes for robots."""
 
 from typing import Annotated
 
@@ -30,7 +30,7 @@ def robot_router(state: ServiceState) -> APIRouter:
     """Packets in, acknowledgements and corrections out."""
     router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
     as_robot = state.require(Role.ROBOT)
-    taken = {status: {**told, "model": PacketProblem} for status, told in refusals(400, 409).items()}
+    taken = {status: {**refusal, "model": PacketProblem} for status, refusal in refusals(400, 409).items()}
 
     @router.post(
         "/robots/{robot}/packets",
@@ -45,7 +45,7 @@ def robot_router(state: ServiceState) -> APIRouter:
         agent: Annotated[str, Header(alias=AGENT_HEADER, max_length=64)] = "",
         correction: Annotated[int, Header(alias=CORRECTION_HEADER, ge=-1)] = -1,
     ) -> Response:
-        """Store a batch of packets; the answer acknowledges what is on disk."""
+        """Store a batch of packets; the response acknowledges what is on disk."""
         body = await read_body(request, MAXIMUM_BATCH_BYTES)
         mission = state.mission
 
@@ -60,7 +60,7 @@ def robot_router(state: ServiceState) -> APIRouter:
 
     @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
     def get_state(robot: Name) -> RobotState:
-        """Where a robot that starts again goes on, and which of its packets were refused."""
+        """Where a robot continues after a restart, and which of its packets were refused."""
         store = state.mission.store
         sessions = state.mission.intake.sessions(robot)
         newest = sessions[-1].epoch if sessions else None
@@ -98,7 +98,7 @@ def detector_router(state: ServiceState) -> APIRouter:
 
 
 def refused_packets(state: ServiceState, robot: str) -> list[PacketRefusal]:
-    """Packets of a robot that count for nothing."""
+    """Refused packets of a robot."""
     return [
         PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
         for epoch, sequence, reason in state.mission.store.refusals(robot)
@@ -116,7 +116,7 @@ def _check_rate(rate: RateLimit, robot: str, body: bytes) -> None:
 
 
 def _unpacked_size(body: bytes) -> int:
-    """What a batch counts in its robot's rate: it takes time to unpack, however short it travels.
+    """Size of a batch for the rate limit: the unpacked size, because unpacking takes time.
 
     Raises:
         PacketError: it is no batch.

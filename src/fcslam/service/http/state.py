@@ -1,4 +1,4 @@
-"""What all parts of the HTTP service share."""
+"""State shared by all routes of the HTTP service."""
 
 import asyncio
 from dataclasses import dataclass, field
@@ -7,11 +7,11 @@ from fastapi import Depends, HTTPException, Request, Security
 from fastapi.params import Depends as Dependency
 from fastapi.security import HTTPBearer
 
-from fcslam.service.detectors import DetectorShelf
+from fcslam.service.detectors import DetectorStore
 from fcslam.service.http.authentication import Authenticator, Role
 from fcslam.service.http.events import EventStream
 from fcslam.service.http.limits import RateLimit
-from fcslam.service.http.prometheus import Measures
+from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission
 
 _BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
@@ -19,26 +19,26 @@ _BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of toke
 
 @dataclass(slots=True)
 class ServiceState:
-    """Handed to every router."""
+    """Passed to every router."""
 
     missions: Missions
     authenticator: Authenticator
     rate: RateLimit
     events: EventStream
-    measures: Measures = field(default_factory=Measures)
+    measures: ServiceMetrics = field(default_factory=ServiceMetrics)
     closing: bool = False
-    """Nothing new is begun any more."""
+    """Whether the service is stopping and takes no new requests."""
     changing: asyncio.Lock = field(default_factory=asyncio.Lock)
-    """Whoever has it may begin, open and bring in missions."""
+    """Held while missions are created, opened or imported."""
 
     @property
     def mission(self) -> OpenMission:
-        """The one that robots' packets go to."""
+        """The open mission."""
         return self.missions.open_mission
 
     @property
-    def detectors(self) -> DetectorShelf:
-        """Networks that robots may fetch."""
+    def detectors(self) -> DetectorStore:
+        """Detectors that robots may download."""
         return self.missions.detectors
 
     def require(self, *roles: Role) -> list[Dependency]:

@@ -1,4 +1,4 @@
-"""Whose certificate a connection was made with, told to the application by ASGI's TLS extension."""
+"""The client certificate of a connection, passed to the application by ASGI's TLS extension."""
 
 import asyncio
 import ssl
@@ -15,7 +15,7 @@ class CertifiedProtocol(H11Protocol):
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """The handshake is over: a certificate that is there was signed by whom the service trusts."""
+        """After the handshake: a client certificate, if there is one, was signed by the trusted authority."""
         super().connection_made(transport)
         tls: ssl.SSLObject | None = transport.get_extra_info("ssl_object")
         shown = None if tls is None else tls.getpeercert(binary_form=True)

@@ -1,4 +1,4 @@
-"""What everybody may see: the live run, as numbers and as files."""
+"""Routes for viewers: the live run as numbers and as files."""
 
 import math
 from functools import lru_cache
@@ -15,12 +15,12 @@ from fcslam.records import Channel, ClosureStatus
 from fcslam.runs import POSE_GRAPH, TRAJECTORIES, ClosureRow, Run, open_run
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
-    Closure,
+    ClosureSummary,
     DetectorSummary,
     FleetSummary,
     MapSummary,
-    RobotSession,
     RobotSummary,
+    SessionSummary,
     content,
     refusals,
 )
@@ -28,7 +28,7 @@ from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ServiceState
 
 MOST = 2**31 - 1
-"""No map and no square has a larger number."""
+"""Largest number of a map or tile."""
 Index = Annotated[int, PathParameter(ge=0, le=MOST)]
 Square = Annotated[int, PathParameter(ge=-MOST, le=MOST)]
 TEXT = "text/plain"
@@ -36,7 +36,7 @@ MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "applica
 
 
 def fleet_router(state: ServiceState) -> APIRouter:
-    """Robots, closures, words."""
+    """Robots, closures and vocabularies."""
     router = APIRouter(
         tags=["fleet"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503, 507)
     )
@@ -59,7 +59,7 @@ def fleet_router(state: ServiceState) -> APIRouter:
         )
 
     @router.get("/robots")
-    def get_robots() -> list[RobotSession]:
+    def get_robots() -> list[SessionSummary]:
         """All robots' sessions."""
         return [
             robot
@@ -78,7 +78,7 @@ def fleet_router(state: ServiceState) -> APIRouter:
     @router.get("/closures", responses=refusals(400))
     def get_closures(
         status: ClosureStatus | None = None, limit: Annotated[int, Query(ge=1, le=10_000)] = 1000
-    ) -> list[Closure]:
+    ) -> list[ClosureSummary]:
         """The newest closures."""
         chosen = [closure for closure in _live_run(state).closures if status in (None, closure.status)]
         return [_closure(closure) for closure in chosen[-limit:]]
@@ -92,7 +92,7 @@ def fleet_router(state: ServiceState) -> APIRouter:
 
     @router.get("/detectors")
     def get_detectors() -> list[DetectorSummary]:
-        """Networks that robots may fetch, and whether they are told of them."""
+        """Detectors that robots may download, and whether they are announced."""
         return _detectors(state)
 
     return router
@@ -106,7 +106,7 @@ def map_router(state: ServiceState) -> APIRouter:
 
     @router.get("/maps")
     def get_maps() -> list[MapSummary]:
-        """Which robots share which map."""
+        """The robots of each map."""
         robots = _live_run(state).trajectories.values()
         numbers = sorted({robot.map_index for robot in robots})
         return [MapSummary(map=k, robots=[r.robot for r in robots if r.map_index == k]) for k in numbers]
@@ -169,21 +169,21 @@ def _file(state: ServiceState, name: str, media_type: str = TEXT) -> FileRespons
 
 
 def _detectors(state: ServiceState) -> list[DetectorSummary]:
-    told = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
+    announced = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
     return [
-        DetectorSummary(channel=Channel(channel), version=version, announced=(channel, version) in told)
+        DetectorSummary(channel=Channel(channel), version=version, announced=(channel, version) in announced)
         for channel, version in state.detectors.versions()
     ]
 
 
-def _sessions(state: ServiceState, robot: str) -> list[RobotSession]:
+def _sessions(state: ServiceState, robot: str) -> list[SessionSummary]:
     store, mapped = state.mission.store, _live_run(state).trajectories
-    told = []
+    sessions = []
     for session in state.mission.intake.sessions(robot):
         name = session_name(robot, session.epoch)
         known, correction = mapped.get(name), store.correction(robot, session.epoch)
-        told.append(
-            RobotSession(
+        sessions.append(
+            SessionSummary(
                 robot=robot,
                 session=name,
                 epoch=session.epoch,
@@ -198,12 +198,12 @@ def _sessions(state: ServiceState, robot: str) -> list[RobotSession]:
                 last_heard_s=state.mission.intake.last_heard_s(robot),
             )
         )
-    return told
+    return sessions
 
 
 @lru_cache(maxsize=4)
 def _run(folder: Path) -> Run:
-    """A snapshot; it never changes."""
+    """A snapshot, which never changes."""
     return open_run(folder)
 
 
@@ -211,8 +211,8 @@ def _stem(k: int) -> str:
     return f"map_{k}" if k else "map"
 
 
-def _closure(closure: ClosureRow) -> Closure:
-    return Closure(
+def _closure(closure: ClosureRow) -> ClosureSummary:
+    return ClosureSummary(
         robot_i=closure.robot_i, stamp_i=closure.stamp_i, robot_j=closure.robot_j, stamp_j=closure.stamp_j,
         channel=closure.channel, similarity=closure.similarity, T_i_j=closure.T_i_j.tolist(), status=closure.status,
         reason=closure.reason,
