@@ -165,7 +165,7 @@ def test_a_deployed_fleet_ends_as_one_in_a_process(deployment, embedded):
     deployment.until("server", "waiting: 0 robots are there, 2 needed")
     stranger = deployment.robot("one", key="stranger")
     assert stranger.wait(LIMIT_S) == 2
-    assert "does not take this robot" in deployment.said("stranger")
+    assert "does not accept this robot" in deployment.said("stranger")
     for robot in ("one", "two"):
         deployment.robot(robot)
     assert server.wait(LIMIT_S) == 0, deployment.said("server")
