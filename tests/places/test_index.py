@@ -174,7 +174,7 @@ def test_excluded_places_make_room_for_the_next(strategy, scoring):
     expected = [found for found in everything if found.id not in excluded]
     assert index.query(places[3], top_k=5, exclude=excluded) == expected[:5]
     result = index.compare(places[3])
-    assert [result.of(place) for place in places] == [dict(everything).get(place, 0.0) for place in places]
+    assert [result.similarity_of(place) for place in places] == [dict(everything).get(place, 0.0) for place in places]
 
 
 @EVERY
