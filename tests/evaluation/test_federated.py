@@ -315,7 +315,7 @@ def test_nothing_is_closed_where_central_is_no_better():
 def test_poison_is_what_it_says(poison):
     before = {"weight": np.zeros(6, np.float32)}
     bad = PoisonedClient(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
-    sent = bad.learn(before, 0, "run", FederatedSettings()).weights["weight"]
+    sent = bad.train(before, 0, "run", FederatedSettings()).weights["weight"]
     expected = {
         "flipped": -np.arange(6.0),
         "scaled": 10 * np.arange(6.0),
