@@ -23,7 +23,7 @@ def photos(tmp_path):
 
 
 def complaint(capsys, *arguments):
-    assert main(["train", *map(str, arguments), *OPTIONS]) == BAD_INPUT
+    assert main(["train", *map(str, arguments), *OPTIONS, "--quiet"]) == BAD_INPUT
     (line,) = capsys.readouterr().err.splitlines()
     return line
 
@@ -69,5 +69,5 @@ def test_a_folder_of_no_use_is_one_line(tmp_path, capsys):
 
 
 def test_without_torch_it_says_what_to_install(photos, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    monkeypatch.setattr("fcslam.cli.training_options.find_spec", lambda _: None)
     assert "pip install 'fcslam[train]'" in complaint(capsys, photos, "-o", tmp_path / "out")

@@ -115,5 +115,5 @@ def test_the_common_name_must_be_a_robots(subject, who):
 def test_a_certificate_that_cannot_be_used_is_told(authority, tmp_path):
     with pytest.raises(CloudError, match="cannot read the certificate and its key"):
         HttpTransport("https://cloud.example", "a", "ab" * 16, own=(authority / "ca.pem", tmp_path / "none"))
-    with pytest.raises(CloudError, match="use https"):
+    with pytest.raises(CloudError, match="need https"):
         HttpTransport("http://localhost", "a", "ab" * 16, own=pair(authority / "robots", "a"))
