@@ -41,6 +41,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@echo "Installing fcslam[$(EXTRAS)] into $(VENV); the first time takes about a minute."
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) -e ".[$(EXTRAS)]"
+	@find src -name '*.nb[ic]' -delete  # compiled code that names classes by where they were
 	@touch $@
 
 # Never fails: without a GL library there are LiDARs.

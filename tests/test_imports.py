@@ -4,7 +4,9 @@ import ast
 import json
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -140,6 +142,39 @@ def test_rooms_import_only_rooms_below():
 )
 def test_the_rule_itself(room, line, refused):
     assert bool(violations(line, Path(room))) is refused
+
+
+def import_graph() -> dict[str, set[str]]:
+    """The modules that each module imports, imports inside functions included."""
+    paths = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")}
+    modules = {name.removesuffix(".__init__"): path for name, path in paths.items()}
+    graph: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                inner = {f"{node.module}.{alias.name}" for alias in node.names}
+                found |= inner & modules.keys() or {node.module}
+        graph[name] = found & modules.keys() - {name}
+    return graph
+
+
+def test_no_module_imports_itself_through_others():
+    graph = import_graph()
+    assert len(graph["fcslam.mission"]) > 5
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the cycle
+
+
+def test_a_class_name_has_one_meaning():
+    names = [
+        node.name
+        for path in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
+    assert [name for name, count in Counter(names).items() if count > 1] == []
 
 
 def probe(statement: str, folder: Path) -> dict[str, object]:
