@@ -78,7 +78,7 @@ def run(case: Case, checkout: Path, place: Path) -> None:
         return
     shutil.rmtree(output, ignore_errors=True)
     place.mkdir(parents=True, exist_ok=True)
-    environment = {**os.environ, "PYTHONPATH": str(checkout / "src"), "PYTHONDONTWRITEBYTECODE": ""}
+    environment = {**os.environ, "PYTHONPATH": str(checkout / "src"), "OMP_NUM_THREADS": "1"}
     arguments = [argument.format(output=output) for argument in case.arguments]
     if arguments[0] == "federate" and not (checkout / "src/fcslam/cli/federate/__init__.py").exists():
         arguments[1] = "--local"  # before the command had subcommands
