@@ -22,6 +22,16 @@ settings.load_profile("fcslam")
 lock_numba_cache()
 
 
+SIMULATED = frozenset({"drawn", "packets", "logs"})
+"""Fixtures that simulate and map a fleet: what uses one of them is slow."""
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if SIMULATED & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session")
 def drawn() -> SimulatedFleet:
     """Three robots, 30 m each, that meet."""

@@ -217,6 +217,7 @@ fcslam.map_recordings("a.clf", seeds=1)
 """
 
 
+@pytest.mark.slow
 def test_type_checkers_know_the_api(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(USER_SCRIPT)

@@ -98,6 +98,7 @@ def test_a_report_is_two_files_that_say_the_same(common, tmp_path, monkeypatch, 
     assert {"date", "machine", "versions", "command"} <= set(content)
 
 
+@pytest.mark.slow
 def test_a_picture_lies_beside_the_report(common, tmp_path, monkeypatch, capsys):
     from matplotlib.figure import Figure
 

@@ -54,6 +54,7 @@ def report(scenes):
     return evaluate_homography(find_scenes([scenes]), choose_detectors(kinds, [], []))
 
 
+@pytest.mark.slow
 def test_what_can_be_matched_is(report):
     for name in ("orb", "sift"):
         pairs = report.of(name)

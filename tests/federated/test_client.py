@@ -154,6 +154,7 @@ def test_codes_are_kept_to_those_of_the_run_s_first_weights(folder, start, tmp_p
     assert same(restarted.train(moved, 1, "run", chosen).weights, later)
 
 
+@pytest.mark.slow
 def test_a_robot_that_cannot_keep_the_first_weights_says_so(folder, start, tmp_path):
     robot(folder, tmp_path).train(start, 0, "run", settings(compatible=1.0))
     (former,) = tmp_path.glob("former-*.npz")

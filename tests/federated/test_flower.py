@@ -80,6 +80,7 @@ def options(program):
     return subprocess.run(command, env=flower.QUIET, capture_output=True, text=True, check=True).stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("secure", [False, True])
 def test_the_daemons_know_the_options_that_they_are_given(secure):
     files = Certificates(Path("ca.crt"), Path("own.crt"), Path("own.key")) if secure else None

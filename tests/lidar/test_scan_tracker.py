@@ -68,6 +68,7 @@ def test_a_slip_is_recovered(truth, odometry, slip):
     assert np.rad2deg(turn[201:].max()) < 0.5
 
 
+@pytest.mark.slow
 def test_without_returns_poses_follow_odometry(truth, odometry):
     scans = [replace(s, ranges_m=frozen(np.full(360, np.nan), np.float32)) for s in recording(truth, odometry, ring())]
     poses, _ = track(scans)

@@ -172,6 +172,7 @@ def test_single_beams_do_not_widen_a_chart():
     assert lost.bounds()[1][0] == pytest.approx(12.0 + RAY_M)
 
 
+@pytest.mark.slow
 def test_maps_of_nothing_are_still_a_figure(tmp_path):
     nothing = LabelledGrid(np.zeros((1, 1), np.bool_), np.zeros((1, 1), np.bool_), SIDE_M, np.zeros(3))
     stands = Chart(nothing, {"a": np.zeros((1, 3))})
@@ -247,6 +248,7 @@ def test_what_is_missing_is_told(run_folder):
         fleet_charts(run_folder)
 
 
+@pytest.mark.slow
 def test_the_command_draws_it(run_folder):
     drawn = run_folder.parent / "figure.png"
     assert main(["evaluate", "fleet", str(run_folder), "--figure", str(drawn)]) == 0

@@ -164,6 +164,7 @@ def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone
     assert list(cloud.stored) == [(0, k) for k in range(len(sent))]
 
 
+@pytest.mark.slow
 def test_a_refused_packet_is_kept_with_its_reason(scans, alone, tmp_path):
     place = next(packet for packet in alone if isinstance(packet.body, Place))
     cloud = FakeCloud(unwanted={content(encode(place))})
@@ -174,6 +175,7 @@ def test_a_refused_packet_is_kept_with_its_reason(scans, alone, tmp_path):
     assert len(cloud.stored) == len(alone) - 1
 
 
+@pytest.mark.slow
 def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
     place = next(packet for packet in alone if isinstance(packet.body, Place))
     cloud = FakeCloud(unwanted={content(encode(place))})
