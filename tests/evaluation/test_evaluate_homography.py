@@ -19,6 +19,8 @@ from fcslam.metrics.framing import HomographyGroundTruth, framed_homography
 from fcslam.metrics.homography import warp
 from tests.features.networks import tiny_network
 
+pytestmark = pytest.mark.slow
+
 TURN = np.array([[0.96, -0.12, 40.0], [0.10, 0.98, -15.0], [4e-5, 2e-5, 1.0]])
 
 

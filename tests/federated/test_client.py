@@ -20,6 +20,8 @@ from fcslam.learning.arrays import read_arrays, write_arrays  # noqa: E402
 from fcslam.learning.local_training import network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 TINY = {"rounds": 2, "local_steps": 2, "training": {"pairs": 1, "side_px": 64, "points": 32, "label_copies": 1}}
 
 

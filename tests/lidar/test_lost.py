@@ -11,6 +11,8 @@ from fcslam.lidar.mapper import LidarConfig, Mapper
 from fcslam.records import frozen
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
+pytestmark = pytest.mark.slow
+
 CONFIG = LostConfig()
 
 

@@ -13,6 +13,8 @@ from fcslam.wire.packets import encode
 from tests import small_fleet
 from tests.robot.kidnapping import drives, kidnapping
 
+pytestmark = pytest.mark.slow
+
 LIDAR = (Channel.LIDAR,)
 ROBOT = RobotConfig(channels=LIDAR)
 BLIND = RobotConfig(channels=LIDAR, lost=LostConfig(doubted=0.0))

@@ -20,6 +20,8 @@ from tests.features.networks import tiny_network
 from tests.robot.test_views import records_of
 from tests.small_fleet import fingerprint
 
+pytestmark = pytest.mark.slow
+
 WITH_ORB = RobotConfig(channels=(Channel.CAMERA,), views=ViewsConfig(detector=DetectorKind.ORB))
 WITH_NETWORK = RobotConfig(channels=(Channel.CAMERA,))
 SHIPPED = describe_detector_file(BUNDLED_NETWORK)
