@@ -42,7 +42,7 @@ class Cloud:
         refusal = None
         for ready in self._log.ready(number.session):
             try:
-                self.fleet.apply(packet if ready == number else self._read(ready))
+                self.fleet.apply(packet if self._packets[ready][1] is data else self._read(ready))
             except PacketError as error:
                 self._log.refuse(ready)
                 del self._packets[ready]
