@@ -19,11 +19,13 @@ from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 COLUMNS = {"building": "", "cameras": "", "floor, m2": ".0f", "rooms": "", "driven, s": ".0f", "scans": ",",
            "images": ",", "wall, s": ".1f", "CPU, s": ".1f", "x real time": ".1f", "if alone": ".1f",
            "peak, MB": ".0f"}  # fmt: skip
+INDOORS = [building for building in Building if building is not Building.YARD]
+"""Kinds of building that have cameras."""
 
 
 def main() -> None:
     parser = common.options(__doc__)
-    parser.add_argument("--buildings", nargs="+", type=Building, default=list(Building), help="kinds of building")
+    parser.add_argument("--buildings", nargs="+", type=Building, default=INDOORS, help="kinds of building")
     parser.add_argument("--seed", type=int, default=1, help="of the buildings")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)

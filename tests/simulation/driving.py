@@ -2,7 +2,10 @@
 
 import numpy as np
 
+from fcslam.simulation.options import Building
 from fcslam.simulation.route import draw_goals, plan_route
+
+INDOORS = [building for building in Building if building is not Building.YARD]
 
 
 def route(plan, length_m, rng):

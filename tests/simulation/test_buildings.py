@@ -11,9 +11,9 @@ from fcslam.simulation.floorplan import DOOR_M, PieceKind, draw_floor_plan, move
 from fcslam.simulation.lighting import light_of
 from fcslam.simulation.options import Building, Lighting
 from fcslam.simulation.route import drive, schedule
-from tests.simulation.driving import distances, route
+from tests.simulation.driving import INDOORS, distances, route
 
-every_building = pytest.mark.parametrize("building", Building)
+every_building = pytest.mark.parametrize("building", INDOORS)
 
 
 @every_building

@@ -1,5 +1,6 @@
 """`fcslam simulate`: recordings of a fleet that drives in a simulated building."""
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -11,7 +12,7 @@ import typer
 
 from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
-from fcslam.simulation.options import Building, Lighting
+from fcslam.simulation.options import Building, Lighting, OdometryKind
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,8 +39,23 @@ def simulate(
         ),
     ] = None,
     moved_furniture: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Share of the furniture that moves between the drives of robots.")
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="Share of the furniture, or in a yard of the cars, that moves between drives.",
+        ),
     ] = 0.0,
+    lidar_range: Annotated[
+        float | None,
+        typer.Option(min=1.0, max=500.0, help="Range of the LiDARs, in metres.", show_default="12; in a yard 30"),
+    ] = None,
+    lidar_rate: Annotated[float, typer.Option(min=0.1, max=100.0, help="Scans of a LiDAR per second.")] = 10.0,
+    beams: Annotated[int, typer.Option(min=8, max=10_000, help="Beams of a scan.")] = 360,
+    field_of_view: Annotated[
+        float, typer.Option(min=10.0, max=360.0, help="Angle that a scan covers, in degrees, centred ahead.")
+    ] = 360.0,
+    odometry: Annotated[OdometryKind, typer.Option(help="Kind of wheel odometry.")] = OdometryKind.DEFAULT,
     no_camera: NoCamera = False,
     bag: Annotated[bool, typer.Option("--bag", help="Also write a ROS 2 bag (.mcap) of each robot.")] = False,
     resume: Annotated[
@@ -49,6 +65,8 @@ def simulate(
 ) -> None:
     """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
     from fcslam.errors import OutputError
+    from fcslam.simulation.noise import LidarSettings
+    from fcslam.simulation.odometry import KINDS
     from fcslam.simulation.recording import prepare_fleet_folder
     from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 
@@ -60,6 +78,13 @@ def simulate(
         path_length_m=path_length,
         lighting=tuple(lighting or (Lighting.DAY,)),
         moved_furniture=moved_furniture,
+        lidar=LidarSettings(
+            beams=beams,
+            field_of_view_rad=math.radians(field_of_view),
+            max_range_m=lidar_range or (30.0 if building is Building.YARD else 12.0),
+            rate_hz=lidar_rate,
+        ),
+        drift=KINDS[odometry],
         camera=None if no_camera else CameraSettings(),
     )
     fleet = simulate_fleet(settings, seed)

@@ -14,6 +14,7 @@ import numpy as np
 from fcslam.records import FloatArray, frozen
 from fcslam.simulation.layouts import Lane, Layout, Row, draw_layout
 from fcslam.simulation.options import Building
+from fcslam.simulation.terrain import Terrain
 
 WALL_M = 0.12
 """Thickness of a wall."""
@@ -36,15 +37,27 @@ class PieceKind(StrEnum):
     COLUMN = "column"
     LINTEL = "lintel"
     """The wall above a door; robots and LiDAR beams pass under it."""
+    GLASS = "glass"
+    TRUNK = "trunk"
+    BOLLARD = "bollard"
+    HEDGE = "hedge"
+    """A bush; hedges are rows of them."""
+    FENCE = "fence"
+    LOW_WALL = "low wall"
+    CAR = "car"
+
+
+ROUND = frozenset({PieceKind.COLUMN, PieceKind.TRUNK, PieceKind.BOLLARD, PieceKind.HEDGE})
+"""Kinds of pieces that are discs, with eight corners on their edge."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A wall or a piece of furniture, seen from above."""
+    """A wall, a piece of furniture or something that stands in a yard, seen from above."""
 
     kind: PieceKind
     outline: FloatArray
-    """Corners counter-clockwise, metres: (4, 2) of a rectangle, (8, 2) of a column."""
+    """Corners counter-clockwise, metres: (8, 2) of a round kind, else (4, 2) of a rectangle or (K, 2) of a car."""
 
     @property
     def centre(self) -> FloatArray:
@@ -53,8 +66,8 @@ class Piece:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Length and width, metres; for a column the diameter twice."""
-        if self.kind is PieceKind.COLUMN:
+        """Length and width, metres; for round kinds the diameter twice."""
+        if self.kind in ROUND:
             diameter = float(np.linalg.norm(self.outline[4] - self.outline[0]))
             return diameter, diameter
         sides = np.linalg.norm(np.diff(self.outline[:3], axis=0), axis=1)
@@ -83,7 +96,7 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
-    """Obstacles, corridors and rooms of one floor."""
+    """Obstacles, corridors and rooms of one floor; or a yard, which has ways and no rooms."""
 
     size_m: tuple[float, float]
     """From west to east and from south to north."""
@@ -91,8 +104,10 @@ class FloorPlan:
     segments: FloatArray
     """Sides of walls and furniture at the laser's height: x1 y1 x2 y2, shape (S, 4)."""
     lanes: tuple[Lane, ...]
-    """Centre lines of the corridors."""
+    """Centre lines of the corridors, or of a yard's ways, which meet at their ends."""
     rooms: tuple[Room, ...]
+    terrain: Terrain | None = None
+    """The ground of a yard; None for a building, whose floor is level."""
 
     @property
     def floor_m2(self) -> float:
@@ -117,7 +132,7 @@ def build(layout: Layout, rng: np.random.Generator) -> FloorPlan:
         rooms += row_rooms
     pieces += _corridor_cabinets(layout, [(room.doorway, room.inside) for room in rooms], rng)
     size_m = (layout.width, layout.height)
-    return FloorPlan(size_m, tuple(pieces), _segments(pieces), layout.lanes, tuple(rooms))
+    return FloorPlan(size_m, tuple(pieces), segments_of(pieces), layout.lanes, tuple(rooms))
 
 
 def move_furniture(plan: FloorPlan, share: float, rng: np.random.Generator) -> FloorPlan:
@@ -129,16 +144,16 @@ def move_furniture(plan: FloorPlan, share: float, rng: np.random.Generator) -> F
         _moved(piece, room, rng) if (room := _room_of(piece, plan)) and rng.random() < share else piece
         for piece in plan.pieces
     ]
-    return replace(plan, pieces=tuple(moved), segments=_segments(moved))
+    return replace(plan, pieces=tuple(moved), segments=segments_of(moved))
 
 
 def _moved(piece: Piece, room: Room, rng: np.random.Generator) -> Piece:
     centre, margin = piece.centre, 0.5 * float(np.hypot(*piece.size))
     for _ in range(_ATTEMPTS):
         place = centre + rng.normal(0.0, _SHIFT_M, 2)
-        turned = (piece.outline - centre) @ _rotation(rng.normal(0.0, _TURN_RAD))
+        turned = (piece.outline - centre) @ rotation(rng.normal(0.0, _TURN_RAD))
         fits = np.all(place > room.low + margin) and np.all(place < room.high - margin)
-        if fits and _distance(place, (room.doorway, room.inside)) > CLEARANCE_M + margin:
+        if fits and distance_m(place, (room.doorway, room.inside)) > CLEARANCE_M + margin:
             return Piece(piece.kind, frozen(turned + place))
     return piece
 
@@ -184,10 +199,10 @@ def _furniture(room: Room, rng: np.random.Generator) -> list[Piece]:
         size = rng.uniform((0.4, 0.3), (1.6, 0.8))
         margin = 0.5 * float(np.hypot(*size))
         column = rng.random() < 0.25
-        outline = _column(size[1] / 2.0) if column else _rectangle(size, rng.normal(0.0, 0.15))
+        outline = disc(size[1] / 2.0) if column else rectangle(size, rng.normal(0.0, 0.15))
         for _ in range(_ATTEMPTS):
             centre = rng.uniform(room.low + margin, room.high - margin)
-            if _distance(centre, path) > CLEARANCE_M + margin:
+            if distance_m(centre, path) > CLEARANCE_M + margin:
                 pieces.append(Piece(PieceKind.COLUMN if column else PieceKind.CABINET, frozen(outline + centre)))
                 break
     return pieces
@@ -204,13 +219,13 @@ def _corridor_cabinets(layout: Layout, paths: list[Lane], rng: np.random.Generat
         aside = rng.choice((-1.0, 1.0)) * (layout.corridor - WALL_M - depth) / 2.0
         centre = start + rng.uniform(0.15, 0.85) * (end - start) + aside * np.array([-along[1], along[0]])
         ways = [*paths, *(other for k, other in enumerate(layout.lanes) if k != lane)]
-        if all(_distance(centre, way) > CLEARANCE_M + length / 2.0 for way in ways):
-            outline = _rectangle((length, depth), float(np.arctan2(along[1], along[0]))) + centre
+        if all(distance_m(centre, way) > CLEARANCE_M + length / 2.0 for way in ways):
+            outline = rectangle((length, depth), float(np.arctan2(along[1], along[0]))) + centre
             pieces.append(Piece(PieceKind.CABINET, frozen(outline)))
     return pieces
 
 
-def _segments(pieces: Sequence[Piece]) -> FloatArray:
+def segments_of(pieces: Sequence[Piece]) -> FloatArray:
     """Sides of all pieces at the laser's height, shape (S, 4)."""
     return frozen(np.concatenate([_sides(piece.outline) for piece in pieces if piece.kind is not PieceKind.LINTEL]))
 
@@ -228,20 +243,20 @@ def _wall(x1: float, y1: float, x2: float, y2: float) -> FloatArray:
     )
 
 
-def _rectangle(size: Sequence[float] | FloatArray, heading_rad: float) -> FloatArray:
+def rectangle(size: Sequence[float] | FloatArray, heading_rad: float) -> FloatArray:
     """Outline of a rectangle around the origin, shape (4, 2)."""
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * np.asarray(size)
-    return np.asarray(corners @ _rotation(heading_rad))
+    return np.asarray(corners @ rotation(heading_rad))
 
 
-def _rotation(heading_rad: float) -> FloatArray:
+def rotation(heading_rad: float) -> FloatArray:
     """Rotation matrix (2, 2) to multiply points (N, 2) by from the right."""
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     return np.array([[cos, sin], [-sin, cos]])
 
 
-def _column(radius: float) -> FloatArray:
-    """Outline of an octagonal column around the origin, shape (8, 2)."""
+def disc(radius: float) -> FloatArray:
+    """Outline of a round piece around the origin, shape (8, 2)."""
     angles = np.arange(8) * np.pi / 4.0
     return radius * np.column_stack((np.cos(angles), np.sin(angles)))
 
@@ -251,7 +266,7 @@ def _sides(outline: FloatArray) -> FloatArray:
     return np.hstack((outline, np.roll(outline, -1, axis=0)))
 
 
-def _distance(point: FloatArray, path: Lane) -> float:
+def distance_m(point: FloatArray, path: Lane) -> float:
     """Distance of a point from the segment between two others."""
     start, end = path
     along = end - start

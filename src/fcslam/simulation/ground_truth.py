@@ -10,9 +10,7 @@ from fcslam.geometry import se2
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
 from fcslam.records import FloatArray, LaserModel, frozen
 from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
-from fcslam.simulation.scene import bare_model
-from fcslam.simulation.sensors import RayCaster
-from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot
+from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, ray_caster
 from fcslam.storage.files import write_file
 
 RESOLUTION_M = 0.05
@@ -93,7 +91,7 @@ def true_map(fleet: SimulatedFleet) -> OccupancyMap:
 def _draw_beams(robot: SimulatedRobot, passed: Cells, hit: Cells) -> None:
     import cv2
 
-    caster, laser = RayCaster(bare_model(robot.plan), robot.laser), robot.laser
+    caster, laser = ray_caster(robot.plan, robot.laser), robot.laser
     for pose in _spaced(robot.T_building_base):
         start, ends = _beams(caster.cast(pose), laser, pose)
         columns, rows = np.floor(ends).astype(int).T

@@ -6,6 +6,7 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.records import FloatArray
+from fcslam.simulation.options import OdometryKind
 
 
 class OdometryNoiseSettings(Settings):
@@ -34,6 +35,26 @@ class OdometryNoiseSettings(Settings):
     )
     slips_per_m: float = Field(default=0.0, ge=0.0, description="mean number of wheel slips per distance [1/m]")
     slip_m: float = Field(default=0.05, ge=0.0, description="mean distance that a wheel slip adds to the odometry [m]")
+    slip_limit_m: float | None = Field(
+        default=None, gt=0.0, description="largest distance that a wheel slip adds [m]; null for no limit"
+    )
+    slip_turn_rad: float = Field(
+        default=0.0, ge=0.0, description="largest turn that a wheel slip adds, to either side [rad]"
+    )
+
+
+KINDS = {
+    OdometryKind.DEFAULT: OdometryNoiseSettings(slips_per_m=0.05),
+    OdometryKind.GOOD: OdometryNoiseSettings(heading_noise_rad=0.003, veer_bias_rad_m=0.001, scale_bias=0.015),
+    OdometryKind.SLIPPING: OdometryNoiseSettings(
+        heading_noise_rad=0.006,
+        scale_bias=0.02,
+        slips_per_m=0.05,
+        slip_m=0.25,
+        slip_limit_m=0.7,
+        slip_turn_rad=0.1,
+    ),
+}
 
 
 def simulate_odometry(
@@ -61,7 +82,12 @@ def simulate_odometry(
     )
     if settings.slips_per_m:
         slips = rng.poisson(settings.slips_per_m * travel)
-        wrong[:, 0] += rng.exponential(settings.slip_m, len(travel)) * slips * np.sign(twists[:, 0])
+        slipped_m = rng.exponential(settings.slip_m, len(travel)) * slips
+        if settings.slip_limit_m is not None:
+            slipped_m = np.minimum(slipped_m, settings.slip_limit_m)
+        wrong[:, 0] += slipped_m * np.sign(twists[:, 0])
+        if settings.slip_turn_rad:
+            wrong[:, 2] += rng.uniform(-settings.slip_turn_rad, settings.slip_turn_rad, len(travel)) * (slips > 0)
     return _chain(se2.exp(wrong))
 
 

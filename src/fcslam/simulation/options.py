@@ -1,4 +1,4 @@
-"""Kinds of building and of lighting, for the command line. Imports no library, so that help is fast."""
+"""Kinds of building, odometry and lighting, for the command line. Imports no library, so that help is fast."""
 
 from enum import StrEnum
 
@@ -10,6 +10,19 @@ class Building(StrEnum):
     DEFAULT = "default"
     OFFICE = "office"
     CORRIDOR = "corridor"
+    YARD = "yard"
+    """Outdoors, between buildings."""
+
+
+class OdometryKind(StrEnum):
+    """Kinds of wheel odometry."""
+
+    DEFAULT = "default"
+    """A cheap indoor robot with small slips."""
+    GOOD = "good"
+    """Right to a few percent of the distance and about a degree in 10 m, without slips."""
+    SLIPPING = "slipping"
+    """Slips by up to 0.7 m between two scans."""
 
 
 class Lighting(StrEnum):

@@ -32,11 +32,14 @@ from fcslam.simulation.decoration import Decoration, decorate
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
 from fcslam.simulation.lighting import light_of
 from fcslam.simulation.noise import LidarSettings, simulate_ranges
-from fcslam.simulation.odometry import OdometryNoiseSettings, simulate_odometry
-from fcslam.simulation.options import Building, Lighting
+from fcslam.simulation.odometry import KINDS, OdometryNoiseSettings, simulate_odometry
+from fcslam.simulation.options import Building, Lighting, OdometryKind
+from fcslam.simulation.outdoor_rays import OutdoorRayCaster
 from fcslam.simulation.route import Schedule, draw_goals, plan_route, schedule
 from fcslam.simulation.scene import bare_model, furnished_model
 from fcslam.simulation.sensors import Camera, RayCaster
+from fcslam.simulation.walk import draw_starts, plan_walk
+from fcslam.simulation.yard import draw_yard, move_cars
 
 FIRST_STAMP = 1000.0
 STAMP_SHIFT_S = 0.001
@@ -75,7 +78,7 @@ class SimulationSettings(Settings):
     """A simulated fleet."""
 
     building: Building = Field(
-        default=Building.DEFAULT, description="kind of building: flat, default, office or corridor"
+        default=Building.DEFAULT, description="kind of building: flat, default, office, corridor or yard"
     )
     robots: int = Field(default=3, ge=1, description="number of robots")
     path_length_m: float = Field(default=60.0, gt=0.0, description="length of each robot's path [m]")
@@ -86,10 +89,11 @@ class SimulationSettings(Settings):
         default=0.0,
         ge=0.0,
         le=1.0,
-        description="share of the furniture in rooms that moves before the second and each further robot",
+        description="share of the furniture in rooms that moves before the second and each further robot; "
+        "in a yard, share of the parked cars that drive away",
     )
     lidar: LidarSettings = LidarSettings(rate_hz=10.0)
-    drift: OdometryNoiseSettings = OdometryNoiseSettings(slips_per_m=0.05)
+    drift: OdometryNoiseSettings = KINDS[OdometryKind.DEFAULT]
     camera: CameraSettings | None = CameraSettings()
 
 
@@ -151,10 +155,11 @@ class SimulatedRobot:
         Raises:
             SimulationError: MuJoCo is missing.
         """
-        caster = RayCaster(bare_model(self.plan), self.laser)
+        caster = ray_caster(self.plan, self.laser)
         for k in range(first, len(self.stamps)):
-            rng = self._generator(_RandomStream.SCANS, k)
-            ranges = simulate_ranges(caster.cast(self.T_building_base[k]), self.laser, self.settings.lidar, rng)
+            rng, pose = self._generator(_RandomStream.SCANS, k), self.T_building_base[k]
+            met = caster.scan(pose, rng) if isinstance(caster, OutdoorRayCaster) else caster.cast(pose)
+            ranges = simulate_ranges(met, self.laser, self.settings.lidar, rng)
             yield LaserScan(float(self.stamps[k]), frozen(ranges, np.float32), self.laser, self.T_odom_base[k])
 
     def _images(self, first: int) -> Generator[CameraImage, None, None]:
@@ -209,9 +214,16 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
     Raises:
         SimulationError: the building is too small for this many robots, or has too little free space.
     """
-    plan = draw_floor_plan(_generator(seed, _RandomStream.BUILDING), settings.building)
+    outdoors = settings.building is Building.YARD
+    if outdoors and settings.camera:
+        raise SimulationError("a yard is simulated for LiDARs only; leave the cameras off (--no-camera)")
+    building, goals_rng = _generator(seed, _RandomStream.BUILDING), _generator(seed, _RandomStream.GOALS)
+    plan = draw_yard(building) if outdoors else draw_floor_plan(building, settings.building)
     _check_room(plan, settings)
-    goals = draw_goals(plan, settings.robots, settings.path_length_m, _generator(seed, _RandomStream.GOALS))
+    if outdoors:
+        goals = draw_starts(plan, settings.robots, goals_rng)
+    else:
+        goals = draw_goals(plan, settings.robots, settings.path_length_m, goals_rng)
     decoration = decorate(plan, _generator(seed, _RandomStream.LOOKS)) if settings.camera else None
     robots = (_robot(plan, decoration, number, goals[number], settings, seed) for number in range(settings.robots))
     return SimulatedFleet(plan, tuple(robots))
@@ -236,16 +248,17 @@ def _robot(
     seed: int,
 ) -> SimulatedRobot:
     rng = _generator(seed, _RandomStream.ROBOTS, number)
+    move, find_way = (move_furniture, plan_route) if plan.terrain is None else (move_cars, plan_walk)
     if number:
-        plan = move_furniture(plan, settings.moved_furniture, rng)
-    route = schedule(plan_route(plan, goals, settings.path_length_m, rng))
+        plan = move(plan, settings.moved_furniture, rng)
+    route = schedule(find_way(plan, goals, settings.path_length_m, rng))
     times = np.arange(0.0, route.duration_s, 1.0 / settings.lidar.rate_hz)
     poses, lidar, camera = route.at(times), settings.lidar, settings.camera
     first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
     image_times = np.arange(IMAGE_DELAY_S, times[-1], 1.0 / camera.rate_hz) if camera else np.empty(0)
     return SimulatedRobot(
         name=f"robot_{number + 1}",
-        laser=LaserModel(lidar.beams, -np.pi, 2.0 * np.pi / lidar.beams, lidar.max_range_m, _T_BASE_LASER),
+        laser=lidar.model(_T_BASE_LASER),
         camera=camera.model() if camera else None,
         stamps=frozen(np.round(first_stamp + times, 6)),
         T_building_base=frozen(poses),
@@ -260,6 +273,15 @@ def _robot(
         seed=seed,
         number=number,
     )
+
+
+def ray_caster(plan: FloorPlan, laser: LaserModel) -> RayCaster | OutdoorRayCaster:
+    """What casts the beams of a laser in a building or in a yard.
+
+    Raises:
+        SimulationError: MuJoCo is missing, which buildings need.
+    """
+    return RayCaster(bare_model(plan), laser) if plan.terrain is None else OutdoorRayCaster(plan, laser)
 
 
 def _between(stamps: FloatArray, known: FloatArray, poses: FloatArray) -> FloatArray:
