@@ -80,7 +80,7 @@ def verified_pairs(run: Run) -> list[tuple]:
     rows = []
     for names, closures in sorted(pairs.items()):
         accepted = sum(c.status.value == "accepted" for c in closures)
-        reasons = sorted({c.reason for c in closures if c.status.value != "accepted"})
+        reasons = sorted({str(c.reason) for c in closures if c.status.value != "accepted"})
         rows.append((*names, len(closures), accepted, "; ".join(reasons)))
     return rows
 

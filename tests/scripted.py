@@ -18,6 +18,8 @@ from fcslam.records import (
     KeyscanId,
     LaserModel,
     Place,
+    Reason,
+    ReasonCode,
     frozen,
 )
 from fcslam.wire.messages import Body, Hello, Packet
@@ -64,7 +66,10 @@ class ScriptedMatcher:
 
 def verified(line: Script) -> Verification:
     worse = Agreement(0.9, 0.0, 600, 0.9, np.eye(2) * 100.0)
-    return Verification(frozen(line.T_i_j), CLOSURE_INFORMATION, worse, True, True, True, line.informative, "")
+    passed = Reason(ReasonCode.VERIFIED)
+    return Verification(
+        frozen(line.T_i_j), CLOSURE_INFORMATION, worse, True, True, True, line.informative, passed, passed
+    )
 
 
 def rectangle(count: int = 61, step_m: float = 1.0) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 
 from fcslam.errors import ConfigError, EvaluationError, OutputError
 from fcslam.geometry import se2
-from fcslam.records import Channel, ClosureStatus
+from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import (
     ClosureRow,
     LocalMap,
@@ -35,7 +35,7 @@ def trajectory(robot="robot_1", map_index=0, count=40, seed=0):
 def run():
     closure = ClosureRow(
         "robot_1", 976052857.33753, "b-2", 976052999.5, Channel.LIDAR, 0.25, np.array([1.0, -2.5, 3.0]),
-        ClosureStatus.REJECTED, 'outside the cluster, "3 of 7"',
+        ClosureStatus.REJECTED, Reason(ReasonCode.FEW_PLACES, 2, 3.5, 'of, "which"'),
     )  # fmt: skip
     trajectories = (trajectory(), trajectory("b-2", 1, count=1, seed=1), trajectory("étage.0", 2, count=0))
     return Run(
@@ -91,7 +91,9 @@ def test_tables_have_the_columns_promised(tmp_path, run):
     assert robots[0] == "robot,map,path_length_m,scans"
     assert robots[2] == "b-2,1,0.000,1"
     closures = (tmp_path / "run" / "closures.csv").read_text().splitlines()
-    assert closures[0] == "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason"
+    assert (
+        closures[0] == "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason,value,limit,setting"
+    )
     line = (tmp_path / "run" / "trajectories" / "robot_1.tum").read_text().splitlines()[0].split()
     assert line[3:6] == ["0", "0", "0"]
     assert [len(line[i].split(".")[1]) for i in (0, 1, 2, 6, 7)] == [9] * 5

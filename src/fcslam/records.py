@@ -5,7 +5,7 @@ REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recor
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple, TypeVar
 
@@ -215,6 +215,79 @@ class ClosureStatus(StrEnum):
     REVOKED = "revoked"
 
 
+class ReasonCode(StrEnum):
+    """Why a closure has its status; the text of ``Reason`` explains each."""
+
+    FOUND_BY_ROBOT = "found_by_robot"
+    VERIFIED = "verified"
+    FITS_JOINT_MAP = "fits_joint_map"
+    IN_CLUSTER = "in_dominant_cluster"
+    FITS_JOINT_GRAPH = "fits_joint_graph"
+    MATCHED_POINT = "matched_point"
+    NOT_ENOUGH_EXPLAINED = "not_enough_explained"
+    IN_FREE_SPACE = "in_free_space"
+    FEW_POINTS = "few_points"
+    LITTLE_OVERLAP = "little_overlap"
+    ASYMMETRIC = "asymmetric_alignment"
+    ONE_DIRECTION = "fixed_in_one_direction"
+    NOT_INFORMATIVE = "no_informative_closure"
+    FEW_PLACES = "few_separate_places"
+    NO_LEAD = "no_clear_lead"
+    RIVAL_PLACES = "rival_has_more_places"
+    OUTSIDE_CLUSTER = "outside_dominant_cluster"
+    CONTRADICTS_JOINT_GRAPH = "contradicts_joint_graph"
+    VETOED = "vetoed"
+    UNUSED = "not_needed_by_rigid_fusion"
+
+
+_REASON_TEXT = {
+    ReasonCode.FOUND_BY_ROBOT: "found by the robot",
+    ReasonCode.VERIFIED: "passes the geometric verification",
+    ReasonCode.FITS_JOINT_MAP: "fits the joint map: {value} m off, less than {limit}",
+    ReasonCode.IN_CLUSTER: "in the dominant cluster of {value} closures",
+    ReasonCode.FITS_JOINT_GRAPH: "fits the joint graph",
+    ReasonCode.MATCHED_POINT: "one of {value} matched points of the rigid fusion",
+    ReasonCode.NOT_ENOUGH_EXPLAINED: "a share of {value} of the points lies on a surface, {limit} needed",
+    ReasonCode.IN_FREE_SPACE: "a share of {value} of the points lies in free space, {limit} allowed",
+    ReasonCode.FEW_POINTS: "{value} points lie on a surface, {limit} needed",
+    ReasonCode.LITTLE_OVERLAP: "a share of {value} of the points lies in known area, {limit} needed",
+    ReasonCode.ASYMMETRIC: "the alignments of both directions differ by {value}, less than {limit} needed",
+    ReasonCode.ONE_DIRECTION: "fixed in one direction only, as in a corridor: eigenvalue {value}, {limit} needed",
+    ReasonCode.NOT_INFORMATIVE: "none of the {value} consistent closures fixes the position in every direction",
+    ReasonCode.FEW_PLACES: "they agree from {value} separate places, {limit} needed",
+    ReasonCode.NO_LEAD: "{value} times as many closures agree as contradict them, {limit} times needed",
+    ReasonCode.RIVAL_PLACES: "closures from {value} separate places agree, but others from {limit} contradict them",
+    ReasonCode.OUTSIDE_CLUSTER: "outside the dominant cluster",
+    ReasonCode.CONTRADICTS_JOINT_GRAPH: "contradicts the joint graph",
+    ReasonCode.VETOED: "vetoed by hand",
+    ReasonCode.UNUSED: "not needed by the rigid fusion",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a closure has its status: a code, and the measured value, its limit and the setting behind the limit."""
+
+    code: ReasonCode
+    value: float | None = None
+    limit: float | None = None
+    setting: str = ""
+    """Dotted name of the setting that holds the limit, as in a configuration file; empty without one."""
+
+    def under(self, section: str) -> "Reason":
+        """The same reason; ``section`` of the configuration contains the setting."""
+        return replace(self, setting=f"{section}.{self.setting}") if self.setting else self
+
+    def __str__(self) -> str:
+        """One clause, with the setting in brackets."""
+        text = _REASON_TEXT[self.code].format(value=_short(self.value), limit=_short(self.limit))
+        return f"{text} ({self.setting})" if self.setting else text
+
+
+def _short(number: float | None) -> str:
+    return "-" if number is None else f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
+
+
 @dataclass(frozen=True, slots=True)
 class LoopClosure:
     """The claim that two keyscans saw the same place."""
@@ -227,7 +300,7 @@ class LoopClosure:
     T_i_j: FloatArray
     information: FloatArray
     status: ClosureStatus
-    reason: str
+    reason: Reason
     informative: bool = True
     """Whether the match constrains the pose in every direction (a bare corridor does not)."""
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from fcslam import __version__, cli
 from fcslam.cli import main
 from fcslam.config import Settings
-from fcslam.records import Channel, ClosureStatus
+from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, RobotTrajectory, Run, open_run
 
 
@@ -75,7 +75,7 @@ def test_closures_tables(run_and_relations, capsys, tmp_path):
     run, relations = run_and_relations
     ends = ("r0", 0.0, "r1", 100.0)
     closures = [
-        ClosureRow(*ends, Channel.LIDAR, 0.5, np.array([x, 0.0, 0.0]), status, "")
+        ClosureRow(*ends, Channel.LIDAR, 0.5, np.array([x, 0.0, 0.0]), status, Reason(ReasonCode.VERIFIED))
         for x, status in ((1.0, ClosureStatus.ACCEPTED), (2.0, ClosureStatus.REVOKED))
     ]
     Run(open_run(Path(run)).trajectories, tuple(closures)).save(Path(run), force=True)

@@ -11,7 +11,7 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import Channel, ClosureStatus, LoopClosure, frozen
+from fcslam.records import Channel, ClosureStatus, LoopClosure, Reason, ReasonCode, frozen
 from tests.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, verified
 
 POSES = rectangle(31)
@@ -21,7 +21,14 @@ T_A_B = np.array([3.0, -2.0, 1.1])
 
 def entry(i, j, T_i_j, information=CLOSURE_INFORMATION):
     closure = LoopClosure(
-        i, j, Channel.LIDAR, 0.5, frozen(T_i_j), frozen(information), ClosureStatus.VERIFIED, "", informative=True
+        i,
+        j,
+        Channel.LIDAR,
+        0.5,
+        frozen(T_i_j),
+        frozen(information),
+        ClosureStatus.VERIFIED,
+        Reason(ReasonCode.VERIFIED),
     )
     return ClosureEntry(closure, independent=True)
 

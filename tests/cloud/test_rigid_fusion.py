@@ -13,7 +13,7 @@ from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import Channel, ClosureStatus, Veto
+from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, Veto
 from tests import small_fleet
 from tests.scripted import ALIAS, closures, rectangle, stream, verified
 from tests.small_fleet import feed, fingerprint, in_order, map_of
@@ -104,7 +104,7 @@ def test_two_points_of_each_further_robot_are_used(results):
     """Three robots in one map are two relations."""
     used = between(results[FusionStrategy.TWO_POINT], ClosureStatus.ACCEPTED)
     assert len(used) == 4
-    assert {c.reason for c in used} == {"one of 2 matched points of two_point"}
+    assert {c.reason for c in used} == {Reason(ReasonCode.MATCHED_POINT, 2)}
     every = between(results[FusionStrategy.N_POINT], ClosureStatus.ACCEPTED)
     assert len(every) > len(used)
     assert {(c.i, c.j) for c in used} <= {(c.i, c.j) for c in every}
@@ -144,7 +144,7 @@ def test_true_matches_of_robots_without_drift_leave_no_error(scripted, strategy)
     assert error_m(result) < 1e-3
     used = between(result, ClosureStatus.ACCEPTED)
     assert len(used) == (2 if strategy is FusionStrategy.TWO_POINT else len(MEETINGS))
-    assert {c.reason for c in between(result, ClosureStatus.VERIFIED)} <= {"not needed by two_point"}
+    assert {c.reason for c in between(result, ClosureStatus.VERIFIED)} <= {Reason(ReasonCode.UNUSED)}
 
 
 @pytest.mark.slow
@@ -163,7 +163,7 @@ def test_a_veto_takes_a_match_away(scripted, strategy):
     result = feed(cloud, two_robots()).finalize()
     assert map_of(result) == {"a": 0, "b": 1}
     (revoked,) = between(result, ClosureStatus.REVOKED)
-    assert revoked.reason == "vetoed by hand"
+    assert revoked.reason.code is ReasonCode.VETOED
 
 
 @pytest.mark.slow

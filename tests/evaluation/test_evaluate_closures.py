@@ -15,7 +15,7 @@ from fcslam.evaluation.fleet.relations import pose_table, write_metrics
 from fcslam.geometry import se2
 from fcslam.metrics.closures import ClosureCriteria
 from fcslam.metrics.relations import Relations, write_relations
-from fcslam.records import Channel, ClosureStatus, frozen
+from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, RobotTrajectory, Run
 
 CRITERIA = ClosureCriteria()
@@ -41,7 +41,7 @@ def closure(i, j, status, off=(0.0, 0.0, 0.0)):
     """Between (robot, step) i and j."""
     T_i_j = se2.compose(se2.between(truth(i[1]), truth(j[1])), off)
     ends = (f"r{i[0]}", float(stamp(*i)), f"r{j[0]}", float(stamp(*j)))
-    return ClosureRow(*ends, Channel.LIDAR, 0.5, frozen(T_i_j), status, "because")
+    return ClosureRow(*ends, Channel.LIDAR, 0.5, frozen(T_i_j), status, Reason(ReasonCode.VERIFIED))
 
 
 def write(folder, closures):
@@ -202,8 +202,10 @@ def test_robots_of_one_clock_are_told_apart_by_name():
     stamps = np.arange(5.0)
     poses = np.zeros((5, 3))
     both = {robot: RobotTrajectory(robot, 0, stamps, poses) for robot in "ab"}
-    rows = [ClosureRow("a", 1.0, "b", 1.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, "")]
-    rows += [ClosureRow("nobody", 1.0, "b", 9.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, "")]
+    rows = [ClosureRow("a", 1.0, "b", 1.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, Reason(ReasonCode.VERIFIED))]
+    rows += [
+        ClosureRow("nobody", 1.0, "b", 9.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, Reason(ReasonCode.VERIFIED))
+    ]
     run = Run(both, tuple(rows))
     table = pose_table(run)
     found = closure_rows(run, table)

@@ -13,7 +13,7 @@ from fcslam.evaluation.fleet.ground_truth import read_grid
 from fcslam.evaluation.fleet.metrics import fleet_metrics
 from fcslam.evaluation.fleet.report import evaluate_fleet
 from fcslam.geometry import se2
-from fcslam.records import Channel, ClosureStatus, frozen
+from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
 
 STEPS = 151
@@ -42,7 +42,7 @@ def closure(i, j, status, channel=LIDAR, off=(0.0, 0.0, 0.0), similarity=0.5):
     """Between (robot, step) i and j."""
     T_i_j = se2.compose(se2.between(truth(i[0])[i[1]], truth(j[0])[j[1]]), off)
     ends = (f"r{i[0]}", float(stamps(i[0])[i[1]]), f"r{j[0]}", float(stamps(j[0])[j[1]]))
-    return ClosureRow(*ends, channel, similarity, frozen(T_i_j), status, "because")
+    return ClosureRow(*ends, channel, similarity, frozen(T_i_j), status, Reason(ReasonCode.VERIFIED))
 
 
 def map_files(stem, occupied, free, origin):

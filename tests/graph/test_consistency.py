@@ -16,6 +16,7 @@ from fcslam.graph.consistency import (
     pairwise_consistency,
 )
 from fcslam.graph.trajectory import Trajectory, build_trajectory
+from fcslam.records import Reason, ReasonCode
 from tests.graph.graph_worlds import INFORMATION, manhattan, measured, walk
 
 SETTINGS = ConsistencySettings(position_drift_m=0.03, heading_drift_rad=0.01)
@@ -85,7 +86,8 @@ def test_the_cluster_is_the_true_closures(seed: int) -> None:
 def test_an_alias_group_of_like_size_forbids_a_verdict() -> None:
     verdict = verdict_of(0, true=12, false=10, aliases=12)
     assert not verdict.dominant
-    assert "disagree" in verdict.reason
+    assert verdict.shortfall is not None
+    assert verdict.shortfall.code is ReasonCode.NO_LEAD
     assert not set(verdict.members) & set(verdict.runner_up)
     groups = {
         tuple(sorted({0 if k < 12 else 2 if k >= 22 else 1 for k in g})) for g in (verdict.members, verdict.runner_up)
@@ -184,9 +186,9 @@ def test_supporters_are_places_that_lie_apart_and_one_must_inform() -> None:
     assert dominant_cluster(agree, far, informative, SETTINGS).dominant
     one_place = dominant_cluster(agree, near, informative, SETTINGS)
     assert (one_place.separate_places, one_place.dominant) == (1, False)
-    assert "1 supporters" in one_place.reason
+    assert one_place.shortfall == Reason(ReasonCode.FEW_PLACES, 1, 3, "minimum_closures")
     corridor = dominant_cluster(agree, far, np.zeros(6, dtype=bool), SETTINGS)
-    assert "information in every direction" in corridor.reason
+    assert corridor.shortfall == Reason(ReasonCode.NOT_INFORMATIVE, 6)
 
 
 def test_places_apart_are_counted_at_their_best() -> None:

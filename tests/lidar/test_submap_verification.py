@@ -6,6 +6,7 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, agreement, build_submap
 from fcslam.lidar.verification import VerificationConfig, _information_of_inverse, verify
+from fcslam.records import ReasonCode
 from tests.lidar.worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
 
 CONFIG = VerificationConfig()
@@ -37,7 +38,7 @@ def test_the_same_room_from_two_drives_is_verified(same_room):
         assert found.strict
         assert found.loose
         assert found.informative
-        assert found.reason == ""
+        assert found.reason.code is ReasonCode.VERIFIED
         rest = se2.between(truth, found.T_a_b)
         assert np.hypot(rest[0], rest[1]) < 0.03
         assert abs(rest[2]) < np.deg2rad(0.3)
@@ -69,7 +70,7 @@ def test_two_different_rooms_are_not_the_same_place(guess):
     found = verify(a, b, np.array(guess), CONFIG)
     assert not found.loose
     assert not found.strict
-    assert found.reason != ""
+    assert found.reason.code is not ReasonCode.VERIFIED
 
 
 def test_a_room_against_itself_turned_around_is_not_the_same_place(same_room):
@@ -91,7 +92,7 @@ def test_a_bare_corridor_is_not_informative(heading):
     (a, anchor_a), (b, anchor_b) = along(0.0, 0.0, 0), along(2.0, 1.9, 1)
     found = verify(a, b, se2.between(anchor_a, anchor_b), CONFIG)
     assert not found.informative
-    assert found.reason != ""
+    assert found.reason.code is not ReasonCode.VERIFIED
     values, vectors = np.linalg.eigh(found.information[:2, :2])
     axis = se2.transform((0, 0, heading - anchor_b[2]), np.array([[1.0, 0.0]]))[0]
     assert abs(vectors[:, 0] @ axis) > 0.98

@@ -15,7 +15,7 @@ from fcslam.maps import palette
 from fcslam.maps.charts import RAY_M, Chart, FleetCharts, MatchedPlaces, Outline, spread
 from fcslam.maps.fleet_figure import MATCHES_DRAWN, WIDTH_PX, draw_figure, write_figure
 from fcslam.metrics.grid import LabelledGrid
-from fcslam.records import Channel, ClosureStatus
+from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, LocalMap, RobotTrajectory, Run, write_tum
 
 SIDE_M = 0.05
@@ -209,7 +209,7 @@ def run_folder(tmp_path):
     trajectories = {robot: RobotTrajectory(robot, k // 2, stamps, poses[robot]) for k, robot in enumerate(ROBOTS)}
     own = {robot: LocalMap(robot, stamps, poses[robot] - poses[robot][0], PGM, YAML.format(robot)) for robot in ROBOTS}
     closures = [
-        ClosureRow(i, 11.0, j, 12.0, Channel.CAMERA, 0.5, np.zeros(3), status, "")
+        ClosureRow(i, 11.0, j, 12.0, Channel.CAMERA, 0.5, np.zeros(3), status, Reason(ReasonCode.VERIFIED))
         for i, j, status in (("b", "a", "accepted"), ("a", "a", "accepted"), ("a", "b", "rejected"))
         for status in [ClosureStatus(status)]
     ]

@@ -101,8 +101,8 @@ def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_pat
         name: expected.map_files[name] for name in expected.map_files if not name.endswith("png")
     }
     assert [str(c) for c in run.closures if c.status is ClosureStatus.ACCEPTED] != []
-    told = [(c.robot_i, c.robot_j, c.status, c.reason) for c in run.closures]
-    assert told == [(c.robot_i, c.robot_j, c.status, c.reason) for c in expected.closures]
+    told = [(c.robot_i, c.robot_j, c.status, str(c.reason)) for c in run.closures]
+    assert told == [(c.robot_i, c.robot_j, c.status, str(c.reason)) for c in expected.closures]
     for robot, same in zip(
         run.trajectories.values(), sorted(expected.trajectories.values(), key=lambda t: t.robot), strict=True
     ):

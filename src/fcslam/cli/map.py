@@ -146,8 +146,20 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, join
             print_line(console, f"{session.robot}: {robot} was lost; this session begins at {session.stamps[0]:.3f} s")
     maps = int(values["maps"])
     if maps > 1:
-        reason = (
-            "some robots share no place that geometry confirms (see closures.csv)" if joined else "one for each robot"
-        )
-        print_line(console, f"{maps} maps: {reason}")
-    print_line(console, f"map: {output / 'map.png'}")
+        print_line(console, f"{maps} maps" if joined else f"{maps} maps: one for each robot")
+    if joined:
+        _print_separations(console, run)
+    for name in sorted(name for name in run.map_files if name.endswith(".png")):
+        print_line(console, f"map: {output / name}")
+
+
+def _print_separations(console: "Console", run: "Run") -> None:
+    """Say for every two maps what keeps them apart; maps without similar places share one line."""
+    from fcslam.runs import separations
+
+    apart = separations(run)
+    similar = [separation for separation in apart if separation.reason is not None]
+    for separation in similar:
+        print_line(console, str(separation))
+    if others := len(apart) - len(similar):
+        print_line(console, f"{others} {'other ' if similar else ''}pairs of maps: no two of their places look alike")

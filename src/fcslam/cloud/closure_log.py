@@ -4,7 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import Channel, ClosureStatus, Constraint, KeyscanId, LoopClosure, frozen
+from fcslam.records import Channel, ClosureStatus, Constraint, KeyscanId, LoopClosure, Reason, ReasonCode, frozen
+
+VERIFICATION = "fleet.matcher.verification"
+"""Section of the configuration that holds the thresholds of the cloud's verification."""
 
 
 @dataclass(slots=True, eq=False)
@@ -22,7 +25,7 @@ class ClosureEntry:
         """Whether it connects two robots."""
         return self.closure.i.robot != self.closure.j.robot
 
-    def set(self, status: ClosureStatus, reason: str) -> None:
+    def set(self, status: ClosureStatus, reason: Reason) -> None:
         """Change the status."""
         self.closure = replace(self.closure, status=status, reason=reason)
 
@@ -59,7 +62,7 @@ class ClosureLog:
             self._confirmed.add((frozenset((match.i, match.j)), match.channel))
         closure = LoopClosure(
             match.i, match.j, match.channel, match.similarity, frozen(match.check.T_a_b),
-            frozen(match.check.information), status, match.check.reason, match.check.informative,
+            frozen(match.check.information), status, match.reason.under(VERIFICATION), match.check.informative,
         )  # fmt: skip
         entry = ClosureEntry(closure, independent=not match.predicted)
         self._entries.append(entry)
@@ -74,7 +77,7 @@ class ClosureLog:
         i, j = KeyscanId(constraint.robot, constraint.i), KeyscanId(constraint.robot, constraint.j)
         closure = LoopClosure(
             i, j, Channel.LIDAR, 0.0, constraint.T_i_j, constraint.information, ClosureStatus.ACCEPTED,
-            "found by the robot",
+            Reason(ReasonCode.FOUND_BY_ROBOT),
         )  # fmt: skip
         entry = ClosureEntry(closure, independent=False, edge=edge)
         self._entries.append(entry)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
-from fcslam.cloud.joining import decide_join, first_estimate
+from fcslam.cloud.joining import CONSISTENCY, decide_join, first_estimate
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.reevaluation import reevaluate
 from fcslam.cloud.result import Fusion
@@ -13,7 +13,7 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import ClosureStatus, Constraint, KeyscanId, Veto
+from fcslam.records import ClosureStatus, Constraint, KeyscanId, Reason, ReasonCode, Veto
 
 CONTESTED_GROWTH = 1.1
 """After a re-evaluation confirmed a contested join, the number of closures grows by this factor before the next one:
@@ -120,8 +120,10 @@ class ClosureDecisions:
             return True
         if closure.i.robot in self.map_of(closure.j.robot):
             off = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
-            if np.hypot(off[0], off[1]) < self._config.surprise_m and abs(off[2]) < self._config.surprise_rad:
-                self._accept(entry, "fits the joint map")
+            off_m = float(np.hypot(off[0], off[1]))
+            if off_m < self._config.surprise_m and abs(off[2]) < self._config.surprise_rad:
+                fits = Reason(ReasonCode.FITS_JOINT_MAP, off_m, self._config.surprise_m, "fleet.surprise_m")
+                self._accept(entry, fits)
                 return True
         entry.independent = True  # the joint map did not predict this closure
         return False
@@ -132,17 +134,17 @@ class ClosureDecisions:
         decision = decide_join(entries, (a, b), self._graph, self._config.consistency)
         joined = b in self.map_of(a)
         self._contested |= joined and decision.contested
-        if not decision.dominant:
-            _explain(entries, decision.reason)
+        if decision.shortfall is not None:
+            _explain(entries, decision.shortfall.under(CONSISTENCY))
             return
         members = [entries[k] for k in decision.members]
         if not joined:
             self._join(members, a, b)
-        reason = f"in the dominant cluster of {len(members)} closures ({decision.separate_places} places apart)"
+        reason = Reason(ReasonCode.IN_CLUSTER, len(members))
         fresh = [entry for entry in members if entry.closure.status is not ClosureStatus.ACCEPTED]
         for entry in fresh:
             self._accept(entry, reason)
-        _explain(entries, "outside the dominant cluster")
+        _explain(entries, Reason(ReasonCode.OUTSIDE_CLUSTER))
         if fresh:
             self._optimize()
 
@@ -157,7 +159,7 @@ class ClosureDecisions:
         older.extend(younger)
         older.sort(key=self._sessions.robots.index)
 
-    def _accept(self, entry: ClosureEntry, reason: str) -> None:
+    def _accept(self, entry: ClosureEntry, reason: Reason) -> None:
         closure = entry.closure
         if entry.edge is None:
             entry.edge = self._graph.close(closure.i, closure.j, closure.T_i_j, closure.information)
@@ -169,7 +171,7 @@ class ClosureDecisions:
         self.version += 1
 
 
-def _explain(entries: Iterable[ClosureEntry], reason: str) -> None:
+def _explain(entries: Iterable[ClosureEntry], reason: Reason) -> None:
     """State why closures that are still only verified were not accepted."""
     for entry in entries:
         if entry.closure.status is ClosureStatus.VERIFIED:

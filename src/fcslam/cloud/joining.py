@@ -11,6 +11,9 @@ from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.consistency import Closures, ConsistencySettings
 from fcslam.records import FloatArray
 
+CONSISTENCY = "fleet.consistency"
+"""Section of the configuration that holds the rule for joining maps."""
+
 
 def decide_join(
     entries: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings

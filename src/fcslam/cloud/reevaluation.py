@@ -5,14 +5,14 @@ from collections.abc import Iterable
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
+from fcslam.cloud.joining import CONSISTENCY
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
-from fcslam.records import ClosureStatus, FloatArray, frozen
+from fcslam.records import ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 
-CONTRADICTS = "contradicts the joint graph"
-VETOED = "vetoed by hand"
+CONTRADICTS = Reason(ReasonCode.CONTRADICTS_JOINT_GRAPH)
 
 
 def reevaluate(graph: JointGraph, closures: ClosureLog, settings: ConsistencySettings) -> Fusion:
@@ -31,9 +31,8 @@ def reevaluate(graph: JointGraph, closures: ClosureLog, settings: ConsistencySet
         assert entry.edge is not None
         pair = frozenset((entry.closure.i.robot, entry.closure.j.robot))
         apart = len({maps[robot] for robot in pair}) > 1
-        _decide(
-            entry, bool(solution.weights[entry.edge] > INLIER_WEIGHT), reasons.get(pair, CONTRADICTS) if apart else ""
-        )
+        contradiction = reasons.get(pair, CONTRADICTS) if apart else CONTRADICTS
+        _decide(entry, bool(solution.weights[entry.edge] > INLIER_WEIGHT), contradiction)
         graph.count(entry.edge, holds=entry.closure.status is ClosureStatus.ACCEPTED)
     members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
     T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
@@ -59,23 +58,24 @@ def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
     return JointEvidence(graph.graph, tuple(graph.robots().values()), informative, independent, vetoed)
 
 
-def _decide(entry: ClosureEntry, holds: bool, apart: str) -> None:
-    """Set the entry's status; ``apart`` is the reason why its robots share no map, or empty."""
+def _decide(entry: ClosureEntry, holds: bool, contradiction: Reason) -> None:
+    """Set the entry's status; ``contradiction`` is the reason if it does not hold."""
     accepted_before = entry.closure.status is ClosureStatus.ACCEPTED
     if entry.vetoed:
-        entry.set(ClosureStatus.REVOKED, VETOED)
+        entry.set(ClosureStatus.REVOKED, Reason(ReasonCode.VETOED))
     elif holds:
-        entry.set(ClosureStatus.ACCEPTED, entry.closure.reason if accepted_before else "fits the joint graph")
+        fits = entry.closure.reason if accepted_before else Reason(ReasonCode.FITS_JOINT_GRAPH)
+        entry.set(ClosureStatus.ACCEPTED, fits)
     elif accepted_before or entry.closure.status is ClosureStatus.REVOKED:
-        entry.set(ClosureStatus.REVOKED, apart or CONTRADICTS)
+        entry.set(ClosureStatus.REVOKED, contradiction)
     else:
-        entry.set(ClosureStatus.REJECTED, apart or CONTRADICTS)
+        entry.set(ClosureStatus.REJECTED, contradiction)
 
 
-def _reasons(solution: JointSolution, robots: list[str]) -> dict[frozenset[str], str]:
+def _reasons(solution: JointSolution, robots: list[str]) -> dict[frozenset[str], Reason]:
     """By pair of robots, why their closures do not join their maps."""
     return {
-        frozenset((robots[link.a], robots[link.b])): link.decision.reason
+        frozenset((robots[link.a], robots[link.b])): link.decision.shortfall.under(CONSISTENCY)
         for link in solution.links
-        if link.decision.reason
+        if link.decision.shortfall is not None
     }

@@ -20,7 +20,7 @@ from fcslam.cloud.result import Fusion
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment, two_point_alignment
 from fcslam.graph.cluster import DIRECTION_M
-from fcslam.records import ClosureStatus, FloatArray, LoopClosure, frozen
+from fcslam.records import ClosureStatus, FloatArray, LoopClosure, Reason, ReasonCode, frozen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,14 +53,14 @@ def fuse_rigidly(closures: ClosureLog, T_local_base: Mapping[str, FloatArray], s
     matches = [_match(entry, T_local_base, order) for entry in closures if _is_valid(entry)]
     links = _links(matches, strategy)
     maps, frames = [[robot] for robot in order], {robot: np.zeros(3) for robot in order}
-    used: dict[ClosureEntry, str] = {}
+    used: dict[ClosureEntry, Reason] = {}
     for robots, members in links.items():
         if _join(robots, _relation(members, strategy), maps, frames):
-            used |= {match.entry: f"one of {len(members)} matched points of {strategy}" for match in members}
+            used |= {match.entry: Reason(ReasonCode.MATCHED_POINT, len(members)) for match in members}
     T_map_base: dict[str, FloatArray] = {
         robot: frozen(se2.compose(frames[robot], poses)) for robot, poses in T_local_base.items()
     }
-    return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used, strategy) for entry in closures))
+    return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used) for entry in closures))
 
 
 def _is_valid(entry: ClosureEntry) -> bool:
@@ -119,11 +119,11 @@ def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], fra
     return True
 
 
-def _closure(entry: ClosureEntry, used: Mapping[ClosureEntry, str], strategy: FusionStrategy) -> LoopClosure:
+def _closure(entry: ClosureEntry, used: Mapping[ClosureEntry, Reason]) -> LoopClosure:
     """The closure with its final status."""
     if not _is_valid(entry):
         return entry.closure
     reason = used.get(entry)
     if reason is None:
-        return replace(entry.closure, status=ClosureStatus.VERIFIED, reason=f"not needed by {strategy}")
+        return replace(entry.closure, status=ClosureStatus.VERIFIED, reason=Reason(ReasonCode.UNUSED))
     return replace(entry.closure, status=ClosureStatus.ACCEPTED, reason=reason)

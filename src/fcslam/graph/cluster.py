@@ -10,7 +10,7 @@ from fcslam.geometry.alignment import two_point_alignment
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_consistency
 from fcslam.graph.trajectory import Trajectory
-from fcslam.records import FloatArray
+from fcslam.records import FloatArray, Reason, ReasonCode
 
 DIRECTION_M = 1.0
 """Least distance between two matched points that fixes a rotation: each point is known to a few centimetres."""
@@ -32,11 +32,15 @@ class ClusterDecision:
     runner_up_separate_places: int
     exact: bool
     """Whether both clusters are proven to be the largest."""
-    dominant: bool
     contested: bool
     """Whether the runner-up would be enough to join two maps as well, and the cluster is not clearly larger."""
-    reason: str
-    """Why the cluster is not dominant, one clause; empty if it is."""
+    shortfall: Reason | None
+    """Why the cluster is not dominant; its setting is one of ``ConsistencySettings``."""
+
+    @property
+    def dominant(self) -> bool:
+        """Whether the cluster is enough to join two maps."""
+        return self.shortfall is None
 
 
 def decide_cluster(
@@ -114,22 +118,23 @@ def dominant_cluster(
     separate = count_separate_places(xy[members], settings.separation_m)
     rivals = count_separate_places(xy[runner_up], settings.separation_m)
     has_no_lead = len(members) < settings.lead * len(runner_up) or separate < rivals
-    reason = ""
+    shortfall = None
     if separate < settings.minimum_closures:
-        reason = f"{separate} supporters {settings.separation_m:g} m apart, {settings.minimum_closures} needed"
+        shortfall = Reason(ReasonCode.FEW_PLACES, separate, settings.minimum_closures, "minimum_closures")
     elif not informs[members].any():
-        reason = "no supporter with information in every direction"
-    elif has_no_lead:
-        reason = f"{len(members)} closures from {separate} places, but {len(runner_up)} from {rivals} disagree"
+        shortfall = Reason(ReasonCode.NOT_INFORMATIVE, len(members))
+    elif len(members) < settings.lead * len(runner_up):
+        shortfall = Reason(ReasonCode.NO_LEAD, len(members) / len(runner_up), settings.lead, "lead")
+    elif separate < rivals:
+        shortfall = Reason(ReasonCode.RIVAL_PLACES, separate, rivals)
     return ClusterDecision(
         members=largest.members,
         runner_up=tuple(runner_up.tolist()),
         separate_places=separate,
         runner_up_separate_places=rivals,
         exact=largest.exact and second.exact,
-        dominant=not reason,
         contested=has_no_lead and rivals >= settings.minimum_closures,
-        reason=reason,
+        shortfall=shortfall,
     )
 
 

@@ -10,13 +10,14 @@ from fcslam.geometry import se2
 from fcslam.lidar.matching import MatchingConfig, match_scan
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import Agreement, Submap, agreement
-from fcslam.records import FloatArray
+from fcslam.records import FloatArray, Reason, ReasonCode
 
 UNFIXED_INFORMATION = 1e-2
 """Information in a direction that no point fixes: a standard deviation of 10 m or 10 rad."""
 ALIGNED_POINTS = 400
 """Points of a submap that are aligned, at least, if it has so many."""
 NO_PRIOR = np.zeros((3, 3))
+_VERIFIED = Reason(ReasonCode.VERIFIED)
 _ALIGNMENT = MatchingConfig(wide_scale_m=0.4)
 """A guess between submaps is worse than one between scans: the loss starts wider."""
 
@@ -125,8 +126,10 @@ class Verification:
     """Passes the gate of this name; ``partial`` closures are informative, too."""
     informative: bool
     """Whether it fixes the pose in every direction."""
-    reason: str
-    """Why it is not strict and informative; empty if it is."""
+    reason: Reason
+    """Why it is not strict and informative, or that it is verified; settings as in ``VerificationConfig``."""
+    loose_reason: Reason
+    """The same for the loose gate."""
 
     @property
     def support(self) -> float:
@@ -169,19 +172,21 @@ def verify(
         max(side.overlap for side in sides),
         worse.normal_tensor,
     )
-    symmetric = np.hypot(gap[0], gap[1]) < config.symmetry_m and abs(gap[2]) < config.symmetry_rad
+    asymmetric = _asymmetry(gap, config)
+    symmetric = asymmetric is None
     informative = worse.weakest >= config.informative
-    strict_reason = _shortfall(worse, config.strict)
-    reason = strict_reason or ("" if informative else "fixed in one direction only, as in a corridor")
+    one_direction = Reason(ReasonCode.ONE_DIRECTION, worse.weakest, config.informative, "informative")
+    strict, loose = _shortfall(worse, config.strict, "strict"), _shortfall(worse, config.loose, "loose")
     return Verification(
         T_a_b=T_a_b,
         information=_information(forward.information + prior, T_a_b, config),
         worse=worse,
-        strict=symmetric and not strict_reason,
-        loose=symmetric and not _shortfall(worse, config.loose),
-        partial=symmetric and informative and not _shortfall(worse, config.partial),
+        strict=symmetric and not strict,
+        loose=symmetric and not loose,
+        partial=symmetric and informative and not _shortfall(worse, config.partial, "partial"),
         informative=informative,
-        reason=reason if symmetric else "the two directions of the alignment disagree",
+        reason=asymmetric or strict or (_VERIFIED if informative else one_direction),
+        loose_reason=asymmetric or loose or _VERIFIED,
     )
 
 
@@ -190,17 +195,26 @@ def _sample(surface: PointScan) -> PointScan:
     return surface.only(np.arange(0, len(surface), max(1, len(surface) // ALIGNED_POINTS)))
 
 
-def _shortfall(found: Agreement, gate: Gate) -> str:
-    """The first threshold of the gate that is not reached, in words."""
+def _asymmetry(gap: FloatArray, config: VerificationConfig) -> Reason | None:
+    """The limit that the gap (3,) between the alignments of both directions reaches, if any."""
+    if (gap_m := float(np.hypot(gap[0], gap[1]))) >= config.symmetry_m:
+        return Reason(ReasonCode.ASYMMETRIC, gap_m, config.symmetry_m, "symmetry_m")
+    if (gap_rad := abs(float(gap[2]))) >= config.symmetry_rad:
+        return Reason(ReasonCode.ASYMMETRIC, gap_rad, config.symmetry_rad, "symmetry_rad")
+    return None
+
+
+def _shortfall(found: Agreement, gate: Gate, name: str) -> Reason | None:
+    """The first threshold of the gate called ``name`` that is not reached."""
     if found.explained < gate.explained:
-        return f"only {found.explained:.2f} explained"
+        return Reason(ReasonCode.NOT_ENOUGH_EXPLAINED, found.explained, gate.explained, f"{name}.explained")
     if found.violation > gate.violation:
-        return f"{found.violation:.2f} in free space"
+        return Reason(ReasonCode.IN_FREE_SPACE, found.violation, gate.violation, f"{name}.violation")
     if found.count < gate.count:
-        return f"only {found.count} points explained"
+        return Reason(ReasonCode.FEW_POINTS, found.count, gate.count, f"{name}.count")
     if found.overlap < gate.overlap:
-        return f"overlap of {found.overlap:.2f}"
-    return ""
+        return Reason(ReasonCode.LITTLE_OVERLAP, found.overlap, gate.overlap, f"{name}.overlap")
+    return None
 
 
 def _information_of_inverse(information: FloatArray, T_a_b: FloatArray) -> FloatArray:

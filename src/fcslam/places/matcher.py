@@ -19,7 +19,7 @@ from fcslam.places.index import PlaceIndex
 from fcslam.places.motions import Motion, MotionConfig, propose_motions
 from fcslam.places.query_result import QueryResult
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.records import Channel, FloatArray, KeyscanId, Place
+from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason
 
 
 class MatcherConfig(Settings):
@@ -78,6 +78,11 @@ class PlaceMatch:
     def M(self) -> bool:
         """The matching flag M_ij of FC-SLAM: whether both are the same place."""
         return self.check.loose if self.predicted else self.check.strict
+
+    @property
+    def reason(self) -> Reason:
+        """Why it is no match, or what the match lacks."""
+        return self.check.loose_reason if self.predicted else self.check.reason
 
 
 class PlaceMatcher:

@@ -11,6 +11,7 @@ from fcslam.runs.folder import (
 )
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.runs.records import ClosureRow, LocalMap, Metric, RobotTrajectory
+from fcslam.runs.separations import Separation, separations
 from fcslam.runs.tables import metrics_json, read_vetoes
 from fcslam.runs.trajectories import read_tum, write_tum
 
@@ -25,11 +26,13 @@ __all__ = [
     "OccupancyMap",
     "RobotTrajectory",
     "Run",
+    "Separation",
     "check_names",
     "metrics_json",
     "open_run",
     "prepare_output",
     "read_tum",
     "read_vetoes",
+    "separations",
     "write_tum",
 ]

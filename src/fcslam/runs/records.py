@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fcslam.records import Channel, ClosureStatus, FloatArray
+from fcslam.records import Channel, ClosureStatus, FloatArray, Reason
 from fcslam.runs.map_files import OccupancyMap, parse_map
 
 
@@ -65,8 +65,8 @@ class ClosureRow:
     T_i_j: FloatArray
     """Measured pose (x, y, theta) of base j in base i, metres and radians, shape (3,)."""
     status: ClosureStatus
-    reason: str
-    """Why the closure has this status, in one sentence."""
+    reason: Reason
+    """Why the closure has this status."""
 
 
 @dataclass(frozen=True, slots=True)

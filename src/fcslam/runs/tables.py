@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fcslam.errors import ConfigError
-from fcslam.records import Channel, ClosureStatus, Veto, frozen
+from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, Veto, frozen
 from fcslam.runs.records import ClosureRow, Metric, RobotTrajectory
 
 _Value = TypeVar("_Value")
 
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
 _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
-_CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", "reason"]
+_REASON_COLUMNS = ["reason", "value", "limit", "setting"]
+_CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", *_REASON_COLUMNS]
 
 
 def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
@@ -121,7 +122,12 @@ def _robot_fields(trajectory: RobotTrajectory) -> list[Any]:
 def _closure_fields(closure: ClosureRow) -> list[Any]:
     ends = [closure.robot_i, f"{closure.stamp_i:.9f}", closure.robot_j, f"{closure.stamp_j:.9f}"]
     numbers = [f"{number:.6f}" for number in (closure.similarity, *closure.T_i_j)]
-    return [*ends, closure.channel.value, *numbers, closure.status.value, closure.reason]
+    return [*ends, closure.channel.value, *numbers, closure.status.value, *_reason_fields(closure.reason)]
+
+
+def _reason_fields(reason: Reason) -> list[str]:
+    numbers = ["" if number is None else f"{number:.6g}" for number in (reason.value, reason.limit)]
+    return [reason.code.value, *numbers, reason.setting]
 
 
 def _read_closure(row: dict[str, str]) -> ClosureRow:
@@ -134,8 +140,13 @@ def _read_closure(row: dict[str, str]) -> ClosureRow:
         similarity=float(row["similarity"]),
         T_i_j=frozen([float(row[axis]) for axis in ("x", "y", "theta")]),
         status=ClosureStatus(row["status"]),
-        reason=row["reason"],
+        reason=_read_reason(row),
     )
+
+
+def _read_reason(row: dict[str, str]) -> Reason:
+    value, limit = (float(row[column]) if row[column] else None for column in ("value", "limit"))
+    return Reason(ReasonCode(row["reason"]), value, limit, row["setting"])
 
 
 def _write_csv(path: Path, columns: list[str], rows: Iterable[list[Any]]) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.records import Channel, ClosureStatus
+from fcslam.records import Channel, ClosureStatus, ReasonCode
 
 Pose = Annotated[list[float], Field(min_length=3, max_length=3, description="x and y in metres, theta in radians")]
 
@@ -96,7 +96,11 @@ class ClosureSummary(Settings):
     similarity: float
     T_i_j: Pose
     status: ClosureStatus
-    reason: str
+    reason: ReasonCode
+    value: float | None = Field(description="the measured value behind the reason, if it has one")
+    limit: float | None = Field(description="the limit that the value was compared with")
+    setting: str = Field(description="the setting that holds the limit; empty without one")
+    explanation: str = Field(description="the reason with its numbers, as one clause")
 
 
 class MapSummary(Settings):

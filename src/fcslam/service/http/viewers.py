@@ -215,5 +215,6 @@ def _closure(closure: ClosureRow) -> ClosureSummary:
     return ClosureSummary(
         robot_i=closure.robot_i, stamp_i=closure.stamp_i, robot_j=closure.robot_j, stamp_j=closure.stamp_j,
         channel=closure.channel, similarity=closure.similarity, T_i_j=closure.T_i_j.tolist(), status=closure.status,
-        reason=closure.reason,
+        reason=closure.reason.code, value=closure.reason.value, limit=closure.reason.limit,
+        setting=closure.reason.setting, explanation=str(closure.reason),
     )  # fmt: skip
