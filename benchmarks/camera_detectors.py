@@ -91,9 +91,7 @@ def main() -> None:
 def recorded(case: str, seed: int, folder: Path) -> Path:
     """The recordings of one fleet; what is there already is not made again."""
     fleet, (simulated, _) = folder / f"{case.replace(',', '').replace(' ', '-')}-{seed}", CASES[case]
-    if not (fleet / "ground_truth" / "map.yaml").exists():  # the last file to be written
-        common.run_fcslam("simulate", "--robots", ROBOTS, "--seed", seed, *simulated, "--output", fleet, "--resume")
-    return fleet
+    return common.simulated(fleet, "--robots", ROBOTS, "--seed", seed, *simulated)
 
 
 def settings(weights: Sequence[Path], folder: Path) -> dict[str, Path]:

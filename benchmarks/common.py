@@ -97,6 +97,14 @@ def run_fcslam_cold(*arguments: object) -> Cost:
         return run_fcslam(*arguments, environment={"NUMBA_CACHE_DIR": cache})
 
 
+def simulated(folder: Path, *arguments: object) -> Path:
+    """A fleet that `fcslam simulate` records into ``folder``; one that is there already is taken as it is."""
+    # The true map is written last.
+    if not (folder / "ground_truth" / "map.yaml").exists():
+        run_fcslam("simulate", *arguments, "--resume", "--output", folder)
+    return folder
+
+
 def metrics(run: Path) -> dict[str, float]:
     """metrics.json of a run folder, by name."""
     rows = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
