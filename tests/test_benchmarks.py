@@ -20,7 +20,7 @@ from fcslam.records import Channel
 from tests.features.networks import tiny_network
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-SHARED = ("common", "processes", "training_fleet")
+SHARED = ("common", "map_search", "processes", "training_fleet")
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 
 
@@ -126,13 +126,13 @@ def test_the_command_is_measured_and_its_failure_ends_the_script(common):
 @pytest.mark.slow
 @pytest.mark.usefixtures("common")
 def test_the_search_finds_where_a_piece_was_cut_out():
-    wean_hall = load(FOLDER / "wean_hall.py")
+    map_search = load(FOLDER / "map_search.py")
     rng = np.random.default_rng(5)
     free = np.zeros((160, 200), bool)
     for row, column in zip(rng.integers(20, 110, 8), rng.integers(20, 140, 8), strict=True):
         free[row : row + 30, column : column + 40] = True
     walls = binary_dilation(free) & ~free
-    whole = wean_hall.Plan(walls, free, 0.1, np.array([-3.0, 2.0]))
+    whole = map_search.Plan(walls, free, 0.1, np.array([-3.0, 2.0]))
     T_whole_piece = np.array([4.0, 6.0, 2.2])
     corner = np.array([-9.0, -9.0])
     cells = [np.zeros((180, 180), bool) for _ in range(2)]
@@ -140,7 +140,7 @@ def test_the_search_finds_where_a_piece_was_cut_out():
         points = se2.transform(se2.inverse(T_whole_piece), whole.points(of))
         inside = np.floor((points[np.abs(points).max(axis=1) < 7.0] - corner) / 0.1).astype(int)
         into[inside[:, 1], inside[:, 0]] = True
-    best, second = wean_hall.search(wean_hall.Plan(cells[0], cells[1] & ~cells[0], 0.1, corner), whole)
+    best, second = map_search.search(map_search.Plan(cells[0], cells[1] & ~cells[0], 0.1, corner), whole)
     np.testing.assert_allclose(se2.between(T_whole_piece, best.T_target_query), 0.0, atol=0.06)
     assert second.score < 0.7 * best.score
 
