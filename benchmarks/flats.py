@@ -105,7 +105,7 @@ def closures(run: Run) -> tuple[int, int, int, str]:
     between = [closure for closure in run.closures if closure.robot_i != closure.robot_j]
     verified = [closure for closure in between if closure.status is not ClosureStatus.CANDIDATE]
     accepted = [closure for closure in between if closure.status is ClosureStatus.ACCEPTED]
-    reasons = Counter(c.reason for c in verified if c.status is not ClosureStatus.ACCEPTED).most_common(1)
+    reasons = Counter(str(c.reason) for c in verified if c.status is not ClosureStatus.ACCEPTED).most_common(1)
     return len(between), len(verified), len(accepted), reasons[0][0] if reasons else ""
 
 
