@@ -161,7 +161,7 @@ def packets_of_every_kind(rng: random.Random) -> Iterator[bytes]:
 
 def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
     laser = LaserModel(min(size, MAXIMUM_BEAMS), -3.0, 0.001, 30.0, (0.1, 0.0, 0.2))
-    yield Hello("alice", 7, laser, {Channel.LIDAR: "birdseye-brief-1", Channel.CAMERA: "light-1"})
+    yield Hello("alice", 7, (laser,), {Channel.LIDAR: "birdseye-brief-1", Channel.CAMERA: "light-1"})
     walk = np.abs(np.cumsum(rng.integers(-40, 41, 2 * size)))[: min(2 * size, MAXIMUM_BEAMS)]
     yield Keyscan(KeyscanId("alice", size), 1e9, dequantise((walk % 65536).astype(np.uint16)))
     yield Keyscan(KeyscanId("alice", size), 1e9, dequantise(rng.integers(0, 65536, size).astype(np.uint16)))

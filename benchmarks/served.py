@@ -134,7 +134,7 @@ def written(sources: Sequence[Any], folder: Path) -> list[Path]:
     for source in sources:
         logs.append(folder / f"{source.name}.fcslam")
         survey = source.survey()
-        write_recording(logs[-1], survey.laser, survey.camera, source.records())
+        write_recording(logs[-1], survey.lasers, survey.camera, source.records())
     return logs
 
 

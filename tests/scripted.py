@@ -85,7 +85,7 @@ def rectangle(count: int = 61, step_m: float = 1.0) -> np.ndarray:
 
 def stream(robot: str, truth: np.ndarray, start_s: float, local: Iterable[Body] = ()) -> list[Packet]:
     """All packets of a robot that drives the true poses without drift: a place each ``PLACE_EVERY`` keyscans."""
-    bodies: list[tuple[float, Body]] = [(start_s, Hello(robot, 0, LASER, {Channel.LIDAR: "test-1"}))]
+    bodies: list[tuple[float, Body]] = [(start_s, Hello(robot, 0, (LASER,), {Channel.LIDAR: "test-1"}))]
     for k in range(len(truth)):
         bodies.append((start_s + k, keyscan(robot, k, start_s + k)))
         if k:

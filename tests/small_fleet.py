@@ -39,7 +39,7 @@ def feed(cloud: Cloud, packets: Iterable[Packet]) -> Cloud:
 def fingerprint(result: FleetResult) -> tuple[object, ...]:
     """All that a result says, to the last bit."""
     robots = tuple(
-        (r.robot, r.map_index, len(r.keyscans), r.T_map_base.tobytes(), r.T_local_base.tobytes(), r.laser)
+        (r.robot, r.map_index, len(r.keyscans), r.T_map_base.tobytes(), r.T_local_base.tobytes(), r.lasers)
         for r in result.robots
     )
     closures = tuple(

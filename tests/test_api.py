@@ -173,7 +173,7 @@ def test_settings_come_from_a_model_a_mapping_or_a_file_and_arguments_replace_th
         ({"config": "none.yaml"}, fcslam.ConfigError, "none.yaml"),
         ({"vetoes": [fcslam.Veto("nobody", "robot_1")]}, fcslam.ConfigError, "nobody"),
         ({"output": "LOG"}, fcslam.OutputError, "no run folder"),
-        ({"bag_options": fcslam.BagOptions(scan_topic="/scan")}, fcslam.SourceError, "ROS bags only"),
+        ({"bag_options": fcslam.BagOptions(scan_topics=("/scan",))}, fcslam.SourceError, "ROS bags only"),
     ],
 )
 def test_what_is_wrong_is_an_input_error_of_one_line_before_the_work(arguments, kind, said, logs):

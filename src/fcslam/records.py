@@ -5,6 +5,7 @@ REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recor
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple, TypeVar
@@ -37,9 +38,25 @@ def frozen(array: ArrayLike, dtype: type[Scalar] = np.float64) -> NDArray[Scalar
     return result
 
 
+class Beams(NamedTuple):
+    """Directions of the beams of one scan in ``laser``."""
+
+    beam_count: int
+    angle_min_rad: float
+    """Direction of the first beam."""
+    angle_increment_rad: float
+    """From one beam to the next; negative: clockwise."""
+
+    @property
+    def span_rad(self) -> float:
+        """Angle from the first to the last beam."""
+        return (self.beam_count - 1) * self.angle_increment_rad
+
+
 @dataclass(frozen=True, slots=True)
 class LaserModel:
-    """Geometry of one 2D LiDAR, constant over a recording."""
+    """Geometry of one 2D LiDAR. Its beams may vary from scan to scan (``geometry.beams.misfit``), the rest is constant
+    over a recording."""
 
     beam_count: int
     angle_min_rad: float
@@ -52,6 +69,15 @@ class LaserModel:
     def angles_rad(self) -> FloatArray:
         """Directions of the beams in ``laser``, shape (beam_count,), radians."""
         return self.angle_min_rad + self.angle_increment_rad * np.arange(self.beam_count, dtype=np.float64)
+
+    @property
+    def beams(self) -> Beams:
+        """The directions of the beams."""
+        return Beams(self.beam_count, self.angle_min_rad, self.angle_increment_rad)
+
+    def with_beams(self, beams: Beams) -> "LaserModel":
+        """The same laser with other beams, as of another scan."""
+        return self if beams == self.beams else LaserModel(*beams, self.max_range_m, self.T_base_laser)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +97,7 @@ class LaserScan:
     ranges_m: Ranges
     """Shape (beam_count,). NaN: invalid; at or above ``laser.max_range_m`` (or inf): no return."""
     laser: LaserModel
+    """Its laser, with the beams of this scan."""
     T_odom_base: FloatArray
     """Shape (3,)."""
 
@@ -143,6 +170,15 @@ class Keyscan:
     stamp: float
     ranges_m: Ranges
     """Shape (beam_count,), as in LaserScan, but an invalid range or a missing return is 0."""
+    laser: int = 0
+    """Index of its laser among those that the robot announced."""
+    beams: Beams | None = None
+    """Its beams; None: those that the laser was announced with."""
+
+    def laser_model(self, lasers: Sequence[LaserModel]) -> LaserModel:
+        """Its laser, with the beams of this scan; ``lasers`` are those that the robot announced."""
+        laser = lasers[self.laser]
+        return laser if self.beams is None else laser.with_beams(self.beams)
 
 
 class ConstraintKind(StrEnum):

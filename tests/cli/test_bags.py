@@ -189,7 +189,7 @@ def test_only_force_replaces(tmp_path, bag, capsys, name):
 
 
 def test_images_go_where_there_is_a_place_for_them(tmp_path, capsys):
-    write_recording(tmp_path / "run.fcslam", LASER, CAMERA, camera_drive())
+    write_recording(tmp_path / "run.fcslam", (LASER,), CAMERA, camera_drive())
     assert run("convert", tmp_path / "run.fcslam", tmp_path / "run.mcap") == 0
     assert "images" not in capsys.readouterr().err
     assert open_source(tmp_path / "run.mcap").survey().camera == CAMERA

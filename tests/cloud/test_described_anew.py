@@ -20,7 +20,7 @@ ANEW = "test-2"
 def again(robot):
     """A hello with another detector, and all places of a robot by it."""
     said = [packet for packet in FIRST if packet.robot == robot]
-    bodies = [Hello(robot, 0, LASER, {Channel.LIDAR: ANEW})]
+    bodies = [Hello(robot, 0, (LASER,), {Channel.LIDAR: ANEW})]
     bodies += [replace(p.body, detector_version=ANEW) for p in said if isinstance(p.body, Place)]
     return [Packet(robot, 0, len(said) + number, said[-1].time, body) for number, body in enumerate(bodies)]
 

@@ -128,7 +128,7 @@ def surfaces(result, drawn, count):
     errors = position_errors(T_truth_map, np.concatenate(true), np.concatenate([r.T_map_base for r in robots]))
     keyscans = [keyscan for robot in robots for keyscan in robot.keyscans]
     poses = np.concatenate([robot.T_map_base[robot.numbers()] for robot in robots])
-    fused = fuse(keyscans, poses, {robot.robot: robot.laser for robot in robots}, OccupancyConfig())
+    fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in robots}, OccupancyConfig())
     truth = true_map(replace(drawn, robots=drawn.robots[:count]))
     return errors, grid_agreement(labelled(fused), labelled(truth), T_truth_map).f1
 

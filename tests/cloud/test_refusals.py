@@ -9,7 +9,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.replies import is_news
 from fcslam.cloud.settings import FleetConfig
-from fcslam.records import Channel, ConstraintKind, Correction, KeyscanId, frozen
+from fcslam.records import Beams, Channel, ConstraintKind, Correction, KeyscanId, frozen
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
 from fcslam.wire.transport import InMemoryTransport
@@ -32,7 +32,12 @@ HOSTILE = {
     "motion of an unknown robot": (motion("x", 0, 1, STEP), "does not lead to a new keyscan"),
     "closure of an unknown robot": (motion("x", 0, 1, STEP, ConstraintKind.CLOSURE), "names keyscan 0"),
     "place of an unknown robot": (place("x", 0), "names keyscan 0"),
-    "another laser": (Hello("a", 0, replace(LASER, max_range_m=9.0), {}), "hello again with another laser"),
+    "another laser": (Hello("a", 0, (replace(LASER, max_range_m=9.0),), {}), "hello again with another laser"),
+    "a laser that is not announced": (replace(keyscan("a", NUMBER, NOW), laser=1), "of laser 1, 1 announced"),
+    "beams of another laser": (
+        replace(keyscan("a", NUMBER, NOW, beams=4), beams=Beams(4, -np.pi, np.pi / 2)),
+        "not of laser 0: its beams are 90 degrees apart",
+    ),
     "too many beams": (keyscan("a", NUMBER, NOW, beams=9), "9 beams, 8 announced"),
     "too few beams": (keyscan("a", NUMBER, NOW, beams=1), "1 beams, 8 announced"),
     "a keyscan left out": (keyscan("a", NUMBER + 1, NOW), f"keyscan {NUMBER + 1} where {NUMBER} is next"),
@@ -101,7 +106,7 @@ def test_what_comes_early_and_does_not_fit_does_no_harm_either(scripted, referen
 @pytest.mark.parametrize("name", ["a+1", "a+0", "x+2+3"])
 def test_a_robot_that_is_called_like_a_session_is_refused(scripted, reference, name):
     cloud = feed(scripted(SCRIPT), PACKETS[:HALF])
-    again = Packet(name, 0, 0, NOW, Hello(name, 0, LASER, {}))
+    again = Packet(name, 0, 0, NOW, Hello(name, 0, (LASER,), {}))
     assert "without '+" in (InMemoryTransport(cloud.receive).send(encode(again)).refusal or "")
     assert fingerprint(feed(cloud, PACKETS[HALF:]).finalize()) == reference
 
@@ -189,7 +194,7 @@ def test_detectors_of_two_channels_may_have_one_name():
     cloud = Cloud(FleetConfig(), seed=0)
     rng = np.random.default_rng(0)
     for robot in ("x", "y"):
-        bodies = [Hello(robot, 0, LASER, dict.fromkeys(Channel, "one"))]
+        bodies = [Hello(robot, 0, (LASER,), dict.fromkeys(Channel, "one"))]
         bodies += [keyscan(robot, 0, NOW)]
         for channel, axes in ((Channel.LIDAR, 2), (Channel.CAMERA, 3)):
             keypoints = rng.uniform(0.1, 2.0, (30, axes)).astype(np.float32)

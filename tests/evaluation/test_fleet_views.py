@@ -70,7 +70,7 @@ def test_where_nothing_comes_back_nothing_is_judged():
 
 def record(folder, poses, camera=CAMERA):
     """A scan and an image at each pose; a first image before any scan, and a last pose without an image."""
-    with RecordingWriter.create(folder, LASER, camera) as writer:
+    with RecordingWriter.create(folder, (LASER,), camera) as writer:
         picture = cv2.imencode(".png", np.zeros((CAMERA.height, CAMERA.width), np.uint8))[1].tobytes()
         for k, pose in enumerate(poses):
             if camera is not None and k < len(poses) - 1:

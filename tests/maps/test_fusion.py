@@ -9,8 +9,8 @@ from fcslam.runs.map_files import Occupancy, map_yaml, pgm_bytes
 
 CONFIG = OccupancyConfig()
 LASERS = {
-    "a": LaserModel(361, -np.pi, np.pi / 180, 30.0),
-    "b": LaserModel(181, -np.pi / 2, np.pi / 180, 20.0, (0.2, 0.0, 0.0)),
+    "a": (LaserModel(361, -np.pi, np.pi / 180, 30.0),),
+    "b": (LaserModel(181, -np.pi / 2, np.pi / 180, 20.0, (0.2, 0.0, 0.0)),),
 }
 CORRIDOR = {"left": -1.02, "right": 6.03, "bottom": -0.73, "top": 2.48}  # no symmetry: a flip is seen
 
@@ -29,7 +29,7 @@ def fleet():
     keyscans = []
     for k, pose in enumerate(poses):
         robot = "ab"[k % 2]
-        keyscans.append(Keyscan(KeyscanId(robot, k // 2), float(k), ranges_in_corridor(LASERS[robot], pose)))
+        keyscans.append(Keyscan(KeyscanId(robot, k // 2), float(k), ranges_in_corridor(LASERS[robot][0], pose)))
     return keyscans, poses
 
 

@@ -64,7 +64,7 @@ def test_hello_comes_first_and_once(scans):
     _, packets = drive(scans)
     assert bodies(packets, Hello) == [packets[0].body]
     versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: OnnxDetector(OnnxConfig()).version}
-    assert packets[0].body == Hello("r", 0, scans[0].laser, versions)
+    assert packets[0].body == Hello("r", 0, (scans[0].laser,), versions)
 
 
 def test_every_keyscan_is_followed_by_the_motion_that_leads_to_it(scans):

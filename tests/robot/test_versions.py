@@ -53,7 +53,7 @@ def test_old_places_are_described_again_and_new_ones_by_the_new_detector_alone(s
     packets = driven(robot, seen, half)
     hellos = [k for k, packet in enumerate(packets) if isinstance(packet.body, Hello)]
     first, second = (packets[k].body for k in hellos)
-    assert first.laser == second.laser
+    assert first.lasers == second.lasers
     orb = first.detector_versions[Channel.CAMERA]
     assert second.detector_versions == {Channel.CAMERA: SHIPPED.version}
     before, after = packets[: hellos[1]], packets[hellos[1] :]

@@ -47,7 +47,7 @@ def test_a_bag_and_a_recording_of_one_drive_hold_the_same_scans_and_images(tmp_p
     write_bag(tmp_path / "run.mcap", records)
     bag = open_source(tmp_path / "run.mcap")
     survey = bag.survey()
-    write_recording(tmp_path / "run.fcslam", survey.laser, survey.camera, bag.records())
+    write_recording(tmp_path / "run.fcslam", survey.lasers, survey.camera, bag.records())
     read = list(open_source(tmp_path / "run.fcslam").records())
     assert len(read) == 30
     assert all(map(same, bag.records(), read))

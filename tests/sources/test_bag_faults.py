@@ -79,12 +79,12 @@ def test_no_odometry_in_tf(tmp_path):
     ("options", "words"),
     [
         (
-            BagOptions(scan_topic="/lidar"),
+            BagOptions(scan_topics=("/lidar",)),
             ["topic /lidar is not there", "--scan-topic", "/scan (sensor_msgs/Laser"],
         ),
         (BagOptions(odom_topic="/lidar"), ["topic /lidar is not there", "--odom-topic", "/odom (nav_msgs/Odometry"]),
         (
-            BagOptions(scan_topic="/odom"),
+            BagOptions(scan_topics=("/odom",)),
             ["/odom has 42 messages of type nav_msgs/Odometry", "needs sensor_msgs/LaserScan"],
         ),
         (
@@ -118,7 +118,7 @@ def test_a_tilted_laser(tmp_path):
     tilted = tf(99, "base_link", "laser", rotation=quaternion(pitch=math.radians(30)), topic="/tf_static")
     bag = save(tmp_path / "run.bag", [tilted, *drive(20)[1:]])
     assert "tilted by 30 degrees" in refusal(bag)
-    assert open_source(bag, BagOptions(laser_pose=(0.0, 0.0, 0.0))).survey().scan_count == 20
+    assert open_source(bag, BagOptions(laser_poses=((0.0, 0.0, 0.0),))).survey().scan_count == 20
 
 
 def test_clocks_that_differ(tmp_path):
@@ -169,18 +169,25 @@ def test_scans_before_the_odometry_are_left_out_and_counted(tmp_path):
 # Beams
 
 
+def other_sensor(count):
+    other = [scan(108.05 + 0.2 * k, (1.0,) * 5) for k in range(count)]
+    return [*other, *(odom(108 + 0.1 * k, pose_at(8 + 0.1 * k)) for k in range(2 * count + 10))]
+
+
 def test_a_change_of_sensor(tmp_path):
-    other = [scan(108.05 + 0.2 * k, (1.0,) * 5) for k in range(10)]
-    said = [*drive(40), *other, *(odom(108 + 0.1 * k, pose_at(8 + 0.1 * k)) for k in range(30))]
-    assert "message 41: the beam count changes" in refusal(save(tmp_path / "run.bag", said))
+    bag = save(tmp_path / "run.bag", [*drive(40), *other_sensor(50)])
+    assert "message 41: 50 scans are not of the laser of the first ones (40 scans are)" in refusal(bag)
+    source = open_source(save(tmp_path / "less.bag", [*drive(40), *other_sensor(10)]))
+    assert len(scans_of(source)) == source.survey().scan_count == 40
+    assert source.faults[Fault.OTHER_BEAMS] == FaultCount(10, 41)
 
 
 def test_a_few_other_scans_are_skipped_and_counted(tmp_path):
     said = [*drive(200), scan(110.0, (1.0,) * 5, bag_time=110.08), scan(111.0, angle_min=0.0, bag_time=111.08)]
     source = open_source(save(tmp_path / "run.bag", said))
     assert len(scans_of(source)) == 200
-    assert source.faults[Fault.BEAM_COUNT].count == 2
-    assert "scans with another beam count skipped: 2 (first: message 52)" in str(source.faults)
+    assert source.faults[Fault.OTHER_BEAMS].count == 2
+    assert "scans with the beams of another laser skipped: 2 (first: message 52)" in str(source.faults)
 
 
 # Broken messages
@@ -219,9 +226,9 @@ def test_broken_messages_are_skipped_and_counted(tmp_path, name):
     broken = [list(hostile(100.03 + 0.2 * k))[k] for k in range(22)]
     source = open_source(save(tmp_path / name, [*drive(60), *broken]))
     assert len(scans_of(source)) == 60
-    assert source.faults[Fault.BROKEN_MESSAGE].count == 22
-    assert source.faults.counts.keys() == {Fault.BROKEN_MESSAGE}
-    assert "broken messages skipped: 22 (first: message 1)" in str(source.faults)
+    assert source.faults[Fault.BAD_BEAMS].count == 7
+    assert source.faults.counts.keys() == {Fault.BROKEN_MESSAGE, Fault.BAD_BEAMS}
+    assert "broken messages skipped: 15 (first: message 1)" in str(source.faults)
 
 
 def test_mostly_broken_messages_are_refused(tmp_path):
@@ -235,7 +242,7 @@ def test_a_laser_that_claims_to_see_for_ever(tmp_path):
     said = [message._replace(fields={**message.fields, "range_max": math.inf, "range_min": math.nan})
             if message.topic == "/scan" else message for message in drive(12)]  # fmt: skip
     source = open_source(save(tmp_path / "run.bag", said))
-    assert source.survey().laser.max_range_m == 1000.0
+    assert source.survey().lasers[0].max_range_m == 1000.0
     assert np.isfinite(scans_of(source)[0].ranges_m).all()
 
 

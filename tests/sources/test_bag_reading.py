@@ -41,11 +41,11 @@ def test_every_kind_of_bag_says_the_same(tmp_path, name):
     source = open_source(save(tmp_path / name, [*drive(40), text(101.0)]))
     survey = source.survey()
     assert source.name == "run"
-    assert (survey.scan_count, survey.beam_count, bool(survey.faults), survey.notes) == (40, BEAMS, False, ())
+    assert (survey.scan_count, survey.lasers[0].beam_count, bool(survey.faults), survey.notes) == (40, BEAMS, False, ())
     assert survey.duration_s == pytest.approx(39 * 0.2)
-    assert survey.laser.T_base_laser == pytest.approx(LASER_POSE, abs=1e-9)
-    assert survey.laser.max_range_m == 20.0
-    np.testing.assert_allclose(survey.laser.angles_rad(), ANGLE_MIN + INCREMENT * np.arange(BEAMS), atol=1e-12)
+    assert survey.lasers[0].T_base_laser == pytest.approx(LASER_POSE, abs=1e-9)
+    assert survey.lasers[0].max_range_m == 20.0
+    np.testing.assert_allclose(survey.lasers[0].angles_rad(), ANGLE_MIN + INCREMENT * np.arange(BEAMS), atol=1e-12)
     for step, record in enumerate(scans_of(source)):
         at = 0.2 * step + 0.05
         assert record.stamp == pytest.approx(100.0 + at, abs=1e-9)
@@ -137,7 +137,7 @@ def test_odometry_from_tf(tmp_path):
         said.append(tf(100 + k, "odom", "base_link", (0.1 * k, 0.0, 0.0), quaternion(0.01 * k)))
         said.append(scan(100.5 + k))
     source = open_source(save(tmp_path / "run.mcap", [*said, tf(130, "odom", "base_link", (3.0, 0.0, 0.0))]))
-    assert source.survey().laser.T_base_laser == pytest.approx(LASER_POSE, abs=1e-9)
+    assert source.survey().lasers[0].T_base_laser == pytest.approx(LASER_POSE, abs=1e-9)
     expected = [(0.1 * k + 0.05, 0.0, 0.01 * k + 0.005) for k in range(29)]
     np.testing.assert_allclose([scan.T_odom_base for scan in scans_of(source)][:29], expected, atol=1e-9)
 
@@ -185,7 +185,7 @@ def test_ranges_by_rep_117(tmp_path):
     np.testing.assert_array_equal(scans_of(source)[0].ranges_m, expected)
 
 
-def test_a_laser_whose_beams_vary_is_brought_to_the_usual_ones(tmp_path):
+def test_each_scan_of_a_laser_whose_beams_vary_has_its_own(tmp_path):
     """As an RPLidar: one turn, now 360, now 358 beams, of a room in which the range tells the direction."""
 
     def turn(stamp, beams):
@@ -197,12 +197,11 @@ def test_a_laser_whose_beams_vary_is_brought_to_the_usual_ones(tmp_path):
     said = [mounted(), *(odom(100 + k, (k, 0, 0)) for k in range(7))]
     source = open_source(save(tmp_path / "run.bag", said + [turn(100 + k, n) for k, n in enumerate(counts)]))
     scans = scans_of(source)
-    assert len(scans) == 7
+    assert [len(read.ranges_m) for read in scans] == counts
     for read in scans:
-        seen = np.isfinite(read.ranges_m)
-        assert seen.sum() >= 358
-        assert np.abs(read.ranges_m - 5.0 - read.laser.angles_rad())[seen].max() < math.radians(1.1) / 2
-    assert source.faults[Fault.RESAMPLED].count == 2
+        np.testing.assert_allclose(read.ranges_m - 5.0, read.laser.angles_rad(), atol=1e-4)
+    assert source.survey().lasers[0].beam_count == 360
+    assert not source.faults
 
 
 def test_a_laser_that_turns_to_the_right_is_turned_round(tmp_path):
@@ -245,14 +244,14 @@ def test_a_laser_on_the_base_itself_needs_no_tf(tmp_path):
     said = [message for message in drive(12) if message.topic != "/tf_static"]
     for message in said:
         message.fields.update({"frame": "base_link"} if message.topic == "/scan" else {})
-    assert open_source(save(tmp_path / "run.bag", said)).survey().laser.T_base_laser == (0.0, 0.0, 0.0)
+    assert open_source(save(tmp_path / "run.bag", said)).survey().lasers[0].T_base_laser == (0.0, 0.0, 0.0)
 
 
 def test_the_users_pose_replaces_tf(tmp_path):
-    options = BagOptions(laser_pose=(0.5, -0.25, 1.5))
+    options = BagOptions(laser_poses=((0.5, -0.25, 1.5),))
     for said in (drive(12), drive(12)[1:]):
         source = open_source(save(tmp_path / f"{len(said)}.bag", said), options)
-        assert source.survey().laser.T_base_laser == (0.5, -0.25, 1.5)
+        assert source.survey().lasers[0].T_base_laser == (0.5, -0.25, 1.5)
 
 
 @pytest.mark.parametrize(("tilt_deg", "noted"), [(1.0, False), (5.0, True)])
@@ -284,7 +283,7 @@ def test_the_widest_laser_is_chosen_and_said(tmp_path):
 
 def test_the_user_chooses(tmp_path):
     bag = save(tmp_path / "run.bag", several())
-    source = open_source(bag, BagOptions(scan_topic="/narrow", odom_topic="filtered"))
+    source = open_source(bag, BagOptions(scan_topics=("/narrow",), odom_topic="filtered"))
     assert source.survey().scan_count == 30
     assert source.survey().notes == ()
     assert scans_of(source)[0].T_odom_base[0] == 9.0
@@ -293,9 +292,9 @@ def test_the_user_chooses(tmp_path):
 def test_options_of_bags_are_refused_for_logs(tmp_path):
     log = save_log(tmp_path / "run.log", drive_log(12))
     with pytest.raises(SourceError, match="a CARMEN log has neither topics nor tf"):
-        open_source(log, BagOptions(scan_topic="/scan"))
+        open_source(log, BagOptions(scan_topics=("/scan",)))
     with pytest.raises(dataclasses.FrozenInstanceError):
-        BagOptions().scan_topic = "/scan"
+        BagOptions().scan_topics = ("/scan",)
 
 
 def test_a_name_may_be_given(tmp_path):

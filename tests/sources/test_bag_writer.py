@@ -115,7 +115,7 @@ def test_a_bag_of_a_bag_has_no_more_messages(tmp_path):
         source = open_source(tmp_path / name)
         counts.append(sum(1 for _ in source.records()))
     assert counts[0] == counts[1]
-    assert source.survey().beam_count == BEAMS
+    assert source.survey().lasers[0].beam_count == BEAMS
 
 
 def test_a_file_is_replaced_when_the_new_one_is_complete(tmp_path):

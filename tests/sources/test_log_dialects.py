@@ -46,7 +46,7 @@ def test_dpslam_scans_take_the_pose_before_them_and_made_stamps(tmp_path):
     np.testing.assert_array_equal([scan.T_odom_base for scan in scans], [pose_at(k) for k in range(5)])
     assert [scan.stamp for scan in scans] == [0.0, 1.0, 2.0, 3.0, 4.0]
     np.testing.assert_allclose(scans[3].ranges_m, 1.0 + 0.01 * np.arange(181), rtol=1e-6)
-    laser = source.survey().laser
+    laser = source.survey().lasers[0]
     assert laser.T_base_laser == pytest.approx((0.4, 0.0, 0.0))
     np.testing.assert_allclose(np.degrees(laser.angles_rad()), np.arange(-90, 91), atol=1e-9)
     assert laser.max_range_m < 8.191
@@ -104,7 +104,7 @@ def test_the_rovers_laser_looks_past_its_body(tmp_path):
     ranges = [0] * 70 + [7, 19, 20, *range(1003, 1542)] + [0] * 70
     lines = [coreslam(100_000 * k, 100 * k, 100 * k, ranges) for k in range(3)]
     source = open_source(save(tmp_path / "exp.dat", lines))
-    laser = source.survey().laser
+    laser = source.survey().lasers[0]
     assert laser.beam_count == 542
     assert laser.angles_rad()[270] == pytest.approx(0.0, abs=1e-9)
     assert np.degrees(laser.angle_increment_rad) == pytest.approx(360 / 1024)

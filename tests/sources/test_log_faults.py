@@ -74,10 +74,9 @@ def test_a_log_without_odometry_is_refused(tmp_path):
     assert open_source(save(tmp_path / "short.log", standing[:9])).survey().scan_count == 9
 
 
-def test_a_change_of_the_beam_count_is_refused_with_its_line(tmp_path):
-    message = refusal(save(tmp_path / "run.log", drive(30) + drive(30, start_stamp=200, beams=9)))
-    assert "line 62" in message
-    assert "beam count changes" in message
+def test_a_change_of_the_laser_is_refused_with_its_line(tmp_path):
+    message = refusal(save(tmp_path / "run.log", drive(30) + drive(31, start_stamp=200, beams=9)))
+    assert "line 62: 31 scans are not of the laser of the first ones" in message
 
 
 def test_two_recordings_put_together_are_refused_with_the_line(tmp_path):
@@ -130,7 +129,7 @@ def test_a_few_misfits_are_skipped_and_counted(tmp_path):
     lines[301] = flaser(3.0, pose_at(150))
     source = open_source(save(tmp_path / "run.log", lines))
     assert len(scans_of(source)) == source.survey().scan_count == 198
-    assert source.faults[Fault.BEAM_COUNT] == FaultCount(1, 102)
+    assert source.faults[Fault.OTHER_BEAMS] == FaultCount(1, 102)
     assert source.faults[Fault.MISPLACED_SCAN].first_line == 302
     assert source.survey().faults.counts == source.faults.counts
 

@@ -59,10 +59,10 @@ def test_survey_tells_what_the_records_hold(tmp_path):
     survey, scans = source.survey(), scans_of(source)
     poses = np.array([scan.T_odom_base for scan in scans])
     assert survey.scan_count == 40
-    assert survey.beam_count == BEAMS
+    assert survey.lasers[0].beam_count == BEAMS
     assert survey.duration_s == pytest.approx(scans[-1].stamp - scans[0].stamp)
     assert survey.path_length_m == pytest.approx(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).sum())
-    assert all(scan.laser is survey.laser for scan in scans)
+    assert all(scan.laser is survey.lasers[0] for scan in scans)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_white_space_does_not_matter(tmp_path, messy):
     ],
 )
 def test_the_beam_count_decides_the_angles_of_flaser(tmp_path, beams, first_deg, step_deg):
-    laser = open_source(save(tmp_path / "run.log", drive(2, beams=beams))).survey().laser
+    laser = open_source(save(tmp_path / "run.log", drive(2, beams=beams))).survey().lasers[0]
     angles_deg = np.degrees(laser.angles_rad())
     assert angles_deg[0] == pytest.approx(first_deg)
     np.testing.assert_allclose(np.diff(angles_deg), step_deg)
@@ -104,7 +104,7 @@ def test_the_beam_count_decides_the_angles_of_flaser(tmp_path, beams, first_deg,
 )
 def test_parameters_state_the_field_of_view_where_they_fit_the_count(tmp_path, resolution, fov, span_deg):
     parameters = [f"PARAM laser_front_laser_resolution {resolution} h 0", f"PARAM laser_front_laser_fov {fov} h 0"]
-    laser = open_source(save(tmp_path / "run.log", [*parameters, *drive(2, beams=360)])).survey().laser
+    laser = open_source(save(tmp_path / "run.log", [*parameters, *drive(2, beams=360)])).survey().lasers[0]
     assert np.degrees(np.ptp(laser.angles_rad())) == pytest.approx(span_deg)
 
 
@@ -114,7 +114,7 @@ def test_robotlaser_states_its_geometry(tmp_path, kind, max_range_m, remissions)
     config = (kind, -2.0, 4.0, 2.0, 81.0, 0.01, 0)
     lines = [robotlaser(k, pose_at(k), config, (1.5, 2.5, 3.5), remissions) for k in range(3)]
     source = open_source(save(tmp_path / "run.log", lines))
-    laser = source.survey().laser
+    laser = source.survey().lasers[0]
     np.testing.assert_allclose(laser.angles_rad(), [-2.0, 0.0, 2.0])
     assert laser.max_range_m == max_range_m
     scans = scans_of(source)
@@ -128,7 +128,7 @@ def test_a_stated_geometry_goes_before_a_guessed_one(tmp_path):
     lines = [flaser(0, pose_at(0), ranges=(1, 2, 3)), robotlaser(1, pose_at(1), config, (1, 2, 3))]
     survey = open_source(save(tmp_path / "run.log", lines)).survey()
     assert survey.scan_count == 2
-    assert survey.laser.max_range_m == 20.0
+    assert survey.lasers[0].max_range_m == 20.0
 
 
 mountings = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3))
@@ -142,7 +142,7 @@ def test_both_poses_of_the_scans_say_where_the_laser_sits(tmp_path_factory, moun
     for step in range(5):
         laser = tuple(f"{value:.6f}" for value in se2.compose(pose_at(step), mounting))
         lines.append(flaser(step, pose_at(step), laser))
-    found = open_source(save(tmp_path_factory.mktemp("log") / "run.log", lines)).survey().laser.T_base_laser
+    found = open_source(save(tmp_path_factory.mktemp("log") / "run.log", lines)).survey().lasers[0].T_base_laser
     expected = mounting if any(mounting) else (0.3, 0.0, 0.0)
     np.testing.assert_allclose(found, expected, atol=2e-4)
 
@@ -153,7 +153,7 @@ def test_the_parameter_says_where_the_laser_sits_if_the_poses_do_not(tmp_path):
     corrected = [flaser(k, pose_at(k), (1.0 + k, 2.0 * k, 0.0)) for k in range(20)]
     one_corrected = save(tmp_path / "corrected.log", [parameter, *corrected])
     for path in (same_pose_twice, one_corrected):
-        assert open_source(path).survey().laser.T_base_laser == (-0.04, 0.0, 0.0)
+        assert open_source(path).survey().lasers[0].T_base_laser == (-0.04, 0.0, 0.0)
 
 
 def test_cmu_logs_are_read_in_metres(tmp_path):
@@ -165,7 +165,7 @@ def test_cmu_logs_are_read_in_metres(tmp_path):
         lines.append(f"O {x} {y} {theta} {step}.6")
     source = open_source(save(tmp_path / "wean.txt", lines))
     records = list(source.records())
-    laser = source.survey().laser
+    laser = source.survey().lasers[0]
     assert laser.T_base_laser == pytest.approx((0.25, 0.0, 0.0))
     assert np.degrees(laser.angle_min_rad) == pytest.approx(-90)
     np.testing.assert_allclose(records[2].T_odom_base, (1.0, 0.5, 0.5))

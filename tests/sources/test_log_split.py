@@ -55,7 +55,7 @@ def test_parts_are_named_and_surveyed_as_robots_of_their_own(recording):
         assert survey.scan_count == len(scans)
         assert survey.duration_s == pytest.approx(scans[-1].stamp - scans[0].stamp)
         assert survey.path_length_m == pytest.approx(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).sum())
-        assert survey.laser == recording.survey().laser
+        assert survey.lasers[0] == recording.survey().lasers[0]
 
 
 def test_parts_can_be_read_side_by_side(tmp_path):

@@ -42,7 +42,7 @@ def test_logs_hold_what_their_description_says(log, shape, path_m, duration_s, l
     assert (survey.scan_count, survey.beam_count) == shape
     assert survey.path_length_m == pytest.approx(path_m, rel=0.01)
     assert survey.duration_s == pytest.approx(duration_s, abs=1.0)
-    assert survey.laser.T_base_laser == pytest.approx((laser_x_m, 0.0, 0.0), abs=1e-4)
+    assert survey.lasers[0].T_base_laser == pytest.approx((laser_x_m, 0.0, 0.0), abs=1e-4)
     assert len(scans_of(source)) == shape[0]
 
 

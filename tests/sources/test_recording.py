@@ -3,9 +3,11 @@
 import contextlib
 import math
 import resource
+import shutil
 import struct
 import subprocess
 import sys
+import zlib
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,14 +19,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import OutputError, SourceError
-from fcslam.records import GroundTruth, LaserScan, Odometry, frozen
-from fcslam.sources import Fault, Recording, RecordingWriter, open_source, split, write_recording
+from fcslam.records import Beams, GroundTruth, LaserModel, LaserScan, Odometry, frozen
+from fcslam.sources import Fault, FaultCount, Recording, RecordingWriter, open_source, split, write_recording
 from fcslam.sources.images import image_size
-from fcslam.sources.recording.layout import ODOMETRY_FILE
+from fcslam.sources.recording.layout import ODOMETRY_FILE, SCANS_FILE
 from tests.sources.camera_records import CAMERA, LASER, drive, image, png, same, scan
 
 GOLDEN = Path(__file__).parent / "golden" / "robot.fcslam"
-HEADER, SCAN, IMAGE = 16, 8 + 8 + 24 + 4 * LASER.beam_count + 4, 8 + 8 + 24 + 4 + 4 + 4 + 4
+FILES = ("meta.yaml", "scans.bin", "ranges.bin", "odometry.bin", "images.bin")
+GOLDEN_1 = GOLDEN.with_name("version-1.fcslam")
+ENTRY = 8 + 8 + 24
+HEADER, SCAN, IMAGE = 16, ENTRY + 4 + 4 + 8 + 8 + 8 + 4 + 4, ENTRY + 4 + 4 + 4 + 4
+REAR = LaserModel(9, -1.0, 0.25, 8.0, (-0.25, 0.0, 3.0))
 
 numbers = st.floats(-1e6, 1e6)
 poses = st.tuples(numbers, numbers, numbers)
@@ -42,8 +48,9 @@ def recordings(draw):
         if kind == "odometry":
             records.append(Odometry(stamp, frozen(pose)))
         elif kind == "scan":
-            values = draw(st.lists(ranges, min_size=LASER.beam_count, max_size=LASER.beam_count))
-            records.append(LaserScan(stamp, frozen(values, np.float32), LASER, frozen(pose)))
+            laser = draw(st.sampled_from([LASER, REAR, LASER.with_beams(Beams(11, -3.0, math.tau / 11))]))
+            values = draw(st.lists(ranges, min_size=laser.beam_count, max_size=laser.beam_count))
+            records.append(LaserScan(stamp, frozen(values, np.float32), laser, frozen(pose)))
         else:
             records.append(image(stamp, pose if kind == "image" else None, png(shade=draw(st.integers(0, 255)))))
     return records
@@ -60,7 +67,7 @@ def sensed(records):
 
 def written(tmp_path, records=None, name="robot.fcslam"):
     folder = tmp_path / name
-    write_recording(folder, LASER, CAMERA, drive() if records is None else records)
+    write_recording(folder, (LASER, REAR), CAMERA, drive() if records is None else records)
     return folder
 
 
@@ -95,7 +102,7 @@ def test_a_recording_cut_off_anywhere_and_resumed_is_the_same(tmp_path_factory, 
     folder = tmp_path_factory.mktemp("recording")
     whole = written(folder, records, "whole.fcslam")
     cut = written(folder, records[:at], "cut.fcslam")
-    for name in ("scans.bin", "odometry.bin", "images.bin"):
+    for name in ("scans.bin", "ranges.bin", "odometry.bin", "images.bin"):
         with (cut / name).open("ab") as file:
             file.write(torn)
     with RecordingWriter.resume(cut) as writer:
@@ -111,8 +118,12 @@ def contents(folder):
 def test_the_golden_recording_means_what_it_says():
     """Read by hand, as docs/recording.md lays it out."""
     scans = (GOLDEN / "scans.bin").read_bytes()
-    assert struct.unpack_from("<8sII", scans) == (b"FCSLAMsc", 1, SCAN)
-    assert struct.unpack_from("<Qd3d12f", scans, HEADER) == (1, 100.0, 0.0, 0.0, 0.0, *[2.0] * 12)
+    assert struct.unpack_from("<8sII", scans) == (b"FCSLAMsc", 2, SCAN)
+    assert struct.unpack_from("<Qd3d", scans, HEADER + SCAN) == (4, 100.25, 0.125, 0.0, 0.0)
+    *beams, offset, crc = struct.unpack_from("<IIddQI", scans, HEADER + SCAN + ENTRY)
+    assert beams == [0, 12, LASER.angle_min_rad, LASER.angle_increment_rad]
+    ranges = (GOLDEN / "ranges.bin").read_bytes()[offset : offset + 48]
+    assert (offset, crc, struct.unpack("<12f", ranges)) == (48, zlib.crc32(ranges), (2.0,) * 12)
     images = (GOLDEN / "images.bin").read_bytes()
     assert struct.unpack_from("<8sII", images) == (b"FCSLAMim", 1, IMAGE)
     sequence, stamp, x, _, _, suffix, size = struct.unpack_from("<Qd3d4sI", images, HEADER + IMAGE)
@@ -127,6 +138,40 @@ def test_the_golden_recording_is_read_and_written(tmp_path):
     assert all(map(same, sensed(records), source.records()))
     assert [truth.T_building_base[0] for truth in source.ground_truth()] == [1.0, 1.125, 1.25]
     assert contents(written(tmp_path, records)) == contents(GOLDEN)
+
+
+def test_a_recording_of_version_1_is_read_but_not_continued(tmp_path):
+    source = Recording(GOLDEN_1, "robot")
+    assert source.survey().lasers == (LASER,)
+    assert all(map(same, sensed(drive(3)), source.records()))
+    copy = shutil.copytree(GOLDEN_1, tmp_path / "robot.fcslam")
+    with pytest.raises(SourceError, match="is of version 1, which is read but not continued"):
+        RecordingWriter.resume(copy)
+    edit(copy, lambda content: content["laser"].update(beam_count=13))
+    with pytest.raises(SourceError, match="does not fit"):
+        open_source(copy).survey()
+
+
+def test_damaged_ranges_cost_their_scan_alone(tmp_path):
+    folder = written(tmp_path)
+    spoil(folder / "ranges.bin", 48 * 3 + 5)
+    source = open_source(folder)
+    assert counts(source) == {"CameraImage": 20, "LaserScan": 19, "Odometry": 20}
+    assert source.faults[Fault.BROKEN_RECORD] == FaultCount(1, 4)
+    (folder / "ranges.bin").write_bytes((folder / "ranges.bin").read_bytes()[:-5])
+    assert counts(open_source(folder))["LaserScan"] == 18
+
+
+def test_a_scan_of_no_laser_of_the_recording_is_damage(tmp_path):
+    folder = written(tmp_path)
+    edit(folder, lambda content: content.update(lasers=content["lasers"][1:]))
+    with pytest.raises(SourceError, match="20 scans are not of the laser of the first ones"):
+        open_source(folder).survey()
+    with (folder / "scans.bin").open("ab") as file:
+        for beams in ((7, 9, -1.0, 0.25), (0, 2**32 - 1, -1.0, 0.25), (0, 9, math.nan, 0.25), (0, 9, -1.0, -0.25)):
+            file.write(SCANS_FILE.packed(1000, 200.0, (0.0, 0.0, 0.0), *beams, 0, 0))
+    with pytest.raises(SourceError, match="20 scans are not of"):
+        open_source(folder).survey()
 
 
 def test_parts_and_names(tmp_path):
@@ -222,14 +267,15 @@ def test_without_the_images_file_the_laser_goes_on(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda content: content.update(version=2), "version 2"),
+        (lambda content: content.update(version=3), "version 3"),
         (lambda content: content.pop("version"), "no version"),
-        (lambda content: content.pop("laser"), "laser"),
+        (lambda content: content.pop("lasers"), "laser"),
+        (lambda content: content.update(lasers=[]), "1 to 8 lasers"),
+        (lambda content: content.update(lasers=9 * content["lasers"]), "1 to 8 lasers"),
         (lambda content: content.update(extra=1), "extra"),
-        (lambda content: content["laser"].update(beam_count=10**9), "beams"),
-        (lambda content: content["laser"].update(beam_count=13), "does not fit"),
-        (lambda content: content["laser"].update(angle_increment_rad=math.nan), "field of view|finite"),
-        (lambda content: content["laser"].update(max_range_m=-1.0), "range"),
+        (lambda content: content["lasers"][0].update(beam_count=10**9), "beams"),
+        (lambda content: content["lasers"][0].update(angle_increment_rad=math.nan), "field of view|finite"),
+        (lambda content: content["lasers"][0].update(max_range_m=-1.0), "range"),
         (lambda content: content["camera"].update(fx=0.0), "fx"),
         (lambda content: content["camera"].update(width=1 << 20), "width"),
         (lambda content: content["camera"]["T_base_camera"].update(rotation=[0, 0, 0, 2]), "quaternion"),
@@ -252,7 +298,7 @@ def test_a_description_that_is_none(tmp_path, text):
         open_source(folder).survey()
 
 
-@pytest.mark.parametrize("name", ["meta.yaml", "scans.bin", "odometry.bin"])
+@pytest.mark.parametrize("name", FILES[:-1])
 def test_a_file_that_is_missing_is_named(tmp_path, name):
     folder = written(tmp_path)
     (folder / name).unlink()
@@ -262,7 +308,10 @@ def test_a_file_that_is_missing_is_named(tmp_path, name):
 
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
-@given(st.sampled_from(["meta.yaml", "scans.bin", "odometry.bin", "images.bin", "images/00000001.png"]), st.data())
+@given(
+    st.sampled_from(["meta.yaml", "scans.bin", "ranges.bin", "odometry.bin", "images.bin", "images/00000001.png"]),
+    st.data(),
+)
 def test_no_damage_ends_in_anything_but_fewer_records_or_a_refusal(tmp_path_factory, name, data):
     folder = written(tmp_path_factory.mktemp("recording"), drive(4))
     size = (folder / name).stat().st_size
@@ -295,7 +344,7 @@ sys.path[:0] = [{str(Path(__file__).parents[2])!r}, {str(Path(__file__).parents[
 from tests.sources.camera_records import CAMERA, LASER, drive
 from fcslam.sources import RecordingWriter
 from pathlib import Path
-writer = RecordingWriter.create(Path({str(tmp_path / "run.fcslam")!r}), LASER, CAMERA)
+writer = RecordingWriter.create(Path({str(tmp_path / "run.fcslam")!r}), (LASER,), CAMERA)
 for record in drive():
     writer.write(record)
 os._exit(9)
@@ -316,7 +365,7 @@ def test_a_full_disk_leaves_what_was_written(tmp_path):
             writer.write(record)
             done.append(record)
 
-    with RecordingWriter.create(tmp_path / "run.fcslam", LASER, CAMERA) as writer:
+    with RecordingWriter.create(tmp_path / "run.fcslam", (LASER,), CAMERA) as writer:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
         try:
             with pytest.raises(OutputError, match=r"run\.fcslam: cannot be written .* can be read") as refusal:
@@ -344,7 +393,7 @@ def test_a_full_disk_leaves_what_was_written(tmp_path):
 )
 def test_records_that_cannot_be_kept(tmp_path, item, words):
     with (
-        RecordingWriter.create(tmp_path / "run.fcslam", LASER, CAMERA) as writer,
+        RecordingWriter.create(tmp_path / "run.fcslam", (LASER,), CAMERA) as writer,
         pytest.raises(OutputError, match=words),
     ):
         writer.write(item)
@@ -353,9 +402,9 @@ def test_records_that_cannot_be_kept(tmp_path, item, words):
 def test_a_place_that_is_taken_or_not_there(tmp_path):
     folder = written(tmp_path)
     with pytest.raises(OutputError, match="is not empty"):
-        RecordingWriter.create(folder, LASER)
+        RecordingWriter.create(folder, (LASER,))
     with pytest.raises(OutputError, match="cannot be written"):
-        RecordingWriter.create(tmp_path / "missing" / "run.fcslam", LASER)
+        RecordingWriter.create(tmp_path / "missing" / "run.fcslam", (LASER,))
     (folder / "scans.bin").write_bytes(b"something else than a header")
     with pytest.raises(SourceError, match="does not fit"):
         RecordingWriter.resume(folder)

@@ -1,12 +1,13 @@
 """One packet of every kind, written down; ``python -m wire.examples`` (from tests/) writes the golden files anew."""
 
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fcslam.records import (
+    Beams,
     Channel,
     Constraint,
     ConstraintKind,
@@ -27,7 +28,10 @@ GOLDEN = Path(__file__).parent / "golden"
 HELLO = Hello(
     "alice",
     7,
-    LaserModel(181, -1.5, 0.0166015625, 81.25, (0.125, -0.25, 0.5)),
+    (
+        LaserModel(181, -1.5, 0.0166015625, 81.25, (0.125, -0.25, 0.5)),
+        LaserModel(360, -3.125, 0.0166015625, 12.0, (-0.25, 0.0, 3.125)),
+    ),
     {Channel.LIDAR: "orb-1", Channel.CAMERA: "cnn-0.3+r12"},
 )
 KEYSCAN = Keyscan(
@@ -35,6 +39,7 @@ KEYSCAN = Keyscan(
     1042.25,
     dequantise(np.array([0, 1, 500, 501, 501, 499, 65535, 0, 0, 1000, 999, 998, 997, 996], np.uint16)),
 )
+VARIED_KEYSCAN = replace(KEYSCAN, laser=1, beams=Beams(14, -1.25, 0.0078125))
 ODOMETRY = Constraint(
     "alice",
     11,
@@ -78,6 +83,7 @@ def packet(body: Body) -> Packet:
 EXAMPLES = {
     "hello": packet(HELLO),
     "keyscan": packet(KEYSCAN),
+    "varied_keyscan": packet(VARIED_KEYSCAN),
     "odometry": packet(ODOMETRY),
     "closure": packet(CLOSURE),
     "lidar_place": packet(LIDAR_PLACE),

@@ -95,13 +95,23 @@ def detector_files():
     return st.builds(DetectorFile, st.sampled_from(Channel), NAMES, NUMBERS, st.integers(1, 2**26), digests)
 
 
+@st.composite
+def keyscans(draw, identities, stamps):
+    ranges = draw(codes().map(dequantise))
+    laser = draw(lasers())
+    beams = draw(st.none() | st.just(laser.beams._replace(beam_count=len(ranges))))
+    return Keyscan(draw(identities), draw(stamps), ranges, draw(st.integers(0, 7)), beams)
+
+
 def bodies(robot, epoch, time):
     versions = st.dictionaries(st.sampled_from(Channel), NAMES)
     stamps = st.floats(max_value=time, allow_nan=False, allow_infinity=False)
     identity = st.builds(KeyscanId, st.just(robot), NUMBERS)
     return st.one_of(
-        st.builds(Hello, st.just(robot), st.just(epoch), lasers(), versions),
-        st.builds(Keyscan, identity, stamps, codes().map(dequantise)),
+        st.builds(
+            Hello, st.just(robot), st.just(epoch), st.lists(lasers(), min_size=1, max_size=8).map(tuple), versions
+        ),
+        keyscans(identity, stamps),
         constraints(robot),
         places(robot),
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import PacketError
-from fcslam.records import Channel, KeyscanId
+from fcslam.records import Beams, Channel, KeyscanId
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.packets import decode, encode
 from fcslam.wire.streams import pack_ranges
@@ -42,7 +42,11 @@ def place(count, positions=None, codes=None):
 
 
 def hello(**laser):
-    return replace(HELLO, laser=replace(HELLO.laser, **laser))
+    return replace(HELLO, lasers=(replace(HELLO.lasers[0], **laser),))
+
+
+def beams(*, count=14, first=-1.25, increment=0.0078125):
+    return replace(KEYSCAN, beams=Beams(count, first, increment))
 
 
 def detector_update(**changes):
@@ -53,6 +57,8 @@ REFUSED_BODIES = [
     (replace(HELLO, robot="bob"), "holds a record of robot"),
     (replace(HELLO, epoch=8), "epoch 8 in a packet of epoch 7"),
     (replace(HELLO, detector_versions={Channel.LIDAR: "two words"}), "detector version of lidar"),
+    (replace(HELLO, lasers=()), "0 lasers"),
+    (replace(HELLO, lasers=9 * HELLO.lasers[:1]), "9 lasers"),
     (hello(beam_count=0), "0 beams"),
     (hello(beam_count=4097), "4097 beams"),
     (hello(angle_min_rad=NAN), "first beam"),
@@ -79,6 +85,15 @@ REFUSED_BODIES = [
     (replace(KEYSCAN, ranges_m=np.array([NAN], np.float32)), "not quantised"),
     (replace(KEYSCAN, ranges_m=np.array([131.1], np.float32)), "not quantised"),
     (replace(KEYSCAN, ranges_m=np.array([-0.5], np.float32)), "not quantised"),
+    (replace(KEYSCAN, laser=-1), "laser is -1"),
+    (replace(KEYSCAN, laser=8), "laser is 8"),
+    (beams(count=13), "14 ranges of 13 beams"),
+    (beams(first=NAN), "first beam"),
+    (beams(first=-6.3), "first beam"),
+    (beams(increment=0.0), "do not turn"),
+    (beams(increment=NAN), "do not turn"),
+    (beams(increment=-INF), "more than a full turn"),
+    (beams(increment=0.5), "over a full turn"),
     (replace(CLOSURE, i=12), "not below"),
     (replace(CLOSURE, i=-1), "i is -1"),
     (replace(CLOSURE, j=2**31), "j is"),
@@ -184,11 +199,21 @@ def changed(name, **fields):
         elif isinstance(value, list):
             target.ClearField(field)
             getattr(target, field).extend(value)
-        elif isinstance(value, pb.Pose):
+        elif isinstance(value, pb.Pose | pb.Beams):
             getattr(target, field).CopyFrom(value)
         else:
             setattr(target, field, value)
     return message.SerializeToString()
+
+
+def laser(**fields):
+    message = pb.Packet.FromString(encode(EXAMPLES["hello"])).hello.lasers[0]
+    for field, value in fields.items():
+        if isinstance(value, pb.Pose):
+            getattr(message, field).CopyFrom(value)
+        else:
+            setattr(message, field, value)
+    return message
 
 
 LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, version="b")
@@ -197,17 +222,19 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
 @pytest.mark.parametrize(
     ("name", "fields", "reason"),
     [
-        ("hello", {"version": 0}, "version 0 is unknown, this side speaks version 1"),
-        ("hello", {"version": 2}, "version 2 is unknown"),
+        ("hello", {"version": 0}, "version 0 is unknown, this side speaks version 2"),
+        ("hello", {"version": 1}, "version 1 is unknown"),
         ("hello", {"robot": "a/b"}, "no name"),
         ("hello", {"epoch": 2**63}, "epoch"),
         ("hello", {"sequence": 2**64 - 1}, "sequence"),
         ("hello", {"time": NAN}, "time"),
-        ("hello", {"beam_count": 0}, "beams"),
-        ("hello", {"beam_count": 2**32 - 1}, "beams"),
-        ("hello", {"angle_increment_rad": 0.05}, "full turn"),
-        ("hello", {"t_base_laser": None}, "t_base_laser is missing"),
-        ("hello", {"t_base_laser": pb.Pose(theta_rad=INF)}, "angle"),
+        ("hello", {"lasers": []}, "0 lasers"),
+        ("hello", {"lasers": 5000 * [pb.Laser()]}, "lasers: 5000, at most 8"),
+        ("hello", {"lasers": [laser(beam_count=0)]}, "beams"),
+        ("hello", {"lasers": [laser(beam_count=2**32 - 1)]}, "beams"),
+        ("hello", {"lasers": [laser(angle_increment_rad=0.05)]}, "full turn"),
+        ("hello", {"lasers": [pb.Laser(beam_count=9)]}, "t_base_laser is missing"),
+        ("hello", {"lasers": [laser(t_base_laser=pb.Pose(theta_rad=INF))]}, "angle"),
         ("hello", {"detectors": [CAMERA, LIDAR]}, "ascending"),
         ("hello", {"detectors": [LIDAR, LIDAR]}, "ascending"),
         ("hello", {"detectors": [pb.Detector(version="a")]}, "channel 0 is unknown"),
@@ -222,6 +249,16 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
         ("keyscan", {"count": 2**32 - 1}, "at most 4096"),
         ("keyscan", {"count": 0, "ranges": b""}, "0 ranges"),
         ("keyscan", {"ranges": pack_ranges(np.full(14, 5, np.uint16)) + b"x"}, "goes on"),
+        ("keyscan", {"laser": 8}, "laser is 8"),
+        ("keyscan", {"laser": 2**32 - 1}, "laser is"),
+        ("keyscan", {"beams": pb.Beams()}, "do not turn"),
+        ("keyscan", {"beams": pb.Beams(angle_min_rad=NAN, angle_increment_rad=0.01)}, "first beam"),
+        ("keyscan", {"beams": pb.Beams(angle_increment_rad=1e9)}, "more than a full turn"),
+        (
+            "varied_keyscan",
+            {"count": 15, "ranges": bytes(30), "beams": pb.Beams(angle_increment_rad=0.6)},
+            "over a full",
+        ),
         ("closure", {"i": 12}, "not below"),
         ("closure", {"kind": 0}, "kind 0 is unknown"),
         ("closure", {"kind": 9}, "kind 9 is unknown"),
@@ -263,7 +300,7 @@ def test_numbers_beyond_a_limit_are_not_read():
     for body, reason in [(pb.Correction(version=2**31), "version"), (pb.Correction(map_index=2**31), "map index")]:
         body.t_map_odom.x_m = 1.0
         with pytest.raises(PacketError, match=reason):
-            decode(pb.Packet(version=1, robot="alice", correction=body).SerializeToString())
+            decode(pb.Packet(version=2, robot="alice", correction=body).SerializeToString())
 
 
 def test_only_whole_known_messages_are_read():
@@ -275,7 +312,7 @@ def test_only_whole_known_messages_are_read():
         (data + unknown_field, "unknown, repeated"),
         (data + data, "unknown, repeated"),
         (data + b"\x18\x87\x00", "unknown, repeated"),  # epoch 7 again, in an overlong varint
-        (pb.Packet(version=1, robot="alice").SerializeToString(), "empty"),
+        (pb.Packet(version=2, robot="alice").SerializeToString(), "empty"),
         (data + bytes(96 * 1024), "at most 98304"),
     ]:
         with pytest.raises(PacketError, match=reason):

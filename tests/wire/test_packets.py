@@ -104,7 +104,7 @@ def test_every_kind_has_a_golden_file():
 
 
 def test_read_label_reads_no_body():
-    data = pb.Packet(version=1, robot="bob", keyscan=pb.Keyscan(count=9, ranges=b"broken")).SerializeToString()
+    data = pb.Packet(version=2, robot="bob", keyscan=pb.Keyscan(count=9, ranges=b"broken")).SerializeToString()
     assert read_label(data) == Label("bob", PacketKind.KEYSCAN)
     with pytest.raises(PacketError):
         decode(data)

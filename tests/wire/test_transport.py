@@ -69,7 +69,7 @@ def test_places_are_counted_by_channel_and_what_goes_up_by_robot():
 
 
 def test_a_place_of_an_unknown_channel_is_refused():
-    place = pb.Packet(version=1, robot="bob", place=pb.Place(channel=7)).SerializeToString()
+    place = pb.Packet(version=2, robot="bob", place=pb.Place(channel=7)).SerializeToString()
     assert InMemoryTransport(Cloud().receive).send(place) == Reply(refusal="channel 7 is unknown")
 
 

@@ -94,7 +94,7 @@ def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") ->
         with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
             whole = Path(staging, output.name)
             if output.suffix == _RECORDING:
-                write_recording(whole, survey.laser, survey.camera, records)
+                write_recording(whole, survey.lasers, survey.camera, records)
             else:
                 (write_carmen if _CARMEN.search(output.name) else write_bag)(whole, records)
             if output.is_dir():

@@ -18,9 +18,12 @@ if TYPE_CHECKING:
 _BAGS = "ROS bags"
 
 ScanTopic = Annotated[
-    str | None,
-    typer.Option("--scan-topic", metavar="TOPIC", help="Topic of the laser scans.", rich_help_panel=_BAGS),
-]
+    list[str] | None,
+    typer.Option(
+        "--scan-topic", metavar="TOPIC", rich_help_panel=_BAGS,
+        help="Topic of the laser scans; repeat it if the robot has several lasers.",
+    ),
+]  # fmt: skip
 OdomTopic = Annotated[
     str | None,
     typer.Option(
@@ -32,29 +35,30 @@ CameraTopic = Annotated[
     typer.Option("--camera-topic", metavar="TOPIC", help="Topic of the camera images.", rich_help_panel=_BAGS),
 ]
 LaserPose = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option(
         "--laser-pose",
         metavar="X,Y,THETA",
-        help="Pose of the laser in the base frame (metres, radians). It replaces the transform in tf.",
+        help="Pose of the laser in the base frame (metres, radians). It replaces the transform in tf. Give one for "
+        "each --scan-topic, in the same order.",
         rich_help_panel=_BAGS,
     ),
 ]
 
 
 def bag_options(
-    scan_topic: str | None, odom_topic: str | None, camera_topic: str | None, laser_pose: str | None
+    scan_topics: list[str] | None, odom_topic: str | None, camera_topic: str | None, laser_poses: list[str] | None
 ) -> "BagOptions | None":
     """The options of bags; None if none is given.
 
     Raises:
-        InputError: ``laser_pose`` is no pose.
+        InputError: one of ``laser_poses`` is no pose.
     """
     from fcslam.sources import BagOptions
 
-    if scan_topic is None and odom_topic is None and camera_topic is None and laser_pose is None:
+    if not scan_topics and odom_topic is None and camera_topic is None and not laser_poses:
         return None
-    return BagOptions(scan_topic, odom_topic, camera_topic, None if laser_pose is None else _pose(laser_pose))
+    return BagOptions(tuple(scan_topics or ()), odom_topic, camera_topic, tuple(map(_pose, laser_poses or ())))
 
 
 def open_recording(argument: str, options: "BagOptions | None") -> "Source":

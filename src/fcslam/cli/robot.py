@@ -258,7 +258,7 @@ def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kb
     from fcslam.config import dump
 
     length = survey.scan_count, survey.duration_s, survey.path_length_m
-    inputs = (fcslam.__version__, name, *length, survey.laser, budget_kbps)
+    inputs = (fcslam.__version__, name, *length, survey.lasers, budget_kbps)
     return hashlib.sha256(f"{inputs} {dump(settings)}".encode()).hexdigest()
 
 

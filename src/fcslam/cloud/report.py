@@ -103,7 +103,7 @@ def _link_metrics(link: str, traffic: Mapping[str, Traffic], tracks: Mapping[str
 
 def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> LocalMap:
     """The robot's own map, made without other robots."""
-    fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.laser}, grid)
+    fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.lasers}, grid)
     name = f"{robot.robot}.pgm"
     return LocalMap(
         robot.robot,
@@ -140,7 +140,7 @@ def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> Occup
     """One map of robots that share it."""
     keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
     poses: FloatArray = np.concatenate([robot.T_map_base[robot.numbers()] for robot in members])
-    return fuse(keyscans, poses, {robot.robot: robot.laser for robot in members}, grid)
+    return fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid)
 
 
 def _drawn_closures(closures: Sequence[LoopClosure], members: Sequence[MappedRobot]) -> list[DrawnClosure]:

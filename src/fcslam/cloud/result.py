@@ -29,7 +29,8 @@ class MappedRobot:
     T_local_base: FloatArray
     """Of each stamp, in the robot's own map, made without other robots, shape (N, 3); the origin is its
     first keyscan."""
-    laser: LaserModel
+    lasers: tuple[LaserModel, ...]
+    """As the robot announced them."""
 
     def numbers(self) -> NDArray[np.int64]:
         """Rows of ``keyscans`` in stamps and poses, ascending."""
@@ -81,7 +82,7 @@ def conclude(
             sessions.keyscans(robot),
             fusion.T_map_base[robot],
             fusion.T_local_base[robot],
-            sessions.laser(robot),
+            sessions.lasers(robot),
         )
         for robot in sessions.robots
     )

@@ -7,6 +7,7 @@ import numpy as np
 
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
+from fcslam.geometry.beams import misfit
 from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, Place
 from fcslam.wire.limits import MAXIMUM_COORDINATE_M
 from fcslam.wire.messages import Hello
@@ -17,7 +18,7 @@ quarter of the packet format's limit leaves room for that."""
 
 
 class SessionStore:
-    """Laser, detectors, keyscans and places of every session; to the cloud each session is a robot.
+    """Lasers, detectors, keyscans and places of every session; to the cloud each session is a robot.
 
     Packets of a session come in the order of their numbers. A refused packet changes nothing.
     """
@@ -45,13 +46,13 @@ class SessionStore:
         return tuple(self._connected)
 
     def add_hello(self, hello: Hello) -> None:
-        """Note how to read the session's packets: at its start, or because a detector changed.
+        """Note how to read the session's packets: at its start, or because there is a new detector or one more laser.
 
         Raises:
-            PacketError: it has another laser than before.
+            PacketError: a laser of before is missing or different.
         """
         before = self._hellos.get(hello.robot)
-        if before is not None and before.laser != hello.laser:
+        if before is not None and before.lasers != hello.lasers[: len(before.lasers)]:
             raise PacketError(f"{hello.robot}: says hello again with another laser")
         self._hellos[hello.robot] = hello
         self._announced.setdefault(hello.robot, set()).update(hello.detector_versions.items())
@@ -65,13 +66,12 @@ class SessionStore:
         robot, number = keyscan.id
         if robot not in self._hellos:
             raise PacketError(f"{robot}: sends a keyscan before its hello")
-        known, beam_count = len(self._stamps.get(robot, ())), self.laser(robot).beam_count
+        known = len(self._stamps.get(robot, ()))
         if number != known:
             raise PacketError(f"{robot}: keyscan {number} where {known} is next")
         if number > self._connected.get(robot, 0):
             raise PacketError(f"{robot}: keyscan {number} before the motion to keyscan {number - 1}")
-        if len(keyscan.ranges_m) != beam_count:
-            raise PacketError(f"{robot}: {len(keyscan.ranges_m)} beams, {beam_count} announced")
+        self._check_laser(keyscan)
         self._keyscans.setdefault(robot, []).append(keyscan)
         self._stamps.setdefault(robot, []).append(keyscan.stamp)
         self._holders.setdefault(robot, []).append(0)
@@ -156,6 +156,17 @@ class SessionStore:
         """What the robot describes places with now; nothing before its hello."""
         return self._hellos[robot].detector_versions if robot in self._hellos else {}
 
-    def laser(self, robot: str) -> LaserModel:
-        """The robot's laser."""
-        return self._hellos[robot].laser
+    def lasers(self, robot: str) -> tuple[LaserModel, ...]:
+        """The lasers that the robot announced."""
+        return self._hellos[robot].lasers
+
+    def _check_laser(self, keyscan: Keyscan) -> None:
+        robot, lasers = keyscan.id.robot, self.lasers(keyscan.id.robot)
+        if keyscan.laser >= len(lasers):
+            raise PacketError(f"{robot}: a keyscan of laser {keyscan.laser}, {len(lasers)} announced")
+        announced = lasers[keyscan.laser]
+        reason = None if keyscan.beams is None else misfit(keyscan.beams, announced.beams)
+        if reason is not None:
+            raise PacketError(f"{robot}: a keyscan is not of laser {keyscan.laser}: {reason}")
+        if keyscan.beams is None and len(keyscan.ranges_m) != announced.beam_count:
+            raise PacketError(f"{robot}: {len(keyscan.ranges_m)} beams, {announced.beam_count} announced")

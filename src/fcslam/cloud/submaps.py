@@ -34,9 +34,12 @@ class SubmapCache:
 
     def _build(self, place: Place) -> Submap:
         robot = place.id.robot
-        laser, anchor = self._sessions.laser(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
+        lasers, anchor = self._sessions.lasers(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
         poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))
         keyscans = self._sessions.keyscans(robot, place.first, place.last)
         return build_submap(
-            [(point_scan(keyscan.ranges_m, laser), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]
+            [
+                (point_scan(keyscan.ranges_m, keyscan.laser_model(lasers)), pose)
+                for keyscan, pose in zip(keyscans, poses, strict=True)
+            ]
         )

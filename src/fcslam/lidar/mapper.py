@@ -13,6 +13,7 @@ from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LocalClosure, LoopCloser
 from fcslam.lidar.correlative import SearchConfig
+from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.lidar.tracker import (
@@ -24,7 +25,17 @@ from fcslam.lidar.tracker import (
     odometry_information,
 )
 from fcslam.lidar.verification import VerificationConfig
-from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, KeyscanId, LaserScan, Ranges, frozen
+from fcslam.records import (
+    Constraint,
+    ConstraintKind,
+    FloatArray,
+    Keyscan,
+    KeyscanId,
+    LaserModel,
+    LaserScan,
+    Ranges,
+    frozen,
+)
 
 SOLVE_AFTER, SOLVE_AFTER_SHARE = 20, 0.08
 """The graph is solved once this many closures wait, or this share of the number of keyscans if that is more. The time
@@ -116,6 +127,8 @@ class Mapper:
         self._closer = LoopCloser(config.closing, config.search, config.verification)
         self._graph = PoseGraph()
         self._factors = FactorCache(self._graph)
+        self._lasers = Lasers()
+        self._newest: dict[int, int] = {}  # number of the newest keyscan of each laser
         self._poses: list[FloatArray] = []  # T_map_base of each keyscan, optimised
         self._local: list[FloatArray] = []  # T_local_base of each keyscan, smooth
         self._travel: list[float] = []
@@ -142,12 +155,18 @@ class Mapper:
         self._tracker.commit(tracking)
         tracked = tracking.tracked
         # 2. Keyscan: after enough motion the scan becomes a variable of the pose graph.
-        if not self._is_keyscan(tracked):
+        laser = self._lasers.index(scan.laser)
+        if not self._is_keyscan(tracked, laser):
             return Step(self._scan_pose(scan.stamp, tracked))
-        keyscan, odometry = self._add_keyscan(scan, tracked)
+        keyscan, odometry = self._add_keyscan(scan, tracked, laser)
         # 3. Submap and loop closing: a complete submap is compared with earlier ones; closures start a solve.
         submap = self._finish_submap()
         return Step(self._scan_pose(scan.stamp, tracked), keyscan, odometry, submap)
+
+    @property
+    def lasers(self) -> tuple[LaserModel, ...]:
+        """The lasers whose scans were processed; keyscans name theirs by its index."""
+        return self._lasers.known
 
     @property
     def travel_m(self) -> float:
@@ -178,12 +197,13 @@ class Mapper:
             self._poses = list(optimize_gnc(self._graph, self._poses, factors=self._factors).poses)
         return np.array(self._poses).reshape(-1, 3)
 
-    def _is_keyscan(self, tracked: TrackedScan) -> bool:
+    def _is_keyscan(self, tracked: TrackedScan, laser: int) -> bool:
+        """Whether the robot moved enough since the last keyscan of this laser; so each of them maps what it sees."""
         if tracked.scan is None:
             return False
-        if not self._local:
+        if laser not in self._newest:
             return True
-        motion = se2.between(self._local[-1], tracked.T_local_base)
+        motion = se2.between(self._local[self._newest[laser]], tracked.T_local_base)
         gate = self.config.keyscans
         return bool(
             np.hypot(motion[0], motion[1]) >= gate.minimum_travel_distance_m
@@ -194,15 +214,16 @@ class Mapper:
         number = len(self._local) - 1
         return ScanPose(stamp, number, se2.between(self._local[number], tracked.T_local_base))
 
-    def _add_keyscan(self, scan: LaserScan, tracked: TrackedScan) -> tuple[Keyscan, Constraint | None]:
+    def _add_keyscan(self, scan: LaserScan, tracked: TrackedScan, laser: int) -> tuple[Keyscan, Constraint | None]:
         """Add a variable to the pose graph, with a constraint to the keyscan before it."""
         points = tracked.scan or point_scan(scan.ranges_m, scan.laser)
         number = len(self._local)
         self._tracker.insert(points, tracked.T_local_base)
         self._points[number] = points
-        keyscan = Keyscan(
-            KeyscanId(self.robot, number), scan.stamp, _valid_ranges(scan.ranges_m, scan.laser.max_range_m)
-        )
+        self._newest[laser] = number
+        ranges_m, announced = _valid_ranges(scan.ranges_m, scan.laser.max_range_m), self.lasers[laser]
+        beams = None if scan.laser == announced else scan.laser.beams
+        keyscan = Keyscan(KeyscanId(self.robot, number), scan.stamp, ranges_m, laser, beams)
         if number == 0:
             start = np.array(scan.T_odom_base)
             self._local.append(tracked.T_local_base)

@@ -61,7 +61,7 @@ Casting = tuple[Ranges, LaserModel, FloatArray]
 
 
 class _Beams(NamedTuple):
-    """Scans of one laser, stacked."""
+    """Scans of one laser with the same beams, stacked."""
 
     ranges_m: Ranges  # (N, beam_count)
     angles_rad: FloatArray  # (beam_count,)
@@ -94,8 +94,10 @@ def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
     Raises:
         ValueError: the number of ranges is not that of the beams, or a pose is not finite or too far away.
     """
-    lasers = list(dict.fromkeys(laser for _, laser, _ in keyscans))
-    groups = [_stacked([scan for scan in keyscans if scan[1] == laser], laser) for laser in lasers]
+    by_laser: dict[LaserModel, list[Casting]] = {}
+    for scan in keyscans:
+        by_laser.setdefault(scan[1], []).append(scan)
+    groups = [_stacked(scans, laser) for laser, scans in by_laser.items()]
     layout = _layout(groups, config)
     hits, passes = (np.zeros((layout.height, layout.width), np.uint32) for _ in range(2))
     for beams in groups:

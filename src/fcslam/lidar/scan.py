@@ -73,7 +73,7 @@ def point_scan(ranges_m: Ranges, laser: LaserModel) -> PointScan:
     return PointScan(points, normals, solitary, T_base_laser[:2])
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
 def _beams(laser: LaserModel) -> FloatArray:
     """Direction of each beam in ``base`` as cosine and sine, shape (N, 2)."""
     angles = laser.angles_rad() + laser.T_base_laser[2]

@@ -8,7 +8,7 @@ from fcslam.config import Settings
 from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig, describe
 from fcslam.lidar.mapper import FinishedSubmap, LidarConfig, Mapper, ScanPose, Step
 from fcslam.lidar.tracker import TrackingResult
-from fcslam.records import CameraImage, Channel, KeyscanId, LaserModel, LaserScan, Place
+from fcslam.records import CameraImage, Channel, KeyscanId, LaserScan, Place
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
 from fcslam.wire.messages import Body, Hello, Packet
 
@@ -45,17 +45,15 @@ class RobotSession:
         """By keyscan of a camera place: first and last keyscan of the submap that it was sent with."""
         self._described: set[tuple[int, str]] = set()
         """Keyscan and detector version of every camera place that was sent."""
-        self._laser: LaserModel | None = None
-        self._announced: str | None = None
-        """Version of the camera's detector in the last hello."""
+        self._announced: Hello | None = None
+        """The last hello."""
         self._sequence = 0
 
     def process_scan(self, scan: LaserScan, tracking: TrackingResult | None = None) -> list[Packet]:
         """Process the next scan, with its result of ``Mapper.localize`` if that was called; returns its packets."""
         self.time = max(self.time, scan.stamp)
-        self._laser = scan.laser
-        announcement = self._detector_announcement()
         step = self.mapper.process(scan, tracking)
+        announcement = self._announcement()
         self.scan_poses.append(step.pose)
         self._view_extractor.set_scan(scan, step.pose)
         return self._packets([*announcement, *self._bodies(step)])
@@ -68,7 +66,7 @@ class RobotSession:
 
     def finish(self) -> list[Packet]:
         """End the session; returns the packets of open submaps."""
-        announcement, rest = self._detector_announcement(), self.mapper.finish()
+        announcement, rest = self._announcement(), self.mapper.finish()
         last = rest[-1:]
         bodies = [body for submap in rest for body in self._submap_bodies(submap, submap in last)]
         return self._packets([*announcement, *bodies])
@@ -95,16 +93,20 @@ class RobotSession:
         self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
         return [*bodies, *(self._camera_place(view) for view in shown)]
 
-    def _detector_announcement(self) -> list[Body]:
-        """A hello at the start and after a change of the detector, then the camera places that it describes again."""
-        if self._laser is None or self._announced == self._view_extractor.detector_version:
+    def _announcement(self) -> list[Body]:
+        """A hello at the start and if there is one more laser or another detector, then the camera places that this
+        detector describes again."""
+        hello, before = self._hello(), self._announced
+        if not hello.lasers or hello == before:
             return []
-        self._announced = self._view_extractor.detector_version
+        self._announced = hello
+        if before is not None and hello.detector_versions == before.detector_versions:
+            return [hello]
         views = {view.keyscan: view for view in self._view_extractor.describe_again()} if self._submaps else {}
         self._views = [views.get(view.keyscan, view) for view in self._views]
         sent = [view for view in views.values() if view.keyscan in self._submaps]
         fresh = [view for view in sent if (view.keyscan, view.detector_version) not in self._described]
-        return [self._hello(self._laser), *(self._camera_place(view) for view in fresh)]
+        return [hello, *(self._camera_place(view) for view in fresh)]
 
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
         features = describe(submap.surface, self._config.birdseye)
@@ -121,9 +123,10 @@ class RobotSession:
             view.descriptors,
         )  # fmt: skip
 
-    def _hello(self, laser: LaserModel) -> Hello:
+    def _hello(self) -> Hello:
         versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
-        return Hello(self.robot, self.epoch, laser, {channel: versions[channel] for channel in self._config.channels})
+        chosen = {channel: versions[channel] for channel in self._config.channels}
+        return Hello(self.robot, self.epoch, self.mapper.lasers, chosen)
 
     def _packets(self, bodies: Iterable[Body]) -> list[Packet]:
         packets = []

@@ -25,7 +25,8 @@ APPLIED = "applied"
 CONFIG = "config"
 """A fact: the mission's configuration."""
 
-_VERSION = 3
+_VERSION = 4
+"""Version of the schema and of the packets."""
 _COLUMNS = "robot, epoch, sequence, time, kind, channel, data, refusal"
 
 _SCHEMA = """

@@ -77,7 +77,7 @@ def _packets() -> Iterator[bytes]:
 
 
 def _bodies(robot: str, poses: FloatArray, landmarks: FloatArray, codes: np.ndarray) -> Iterator[Body]:
-    yield Hello(robot, 0, _LASER, dict.fromkeys(Channel, _DETECTOR))
+    yield Hello(robot, 0, (_LASER,), dict.fromkeys(Channel, _DETECTOR))
     for k, pose in enumerate(poses):
         yield Keyscan(KeyscanId(robot, k), float(k), dequantise(quantise(_ranges(pose))))
         if k:

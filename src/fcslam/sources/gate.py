@@ -4,17 +4,19 @@
   0.9 s). Scans stay in file order, in which the odometry is consistent. A scan more than 2 s before both preceding
   scans is misplaced and skipped (both, because one of them may have a damaged stamp far ahead). A recording with more
   than 1 % misplaced scans, or with more than half of its steps back in time, is rejected.
-- Beam count. A scan with a different beam count is skipped. A recording with more than 1 % of them is rejected, because
-  the sensor changed.
+- Beams. The beams of one laser may vary from scan to scan; ``geometry.beams.misfit`` decides whether a scan can be of
+  the laser. One that cannot is skipped. A recording in which these are the majority is rejected.
 - Equal stamps are kept. Some logs were printed with too few digits or without a clock.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import inf
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from fcslam.errors import SourceError
+from fcslam.geometry.beams import misfit
+from fcslam.records import Beams
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.source import ScanRange
 
@@ -23,45 +25,41 @@ MAX_STEP_BACK_S = 2.0
 TOLERATED_SHARE = 0.01
 """Largest share of inconsistent scans in a recording."""
 SCANS_THAT_VOTE = 20
-"""Number of first scans whose majority decides the nominal beam count."""
+"""Number of first scans that decide which beams the laser has."""
 
 Entry = TypeVar("Entry")
 
 
-class StampedScan(Protocol):
-    """The part of a scan that the gate checks."""
-
-    @property
-    def stamp(self) -> float:
-        """Seconds of the recording's clock."""
-
-    @property
-    def beam_count(self) -> int:
-        """Ranges in the scan."""
+def usual_beams(scans: Sequence[Beams]) -> Beams:
+    """Those of the first of the ``scans`` that agrees with most of them."""
+    return max(scans, key=lambda declared: sum(misfit(beams, declared) is None for beams in scans))
 
 
 class ScanGate:
-    """Filters inconsistent scans out and counts them."""
+    """Filters inconsistent scans of one laser out and counts them."""
 
-    def __init__(self, beam_count: int, audit: Audit) -> None:
-        self._beam_count = beam_count
+    def __init__(self, beams: Beams, audit: Audit) -> None:
+        self._beams = beams
         self._audit = audit
         self._previous = self._before_previous = -inf
 
-    def admits(self, number: int, scan: StampedScan) -> bool:
-        """Whether the scan on line (or in message) ``number`` is consistent; counts its faults."""
-        if scan.beam_count != self._beam_count:
-            self._audit.add(Fault.BEAM_COUNT, number)
+    def admits(self, number: int, stamp: float, beams: Beams | None) -> bool:
+        """Whether the scan on line (or in message) ``number`` is consistent; counts its faults.
+
+        ``beams`` are None if nothing is known about them.
+        """
+        if beams is None or misfit(beams, self._beams) is not None:
+            self._audit.add(Fault.OTHER_BEAMS, number)
             return False
-        step_back_s = self._previous - scan.stamp
-        if min(self._previous, self._before_previous) - scan.stamp > MAX_STEP_BACK_S:
+        step_back_s = self._previous - stamp
+        if min(self._previous, self._before_previous) - stamp > MAX_STEP_BACK_S:
             self._audit.add(Fault.MISPLACED_SCAN, number, step_s=step_back_s)
             return False
         if step_back_s > 0.0:
             self._audit.add(Fault.TIME_REVERSAL, number, step_s=step_back_s)
         elif step_back_s == 0.0:
             self._audit.add(Fault.REPEATED_STAMP, number)
-        self._before_previous, self._previous = self._previous, scan.stamp
+        self._before_previous, self._previous = self._previous, stamp
         return True
 
 
@@ -84,22 +82,28 @@ def scan_window(
             yield number, entry
 
 
-def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int, beam_count: int) -> None:
+def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int) -> None:
     """Reject a recording with too many inconsistent or damaged scans.
 
     Raises:
-        SourceError: it is mostly damaged, its beam count changes, or its time jumps or runs back.
+        SourceError: it is mostly damaged, most scans are of another laser than the first ones, or its time jumps or
+            runs back.
     """
     broken = sum(faults[kind].count for kind in (Fault.BROKEN_LINE, Fault.BROKEN_MESSAGE, Fault.BROKEN_RECORD))
-    other, misplaced, reversals = (
-        faults[kind] for kind in (Fault.BEAM_COUNT, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
+    other, contradictory, misplaced, reversals = (
+        faults[kind] for kind in (Fault.OTHER_BEAMS, Fault.BAD_BEAMS, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
     )
     if broken > scan_count + odometry_count:
         raise SourceError(f"{path}: most {faults.unit}s are damaged, {faults}; copy or export the recording again")
-    if other.count > TOLERATED_SHARE * scan_count:
+    if contradictory.count > scan_count:
         raise SourceError(
-            f"{path}: {faults.unit} {other.first_line}: the beam count changes ({other.count} scans do not have the "
-            f"{beam_count} beams of the first ones); give one recording for each laser"
+            f"{path}: {faults.unit} {contradictory.first_line}: the ranges of {contradictory.count} scans do not fit "
+            "angle_min, angle_max and angle_increment; correct the laser's driver and record again"
+        )
+    if other.count > scan_count:
+        raise SourceError(
+            f"{path}: {faults.unit} {other.first_line}: {other.count} scans are not of the laser of the first ones "
+            f"({scan_count} scans are): other beams; give one recording for each laser"
         )
     if misplaced.count > TOLERATED_SHARE * scan_count:
         raise SourceError(

@@ -24,23 +24,19 @@ class Survey:
     """Summary of a recording from one pass that does not parse the ranges."""
 
     scan_count: int
-    """Scans that ``records`` yields; it yields fewer only if a range is not a number."""
+    """Scans that ``records`` yields; it yields fewer only if the ranges of a scan are damaged."""
     duration_s: float
     """Time between the earliest and the latest scan."""
     path_length_m: float
     """Length of the odometry's polyline through the scans, in file order."""
-    laser: LaserModel
+    lasers: tuple[LaserModel, ...]
+    """One or more; the beams of their scans may vary (``geometry.beams.misfit``)."""
     faults: Faults
     """Faults of this pass, so without those of the ranges."""
     notes: tuple[str, ...] = ()
     """Choices that were made for the user, such as topics, as sentences."""
     camera: CameraModel | None = None
     """None if ``records`` yields no images."""
-
-    @property
-    def beam_count(self) -> int:
-        """Ranges in a scan."""
-        return self.laser.beam_count
 
 
 class Source(Protocol):
@@ -58,8 +54,8 @@ class Source(Protocol):
         """Summarise ``scans`` in one quick pass, and reject a recording that cannot be mapped.
 
         Raises:
-            SourceError: the archive is truncated, there are no laser scans or no odometry, the beam count changes,
-                time jumps back, or most of the recording is damaged.
+            SourceError: the archive is truncated, there are no laser scans or no odometry, most scans
+                are of another laser than the first ones, time jumps back, or most of the recording is damaged.
         """
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:

@@ -9,6 +9,7 @@ from google.protobuf.message import Message
 
 from fcslam.errors import PacketError
 from fcslam.records import (
+    Beams,
     Channel,
     Constraint,
     ConstraintKind,
@@ -22,7 +23,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS
+from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS, MAXIMUM_LASERS
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, PacketKind
 from fcslam.wire.quantisation import (
     dequantise,
@@ -52,13 +53,8 @@ _CONSTRAINT_KIND_OF_CODE = {int(code): kind for kind, code in _CONSTRAINT_KINDS.
 
 
 def _write_hello(hello: Hello) -> pb.Hello:
-    laser = hello.laser
     return pb.Hello(
-        beam_count=laser.beam_count,
-        angle_min_rad=laser.angle_min_rad,
-        angle_increment_rad=laser.angle_increment_rad,
-        max_range_m=laser.max_range_m,
-        t_base_laser=_write_pose(frozen(laser.T_base_laser)),
+        lasers=map(_write_laser, hello.lasers),
         detectors=[
             pb.Detector(channel=code, version=hello.detector_versions[channel])
             for channel, code in _CHANNELS.items()
@@ -68,26 +64,51 @@ def _write_hello(hello: Hello) -> pb.Hello:
 
 
 def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
-    x, y, theta = _read_pose(message, "t_base_laser").tolist()
-    laser = LaserModel(
-        message.beam_count, message.angle_min_rad, message.angle_increment_rad, message.max_range_m, (x, y, theta)
-    )
+    _check_at_most(len(message.lasers), MAXIMUM_LASERS, "hello: lasers")
+    lasers = tuple(map(_read_laser, message.lasers))
     codes = [detector.channel for detector in message.detectors]
     if codes != sorted(set(codes)):
         raise PacketError("hello: detectors are not in ascending order of their channels")
     versions = {read_channel(detector.channel): detector.version for detector in message.detectors}
-    return Hello(envelope.robot, envelope.epoch, laser, MappingProxyType(versions))
+    return Hello(envelope.robot, envelope.epoch, lasers, MappingProxyType(versions))
+
+
+def _write_laser(laser: LaserModel) -> pb.Laser:
+    return pb.Laser(
+        beam_count=laser.beam_count,
+        angle_min_rad=laser.angle_min_rad,
+        angle_increment_rad=laser.angle_increment_rad,
+        max_range_m=laser.max_range_m,
+        t_base_laser=_write_pose(frozen(laser.T_base_laser)),
+    )
+
+
+def _read_laser(message: pb.Laser) -> LaserModel:
+    x, y, theta = _read_pose(message, "t_base_laser").tolist()
+    return LaserModel(
+        message.beam_count, message.angle_min_rad, message.angle_increment_rad, message.max_range_m, (x, y, theta)
+    )
 
 
 def _write_keyscan(keyscan: Keyscan) -> pb.Keyscan:
-    codes = quantise(keyscan.ranges_m)
-    return pb.Keyscan(number=keyscan.id.number, stamp=keyscan.stamp, count=len(codes), ranges=pack_ranges(codes))
+    codes, beams = quantise(keyscan.ranges_m), keyscan.beams
+    return pb.Keyscan(
+        number=keyscan.id.number,
+        stamp=keyscan.stamp,
+        count=len(codes),
+        ranges=pack_ranges(codes),
+        laser=keyscan.laser,
+        beams=beams and pb.Beams(angle_min_rad=beams.angle_min_rad, angle_increment_rad=beams.angle_increment_rad),
+    )
 
 
 def _read_keyscan(message: pb.Keyscan, envelope: pb.Packet) -> Keyscan:
     _check_at_most(message.count, MAXIMUM_BEAMS, "keyscan: ranges")
     ranges = dequantise(unpack_ranges(message.ranges, message.count))
-    return Keyscan(KeyscanId(envelope.robot, message.number), message.stamp, ranges)
+    beams = None
+    if message.HasField("beams"):
+        beams = Beams(message.count, message.beams.angle_min_rad, message.beams.angle_increment_rad)
+    return Keyscan(KeyscanId(envelope.robot, message.number), message.stamp, ranges, message.laser, beams)
 
 
 def _write_constraint(constraint: Constraint) -> pb.Constraint:

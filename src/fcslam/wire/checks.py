@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, NAME, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
+from fcslam.records import CODE_BYTES, NAME, Beams, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
 from fcslam.wire.limits import (
     DIGEST_BYTES,
     KEYPOINT_AXES,
@@ -17,6 +17,7 @@ from fcslam.wire.limits import (
     MAXIMUM_INFORMATION,
     MAXIMUM_KEYPOINTS,
     MAXIMUM_LASER_RANGE_M,
+    MAXIMUM_LASERS,
     MAXIMUM_NETWORK_BYTES,
     MAXIMUM_NUMBER,
     MAXIMUM_SEQUENCE,
@@ -59,21 +60,29 @@ def _robot_of(body: Body) -> str:
 
 def _check_hello(hello: Hello, packet: Packet) -> None:
     _require(hello.epoch == packet.epoch, f"hello: epoch {hello.epoch} in a packet of epoch {packet.epoch}")
-    _check_laser(hello.laser)
+    count = len(hello.lasers)
+    _require(0 < count <= MAXIMUM_LASERS, f"hello: {count} lasers, not in 1..{MAXIMUM_LASERS}")
+    for laser in hello.lasers:
+        _check_laser(laser)
     for channel, version in hello.detector_versions.items():
         check_name(version, f"hello: detector version of {channel}")
 
 
 def _check_laser(laser: LaserModel) -> None:
-    _require(0 < laser.beam_count <= MAXIMUM_BEAMS, f"laser: {laser.beam_count} beams, not in 1..{MAXIMUM_BEAMS}")
-    _require(abs(laser.angle_min_rad) <= FULL_TURN_RAD, "laser: first beam is not within a full turn")
-    turns = 0.0 < abs(laser.angle_increment_rad) <= FULL_TURN_RAD
-    _require(turns, "laser: beams do not turn, or by more than a full turn")
-    span = abs(laser.angle_increment_rad) * laser.beam_count
-    # The first and last beam of a full turn may coincide, and drivers round the increment.
-    _require(span <= 1.01 * FULL_TURN_RAD + abs(laser.angle_increment_rad), "laser: beams cover over a full turn")
+    _check_beams(laser.beams, "laser")
     _require(0.0 < laser.max_range_m <= MAXIMUM_LASER_RANGE_M, "laser: maximum range is not in (0, 1000] m")
     _check_pose(np.array(laser.T_base_laser), "laser: T_base_laser")
+
+
+def _check_beams(beams: Beams, what: str) -> None:
+    count, first, increment = beams
+    _require(0 < count <= MAXIMUM_BEAMS, f"{what}: {count} beams, not in 1..{MAXIMUM_BEAMS}")
+    _require(abs(first) <= FULL_TURN_RAD, f"{what}: first beam is not within a full turn")
+    turns = 0.0 < abs(increment) <= FULL_TURN_RAD
+    _require(turns, f"{what}: beams do not turn, or by more than a full turn")
+    # The first and last beam of a full turn may coincide, and drivers round the increment.
+    within = abs(increment) * count <= 1.01 * FULL_TURN_RAD + abs(increment)
+    _require(within, f"{what}: beams cover over a full turn")
 
 
 def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
@@ -85,6 +94,11 @@ def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
     _require(0 < len(ranges) <= MAXIMUM_BEAMS, f"keyscan: {len(ranges)} ranges, not in 1..{MAXIMUM_BEAMS}")
     if not np.array_equal(ranges, dequantise(quantise(ranges))):
         raise PacketError("keyscan: ranges are not quantised; work with dequantise(quantise(ranges_m))")
+    _check_count(keyscan.laser, "keyscan: laser", MAXIMUM_LASERS - 1)
+    if keyscan.beams is not None:
+        _check_beams(keyscan.beams, "keyscan")
+        count = keyscan.beams.beam_count
+        _require(count == len(ranges), f"keyscan: {len(ranges)} ranges of {count} beams")
 
 
 def _check_constraint(constraint: Constraint, _: Packet) -> None:

@@ -64,20 +64,26 @@ class Pose(_message.Message):
     def __init__(self, x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., theta_rad: _Optional[float] = ...) -> None: ...
 
 class Hello(_message.Message):
-    __slots__ = ("beam_count", "angle_min_rad", "angle_increment_rad", "max_range_m", "t_base_laser", "detectors")
+    __slots__ = ("lasers", "detectors")
+    LASERS_FIELD_NUMBER: _ClassVar[int]
+    DETECTORS_FIELD_NUMBER: _ClassVar[int]
+    lasers: _containers.RepeatedCompositeFieldContainer[Laser]
+    detectors: _containers.RepeatedCompositeFieldContainer[Detector]
+    def __init__(self, lasers: _Optional[_Iterable[_Union[Laser, _Mapping]]] = ..., detectors: _Optional[_Iterable[_Union[Detector, _Mapping]]] = ...) -> None: ...
+
+class Laser(_message.Message):
+    __slots__ = ("beam_count", "angle_min_rad", "angle_increment_rad", "max_range_m", "t_base_laser")
     BEAM_COUNT_FIELD_NUMBER: _ClassVar[int]
     ANGLE_MIN_RAD_FIELD_NUMBER: _ClassVar[int]
     ANGLE_INCREMENT_RAD_FIELD_NUMBER: _ClassVar[int]
     MAX_RANGE_M_FIELD_NUMBER: _ClassVar[int]
     T_BASE_LASER_FIELD_NUMBER: _ClassVar[int]
-    DETECTORS_FIELD_NUMBER: _ClassVar[int]
     beam_count: int
     angle_min_rad: float
     angle_increment_rad: float
     max_range_m: float
     t_base_laser: Pose
-    detectors: _containers.RepeatedCompositeFieldContainer[Detector]
-    def __init__(self, beam_count: _Optional[int] = ..., angle_min_rad: _Optional[float] = ..., angle_increment_rad: _Optional[float] = ..., max_range_m: _Optional[float] = ..., t_base_laser: _Optional[_Union[Pose, _Mapping]] = ..., detectors: _Optional[_Iterable[_Union[Detector, _Mapping]]] = ...) -> None: ...
+    def __init__(self, beam_count: _Optional[int] = ..., angle_min_rad: _Optional[float] = ..., angle_increment_rad: _Optional[float] = ..., max_range_m: _Optional[float] = ..., t_base_laser: _Optional[_Union[Pose, _Mapping]] = ...) -> None: ...
 
 class Detector(_message.Message):
     __slots__ = ("channel", "version")
@@ -88,16 +94,28 @@ class Detector(_message.Message):
     def __init__(self, channel: _Optional[_Union[Channel, str]] = ..., version: _Optional[str] = ...) -> None: ...
 
 class Keyscan(_message.Message):
-    __slots__ = ("number", "stamp", "count", "ranges")
+    __slots__ = ("number", "stamp", "count", "ranges", "laser", "beams")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     STAMP_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
     RANGES_FIELD_NUMBER: _ClassVar[int]
+    LASER_FIELD_NUMBER: _ClassVar[int]
+    BEAMS_FIELD_NUMBER: _ClassVar[int]
     number: int
     stamp: float
     count: int
     ranges: bytes
-    def __init__(self, number: _Optional[int] = ..., stamp: _Optional[float] = ..., count: _Optional[int] = ..., ranges: _Optional[bytes] = ...) -> None: ...
+    laser: int
+    beams: Beams
+    def __init__(self, number: _Optional[int] = ..., stamp: _Optional[float] = ..., count: _Optional[int] = ..., ranges: _Optional[bytes] = ..., laser: _Optional[int] = ..., beams: _Optional[_Union[Beams, _Mapping]] = ...) -> None: ...
+
+class Beams(_message.Message):
+    __slots__ = ("angle_min_rad", "angle_increment_rad")
+    ANGLE_MIN_RAD_FIELD_NUMBER: _ClassVar[int]
+    ANGLE_INCREMENT_RAD_FIELD_NUMBER: _ClassVar[int]
+    angle_min_rad: float
+    angle_increment_rad: float
+    def __init__(self, angle_min_rad: _Optional[float] = ..., angle_increment_rad: _Optional[float] = ...) -> None: ...
 
 class Constraint(_message.Message):
     __slots__ = ("i", "j", "kind", "t_i_j", "information")

@@ -1,8 +1,8 @@
-"""All limits of the format, version 1. Packets beyond a limit are neither written nor read."""
+"""All limits of the format, version 2. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
@@ -12,6 +12,8 @@ MAXIMUM_SEQUENCE = 2**63 - 1
 MAXIMUM_NUMBER = 2**31 - 1
 """Numbers of keyscans, versions and maps."""
 
+MAXIMUM_LASERS = 8
+"""Lasers of one robot."""
 MAXIMUM_BEAMS = 4096
 BYTES_PER_RANGE = 2
 

@@ -25,11 +25,12 @@ UPLINK = frozenset({PacketKind.HELLO, PacketKind.KEYSCAN, PacketKind.CONSTRAINT,
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Describes the packets that follow: the first packet of an epoch, repeated after each change of a detector."""
+    """Describes the packets that follow: first in an epoch, repeated with a new detector or one more laser."""
 
     robot: str
     epoch: int
-    laser: LaserModel
+    lasers: tuple[LaserModel, ...]
+    """One or more; keyscans name theirs by its index."""
     detector_versions: Mapping[Channel, str]
 
 

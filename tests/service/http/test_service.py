@@ -118,7 +118,7 @@ def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk, monkey
     def batch(first, count):
         numbers = range(first, first + count)
         body = {"number": 0, "channel": 1, "count": 2048, "detector_version": "test-1"}
-        return [pb.Packet(version=1, robot="a", sequence=k, place=body).SerializeToString() for k in numbers]
+        return [pb.Packet(version=2, robot="a", sequence=k, place=body).SerializeToString() for k in numbers]
 
     assert sum(map(len, batch(0, 100))) < 4000
     monkeypatch.setattr(intake, "decode", unread)
@@ -342,7 +342,7 @@ def test_a_robot_can_fetch_a_detector(desk):
 def test_robots_with_a_camera_are_told_of_a_newer_detector_until_they_have_it(desk):
     network = BUNDLED_NETWORK.read_bytes()
     version = desk.ask("POST", f"{API}/detectors", "boss", content=network).json()["version"]
-    hello = Hello("a", 0, LASER, {Channel.CAMERA: "orb-1", Channel.LIDAR: "test-1"})
+    hello = Hello("a", 0, (LASER,), {Channel.CAMERA: "orb-1", Channel.LIDAR: "test-1"})
     told = desk.told(desk.send("a", [encode(Packet("a", 0, 0, 0.0, hello))]))
     release = next(body for body in told if isinstance(body, DetectorUpdate))
     assert (release.file.version, release.file.size) == (version, len(network))

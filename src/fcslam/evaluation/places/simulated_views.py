@@ -19,7 +19,7 @@ from fcslam.geometry import se2
 from fcslam.metrics.trajectory import interpolate
 from fcslam.records import CameraModel, FloatArray, LaserModel, Ranges
 from fcslam.runs import read_tum
-from fcslam.sources.recording.frames import merged_frames
+from fcslam.sources.recording.frames import RangesFile, merged_frames
 from fcslam.sources.recording.layout import GROUND_TRUTH, IMAGES_FILE, META, image_path, read_meta, scans_file
 
 EVERY_M: Final = 1.0
@@ -48,14 +48,15 @@ def read_fleet_views(folder: Path) -> FleetViews:
     """Read the images of a recorded fleet that are places.
 
     Raises:
-        EvaluationError: there are fewer than two recordings with a camera and true poses, or their sensors differ.
+        EvaluationError: there are fewer than two recordings with a camera and true poses, their sensors differ, or the
+            beams of a laser vary.
         SourceError: a recording cannot be read.
     """
     robots = sorted(path.parent for path in folder.glob(f"*/{META}"))
-    sensors = [(meta.laser, meta.camera) for meta in map(read_meta, robots)]
+    sensors = [(meta.lasers, meta.camera) for meta in map(read_meta, robots)]
     if len(robots) < 2 or any(pair != sensors[0] for pair in sensors):
         raise EvaluationError(f"{folder}: {len(robots)} recordings; a fleet is two or more robots with like sensors")
-    laser, camera = sensors[0]
+    (laser, *_), camera = sensors[0]
     if camera is None:
         raise EvaluationError(f"{folder}: its robots have no camera; simulate them with one")
     views = [list(_views(robot, laser)) for robot in robots]
@@ -112,15 +113,19 @@ def _views(robot: Path, laser: LaserModel) -> Iterator[_ImagePlace]:
     """Images with the scan before each, at least a step of distance or turn apart."""
     images, stamps, scans = [], [], []
     scan = None
-    for frame in merged_frames(robot, [scans_file(laser), IMAGES_FILE]):
-        if frame.fault is not None:
-            continue
-        if frame.is_scan:
-            scan = frame
-        elif scan is not None:
-            images.append(image_path(robot, frame.number - 1, bytes(frame.content["suffix"]).decode()))
-            stamps.append(scan.stamp)
-            scans.append(scan.content["ranges_m"])
+    meta = read_meta(robot)
+    with RangesFile(robot) as ranges:
+        for frame in merged_frames(robot, [scans_file(meta), IMAGES_FILE]):
+            if frame.fault is not None:
+                continue
+            if frame.is_scan and frame.laser == 0:
+                if frame.beams(meta.lasers) != laser.beams:
+                    raise EvaluationError(f"{robot}: the beams of its laser vary; simulate a laser whose beams do not")
+                scan = frame
+            elif not frame.is_scan and scan is not None:
+                images.append(image_path(robot, frame.number - 1, bytes(frame.content["suffix"]).decode()))
+                stamps.append(scan.stamp)
+                scans.append(scan.ranges_m(ranges))
     known, poses = read_tum(robot / GROUND_TRUTH)
     if len(known) < 2 or not images:
         return

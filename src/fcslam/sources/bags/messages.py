@@ -6,27 +6,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fcslam.records import Ranges, Transform
+from fcslam.geometry.beams import SAME_VIEW_BEAMS
+from fcslam.records import Beams, Ranges, Transform
 from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.sources.pose import Pose
 
 _LONGEST_RANGE_M = 1000.0
 _FULL_TURN_RAD = 2.0 * pi + 0.1
+_COUNT_TOLERANCE = 0.01
+"""Share of the ranges by which drivers that round the increment are wrong."""
 _MAX_COORDINATE_M = 1e7
 _NANOSECONDS = 10**9
 
 
-class Beams(NamedTuple):
-    """Directions of a scan's beams, counter-clockwise."""
-
-    beam_count: int
-    angle_min_rad: float
-    angle_increment_rad: float
-
-    @property
-    def span_rad(self) -> float:
-        """Angle between the first and the last beam."""
-        return (self.beam_count - 1) * self.angle_increment_rad
+class BeamsError(ValueError):
+    """The ranges and the angles of a scan contradict each other; the message says how."""
 
 
 class ScanMessage(NamedTuple):
@@ -35,15 +29,13 @@ class ScanMessage(NamedTuple):
     stamp: float
     frame: str
     beams: Beams
+    """Counter-clockwise."""
     range_min_m: float
     range_max_m: float
     raw_ranges_m: Ranges
     """Ranges as sent, metres, shape (beam_count,)."""
-
-    @property
-    def beam_count(self) -> int:
-        """Ranges in the scan."""
-        return self.beams.beam_count
+    laser: int = 0
+    """Index of its topic among those of laser scans."""
 
 
 class OdometryReading(NamedTuple):
@@ -64,14 +56,18 @@ class StampedTransform(NamedTuple):
 
 
 def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
-    """Convert a laser scan; clockwise beams are reversed."""
+    """Convert a laser scan; clockwise beams are reversed.
+
+    Raises:
+        BeamsError: the number of ranges is not the one that the angles say, or there is no field of view.
+        ValueError: the message is invalid otherwise.
+    """
     ranges = np.asarray(content.ranges, dtype=np.float32)
     count = len(ranges)
     first_rad, increment_rad = _angle_rad(content.angle_min), _angle_rad(content.angle_increment)
     range_min_m, range_max_m = float(content.range_min), float(content.range_max)
+    _check_angles(count, first_rad, increment_rad, float(content.angle_max))
     span_rad = (count - 1) * increment_rad
-    if not (count >= 2 and abs(first_rad) <= _FULL_TURN_RAD and 0.0 < abs(span_rad) < _FULL_TURN_RAD):
-        raise ValueError("no sane field of view")
     range_min_m = range_min_m if range_min_m > 0.0 else 0.0
     if not range_max_m > range_min_m:
         raise ValueError("no sane range")
@@ -80,6 +76,22 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     stamp, frame = header_of(content.header, bag_time_ns)
     beams = Beams(count, first_rad, increment_rad)
     return ScanMessage(stamp, frame, beams, range_min_m, min(range_max_m, _LONGEST_RANGE_M), ranges)
+
+
+def _check_angles(count: int, first_rad: float, increment_rad: float, last_rad: float) -> None:
+    """Refuse angles that leave open where the beams look. One range more or less is usual, as drivers count in
+    different ways whether a full turn includes the first direction again."""
+    if not all(map(isfinite, (first_rad, increment_rad, last_rad))):
+        raise BeamsError("an angle is not finite")
+    if increment_rad == 0.0:
+        raise BeamsError("angle_increment is 0")
+    if count < 2 or abs(first_rad) > _FULL_TURN_RAD or abs((count - 1) * increment_rad) >= _FULL_TURN_RAD:
+        raise BeamsError(f"{count} ranges have no sane field of view")
+    stated = (last_rad - first_rad) / increment_rad + 1.0
+    if stated < 1.0:
+        raise BeamsError("angle_increment leads away from angle_max")
+    if abs(stated - count) > max(SAME_VIEW_BEAMS, _COUNT_TOLERANCE * count):
+        raise BeamsError(f"{count} ranges, but the angles are those of {stated:.0f}")
 
 
 def measured_ranges(scan: ScanMessage) -> Ranges:

@@ -9,9 +9,10 @@ from fcslam.sources.pose import Pose
 class BagOptions:
     """Options for one bag; None: chosen automatically."""
 
-    scan_topic: str | None = None
+    scan_topics: tuple[str, ...] = ()
+    """One for each laser; empty: one is chosen automatically."""
     odom_topic: str | None = None
     """A topic of odometry, or one of tf that carries odom -> base."""
     camera_topic: str | None = None
-    laser_pose: Pose | None = None
-    """``T_base_laser`` in metres and radians, instead of the transform in tf."""
+    laser_poses: tuple[Pose, ...] = ()
+    """``T_base_laser`` of each laser in metres and radians, instead of the transforms in tf."""

@@ -14,11 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.errors import SourceError
-from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import OdometryReading, measured_ranges
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedImage, PosedScan
-from fcslam.sources.bags.stream import BagStream
+from fcslam.sources.bags.stream import BagStream, RecordedLaser
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
@@ -36,7 +37,8 @@ class _Reading(NamedTuple):
     """Summary of a bag, and how to read it."""
 
     survey: Survey
-    upside_down: bool
+    upside_down: tuple[bool, ...]
+    """Of each laser."""
 
 
 class RosBag:
@@ -45,6 +47,7 @@ class RosBag:
     def __init__(self, path: Path, name: str, options: BagOptions | None = None) -> None:
         self.name = name
         self._options = options or BagOptions()
+        self._check_options(path)
         self._stream = BagStream(path, self._options)
         self._audit = _audit()
 
@@ -63,18 +66,20 @@ class RosBag:
             if isinstance(entry, PosedScan):
                 track.add(entry.scan.stamp, entry.T_odom_base)
         return Survey(
-            track.count, track.duration_s, track.length_m, whole.laser, audit.faults(), whole.notes, whole.camera
+            track.count, track.duration_s, track.length_m, whole.lasers, audit.faults(), whole.notes, whole.camera
         )
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = _audit()
         reading = self._reading
-        laser, camera = reading.survey.laser, reading.survey.camera
+        lasers, camera = reading.survey.lasers, reading.survey.camera
         for number, entry in self._entries(scans, audit, with_images=camera is not None):
             if isinstance(entry, PosedScan):
-                ranges_m = _turned(measured_ranges(entry.scan), reading.upside_down)
-                yield LaserScan(entry.scan.stamp, ranges_m, laser, pose_array(entry.T_odom_base))
+                scan, upside_down = entry.scan, reading.upside_down[entry.scan.laser]
+                ranges_m = _turned(measured_ranges(scan), upside_down)
+                laser = lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
+                yield LaserScan(scan.stamp, ranges_m, laser, pose_array(entry.T_odom_base))
             elif isinstance(entry, OdometryReading):
                 yield Odometry(entry.stamp, pose_array(entry.T_odom_base))
             elif camera is not None:
@@ -103,40 +108,60 @@ class RosBag:
                 base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry)
         base_frame = base_frame or next((frame for frame in _USUAL_BASES if frame in tree), _USUAL_BASES[-1])
-        mounted = self._mounting(tree, base_frame)
+        mountings = self._mountings(tree, base_frame)
         camera, camera_notes = self._camera(tree, base_frame)
-        notes = (*self._stream.topics.notes, *self._tilt_note(mounted), *camera_notes)
-        laser = self._laser(mounted)
-        survey = Survey(scans.count, scans.duration_s, scans.length_m, laser, audit.faults(), notes, camera)
-        return _Reading(survey, mounted.upside_down)
+        tilts = (
+            self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self._stream.lasers, mountings, strict=True)
+        )
+        notes = (*self._stream.topics.notes, *filter(None, tilts), *camera_notes)
+        lasers = tuple(map(_laser_model, self._stream.lasers, mountings))
+        survey = Survey(scans.count, scans.duration_s, scans.length_m, lasers, audit.faults(), notes, camera)
+        return _Reading(survey, tuple(mounted.upside_down for mounted in mountings))
+
+    def _check_options(self, path: Path) -> None:
+        topics, poses = self._options.scan_topics, self._options.laser_poses
+        for topic in topics:
+            if topics.count(topic) > 1:
+                raise SourceError(f"{path}: --scan-topic {topic} is given twice; give each laser's topic once")
+        if poses and len(poses) != max(1, len(topics)):
+            raise SourceError(
+                f"{path}: {len(poses)} --laser-pose for {max(1, len(topics))} --scan-topic; give one for each laser, "
+                "in the same order"
+            )
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
-        path, topics, first = self._stream.path, self._stream.topics, self._stream.first_scans[0]
-        check_consistency(path, faults, scans.count, odometry.count, first.beam_count)
+        path, topics, (laser, *_) = self._stream.path, self._stream.topics, self._stream.lasers
+        check_consistency(path, faults, scans.count, odometry.count)
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
             raise SourceError(
-                f"{path}: {alone} of {alone + scans.count} scans in {topics.scan.name} have no odometry within 1 s: "
-                f"the first scan has the stamp {first.stamp:.3f} s, {topics.odometry[0].name} goes from "
+                f"{path}: {alone} of {alone + scans.count} scans in {laser.topic.name} have no odometry within 1 s: "
+                f"the first scan has the stamp {laser.first.stamp:.3f} s, {topics.odometry[0].name} goes from "
                 f"{odometry.earliest:.3f} s to {odometry.latest:.3f} s; record both by one clock, all the way"
             )
 
-    def _laser(self, mounted: Mounting) -> LaserModel:
-        beams = self._stream.nominal.beams
-        angle_min_rad = -(beams.angle_min_rad + beams.span_rad) if mounted.upside_down else beams.angle_min_rad
-        max_range_m = self._stream.first_scans[0].range_max_m
-        return LaserModel(beams.beam_count, angle_min_rad, beams.angle_increment_rad, max_range_m, mounted.T_base_laser)
+    def _mountings(self, tree: TransformTree, base_frame: str) -> list[Mounting]:
+        lasers = self._stream.lasers
+        if self._options.laser_poses:
+            return [Mounting(pose, upside_down=False, tilt_rad=0.0) for pose in self._options.laser_poses]
+        topic_of: dict[str, str] = {}
+        for laser in lasers:
+            other = topic_of.setdefault(laser.first.frame, laser.topic.name)
+            if other != laser.topic.name:
+                raise SourceError(
+                    f"{self._stream.path}: the scans of {other} and {laser.topic.name} have one frame, "
+                    f"'{laser.first.frame}', so tf cannot say where each laser sits; say it by --laser-pose X,Y,THETA "
+                    "for each"
+                )
+        return [self._mounting(laser.topic.name, laser.first.frame, tree, base_frame) for laser in lasers]
 
-    def _mounting(self, tree: TransformTree, base_frame: str) -> Mounting:
-        if self._options.laser_pose is not None:
-            return Mounting(self._options.laser_pose, upside_down=False, tilt_rad=0.0)
-        topic, laser_frame = self._stream.topics.scan.name, self._stream.first_scans[0].frame
+    def _mounting(self, topic: str, laser_frame: str, tree: TransformTree, base_frame: str) -> Mounting:
         try:
             mounted = mounting(tree.fixed(base_frame, laser_frame))
         except NoTransformError as error:
             raise SourceError(
                 f"{self._stream.path}: tf has {error}, so it does not say where the laser of {topic} sits; say it by "
-                "--laser-pose X,Y,THETA (metres, radians)"
+                f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self._stream.lasers) > 1)}"
             ) from error
         if mounted.tilt_rad > _STEEPEST_RAD:
             raise SourceError(
@@ -160,14 +185,26 @@ class RosBag:
             return camera, (f"{path}: the images of {topic.name} are distorted, read as if they were not",)
         return camera, ()
 
-    def _tilt_note(self, mounted: Mounting) -> tuple[str, ...]:
+    def _tilt_note(self, topic: Topic, mounted: Mounting) -> str:
         if mounted.tilt_rad <= _LEVEL_RAD:
-            return ()
-        return (f"{self._stream.path}: the laser is tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level",)
+            return ""
+        tilt = f"tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level"
+        which = f" of {topic.name}" * (len(self._stream.lasers) > 1)
+        return f"{self._stream.path}: the laser{which} is {tilt}"
 
 
 def _audit() -> Audit:
     return Audit("message")
+
+
+def _laser_model(laser: RecordedLaser, mounted: Mounting) -> LaserModel:
+    beams = _turned_beams(laser.first.beams, mounted.upside_down)
+    return LaserModel(*beams, laser.first.range_max_m, mounted.T_base_laser)
+
+
+def _turned_beams(beams: Beams, upside_down: bool) -> Beams:
+    """The beams of a laser that is mounted upside down, as seen from above."""
+    return beams._replace(angle_min_rad=-(beams.angle_min_rad + beams.span_rad)) if upside_down else beams
 
 
 def _image(posed: PosedImage, camera: CameraModel) -> CameraImage:

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 from fcslam.errors import SourceError
-from fcslam.sources.bags.beams import NominalBeams
 from fcslam.sources.bags.camera import (
     Calibration,
     ImageMessage,
@@ -15,7 +15,9 @@ from fcslam.sources.bags.camera import (
     raw_image_of,
 )
 from fcslam.sources.bags.container import COMPRESSED_IMAGE, ODOMETRY, BagFile, RawMessage, Topic
+from fcslam.sources.bags.merging import merge_scans
 from fcslam.sources.bags.messages import (
+    BeamsError,
     OdometryReading,
     ScanMessage,
     StampedTransform,
@@ -28,10 +30,18 @@ from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odo
 from fcslam.sources.bags.topics import Topics, choose_topics
 from fcslam.sources.bags.transforms import TransformTree, planar
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate
+from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
 
 _EDGES_NAMED = 10
 _IMAGES_TRIED = 5
+
+
+class RecordedLaser(NamedTuple):
+    """One laser of a bag, by its first scans."""
+
+    topic: Topic
+    first: ScanMessage
+    """The first scan with its usual beams."""
 
 
 class BagStream:
@@ -52,24 +62,23 @@ class BagStream:
         return choose_topics(self._bag, self._options, self._field_of_view_rad, self._has_images)
 
     @cached_property
-    def first_scans(self) -> list[ScanMessage]:
-        """The first scans, at least one, which decide the nominal beams.
+    def lasers(self) -> list[RecordedLaser]:
+        """The lasers, in the order of their topics.
 
         Raises:
-            SourceError: no scan can be read.
+            SourceError: none of a laser's scans can be read.
         """
-        topic = self.topics.scan
+        return [self._laser(topic) for topic in self.topics.scans]
+
+    def _laser(self, topic: Topic) -> RecordedLaser:
         scans = list(islice(self._scans_of(topic), SCANS_THAT_VOTE))
         if not scans:
             raise SourceError(
-                f"{self.path}: none of the {topic.message_count} scans in {topic.name} can be read; record it again"
+                f"{self.path}: none of the {topic.message_count} scans in {topic.name} can be read"
+                f"{self._reason(topic)}; record it again"
             )
-        return scans
-
-    @cached_property
-    def nominal(self) -> NominalBeams:
-        """The beams to which all scans are resampled."""
-        return NominalBeams(self.first_scans)
+        usual = usual_beams([scan.beams for scan in scans])
+        return RecordedLaser(topic, next(scan for scan in scans if scan.beams == usual))
 
     @cached_property
     def calibration(self) -> Calibration | None:
@@ -89,11 +98,11 @@ class BagStream:
 
         ``tree`` collects all transforms, if it is given.
         """
-        gate = ScanGate(self.nominal.beams.beam_count, audit)
-        for number, entry in pair_with_odometry(self._items(audit, tree, with_images)):
+        gates = [ScanGate(laser.first.beams, audit) for laser in self.lasers]
+        for number, entry in pair_with_odometry(merge_scans(self._items(audit, tree, with_images), len(gates))):
             if not isinstance(entry, PosedScan):
                 yield number, entry
-            elif gate.admits(number, entry.scan):
+            elif gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
                 if entry.fault is not None:
                     audit.add(entry.fault, number)
                 if entry.fault is not Fault.NO_ODOMETRY:
@@ -103,31 +112,23 @@ class BagStream:
         topics = self.topics
         heard = () if tree is None else topics.transforms
         seen = (topics.camera,) if with_images and topics.camera is not None else ()
-        for message in self._bag.messages(list(dict.fromkeys((*topics.odometry, *heard, topics.scan, *seen)))):
+        for message in self._bag.messages(list(dict.fromkeys((*topics.odometry, *heard, *topics.scans, *seen)))):
             try:
                 items = self._items_in(message, tree)
+            except BeamsError:
+                audit.add(Fault.BAD_BEAMS, message.number)
             except ValueError:
                 is_image = message.topic == topics.camera
                 audit.add(Fault.BROKEN_IMAGE if is_image else Fault.BROKEN_MESSAGE, message.number)
-                continue
-            for item in items:
-                fitting = self._fitting(item, message.number, audit)
-                if fitting is not None:
-                    yield message.number, fitting
-
-    def _fitting(self, item: Message, number: int, audit: Audit) -> Message | None:
-        """A scan resampled to the nominal beams, or None; other messages unchanged."""
-        if not isinstance(item, ScanMessage):
-            return item
-        scan = self.nominal.resampled(item)
-        if scan is not item:
-            audit.add(Fault.BEAM_COUNT if scan is None else Fault.RESAMPLED, number)
-        return scan
+            else:
+                for item in items:
+                    yield message.number, item
 
     def _items_in(self, message: RawMessage, tree: TransformTree | None) -> list[Message]:
         """Decode one message; raises ValueError if it is invalid."""
-        if message.topic == self.topics.scan:
-            return [scan_of(self._bag.decode(message), message.bag_time_ns)]
+        if message.topic in self.topics.scans:
+            scan = scan_of(self._bag.decode(message), message.bag_time_ns)
+            return [scan._replace(laser=self.topics.scans.index(message.topic))]
         if message.topic == self.topics.camera:
             return [self._image_in(message)]
         if message.topic.type == ODOMETRY:
@@ -173,6 +174,17 @@ class BagStream:
             except ValueError:
                 continue
             yield scan
+
+    def _reason(self, topic: Topic) -> str:
+        """What is wrong with the first scan, if its angles are."""
+        message = next(iter(self._bag.messages([topic])))
+        try:
+            scan_of(self._bag.decode(message), message.bag_time_ns)
+        except BeamsError as error:
+            return f" ({error})"
+        except ValueError:
+            pass
+        return ""
 
     def _image_in(self, message: RawMessage) -> ImageMessage:
         image_of = compressed_image_of if message.topic.type == COMPRESSED_IMAGE else raw_image_of

@@ -22,6 +22,8 @@ _NEEDED = {
     "--odom-topic": f"{ODOMETRY}, or tf",
     "--camera-topic": f"{COMPRESSED_IMAGE} or {IMAGE}",
 }
+_SAME_VIEW_RAD = 0.1
+"""Fields of view that differ by less are equally wide."""
 _TRUTHS = ("ground_truth", "groundtruth")
 """Parts of the name of an odometry topic that holds the ground truth."""
 
@@ -29,7 +31,8 @@ _TRUTHS = ("ground_truth", "groundtruth")
 class Topics(NamedTuple):
     """The topics of a bag that are read."""
 
-    scan: Topic
+    scans: tuple[Topic, ...]
+    """One for each laser."""
     odometry: tuple[Topic, ...]
     """One topic of odometry, or all tf topics."""
     transforms: tuple[Topic, ...]
@@ -49,7 +52,7 @@ def choose_topics(
 ) -> Topics:
     """Choose the topics to read, by these rules in order:
 
-    - laser: the widest field of view (to 0.01 rad), most messages, first by name;
+    - laser: the widest field of view (to 0.1 rad), the name ``scan``, most messages, first by name;
     - odometry: the name ``odom``, most messages, first by name; ground truth only if the user names it;
     - camera: calibrated, most messages, compressed images, first by name.
 
@@ -57,9 +60,12 @@ def choose_topics(
         SourceError: a required topic is missing, or a named topic is missing or of another type.
     """
     heard = [topic for topic in bag.topics if topic.message_count]
-    scans = _candidates(bag, [topic for topic in heard if topic.type == SCAN], options.scan_topic, "--scan-topic")
+    scans = [topic for topic in heard if topic.type == SCAN]
     if not scans:
         raise SourceError(f"{bag.path}: no laser scans ({SCAN}); record them; {_known(bag.topics)}")
+    lasers = [topic for name in options.scan_topics for topic in _candidates(bag, scans, name, "--scan-topic")] or [
+        _widest(scans, field_of_view_rad)
+    ]
     transforms = tuple(topic for topic in heard if is_transforms(topic))
     measured = [topic for topic in heard if topic.type == ODOMETRY and (options.odom_topic or not _is_truth(topic))]
     odometries = _candidates(bag, [*measured, *transforms], options.odom_topic, "--odom-topic")
@@ -67,16 +73,22 @@ def choose_topics(
         raise SourceError(
             f"{bag.path}: no odometry ({ODOMETRY}, or tf from odom to base); record it; {_known(bag.topics)}"
         )
-    views_rad = {topic: round(field_of_view_rad(topic), 2) if len(scans) > 1 else 0.0 for topic in scans}
-    scan = min(scans, key=lambda topic: (-views_rad[topic], -topic.message_count, topic.name))
     camera, camera_info, camera_notes = _choose_camera(bag, options.camera_topic, has_images)
-    notes = [*_note(bag, "laser scans", "--scan-topic", scan, scans), *camera_notes]
+    notes = [*camera_notes]
+    if not options.scan_topics:
+        notes = [*_note(bag, "laser scans", "--scan-topic", lasers[0], scans), *camera_notes]
     measured = [topic for topic in odometries if topic.type == ODOMETRY]
     if not measured:
-        return Topics(scan, tuple(odometries), transforms, camera, camera_info, tuple(notes))
+        return Topics(tuple(lasers), tuple(odometries), transforms, camera, camera_info, tuple(notes))
     odometry = min(measured, key=lambda topic: (_basename(topic) != "odom", -topic.message_count, topic.name))
     notes += _note(bag, "odometry", "--odom-topic", odometry, measured)
-    return Topics(scan, (odometry,), transforms, camera, camera_info, tuple(notes))
+    return Topics(tuple(lasers), (odometry,), transforms, camera, camera_info, tuple(notes))
+
+
+def _widest(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], float]) -> Topic:
+    views_rad = {topic: field_of_view_rad(topic) if len(scans) > 1 else 0.0 for topic in scans}
+    wide = [topic for topic in scans if views_rad[topic] > max(views_rad.values()) - _SAME_VIEW_RAD]
+    return min(wide, key=lambda topic: (_basename(topic) != "scan", -topic.message_count, topic.name))
 
 
 def _choose_camera(

@@ -4,8 +4,9 @@ import bz2
 import gzip
 import lzma
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import closing
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,7 +14,8 @@ import numpy as np
 
 from fcslam.errors import OutputError
 from fcslam.geometry import se2
-from fcslam.records import CameraImage, LaserModel, LaserScan, Odometry, SensorRecord
+from fcslam.records import LaserModel, LaserScan, Odometry, SensorRecord
+from fcslam.sources.gate import SCANS_THAT_VOTE
 from fcslam.sources.logs.laser import assumed_laser
 
 _HEADER = """\
@@ -28,8 +30,8 @@ def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
     """Write ``records`` to ``path``, compressed if its suffix is .gz, .xz or .bz2; equal records give equal bytes.
 
     Ranges have millimetre precision, poses and stamps 1e-6; no return (inf) is written as a value just above the
-    laser's maximum. A laser with the default geometry of its beam count is written as FLASER, any other as ROBOTLASER1.
-    Images are dropped, because the format does not support them.
+    laser's maximum. A laser with the default geometry of its beam count is written as FLASER, any other as ROBOTLASER1,
+    and so is one whose beams vary. Images and the scans of further lasers are dropped: there is no place for them.
 
     Raises:
         OutputError: the file cannot be written.
@@ -37,9 +39,8 @@ def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
     try:
         with path.open("wb") as file, closing(_compressed(file, path.suffix)) as stream:
             stream.write(_HEADER.encode())
-            for record in records:
-                if not isinstance(record, CameraImage):
-                    stream.write((_line(record) + "\n").encode())
+            for line in _lines(records):
+                stream.write((line + "\n").encode())
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error}); choose another folder") from error
 
@@ -56,15 +57,36 @@ def _compressed(file: BinaryIO, suffix: str) -> BinaryIO | gzip.GzipFile | lzma.
             return file
 
 
-def _line(record: LaserScan | Odometry) -> str:
+def _lines(records: Iterable[SensorRecord]) -> Iterator[str]:
+    remaining = iter(records)
+    first, scans = list[SensorRecord](), list[LaserScan]()
+    while len(scans) < SCANS_THAT_VOTE and (record := next(remaining, None)) is not None:
+        first.append(record)
+        if isinstance(record, LaserScan) and record.laser.T_base_laser == (scans or [record])[0].laser.T_base_laser:
+            scans.append(record)
+    laser = scans[0].laser if scans else None
+    is_default = laser is not None and _is_default(laser) and all(scan.laser == laser for scan in scans)
+    for record in chain(first, remaining):
+        match record:
+            case Odometry():
+                yield _line(record)
+            case LaserScan() if laser is not None and record.laser.T_base_laser == laser.T_base_laser:
+                yield _line(record, is_default and record.laser == laser)
+
+
+def _is_default(laser: LaserModel) -> bool:
+    return (laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m) == assumed_laser(laser.beam_count)
+
+
+def _line(record: LaserScan | Odometry, is_default: bool = False) -> str:
+    """``is_default``: the laser of a scan needs no mention."""
     match record:
         case Odometry(stamp, T_odom_base):
             return f"ODOM {_numbers(T_odom_base)} 0 0 0 {_tail(stamp)}"
         case LaserScan(stamp, ranges_m, laser, T_odom_base):
             poses = f"{_numbers(se2.compose(T_odom_base, laser.T_base_laser))} {_numbers(T_odom_base)}"
             ranges = _ranges(ranges_m, laser.max_range_m)
-            stated = (laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m)
-            if stated == assumed_laser(laser.beam_count):
+            if is_default:
                 return f"FLASER {ranges} {poses} {_tail(stamp)}"
             return f"ROBOTLASER1 {_config(laser)} {ranges} 0 {poses} 0 0 0 0 0 {_tail(stamp)}"
 

@@ -7,7 +7,7 @@ from fcslam.errors import SourceError
 from fcslam.sources.faults import Faults
 from fcslam.sources.gate import TOLERATED_SHARE, check_consistency
 from fcslam.sources.logs.dialect import Line, OdometryLine, ParameterLine, ScanLine
-from fcslam.sources.logs.laser import laser_model, parameter
+from fcslam.sources.logs.laser import Interleaving, laser_model, parameter
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import Pose, relative_pose
 from fcslam.sources.source import Survey
@@ -23,6 +23,7 @@ class LogReading(NamedTuple):
     """Summary of a log, and how to read it."""
 
     survey: Survey
+    interleaving: Interleaving | None
     pose_from_odometry: bool
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
 
@@ -72,21 +73,21 @@ class Overview:
         if isinstance(line, ScanLine):
             self._scans.add(line.stamp, line.T_odom_base)
             self._mounting.add(line)
-            if self._scan is None or (self._scan.stated is None and line.stated is not None):
+            if self._scan is None or _tells_more(line, self._scan):
                 self._scan = line
         elif isinstance(line, OdometryLine):
             self._odometry.add(line.stamp, line.T_odom_base)
         elif isinstance(line, ParameterLine):
             self._parameters[line.name] = line.value
 
-    def conclude(self, path: Path, faults: Faults) -> LogReading:
+    def conclude(self, path: Path, faults: Faults, interleaving: Interleaving | None) -> LogReading:
         """Summarise the log at ``path`` after its last line.
 
         Raises:
             SourceError: the log cannot be mapped.
         """
         assert self._scan is not None
-        check_consistency(path, faults, self._scans.count, self._odometry.count, self._scan.beam_count)
+        check_consistency(path, faults, self._scans.count, self._odometry.count)
         pose_from_odometry = not self._scans.moves and self._odometry.moves
         if not (self._scans.moves or pose_from_odometry) and self._scans.count >= SCANS_THAT_MUST_MOVE:
             raise SourceError(
@@ -96,6 +97,14 @@ class Overview:
         offset_m = parameter(self._parameters, "robot_frontlaser_offset") or 0.0
         laser = laser_model(self._scan, self._parameters, self._mounting.T_base_laser(offset_m))
         length_m = self._odometry.length_m if pose_from_odometry else self._scans.length_m
-        return LogReading(
-            Survey(self._scans.count, self._scans.duration_s, length_m, laser, faults), pose_from_odometry
-        )
+        survey = Survey(self._scans.count, self._scans.duration_s, length_m, (laser,), faults)
+        return LogReading(survey, interleaving, pose_from_odometry)
+
+
+def _tells_more(scan: ScanLine, than: ScanLine) -> bool:
+    """Whether a scan says more about the laser: the angles of its beams, or how many beams a full scan has."""
+    if than.stated is not None:
+        return False
+    if scan.stated is not None:
+        return scan.beam_count == than.beam_count
+    return scan.beam_count > than.beam_count

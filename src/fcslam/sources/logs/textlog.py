@@ -7,27 +7,36 @@ Besides the rules of ``gate``:
   and is rejected. If only the odometry messages change, a scan takes the pose of the message before it.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
-from itertools import islice
 from math import nan
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from fcslam.errors import SourceError
-from fcslam.records import LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.records import Beams, LaserScan, Odometry, Ranges, SensorRecord
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, scan_window
 from fcslam.sources.logs.archive import numbered_lines
-from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ScanLine
+from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ParameterLine, ScanLine
+from fcslam.sources.logs.laser import Interleaving, LogBeams, first_beams
 from fcslam.sources.logs.overview import LogReading, Overview
 from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.pose import pose_array
+from fcslam.sources.pose import Pose, pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 _LONGEST_RANGE_M = 1e6
+
+
+class _Scan(NamedTuple):
+    """A scan that the gate admits."""
+
+    line: ScanLine
+    beams: Beams
+    T_odom_base: Pose
+    """The pose to use."""
 
 
 class TextLog:
@@ -49,49 +58,56 @@ class TextLog:
         if scans == WHOLE:
             return self._reading.survey
         audit, track = Audit(), PathSummary()
-        for _, line in self._entries(scans, audit):
-            if isinstance(line, ScanLine):
-                track.add(line.stamp, line.T_odom_base)
-        return Survey(track.count, track.duration_s, track.length_m, self._reading.survey.laser, audit.faults())
+        for _, entry in self._entries(scans, audit):
+            if isinstance(entry, _Scan):
+                track.add(entry.line.stamp, entry.T_odom_base)
+        return Survey(track.count, track.duration_s, track.length_m, self._reading.survey.lasers, audit.faults())
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = Audit()
-        laser = self._reading.survey.laser
-        for number, line in self._entries(scans, audit):
-            T_odom_base = pose_array(line.T_odom_base)
-            if isinstance(line, OdometryLine):
-                yield Odometry(line.stamp, T_odom_base)
+        (laser,) = self._reading.survey.lasers
+        for number, entry in self._entries(scans, audit):
+            T_odom_base = pose_array(entry.T_odom_base)
+            if isinstance(entry, OdometryLine):
+                yield Odometry(entry.stamp, T_odom_base)
                 continue
             try:
-                ranges_m = _ranges(line, self._dialect.metres_per_range_unit, number, audit)
+                ranges_m = _ranges(entry.line, self._dialect.metres_per_range_unit, number, audit)
             except ValueError:
                 audit.add(Fault.BROKEN_LINE, number)
             else:
-                yield LaserScan(line.stamp, ranges_m, laser, T_odom_base)
+                yield LaserScan(entry.line.stamp, ranges_m, laser.with_beams(entry.beams), T_odom_base)
 
     @cached_property
     def _reading(self) -> LogReading:
         """Summary from one pass over the whole log; rejects a log that cannot be mapped."""
         audit = Audit()
         overview = Overview()
-        gate = ScanGate(self._usual_beam_count(), audit)
+        declared, interleaving = self._first_look()
+        gate, log_beams = ScanGate(declared, audit), LogBeams(declared, interleaving)
         for number, line in self._lines(audit):
             if isinstance(line, ScanLine):
-                if not gate.admits(number, line):
+                if not gate.admits(number, line.stamp, log_beams.of(line)):
                     continue
                 self._note_clock(number, audit)
             overview.add(line)
-        return overview.conclude(self._path, audit.faults())
+        return overview.conclude(self._path, audit.faults(), interleaving)
 
-    def _usual_beam_count(self) -> int:
-        audit = Audit()
-        scans = (line for _, line in self._lines(audit) if isinstance(line, ScanLine))
-        counts = Counter(scan.beam_count for scan in islice(scans, SCANS_THAT_VOTE))
-        if not counts:
+    def _first_look(self) -> tuple[Beams, Interleaving | None]:
+        """The usual beams of the first scans, and whether they interleave."""
+        audit, scans, parameters = Audit(), list[ScanLine](), dict[str, str]()
+        for _, line in self._lines(audit):
+            if isinstance(line, ParameterLine):
+                parameters[line.name] = line.value
+            elif isinstance(line, ScanLine):
+                scans.append(line)
+            if len(scans) == SCANS_THAT_VOTE:
+                break
+        if not scans:
             seen = f"; {audit.faults()}" if audit.faults() else ""
             raise SourceError(f"{self._path}: no laser scan in this {self._dialect.name}{seen}; give a log with scans")
-        return counts.most_common(1)[0][0]
+        return first_beams(scans, parameters)
 
     def _lines(self, audit: Audit) -> Iterator[tuple[int, Line]]:
         parse = self._dialect.parser()
@@ -104,24 +120,27 @@ class TextLog:
             if line is not None:
                 yield number, line
 
-    def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, ScanLine | OdometryLine]]:
+    def _entries(self, scans: ScanRange, audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
         """Scans and odometry of the range, with the poses to use; afterwards ``audit`` holds the range's faults."""
-        for number, line in scan_window(self._posed(audit), scans, lambda line: isinstance(line, ScanLine), audit):
-            if isinstance(line, ScanLine):
+        for number, entry in scan_window(self._posed(audit), scans, lambda entry: isinstance(entry, _Scan), audit):
+            if isinstance(entry, _Scan):
                 self._note_clock(number, audit)
-            yield number, line
+            yield number, entry
 
-    def _posed(self, audit: Audit) -> Iterator[tuple[int, ScanLine | OdometryLine]]:
+    def _posed(self, audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
         reading = self._reading
-        gate = ScanGate(reading.survey.beam_count, audit)
+        declared = reading.survey.lasers[0].beams
+        gate, log_beams = ScanGate(declared, audit), LogBeams(declared, reading.interleaving)
         latest = None
         for number, line in self._lines(audit):
             if isinstance(line, OdometryLine):
                 latest = line
                 yield number, line
-            elif isinstance(line, ScanLine) and gate.admits(number, line):
-                late = latest if reading.pose_from_odometry else None
-                yield number, line if late is None else line._replace(T_odom_base=late.T_odom_base)
+            elif isinstance(line, ScanLine):
+                beams = log_beams.of(line)
+                if gate.admits(number, line.stamp, beams) and beams is not None:
+                    late = latest if reading.pose_from_odometry else None
+                    yield number, _Scan(line, beams, (late or line).T_odom_base)
 
     def _note_clock(self, number: int, audit: Audit) -> None:
         if not self._dialect.timed:

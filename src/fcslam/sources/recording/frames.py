@@ -2,16 +2,29 @@
 
 import heapq
 from collections.abc import Iterator, Sequence
-from functools import partial
+from contextlib import ExitStack
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, Self
+from zlib import crc32
 
 import numpy as np
 
 from fcslam.errors import SourceError
+from fcslam.records import Beams, LaserModel, Ranges
 from fcslam.sources.faults import Fault
 from fcslam.sources.pose import Pose
-from fcslam.sources.recording.layout import HEADER_BYTES, META, SCANS, FrameFile, is_whole
+from fcslam.sources.recording.layout import (
+    HEADER_BYTES,
+    META,
+    RANGE,
+    RANGES,
+    SCANS,
+    SCANS_FILE,
+    FrameFile,
+    check_beams,
+    is_whole,
+)
 
 _BLOCK_FRAMES = 256
 
@@ -45,9 +58,70 @@ class Frame(NamedTuple):
         return x, y, theta
 
     @property
-    def beam_count(self) -> int:
-        """Ranges in the scan."""
-        return len(self.content["ranges_m"])
+    def laser(self) -> int:
+        """Index of the scan's laser."""
+        return 0 if self._is_version_1 else int(self.content["laser"])
+
+    def beams(self, lasers: Sequence[LaserModel]) -> Beams:
+        """The scan's beams; raises ValueError if it has no laser of the recording or no sane beams."""
+        if not self.laser < len(lasers):
+            raise ValueError("no laser of this recording")
+        if self._is_version_1:
+            return lasers[self.laser].beams
+        beam_count, *angles_rad = (self.content[name].item() for name in Beams._fields)
+        beams = Beams(beam_count, *angles_rad)
+        check_beams(beams)
+        return beams
+
+    def ranges_m(self, ranges: "RangesFile") -> Ranges:
+        """Ranges of the scan in metres; raises ValueError if they are damaged."""
+        if self._is_version_1:
+            return np.array(self.content["ranges_m"], np.float32)
+        content = ranges.read(int(self.content["offset"]), int(self.content["beam_count"]))
+        if crc32(content) != self.content["ranges_crc32"]:
+            raise ValueError("other ranges")
+        return np.frombuffer(content, RANGE).astype(np.float32)
+
+    @property
+    def _is_version_1(self) -> bool:
+        return self.file is not SCANS_FILE
+
+
+class RangesFile:
+    """The file of the ranges, for a ``with``; it is opened when it is first needed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / RANGES
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def check(self) -> None:
+        """Raise SourceError if the file is missing."""
+        if not self._path.is_file():
+            raise SourceError(f"{self._path}: is missing; copy the whole folder again")
+
+    def read(self, offset: int, count: int) -> bytes:
+        """``count`` ranges from byte ``offset`` on, fewer if the file ends before; raises ValueError if it is far off.
+
+        Raises:
+            SourceError: the file cannot be read.
+        """
+        if offset >= 1 << 63:
+            raise ValueError("no place in a file")
+        try:
+            self._file.seek(offset)
+            return self._file.read(RANGE.itemsize * count)
+        except OSError as error:
+            raise SourceError(f"{self._path}: cannot be read ({error}); check the file and its permissions") from error
+
+    @cached_property
+    def _file(self) -> BinaryIO:
+        return self._stack.enter_context(self._path.open("rb"))
 
 
 def merged_frames(folder: Path, files: Sequence[FrameFile]) -> Iterator[Frame]:

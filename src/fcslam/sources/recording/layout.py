@@ -2,7 +2,9 @@
 
 ``scans.bin``, ``odometry.bin`` and ``images.bin`` have a header and frames of constant size, each with a checksum. So
 damage affects single frames, and the length of a file shows a frame that a crash cut off. The frames of all files share
-one sequence of numbers, which is the order of the recording.
+one sequence of numbers, which is the order of the recording. The ranges of a scan, as many as it has beams, are in
+``ranges.bin``, and its frame says where. In version 1, which is read and no longer written, they were in the frame, and
+all scans had the same beams.
 """
 
 from dataclasses import dataclass
@@ -18,21 +20,28 @@ from pydantic import ValidationError, model_validator
 
 from fcslam.config import Settings
 from fcslam.errors import SourceError
-from fcslam.records import CameraModel, LaserModel
+from fcslam.records import Beams, CameraModel, LaserModel
 from fcslam.sources.images import check_camera
 from fcslam.storage.files import write_file
 
 META = "meta.yaml"
 SCANS = "scans.bin"
+RANGES = "ranges.bin"
 IMAGES = "images"
 GROUND_TRUTH = "ground_truth.tum"
-VERSION = 1
+VERSION = 2
+"""Version that is written."""
+VERSIONS = (1, 2)
+"""Versions that are read."""
+RANGE = np.dtype("<f4")
+"""A range in metres."""
 
 _HEADER = Struct("<8sII")
 HEADER_BYTES = _HEADER.size
 CRC_BYTES = 4
 
 _MAX_META_BYTES = 1 << 16
+_MAX_LASERS = 8
 _MAX_BEAMS = 1 << 16
 _MAX_RANGE_M = 1e6
 _FULL_TURN_RAD = 2.0 * pi + 0.1
@@ -49,6 +58,7 @@ class FrameFile:
     name: str
     magic: bytes
     frame: np.dtype[np.void]
+    version: int = 1
 
     @property
     def frame_bytes(self) -> int:
@@ -58,7 +68,7 @@ class FrameFile:
     @property
     def header(self) -> bytes:
         """The first bytes of the file."""
-        return _HEADER.pack(self.magic, VERSION, self.frame_bytes)
+        return _HEADER.pack(self.magic, self.version, self.frame_bytes)
 
     def packed(self, *values: Any) -> bytes:
         """A frame of ``values``, in the order of its fields, and its checksum."""
@@ -80,9 +90,17 @@ IMAGES_FILE = FrameFile(
 )
 
 
-def scans_file(laser: LaserModel) -> FrameFile:
-    """The file of the scans of ``laser``."""
-    return FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, ("ranges_m", "<f4", (laser.beam_count,)), *_CRC]))
+_BEAMS: list[Any] = [("laser", "<u4"), ("beam_count", "<u4"), ("angle_min_rad", "<f8"), ("angle_increment_rad", "<f8")]
+_PLACE: list[Any] = [("offset", "<u8"), ("ranges_crc32", "<u4")]
+SCANS_FILE = FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, *_BEAMS, *_PLACE, *_CRC]), version=2)
+
+
+def scans_file(meta: "Meta") -> FrameFile:
+    """The file of the scans of a recording."""
+    if meta.version > 1:
+        return SCANS_FILE
+    (laser,) = meta.lasers
+    return FrameFile(SCANS, b"FCSLAMsc", np.dtype([*_ENTRY, ("ranges_m", RANGE, (laser.beam_count,)), *_CRC]))
 
 
 def image_path(folder: Path, index: int, suffix: str) -> Path:
@@ -93,23 +111,29 @@ def image_path(folder: Path, index: int, suffix: str) -> Path:
 class Meta(Settings):
     """The sensors of the robot."""
 
-    version: Literal[1] = 1
-    laser: LaserModel
+    version: Literal[1, 2] = 2
+    lasers: tuple[LaserModel, ...]
     camera: CameraModel | None = None
 
     @model_validator(mode="after")
     def _is_sane(self) -> Self:
-        laser = self.laser
-        if not 2 <= laser.beam_count <= _MAX_BEAMS:
-            raise ValueError(f"a laser has 2 to {_MAX_BEAMS} beams")
-        span_rad = (laser.beam_count - 1) * laser.angle_increment_rad
-        if not (abs(laser.angle_min_rad) <= _FULL_TURN_RAD and 0.0 < span_rad <= _FULL_TURN_RAD):
-            raise ValueError("no sane field of view of the laser")
-        if not 0.0 < laser.max_range_m <= _MAX_RANGE_M or not all(map(isfinite, laser.T_base_laser)):
-            raise ValueError("no sane range or pose of the laser")
+        if not 1 <= len(self.lasers) <= _MAX_LASERS:
+            raise ValueError(f"a recording has 1 to {_MAX_LASERS} lasers")
+        for laser in self.lasers:
+            check_beams(laser.beams)
+            if not 0.0 < laser.max_range_m <= _MAX_RANGE_M or not all(map(isfinite, laser.T_base_laser)):
+                raise ValueError("no sane range or pose of the laser")
         if self.camera is not None:
             check_camera(self.camera)
         return self
+
+
+def check_beams(beams: Beams) -> None:
+    """Raise ValueError for beams that no laser has."""
+    if not 2 <= beams.beam_count <= _MAX_BEAMS:
+        raise ValueError(f"a laser has 2 to {_MAX_BEAMS} beams")
+    if not (abs(beams.angle_min_rad) <= _FULL_TURN_RAD and 0.0 < beams.span_rad <= _FULL_TURN_RAD):
+        raise ValueError("no sane field of view of the laser")
 
 
 def write_meta(folder: Path, meta: Meta) -> None:
@@ -139,8 +163,11 @@ def read_meta(folder: Path) -> Meta:
     version = content.get("version") if isinstance(content, dict) else None
     if type(version) is not int:
         raise SourceError(f"{path}: does not describe a recording (no version); copy it again")
-    if version != VERSION:
-        raise SourceError(f"{path}: is of version {str(version)[:20]}, but {VERSION} is read here; update fcslam")
+    if version not in VERSIONS:
+        known = " and ".join(map(str, VERSIONS))
+        raise SourceError(f"{path}: is of version {str(version)[:20]}, but {known} are read here; update fcslam")
+    if isinstance(content, dict) and version == 1 and "laser" in content:
+        content["lasers"] = [content.pop("laser")]
     try:
         return Meta.model_validate(content)
     except ValidationError as error:

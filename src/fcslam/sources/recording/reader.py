@@ -5,7 +5,7 @@ is missing or different, and frames that a crash cut off. Without the camera's c
 rest is read. ``gate`` decides which scans are consistent.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from math import isnan, nan
@@ -19,6 +19,7 @@ from fcslam.records import (
     CameraImage,
     CameraModel,
     GroundTruth,
+    LaserModel,
     LaserScan,
     Odometry,
     Ranges,
@@ -31,7 +32,7 @@ from fcslam.sources.gate import ScanGate, check_consistency, scan_window
 from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_array
-from fcslam.sources.recording.frames import Frame, frame_count, merged_frames
+from fcslam.sources.recording.frames import Frame, RangesFile, frame_count, merged_frames
 from fcslam.sources.recording.layout import (
     GROUND_TRUTH,
     IMAGES_FILE,
@@ -86,17 +87,26 @@ class Recording:
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = _audit()
-        laser, camera = self._survey.laser, self._survey.camera
-        for number, frame in self._entries(scans, audit):
-            if frame.is_scan:
-                yield LaserScan(frame.stamp, _ranges(frame, audit), laser, pose_array(frame.T_odom_base))
-            elif frame.file is ODOMETRY_FILE:
-                yield Odometry(frame.stamp, pose_array(frame.T_odom_base))
-            elif camera is not None:
-                try:
-                    yield self._image(frame, camera)
-                except (OSError, ValueError):
-                    audit.add(Fault.BROKEN_IMAGE, number)
+        lasers, camera = self._survey.lasers, self._survey.camera
+        with RangesFile(self._path) as ranges:
+            for number, frame in self._entries(scans, audit):
+                if frame.is_scan:
+                    laser = lasers[frame.laser].with_beams(frame.beams(lasers))
+                    try:
+                        ranges_m = _ranges(frame, ranges, audit)
+                    except ValueError:
+                        audit.add(Fault.BROKEN_RECORD, number)
+                    else:
+                        yield LaserScan(frame.stamp, ranges_m, laser, pose_array(frame.T_odom_base))
+                elif frame.file is ODOMETRY_FILE:
+                    yield Odometry(frame.stamp, pose_array(frame.T_odom_base))
+                elif camera is not None:
+                    try:
+                        image = self._image(frame, camera)
+                    except (OSError, ValueError):
+                        audit.add(Fault.BROKEN_IMAGE, number)
+                    else:
+                        yield image
 
     def ground_truth(self) -> Iterator[GroundTruth]:
         """True poses in the order in which they were written; empty if they were not recorded.
@@ -117,18 +127,20 @@ class Recording:
     def _survey(self) -> Survey:
         """Summary from one pass over the whole recording; rejects a recording that cannot be mapped."""
         audit, scans, odometry = _audit(), PathSummary(), PathSummary()
+        if self._meta.version > 1:
+            RangesFile(self._path).check()
         for _, frame in self._checked(audit):
             if frame.is_scan:
                 scans.add(frame.stamp, frame.T_odom_base)
             elif frame.file is ODOMETRY_FILE:
                 odometry.add(frame.stamp, frame.T_odom_base)
-        laser, faults = self._meta.laser, audit.faults()
-        check_consistency(self._path, faults, scans.count, odometry.count, laser.beam_count)
+        faults = audit.faults()
+        check_consistency(self._path, faults, scans.count, odometry.count)
         if not scans.count:
             seen = f"; {faults}" if faults else ""
             raise SourceError(f"{self._path}: no laser scan in this recording{seen}; give one with scans")
         camera, notes = self._camera_and_notes()
-        return Survey(scans.count, scans.duration_s, scans.length_m, laser, faults, notes, camera)
+        return Survey(scans.count, scans.duration_s, scans.length_m, self._meta.lasers, faults, notes, camera)
 
     def _camera_and_notes(self) -> tuple[CameraModel | None, tuple[str, ...]]:
         camera, count = self._meta.camera, frame_count(self._path, IMAGES_FILE)
@@ -143,18 +155,16 @@ class Recording:
 
     def _checked(self, audit: Audit) -> Iterator[tuple[int, Frame]]:
         """The usable frames, each with its number."""
-        files = [scans_file(self._meta.laser), ODOMETRY_FILE]
+        lasers = self._meta.lasers
+        files = [scans_file(self._meta), ODOMETRY_FILE]
         if self._camera_and_notes()[0] is not None:
             files.append(IMAGES_FILE)
-        gate = ScanGate(self._meta.laser.beam_count, audit)
+        gates = [ScanGate(laser.beams, audit) for laser in lasers]
         for frame in merged_frames(self._path, files):
-            if frame.fault is not None or not _is_sane(frame):
+            if frame.fault is not None or not _is_sane(frame, lasers):
                 audit.add(frame.fault or Fault.BROKEN_RECORD, frame.number)
-            elif not frame.is_scan or gate.admits(frame.number, frame):
+            elif not frame.is_scan or gates[frame.laser].admits(frame.number, frame.stamp, frame.beams(lasers)):
                 yield frame.number, frame
-
-    def _is_scan(self, frame: Frame) -> bool:
-        return frame.file.name == "scans.bin"
 
     def _image(self, frame: Frame, camera: CameraModel) -> CameraImage:
         """Raises OSError or ValueError if the image's file is missing or different."""
@@ -173,15 +183,20 @@ class Recording:
         return CameraImage(frame.stamp, encoded, camera, None if isnan(pose[0]) else pose_array(pose))
 
 
-def _is_sane(frame: Frame) -> bool:
+def _is_sane(frame: Frame, lasers: Sequence[LaserModel]) -> bool:
+    try:
+        if frame.is_scan:
+            frame.beams(lasers)
+    except ValueError:
+        return False
     pose = frame.T_odom_base
     unknown = frame.file is IMAGES_FILE and all(map(isnan, pose))
     return abs(frame.stamp) < _MAX_STAMP_S and (unknown or all(abs(value) < _MAX_COORDINATE for value in pose))
 
 
-def _ranges(frame: Frame, audit: Audit) -> Ranges:
-    """Ranges in metres, shape (beam_count,); negative ones become NaN."""
-    ranges: Ranges = frame.content["ranges_m"].astype(np.float32)
+def _ranges(frame: Frame, file: RangesFile, audit: Audit) -> Ranges:
+    """Ranges in metres, shape (beam_count,); negative ones become NaN. Raises ValueError if they are damaged."""
+    ranges = frame.ranges_m(file)
     negative = ranges < 0.0
     if negative.any():
         audit.add(Fault.NEGATIVE_RANGE, frame.number, int(np.count_nonzero(negative)))

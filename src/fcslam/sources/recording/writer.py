@@ -1,7 +1,7 @@
 """Writes sensor records to a recording folder, one by one. A crash loses the last record at most."""
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO, FileIO
 from math import nan
@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from fcslam.errors import OutputError, SourceError
+from fcslam.geometry.beams import is_same_laser
 from fcslam.records import CameraImage, CameraModel, GroundTruth, LaserModel, LaserScan, Odometry, RecordedItem
 from fcslam.runs import write_tum
 from fcslam.sources.images import check_image, image_suffix
@@ -23,12 +24,16 @@ from fcslam.sources.recording.layout import (
     IMAGES_FILE,
     META,
     ODOMETRY_FILE,
+    RANGE,
+    RANGES,
+    SCANS,
+    SCANS_FILE,
+    VERSION,
     FrameFile,
     Meta,
     image_path,
     is_whole,
     read_meta,
-    scans_file,
     write_meta,
 )
 
@@ -52,18 +57,17 @@ class RecordingWriter:
         self._folder = folder
         self._meta = meta
         self._next_sequence = 0
-        self._scans = scans_file(meta.laser)
         self._appenders: dict[str, _Appender] = {}
 
     @classmethod
-    def create(cls, folder: Path, laser: LaserModel, camera: CameraModel | None = None) -> Self:
+    def create(cls, folder: Path, lasers: Sequence[LaserModel], camera: CameraModel | None = None) -> Self:
         """Start a new recording at ``folder``, which must be missing or empty.
 
         Raises:
             OutputError: the folder is not empty or cannot be written, or a sensor model is invalid.
         """
         try:
-            meta = Meta(laser=laser, camera=camera)
+            meta = Meta(lasers=tuple(lasers), camera=camera)
         except ValidationError as error:
             raise OutputError(f"{folder}: cannot hold these sensors ({error.errors()[0]['msg']})") from error
         with _translate_errors(folder):
@@ -78,10 +82,13 @@ class RecordingWriter:
         """Continue the recording at ``folder``; incomplete last records are removed.
 
         Raises:
-            SourceError: the folder has no recording.
+            SourceError: the folder has no recording, or one of version 1.
             OutputError: the recording cannot be written.
         """
-        return cls._opened(folder, read_meta(folder))
+        meta = read_meta(folder)
+        if meta.version != VERSION:
+            raise SourceError(f"{folder}: is of version {meta.version}, which is read but not continued; record again")
+        return cls._opened(folder, meta)
 
     @classmethod
     def _opened(cls, folder: Path, meta: Meta) -> Self:
@@ -95,9 +102,9 @@ class RecordingWriter:
         return writer
 
     @property
-    def laser(self) -> LaserModel:
-        """The laser of all scans."""
-        return self._meta.laser
+    def lasers(self) -> tuple[LaserModel, ...]:
+        """The lasers of all scans."""
+        return self._meta.lasers
 
     @property
     def camera(self) -> CameraModel | None:
@@ -108,7 +115,7 @@ class RecordingWriter:
     def counts(self) -> RecordCounts:
         """Records in the folder."""
         truth = self._appenders[GROUND_TRUTH]
-        scans, odometry, images = (self._count(frames) for frames in (self._scans, ODOMETRY_FILE, IMAGES_FILE))
+        scans, odometry, images = (self._count(frames) for frames in (SCANS_FILE, ODOMETRY_FILE, IMAGES_FILE))
         return RecordCounts(scans, odometry, images, truth.content(0, truth.size).count(b"\n"))
 
     @property
@@ -125,8 +132,8 @@ class RecordingWriter:
         self._check(item)
         with _translate_errors(self._folder):
             match item:
-                case LaserScan(stamp, ranges_m, _, pose):
-                    self._append(self._scans, stamp, pose, ranges_m)
+                case LaserScan():
+                    self._append_scan(item)
                 case Odometry(stamp, pose):
                     self._append(ODOMETRY_FILE, stamp, pose)
                 case CameraImage():
@@ -148,13 +155,15 @@ class RecordingWriter:
         self.close()
 
     def _open_files(self) -> None:
-        files = [self._scans, ODOMETRY_FILE]
+        files = [SCANS_FILE, ODOMETRY_FILE]
         if self._meta.camera is not None:
             files.append(IMAGES_FILE)
             (self._folder / IMAGES).mkdir(exist_ok=True)
         for frames in files:
             appender = self._appenders[frames.name] = _Appender(self._folder / frames.name)
             self._next_sequence = max(self._next_sequence, _cut_to_whole_frames(appender, frames))
+        ranges = self._appenders[RANGES] = _Appender(self._folder / RANGES)
+        ranges.cut(min(ranges.size, _end_of_ranges(self._appenders[SCANS])))
         for unfinished in (self._folder / IMAGES).glob(f"{self._count(IMAGES_FILE):08d}.*"):
             unfinished.unlink()
         truth = self._appenders[GROUND_TRUTH] = _Appender(self._folder / GROUND_TRUTH)
@@ -164,8 +173,8 @@ class RecordingWriter:
         pose = item.T_building_base if isinstance(item, GroundTruth) else item.T_odom_base
         if not np.isfinite(item.stamp) or (pose is not None and not np.all(np.isfinite(pose))):
             raise OutputError(f"{self._folder}: a record at {item.stamp} s has no finite stamp or pose; leave it out")
-        if isinstance(item, LaserScan) and item.laser != self._meta.laser:
-            raise OutputError(f"{self._folder}: a scan at {item.stamp} s is not of the recording's laser; use one each")
+        if isinstance(item, LaserScan) and self._index(item.laser) is None:
+            raise OutputError(f"{self._folder}: a scan at {item.stamp} s is of no laser of the recording; use one each")
         if isinstance(item, CameraImage):
             if item.camera != self._meta.camera:
                 raise OutputError(f"{self._folder}: an image at {item.stamp} s is not of the recording's camera")
@@ -173,6 +182,17 @@ class RecordingWriter:
                 check_image(item.encoded, item.camera)
             except ValueError as error:
                 raise OutputError(f"{self._folder}: an image at {item.stamp} s cannot be kept ({error})") from error
+
+    def _index(self, laser: LaserModel) -> int | None:
+        return next((k for k, known in enumerate(self._meta.lasers) if is_same_laser(laser, known)), None)
+
+    def _append_scan(self, scan: LaserScan) -> None:
+        """Write the ranges before the frame: a frame without ranges is a fault, ranges without a frame are removed."""
+        ranges, content = self._appenders[RANGES], scan.ranges_m.astype(RANGE).tobytes()
+        offset = ranges.size
+        ranges.append(content)
+        place = (*scan.laser.beams, offset, crc32(content))
+        self._append(SCANS_FILE, scan.stamp, scan.T_odom_base, self._index(scan.laser), *place)
 
     def _append(self, frames: FrameFile, *values: object) -> None:
         self._appenders[frames.name].append(frames.packed(self._next_sequence, *values))
@@ -192,7 +212,7 @@ class RecordingWriter:
 
 
 def write_recording(
-    folder: Path, laser: LaserModel, camera: CameraModel | None, records: Iterable[RecordedItem]
+    folder: Path, lasers: Sequence[LaserModel], camera: CameraModel | None, records: Iterable[RecordedItem]
 ) -> None:
     """Write ``records`` to a new recording folder; equal records give equal bytes.
 
@@ -201,7 +221,7 @@ def write_recording(
     Raises:
         OutputError: as ``RecordingWriter.create`` and ``write``.
     """
-    with RecordingWriter.create(folder, laser, camera) as writer:
+    with RecordingWriter.create(folder, lasers, camera) as writer:
         for record in records:
             writer.write(record)
 
@@ -256,6 +276,14 @@ def _cut_to_whole_frames(appender: _Appender, frames: FrameFile) -> int:
         count -= 1
     appender.cut(HEADER_BYTES + count * frames.frame_bytes)
     return int(np.frombuffer(frame, frames.frame)["sequence"][0]) + 1 if count else 0
+
+
+def _end_of_ranges(scans: _Appender) -> int:
+    """The end of the ranges of the last scan, in bytes; 0 without scans."""
+    if scans.size == HEADER_BYTES:
+        return 0
+    frame = np.frombuffer(scans.content(scans.size - SCANS_FILE.frame_bytes, scans.size), SCANS_FILE.frame)[0]
+    return int(frame["offset"]) + RANGE.itemsize * int(frame["beam_count"])
 
 
 @contextmanager

@@ -1,0 +1,56 @@
+"""Whether a scan can be of a laser, judged by the directions of its beams."""
+
+from math import degrees, pi, remainder, tau
+
+from fcslam.records import Beams, LaserModel
+
+LARGEST_RATIO = 1.5
+"""Largest ratio of the increments of two scans of one laser. Scanners whose motor varies stay well below; the next
+resolution of a scanner is twice as fine."""
+SAME_VIEW_RAD = 0.05
+"""Tolerance of the first and the last direction of a field of view."""
+SAME_VIEW_BEAMS = 1.5
+"""The same in increments, if that is more: interleaved scans, one beam more or less, rounded headers."""
+
+
+def misfit(beams: Beams, declared: Beams) -> str | None:
+    """Why a scan with ``beams`` cannot be of the laser that was declared with the beams ``declared``.
+
+    Interleaved scans, an increment that follows the motor's speed, a missing beam and the overlapping beam of a full
+    turn are variations of one laser. Another field of view or another resolution is another laser.
+
+    Args:
+        beams: at least two beams with finite angles, as ``declared``.
+
+    Returns:
+        The reason, for a message; None if the scan can be of this laser.
+    """
+    if beams == declared:
+        return None
+    increment, other = beams.angle_increment_rad, declared.angle_increment_rad
+    if increment * other <= 0.0:
+        return "its beams turn the other way"
+    wide, narrow = max(abs(increment), abs(other)), min(abs(increment), abs(other))
+    if wide > LARGEST_RATIO * narrow:
+        return f"its beams are {degrees(abs(increment)):.3g} degrees apart, the laser's {degrees(abs(other)):.3g}"
+    tolerance_rad = max(SAME_VIEW_RAD, SAME_VIEW_BEAMS * wide)
+    if all(abs(view.span_rad + view.angle_increment_rad) > 2.0 * pi - tolerance_rad for view in (beams, declared)):
+        return None  # a full turn has no first direction
+    first_rad = remainder(beams.angle_min_rad - declared.angle_min_rad, tau)
+    last_rad = first_rad + beams.span_rad - declared.span_rad
+    if max(abs(first_rad), abs(last_rad)) > tolerance_rad:
+        return f"it looks over {_view(beams)}, the laser over {_view(declared)}"
+    return None
+
+
+def is_same_laser(a: LaserModel, b: LaserModel) -> bool:
+    """Whether scans with these models can be of one laser."""
+    if a is b:
+        return True
+    fixed = a.T_base_laser == b.T_base_laser and a.max_range_m == b.max_range_m
+    return fixed and misfit(a.beams, b.beams) is None
+
+
+def _view(beams: Beams) -> str:
+    first, last = degrees(beams.angle_min_rad), degrees(beams.angle_min_rad + beams.span_rad)
+    return f"{first:.1f} to {last:.1f} degrees"
