@@ -37,10 +37,17 @@ LONGEST = {
     "Keyscan.ranges": 2 * 4096,
     "Place.keypoints": 6 * 2048,
     "Place.descriptors": 32 * 2048,
+    "Hello.lasers": 8,
     "Hello.detectors": 2,
     "Constraint.information": 6,
 }
 """Every field that holds more than one number, and how much of it, in bytes, characters or elements."""
+
+
+ELEMENTS = {
+    "Hello.detectors": [pb.Detector(channel=1, version="a")],
+    "Hello.lasers": list(pb.Packet.FromString(encode(EXAMPLES["hello"])).hello.lasers[:1]),
+}
 
 
 def reachable(descriptor):
@@ -78,7 +85,7 @@ def filled(name, count):
                 continue
             field = FIELDS[name]
             if field.is_repeated:
-                elements = [pb.Detector(channel=1, version="a")] if field.message_type else [1.0]
+                elements = ELEMENTS.get(name, [1.0])
                 part.ClearField(field_name)
                 getattr(part, field_name).extend(elements * count)
             else:
