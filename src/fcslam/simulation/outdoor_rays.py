@@ -128,7 +128,13 @@ def _rows(piece: Piece) -> list[list[float]]:
     layers = [[float(value) for value in layer] for layer in LAYERS[piece.kind]]
     if piece.kind in ROUND:
         return [[1.0, *piece.centre, 0.5 * piece.size[0], 0.0, *layer[:5]] for layer in layers]
-    sides = np.hstack((piece.outline, np.roll(piece.outline, -1, axis=0)))
+    if piece.kind is PieceKind.GLASS:
+        # One pane along the middle, or beams would have to pass two.
+        long = 0 if piece.size[0] >= piece.size[1] else 1
+        a, b, c, d = np.roll(piece.outline, -long, axis=0)
+        sides = np.hstack((0.5 * (a + d), 0.5 * (b + c)))[None]
+    else:
+        sides = np.hstack((piece.outline, np.roll(piece.outline, -1, axis=0)))
     # A side is no foliage, so the last column says instead whether it is glass.
     return [[0.0, *side, *layer[:4], layer[5]] for side in sides for layer in layers]
 
