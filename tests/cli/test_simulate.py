@@ -43,6 +43,31 @@ def test_bags_hold_the_same_scans(simulated):
     )
 
 
+def test_the_robot_of_a_yard_is_as_asked(tmp_path):
+    asked = [
+        "--beams",
+        "91",
+        "--field-of-view",
+        "180",
+        "--lidar-range",
+        "81.9",
+        "--lidar-rate",
+        "2",
+        "--odometry",
+        "good",
+    ]
+    tiny = ["simulate", "--building", "yard", "--no-camera", "--robots", "1", "--path-length", "5"]
+    assert main([*tiny, *asked, "--output", str(tmp_path / "yard")]) == 0
+    scans = [record for record in open_source(tmp_path / "yard" / "robot_1").records() if isinstance(record, LaserScan)]
+    laser = scans[0].laser
+    assert (laser.beam_count, laser.max_range_m) == (91, 81.9)
+    assert np.rad2deg(np.ptp(laser.angles_rad())) == pytest.approx(180.0)
+    assert scans[1].stamp - scans[0].stamp == pytest.approx(0.5)
+    assert main([*tiny, "--output", str(tmp_path / "default")]) == 0
+    settings = (tmp_path / "default" / "simulation.yaml").read_text(encoding="utf-8")
+    assert "max_range_m: 30.0" in settings
+
+
 @pytest.mark.slow
 def test_a_simulated_fleet_is_mapped(simulated, tmp_path):
     recordings = [str(simulated / name) for name in ("robot_1", "robot_2")]

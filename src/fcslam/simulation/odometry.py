@@ -43,18 +43,16 @@ class OdometryNoiseSettings(Settings):
     )
 
 
+_GOOD = OdometryNoiseSettings(heading_noise_rad=0.003, veer_bias_rad_m=0.001, scale_bias=0.015)
+
 KINDS = {
     OdometryKind.DEFAULT: OdometryNoiseSettings(slips_per_m=0.05),
-    OdometryKind.GOOD: OdometryNoiseSettings(heading_noise_rad=0.003, veer_bias_rad_m=0.001, scale_bias=0.015),
-    OdometryKind.SLIPPING: OdometryNoiseSettings(
-        heading_noise_rad=0.006,
-        scale_bias=0.02,
-        slips_per_m=0.05,
-        slip_m=0.25,
-        slip_limit_m=0.7,
-        slip_turn_rad=0.1,
+    OdometryKind.GOOD: _GOOD,
+    OdometryKind.SLIPPING: _GOOD.model_copy(
+        update={"slips_per_m": 0.05, "slip_m": 0.25, "slip_limit_m": 0.7, "slip_turn_rad": 0.1}
     ),
 }
+"""The errors of each kind of wheel odometry."""
 
 
 def simulate_odometry(

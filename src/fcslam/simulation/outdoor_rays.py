@@ -195,7 +195,16 @@ def _meet(surface, x, y, dx, dy, depth):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _first_hit(start, direction, far, seed, beam, ideal, world):  # type: ignore[no-untyped-def]  # noqa: PLR0912
+def _passes(surface, above_m, facing, chance):  # type: ignore[no-untyped-def]
+    """Whether a beam goes on where it meets a surface, ``above_m`` over the ground; ``chance`` lies in [0, 1)."""
+    if above_m < surface[5] or above_m > surface[6]:
+        return True
+    glass = surface[0] == 0.0 and surface[9] > 0.0
+    return chance < (_GLASS_PASSES if glass and facing < _GLASS_FACED else 1.0 - surface[7])
+
+
+@njit(cache=True, nogil=True)
+def _first_hit(start, direction, far, seed, beam, ideal, world):  # type: ignore[no-untyped-def]
     """Distance, surface and cosine of the incidence where a beam ends: cell after cell along it."""
     x, y, z = start
     dx, dy, dz = direction
@@ -218,15 +227,9 @@ def _first_hit(start, direction, far, seed, beam, ideal, world):  # type: ignore
             distance, facing = _meet(surface, x, y, dx, dy, depth)
             if distance >= best:
                 continue
-            if not ideal:
-                above = z + distance * dz - _ground_m(world.heights_m, x + distance * dx, y + distance * dy)
-                if above < surface[5] or above > surface[6]:
-                    continue
-                passes = 1.0 - surface[7]
-                if surface[0] == 0.0 and surface[9] > 0.0 and facing < _GLASS_FACED:
-                    passes = _GLASS_PASSES
-                if passes > 0.0 and _uniform(seed + np.uint64(1), beam, number) < passes:
-                    continue
+            above = z + distance * dz - _ground_m(world.heights_m, x + distance * dx, y + distance * dy)
+            if not ideal and _passes(surface, above, facing, _uniform(seed + np.uint64(1), beam, number)):
+                continue
             best, hit, cosine = distance, number, facing
         leaves = min(next_x, next_y)
         if not ideal:
