@@ -21,14 +21,14 @@ LASER_HEIGHT_M: Final = 0.5
 
 _CELL_M: Final = 2.0
 """Side of a cell of the grid that finds the surfaces along a beam."""
-_SHAKE_RAD: Final = 0.003
+_SHAKE_RAD: Final = 0.002
 """Standard deviation of pitch and roll on rough ground."""
 _BEAM_HALF_WIDTH_RAD: Final = 0.0015
 """A beam returns from anywhere in its width."""
 _LEAST_M: Final = 1e-4
 _NOTHING: Final = -1
 _GROUND: Final = -2
-_GROUND_RETURNS: Final = 0.6
+_GROUND_RETURNS: Final = 0.75
 """Share of beams that return from the ground. The others graze it and are lost."""
 _GROUND_ROUGHNESS: Final = 0.04
 """Relative error of a range to the ground."""
@@ -62,7 +62,7 @@ LAYERS: Final = {
     PieceKind.BOLLARD: (Layer(0.0, 0.9, 1.0, 0.5),),
     PieceKind.LOW_WALL: (Layer(0.0, 0.6, 1.0, 0.5),),
     PieceKind.HEDGE: (Layer(0.0, 1.3, 1.0, 0.3, free_path_m=0.18),),
-    PieceKind.FENCE: (Layer(0.0, 1.6, 0.35, 0.5),),
+    PieceKind.FENCE: (Layer(0.0, 1.6, 0.5, 0.5),),
     PieceKind.CAR: (Layer(0.2, 0.85, 0.95, 0.3), Layer(0.85, 1.4, 0.4, 0.3)),
 }
 """What stands in a yard, from the ground upwards."""
