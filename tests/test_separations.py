@@ -5,7 +5,7 @@ import numpy as np
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, RobotTrajectory, Run, separations
 
-FEW = Reason(ReasonCode.FEW_PLACES, 2, 3, "fleet.consistency.minimum_closures")
+FEW = Reason(ReasonCode.FEW_PLACES, 2, 3, "fleet.consistency.minimum_evidence")
 
 
 def run_of(maps, *closures):
@@ -21,7 +21,7 @@ def test_verified_closures_name_what_they_lack():
     assert (found.candidates, found.verified, found.reason) == (1, 146, FEW)
     assert str(found) == (
         "map 0 (a) and map 1 (b): 146 verified closures, but they agree from 2 separate places, 3 needed "
-        "(fleet.consistency.minimum_closures)"
+        "(fleet.consistency.minimum_evidence)"
     )
 
 

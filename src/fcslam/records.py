@@ -267,7 +267,10 @@ class ReasonCode(StrEnum):
     ASYMMETRIC = "asymmetric_alignment"
     ONE_DIRECTION = "fixed_in_one_direction"
     NOT_INFORMATIVE = "no_informative_closure"
+    FEW_CLOSURES = "few_consistent_closures"
     FEW_PLACES = "few_separate_places"
+    NOT_UNIQUE = "alignment_not_unique"
+    MAPS_CONTRADICT = "maps_contradict"
     NO_LEAD = "no_clear_lead"
     RIVAL_PLACES = "rival_has_more_places"
     OUTSIDE_CLUSTER = "outside_dominant_cluster"
@@ -290,7 +293,10 @@ _REASON_TEXT = {
     ReasonCode.ASYMMETRIC: "the alignments of both directions differ by {value}, less than {limit} needed",
     ReasonCode.ONE_DIRECTION: "fixed in one direction only, as in a corridor: eigenvalue {value}, {limit} needed",
     ReasonCode.NOT_INFORMATIVE: "none of the {value} consistent closures fixes the position in every direction",
+    ReasonCode.FEW_CLOSURES: "{value} of them agree, {limit} needed",
     ReasonCode.FEW_PLACES: "they agree from {value} separate places, {limit} needed",
+    ReasonCode.NOT_UNIQUE: "the alignment is not unique: its score is {value} times the best elsewhere, {limit} needed",
+    ReasonCode.MAPS_CONTRADICT: "a share of {value} of the aligned maps' surfaces lies in free space, {limit} allowed",
     ReasonCode.NO_LEAD: "{value} times as many closures agree as contradict them, {limit} times needed",
     ReasonCode.RIVAL_PLACES: "closures from {value} separate places agree, but others from {limit} contradict them",
     ReasonCode.OUTSIDE_CLUSTER: "outside the dominant cluster",

@@ -89,7 +89,7 @@ def test_closures_from_one_place_are_one_witness(scripted, pairs):
     result = feed(scripted(agreeing), [*stream(*a, start_s=0.0), *stream(*B, start_s=LATER)]).finalize()
     assert map_of(result) == {"a": 0, "b": 1}
     assert {c.status for c in between(result)} == {ClosureStatus.REJECTED}
-    assert between(result)[0].reason == Reason(ReasonCode.FEW_PLACES, 1, 3, "fleet.consistency.minimum_closures")
+    assert between(result)[0].reason.code is ReasonCode.NOT_UNIQUE
 
 
 def test_corridors_alone_join_nothing_but_one_informative_place_among_them_does(scripted):
@@ -320,7 +320,7 @@ def test_no_fusing_means_no_comparing(scripted):
 
 
 def test_a_single_closure_joins_where_the_configuration_asks_for_no_more(scripted):
-    cloud = scripted(closures(A, B, TRUE[2:3]), consistency={"minimum_closures": 1})
+    cloud = scripted(closures(A, B, TRUE[2:3]), consistency={"minimum_closures": 1, "minimum_evidence": 1})
     result = feed(cloud, two_robots()).finalize()
     assert map_of(result) == {"a": 0, "b": 0}
     assert joint_error(result) < 1e-3

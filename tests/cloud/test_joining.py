@@ -33,6 +33,10 @@ def entry(i, j, T_i_j, information=CLOSURE_INFORMATION):
     return ClosureEntry(closure, independent=True)
 
 
+def unexamined(*_):
+    return None
+
+
 def graph_of(**trajectories):
     graph = JointGraph()
     for robot, truth in trajectories.items():
@@ -81,7 +85,7 @@ def test_the_verdict_is_the_same_from_both_sides(turned):
     evidence = entries([(0, 0), (8, 8), (16, 16), (24, 24)], turned=turned)
     evidence += entries([(4, 4), (12, 12)], shift=np.array([5.0, 1.0, 0.3]))
     for robots in (("a", "b"), ("b", "a")):
-        verdict = decide_join(evidence, robots, graph, SETTINGS)
+        verdict = decide_join(evidence, robots, graph, SETTINGS, unexamined)
         assert verdict.members == (0, 1, 2, 3)
         assert verdict.runner_up == (4, 5)
         assert verdict.dominant
@@ -92,7 +96,7 @@ def test_the_verdict_is_the_same_from_both_sides(turned):
 def test_only_a_rival_that_could_join_two_maps_contests_the_cluster(rivals, contested):
     graph = graph_of(a=POSES, b=POSES)
     evidence = entries([(0, 0), (8, 8), (16, 16)]) + entries(rivals, shift=np.array([5.0, 1.0, 0.3]))
-    verdict = decide_join(evidence, ("a", "b"), graph, SETTINGS)
+    verdict = decide_join(evidence, ("a", "b"), graph, SETTINGS, unexamined)
     assert not verdict.dominant
     assert verdict.contested is contested
 

@@ -185,8 +185,8 @@ def test_supporters_are_places_that_lie_apart_and_one_must_inform() -> None:
     informative = np.array([False, True, False, False, False, False])
     assert dominant_cluster(agree, far, informative, SETTINGS).dominant
     one_place = dominant_cluster(agree, near, informative, SETTINGS)
-    assert (one_place.separate_places, one_place.dominant) == (1, False)
-    assert one_place.shortfall == Reason(ReasonCode.FEW_PLACES, 1, 3, "minimum_closures")
+    assert (one_place.evidence.separate_places, one_place.dominant) == (1, False)
+    assert one_place.shortfall == Reason(ReasonCode.FEW_PLACES, 1, 3, "minimum_evidence")
     corridor = dominant_cluster(agree, far, np.zeros(6, dtype=bool), SETTINGS)
     assert corridor.shortfall == Reason(ReasonCode.NOT_INFORMATIVE, 6)
 

@@ -252,7 +252,7 @@ def test_a_link_lasts_on_most_of_its_cluster_from_enough_places(dropped: int, la
     ones, zeros = np.ones(len(edges), bool), np.zeros(len(edges), bool)
     evidence = JointEvidence(graph, robots, ones, ones, zeros)
     (link,) = solve_jointly(evidence, SETTINGS).links
-    assert link.decision.separate_places == 4
+    assert link.decision.evidence.separate_places == 4
     weights = np.ones(len(edges))
     weights[len(edges) - dropped :] = 0.0
     own = [build_trajectory(truth, SETTINGS)] * 2

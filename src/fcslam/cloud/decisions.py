@@ -7,14 +7,21 @@ import numpy as np
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.joining import CONSISTENCY, decide_join, first_estimate
 from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.map_comparison import MapComparison
 from fcslam.cloud.reevaluation import reevaluate
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
+from fcslam.graph.consistency import Closures
+from fcslam.graph.evidence import Uniqueness
+from fcslam.graph.trajectory import Trajectory
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import ClosureStatus, Constraint, KeyscanId, Reason, ReasonCode, Veto
 
+EXAMINED_GROWTH = 2.0
+"""The maps of two sessions are compared again when their cluster has grown by this factor: at each place, it would take
+longer than all else."""
 CONTESTED_GROWTH = 1.1
 """After a re-evaluation confirmed a contested join, the number of closures grows by this factor before the next one:
 the same evidence would be weighed again at every place."""
@@ -27,6 +34,9 @@ class ClosureDecisions:
         self._config = config
         self._sessions = sessions
         self._graph = graph
+        self._comparison = MapComparison(sessions)
+        self._examined: dict[frozenset[str], int] = {}
+        """Size of the cluster when the maps of two sessions were compared last."""
         self.closures = ClosureLog()
         self.maps: list[list[str]] = []
         """Sessions by map; maps, and the sessions in them, in the order in which they started."""
@@ -95,7 +105,7 @@ class ClosureDecisions:
 
     def reevaluate(self) -> Fusion:
         """Decide every closure again from all evidence: revoke outvoted ones, separate maps that only they joined."""
-        fusion = reevaluate(self._graph, self.closures, self._config.consistency)
+        fusion = reevaluate(self._graph, self.closures, self._config.consistency, self._comparison.uniqueness)
         self.maps = [list(sessions) for sessions in fusion.maps]
         self._contested, self._postponed_until = False, int(CONTESTED_GROWTH * len(self.closures))
         self.version += 1
@@ -131,7 +141,7 @@ class ClosureDecisions:
     def _decide_pair(self, a: str, b: str) -> None:
         """Join the maps of two sessions, or accept more closures between them, if one cluster dominates."""
         entries = self.closures.evidence(a, b)
-        decision = decide_join(entries, (a, b), self._graph, self._config.consistency)
+        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._examine)
         joined = b in self.map_of(a)
         self._contested |= joined and decision.contested
         if decision.shortfall is not None:
@@ -147,6 +157,14 @@ class ClosureDecisions:
         _explain(entries, Reason(ReasonCode.OUTSIDE_CLUSTER))
         if fresh:
             self._optimize()
+
+    def _examine(self, sessions: tuple[str, str], a: Trajectory, b: Trajectory, members: Closures) -> Uniqueness | None:
+        """Compare the maps of two sessions if their cluster is new or has grown much."""
+        pair = frozenset(sessions)
+        if len(members) < EXAMINED_GROWTH * self._examined.get(pair, 0):
+            return None
+        self._examined[pair] = len(members)
+        return self._comparison.uniqueness(sessions, a, b, members)
 
     def _join(self, members: list[ClosureEntry], a: str, b: str) -> None:
         """Move the younger map into the older one's frame."""

@@ -1,6 +1,6 @@
 """Whether the closures between two robots join their maps: the cloud's entries in the terms of the graph."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -9,19 +9,30 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.graph import cluster
 from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.consistency import Closures, ConsistencySettings
+from fcslam.graph.evidence import Uniqueness
+from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray
+
+ExamineSessions = Callable[[tuple[str, str], Trajectory, Trajectory, Closures], Uniqueness | None]
+"""As ``MapComparison.uniqueness``."""
 
 CONSISTENCY = "fleet.consistency"
 """Section of the configuration that holds the rule for joining maps."""
 
 
 def decide_join(
-    entries: Sequence[ClosureEntry], robots: tuple[str, str], graph: JointGraph, settings: ConsistencySettings
+    entries: Sequence[ClosureEntry],
+    robots: tuple[str, str],
+    graph: JointGraph,
+    settings: ConsistencySettings,
+    examine: ExamineSessions,
 ) -> ClusterDecision:
     """The dominant cluster among the closures of two robots, by the current estimate of their trajectories."""
     a, b = (graph.path(robot, settings) for robot in robots)
-    informative = [entry.closure.informative for entry in entries]
-    return cluster.decide_cluster(a, b, _closures(entries, robots[0]), informative, settings)
+    informative, closures = [entry.closure.informative for entry in entries], _closures(entries, robots[0])
+    return cluster.decide_cluster(
+        a, b, closures, informative, settings, lambda members: examine(robots, a, b, closures.select(members))
+    )
 
 
 def first_estimate(

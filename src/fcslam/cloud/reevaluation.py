@@ -5,26 +5,34 @@ from collections.abc import Iterable
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
-from fcslam.cloud.joining import CONSISTENCY
+from fcslam.cloud.joining import CONSISTENCY, ExamineSessions
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
-from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.consistency import Closures, ConsistencySettings
+from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
+from fcslam.graph.trajectory import Trajectory
 from fcslam.records import ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 
 CONTRADICTS = Reason(ReasonCode.CONTRADICTS_JOINT_GRAPH)
 
 
-def reevaluate(graph: JointGraph, closures: ClosureLog, settings: ConsistencySettings) -> Fusion:
+def reevaluate(
+    graph: JointGraph, closures: ClosureLog, settings: ConsistencySettings, examine: ExamineSessions
+) -> Fusion:
     """Solve the joint graph from all evidence; update the poses of the graph and the status of every entry.
 
     No earlier estimate, join or decision plays a part: a closure that joined two maps and is outvoted now is revoked.
     """
     entries = [entry for entry in closures if entry.closure.status is not ClosureStatus.CANDIDATE]
     _enter(graph, (entry for entry in entries if entry.edge is None))
-    solution = solve_jointly(_evidence(graph, entries), settings)
-    graph.take(solution.poses)
     robots = list(graph.robots())
+
+    def examine_pair(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> Uniqueness | None:
+        return examine((robots[a], robots[b]), path_a, path_b, members)
+
+    solution = solve_jointly(_evidence(graph, entries), settings, examine=examine_pair)
+    graph.take(solution.poses)
     reasons = _reasons(solution, robots)
     maps = dict(zip(robots, solution.maps, strict=True))
     for entry in entries:

@@ -1,6 +1,7 @@
 """The dominant cluster: when consistent closures are enough to fix the transform between the maps of two robots."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,8 +10,12 @@ from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_consistency
+from fcslam.graph.evidence import ClusterEvidence, Uniqueness, amount, amount_shortfall, cluster_shortfall
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode
+
+Examine = Callable[[NDArray[np.int64]], Uniqueness | None]
+"""Compares the transform of some closures, given by their rows, shape (M,), with the best transform elsewhere."""
 
 DIRECTION_M = 1.0
 """Least distance between two matched points that fixes a rotation: each point is known to a few centimetres."""
@@ -27,9 +32,7 @@ class ClusterDecision:
     """Largest cluster of pairwise consistent closures."""
     runner_up: tuple[int, ...]
     """Largest cluster that contradicts it: its closures are inconsistent with at least half of the members."""
-    separate_places: int
-    """Number of members from separate places."""
-    runner_up_separate_places: int
+    evidence: ClusterEvidence
     exact: bool
     """Whether both clusters are proven to be the largest."""
     contested: bool
@@ -43,8 +46,17 @@ class ClusterDecision:
         return self.shortfall is None
 
 
+def not_examined(members: NDArray[np.int64]) -> None:
+    """Leave the maps unaligned: only separate places count."""
+
+
 def decide_cluster(
-    a: Trajectory, b: Trajectory, closures: Closures, informative: ArrayLike, settings: ConsistencySettings
+    a: Trajectory,
+    b: Trajectory,
+    closures: Closures,
+    informative: ArrayLike,
+    settings: ConsistencySettings,
+    examine: Examine = not_examined,
 ) -> ClusterDecision:
     """Decide whether the closures between two robots have a dominant cluster.
 
@@ -53,12 +65,13 @@ def decide_cluster(
         closures: K closures from a to b.
         informative: whether each closure fixes the pose in every direction, shape (K,).
         settings: drift, and what a cluster needs.
+        examine: called where only the amount of evidence is open.
 
     Returns:
         The decision; its members are rows of ``closures``.
     """
     consistent = pairwise_consistency(a, b, closures, settings)
-    return dominant_cluster(consistent, closure_positions(a, b, closures), informative, settings)
+    return dominant_cluster(consistent, closure_positions(a, b, closures), informative, settings, examine)
 
 
 def closure_positions(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
@@ -89,13 +102,18 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
 
 
 def dominant_cluster(
-    consistent: NDArray[np.bool_], places: ArrayLike, informative: ArrayLike, settings: ConsistencySettings
+    consistent: NDArray[np.bool_],
+    places: ArrayLike,
+    informative: ArrayLike,
+    settings: ConsistencySettings,
+    examine: Examine = not_examined,
 ) -> ClusterDecision:
     """Find the largest consistent cluster and decide whether it is enough to join two maps.
 
-    False closures from repeated structure are consistent with one another, too. So the cluster must have members from
-    enough separate places, an informative member, and a clear lead over the largest cluster that contradicts it:
-    ``lead`` times as many closures, and no fewer separate places.
+    False closures from repeated structure are consistent with one another, too. So the cluster must have an informative
+    member, a clear lead over the largest cluster that contradicts it (``lead`` times as many closures, and no fewer
+    separate places), and enough evidence: members from separate places, or an alignment of the maps that is unique
+    (``fcslam.graph.evidence``).
 
     Args:
         consistent: which pairs of closures are consistent, shape (K, K), from :func:`pairwise_consistency`.
@@ -103,6 +121,7 @@ def dominant_cluster(
             one coordinate frame.
         informative: whether each closure fixes the pose in every direction, shape (K,).
         settings: what a cluster needs.
+        examine: called with the members where only the amount of evidence is open.
 
     Returns:
         The decision; its members are rows of ``consistent``.
@@ -115,26 +134,24 @@ def dominant_cluster(
     others = np.setdiff1d(others, members)
     second = maximum_clique(consistent[np.ix_(others, others)])
     runner_up = others[list(second.members)]
-    separate = count_separate_places(xy[members], settings.separation_m)
-    rivals = count_separate_places(xy[runner_up], settings.separation_m)
-    has_no_lead = len(members) < settings.lead * len(runner_up) or separate < rivals
-    shortfall = None
-    if separate < settings.minimum_closures:
-        shortfall = Reason(ReasonCode.FEW_PLACES, separate, settings.minimum_closures, "minimum_closures")
-    elif not informs[members].any():
-        shortfall = Reason(ReasonCode.NOT_INFORMATIVE, len(members))
-    elif len(members) < settings.lead * len(runner_up):
-        shortfall = Reason(ReasonCode.NO_LEAD, len(members) / len(runner_up), settings.lead, "lead")
-    elif separate < rivals:
-        shortfall = Reason(ReasonCode.RIVAL_PLACES, separate, rivals)
+    evidence = ClusterEvidence(
+        closures=len(members),
+        informative=int(np.count_nonzero(informs[members])),
+        separate_places=count_separate_places(xy[members], settings.separation_m),
+        rival_closures=len(runner_up),
+        rival_places=count_separate_places(xy[runner_up], settings.separation_m),
+    )
+    shortfall = cluster_shortfall(evidence, settings)
+    has_no_lead = shortfall is not None and shortfall.code in (ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES)
+    if shortfall is None and amount(evidence, settings) < settings.minimum_evidence:
+        evidence = replace(evidence, uniqueness=examine(np.array(members, dtype=np.int64)))
     return ClusterDecision(
         members=largest.members,
         runner_up=tuple(runner_up.tolist()),
-        separate_places=separate,
-        runner_up_separate_places=rivals,
+        evidence=evidence,
         exact=largest.exact and second.exact,
-        contested=has_no_lead and rivals >= settings.minimum_closures,
-        shortfall=shortfall,
+        contested=has_no_lead and evidence.rival_places >= settings.minimum_evidence,
+        shortfall=shortfall or amount_shortfall(evidence, settings),
     )
 
 

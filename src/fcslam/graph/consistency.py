@@ -13,6 +13,7 @@ from pydantic import Field
 from scipy.special import gammaincinv
 
 from fcslam.geometry import se2
+from fcslam.graph.evidence import EvidenceSettings
 from fcslam.graph.trajectory import DriftSettings, Trajectory, transport_covariance
 from fcslam.records import FloatArray
 
@@ -20,7 +21,7 @@ _PAIRS_AT_ONCE = 100_000
 """Pairs of closures tested in one go: memory must not grow with the square of the number of closures."""
 
 
-class ConsistencySettings(DriftSettings):
+class ConsistencySettings(EvidenceSettings, DriftSettings):
     """When closures between two trajectories are consistent, and when they are enough to join two maps."""
 
     probability: float = Field(
@@ -29,16 +30,8 @@ class ConsistencySettings(DriftSettings):
         lt=1.0,
         description="probability with which two true closures pass the chi-square test of consistency",
     )
-    minimum_closures: int = Field(
-        default=3, ge=1, description="closures from separate places that a cluster needs to join two maps"
-    )
     separation_m: float = Field(
         default=3.0, ge=0.0, description="least distance between two separate places, in the maps of both robots [m]"
-    )
-    lead: float = Field(
-        default=2.0,
-        ge=1.0,
-        description="least ratio of the size of the largest cluster to that of the largest one that contradicts it",
     )
     support_m: float = Field(
         default=10.0,

@@ -5,8 +5,9 @@ the robots' frames are unknown. Pairwise consistency finds these transforms; gra
 closure.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +21,17 @@ from fcslam.graph.cluster import (
     relative_frame,
 )
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
+from fcslam.graph.evidence import Uniqueness, shortfall
 from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import robot_trajectory, solve_single_robot
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, frozen
+
+ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures], Uniqueness | None]
+"""Compares the transform that closures give between the maps of two robots with the best transform elsewhere. It takes
+the numbers of the robots, their own trajectories, and the closures."""
 
 INLIER_WEIGHT = 0.5
 """Weight above which a closure is an inlier: graduated non-convexity ends at weight 1 (inlier) or 0 (outlier)."""
@@ -84,8 +90,15 @@ class JointSolution:
     """Poses of each robot from its own measurements alone, shape (N_k, 3); the first stays where the graph has it."""
 
 
+def not_examined(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> None:
+    """Leave the maps unaligned: only separate places count."""
+
+
 def solve_jointly(
-    evidence: JointEvidence, consistency: ConsistencySettings, gnc: GncSettings | None = None
+    evidence: JointEvidence,
+    consistency: ConsistencySettings,
+    gnc: GncSettings | None = None,
+    examine: ExaminePair = not_examined,
 ) -> JointSolution:
     """Find poses, maps and inlier closures from the evidence alone; no earlier estimate plays a part.
 
@@ -96,6 +109,7 @@ def solve_jointly(
         evidence: graph of N variables and E edges, with the role of every edge.
         consistency: when closures are consistent, and what a cluster needs.
         gnc: settings of graduated non-convexity.
+        examine: called for two robots where only the amount of evidence is open.
 
     Returns:
         Poses (N, 3), weights (E,), and the maps.
@@ -104,7 +118,7 @@ def solve_jointly(
     own = [_solve_own_graph(evidence, robot, consistency, gnc) for robot in evidence.robots]
     paths = [path for path, _ in own]
     # 2. Find the dominant cluster of closures between every two robots (PCM).
-    links = _find_links(evidence, paths, consistency)
+    links = _find_links(evidence, paths, consistency, examine)
     joining = [link for link in links if link.decision.dominant]
     while True:
         # 3. Merge the robots' frames along the strongest links.
@@ -151,15 +165,29 @@ def _solve_own_graph(
     return robot_trajectory(own_graph, solution.poses, consistency), weights
 
 
-def _find_links(evidence: JointEvidence, own: Sequence[Trajectory], settings: ConsistencySettings) -> list[Link]:
+def _find_links(
+    evidence: JointEvidence, own: Sequence[Trajectory], settings: ConsistencySettings, examine: ExaminePair
+) -> list[Link]:
     """Pairwise consistency for every two robots (PCM), on their own trajectories."""
     links = []
     for a, b, rows, closures in _pairs(evidence, evidence.independent & ~evidence.excluded):
-        decision = decide_cluster(own[a], own[b], closures, evidence.informative[rows], settings)
+        examine_members = partial(_examine, examine, (a, b), own, closures)
+        decision = decide_cluster(own[a], own[b], closures, evidence.informative[rows], settings, examine_members)
         members = closures.select(np.array(decision.members, dtype=np.int64))
         T_a_b = relative_frame(own[a], own[b], members) if decision.dominant else None
         links.append(Link(a, b, rows, decision, closures, T_a_b))
     return links
+
+
+def _examine(
+    examine: ExaminePair,
+    robots: tuple[int, int],
+    own: Sequence[Trajectory],
+    closures: Closures,
+    members: NDArray[np.int64],
+) -> Uniqueness | None:
+    a, b = robots
+    return examine(a, b, own[a], own[b], closures.select(members))
 
 
 def _pairs(
@@ -180,7 +208,7 @@ def _merge_frames(count: int, links: Sequence[Link]) -> tuple[list[FloatArray], 
     frames = [np.zeros(3) for _ in range(count)]
     maps = list(range(count))
     for link in sorted(
-        links, key=lambda link: (-link.decision.separate_places, -len(link.decision.members), link.a, link.b)
+        links, key=lambda link: (-link.decision.evidence.separate_places, -len(link.decision.members), link.a, link.b)
     ):
         older, younger = sorted((maps[link.a], maps[link.b]))
         if older == younger or link.T_a_b is None:
@@ -292,9 +320,15 @@ def _is_confirmed(
     kept = np.flatnonzero(solution.weights[link.members] > INLIER_WEIGHT)
     members = np.array(link.decision.members, dtype=np.int64)[kept]
     positions = closure_positions(own[link.a], own[link.b], link.closures.select(members))
-    separate = count_separate_places(positions, settings.separation_m)
-    enough = separate >= settings.minimum_closures and bool(informative[link.edges[members]].any())
-    return 3 * len(members) > 2 * len(link.members) and enough
+    remaining = replace(
+        link.decision.evidence,
+        closures=len(members),
+        informative=int(np.count_nonzero(informative[link.edges[members]])),
+        separate_places=count_separate_places(positions, settings.separation_m),
+        rival_closures=0,
+        rival_places=0,
+    )
+    return 3 * len(members) > 2 * len(link.members) and shortfall(remaining, settings) is None
 
 
 def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,0 +1,102 @@
+"""What counts as evidence for a transform between two maps: one measure and one rule, pure functions of counts.
+
+Each separate place whose closures agree is one independent test of the transform: it counts one. Where the maps
+overlap in few places, an exhaustive alignment of them tells whether the transform is the only one that fits. It adds
+the ratio of its score to the best score elsewhere, less one. A corridor whose doors are alike scores nearly as well one
+door farther, so its alignment adds next to nothing. An unmistakable room replaces two further places.
+"""
+
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.records import Reason, ReasonCode
+
+
+class EvidenceSettings(Settings):
+    """How much evidence joins two maps."""
+
+    minimum_closures: int = Field(
+        default=3, ge=1, description="consistent closures that a cluster needs to join two maps"
+    )
+    minimum_evidence: float = Field(
+        default=3.0,
+        ge=0.0,
+        description="evidence that a cluster needs to join two maps: its separate places, plus the ratio by which the "
+        "alignment of the maps scores better than the best one elsewhere, less one",
+    )
+    violation: float = Field(
+        default=0.03,
+        ge=0.0,
+        le=1.0,
+        description="largest share of one map's surfaces in the other's free space at which an alignment is evidence",
+    )
+    lead: float = Field(
+        default=2.0,
+        ge=1.0,
+        description="least ratio of the size of the largest cluster to that of the largest one that contradicts it",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Uniqueness:
+    """How well two maps fit at one transform, compared with the best transform elsewhere."""
+
+    ratio: float
+    """Score at the transform, divided by the best score elsewhere."""
+    violation: float
+    """Share of one map's surfaces in the other's free space: the worse of both directions."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterEvidence:
+    """What speaks for the transform of one cluster of closures, and what against it."""
+
+    closures: int
+    informative: int
+    """Closures that fix the pose in every direction."""
+    separate_places: int
+    rival_closures: int
+    """Closures of the largest cluster that contradicts this one."""
+    rival_places: int
+    uniqueness: Uniqueness | None = None
+    """None if the maps were not aligned exhaustively."""
+
+
+def amount(evidence: ClusterEvidence, settings: EvidenceSettings) -> float:
+    """The evidence for a cluster, in separate places."""
+    unique = evidence.uniqueness
+    if unique is None or unique.violation > settings.violation:
+        return float(evidence.separate_places)
+    return evidence.separate_places + max(0.0, unique.ratio - 1.0)
+
+
+def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
+    """Why the evidence is not enough to join two maps; None if it is. The reason names one of the settings."""
+    return cluster_shortfall(evidence, settings) or amount_shortfall(evidence, settings)
+
+
+def cluster_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
+    """What the cluster itself lacks, however well the maps fit."""
+    if evidence.closures < settings.minimum_closures:
+        return Reason(ReasonCode.FEW_CLOSURES, evidence.closures, settings.minimum_closures, "minimum_closures")
+    if not evidence.informative:
+        return Reason(ReasonCode.NOT_INFORMATIVE, evidence.closures)
+    if evidence.closures < settings.lead * evidence.rival_closures:
+        return Reason(ReasonCode.NO_LEAD, evidence.closures / evidence.rival_closures, settings.lead, "lead")
+    if evidence.separate_places < evidence.rival_places:
+        return Reason(ReasonCode.RIVAL_PLACES, evidence.separate_places, evidence.rival_places)
+    return None
+
+
+def amount_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
+    """What keeps the amount of evidence below the least one."""
+    if amount(evidence, settings) >= settings.minimum_evidence:
+        return None
+    places, unique = evidence.separate_places, evidence.uniqueness
+    if unique is None:
+        return Reason(ReasonCode.FEW_PLACES, places, settings.minimum_evidence, "minimum_evidence")
+    if unique.violation > settings.violation:
+        return Reason(ReasonCode.MAPS_CONTRADICT, unique.violation, settings.violation, "violation")
+    return Reason(ReasonCode.NOT_UNIQUE, unique.ratio, 1.0 + settings.minimum_evidence - places, "minimum_evidence")

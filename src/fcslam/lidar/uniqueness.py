@@ -1,0 +1,177 @@
+"""Whether two maps fit each other in one way only: an exhaustive alignment, and the best one elsewhere.
+
+A false closure is as certain of itself as a true one where a building repeats. The maps around it tell them apart: at a
+false transform the walls of one map stand in the free space of the other, or the same walls fit a second time, one door
+farther. So both maps are laid on each other at every heading and every position, and the transform in question is
+compared with the best one elsewhere.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.ndimage import distance_transform_edt
+
+from fcslam.geometry import se2
+from fcslam.lidar.matching import MatchingConfig, match_scan
+from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Submap, agreement
+from fcslam.records import FloatArray
+
+Spectrum = NDArray[np.complex128]
+
+CELL_M = 0.25
+"""Cells of the exhaustive search."""
+WELL_INSIDE_M = 0.5
+"""A point in free space farther than this from any surface contradicts it, in the exhaustive search."""
+VIOLATION_WEIGHT = 2.0
+"""A metre of surface in free space cancels so many metres of explained surface."""
+ELSEWHERE_M, ELSEWHERE_RAD = 1.0, np.radians(15.0)
+"""Transforms this far apart are two."""
+PEAKS = 3
+"""Best positions that are kept for each heading."""
+REFINED = 12
+"""Best distinct transforms that are refined and scored exactly."""
+_REFINEMENT = MatchingConfig(wide_scale_m=0.4)
+_ALIGNED_POINTS = 800
+
+
+@dataclass(frozen=True, slots=True)
+class MapAlignment:
+    """How well two maps fit at one transform."""
+
+    T_a_b: FloatArray
+    """Shape (3,), metres and radians."""
+    explained_m: float
+    """Distinct surface of one map that lies on surfaces of the other: of both maps, the one with less."""
+    violating_m: float
+    """Surface of one map in free space of the other: of both maps, the one with more."""
+    violation: float
+    """The same as a share of the surface in known area."""
+
+    @property
+    def score_m(self) -> float:
+        """Metres of surface that speak for the transform, net of those that speak against it."""
+        return self.explained_m - VIOLATION_WEIGHT * self.violating_m
+
+
+def align_map(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment:
+    """Refine a transform between two maps and score it.
+
+    Args:
+        a, b: maps, each in the coordinate frame of its anchor.
+        T_a_b: initial guess, shape (3,), metres and radians.
+    """
+    step = max(1, len(b.surface) // _ALIGNED_POINTS)
+    sample = b.surface.only(np.arange(0, len(b.surface), step))
+    T_a_b = match_scan(sample, a.field, T_a_b, np.zeros((3, 3)), _REFINEMENT).T_field_base
+    sides = agreement(b, a, T_a_b), agreement(a, b, se2.inverse(T_a_b))
+    known = [side.overlap * len(surface) for side, surface in zip(sides, (b.surface, a.surface), strict=True)]
+    violating = [side.violation * count for side, count in zip(sides, known, strict=True)]
+    explained_m, violating_m = SPACING_M * min(side.count for side in sides), SPACING_M * max(violating)
+    return MapAlignment(T_a_b, explained_m, violating_m, max(side.violation for side in sides))
+
+
+def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | None:
+    """The best alignment of two maps that is not ``T_a_b``, from all headings and all positions.
+
+    Args:
+        a, b: maps, each in the coordinate frame of its anchor.
+        T_a_b: the transform in question, shape (3,), metres and radians.
+
+    Returns:
+        The alignment; None if a map is empty or no other transform puts a surface on a surface.
+    """
+    if not len(a.surface) or not len(b.surface):
+        return None
+    distinct: list[FloatArray] = []
+    for _, pose in sorted(_coarse_peaks(a, b), key=lambda peak: -peak[0]):
+        if _is_elsewhere(pose, T_a_b, b) and all(_is_elsewhere(pose, other, b) for other in distinct):
+            distinct.append(pose)
+        if len(distinct) == REFINED:
+            break
+    refined = [align_map(a, b, pose) for pose in distinct]
+    return max((r for r in refined if _is_elsewhere(r.T_a_b, T_a_b, b)), key=lambda r: r.score_m, default=None)
+
+
+def _is_elsewhere(one: FloatArray, other: FloatArray, b: Submap) -> bool:
+    """Whether two transforms put the middle of b at two places, or turn it differently."""
+    middle = b.surface.points.mean(axis=0)
+    gap = se2.transform(one, middle[None]) - se2.transform(other, middle[None])
+    turn = abs((one[2] - other[2] + np.pi) % (2.0 * np.pi) - np.pi)
+    return bool(np.hypot(*gap[0]) > ELSEWHERE_M or turn > ELSEWHERE_RAD)
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawing:
+    """A map as points around the middle of its surface, metres."""
+
+    surface: FloatArray
+    """Shape (N, 2)."""
+    inside: FloatArray
+    """Centres of the free cells well away from any surface, shape (M, 2)."""
+    middle: FloatArray
+    """Shape (2,), in the map's own coordinates."""
+    reach_m: float
+    """Distance of the farthest of these points."""
+
+
+def _drawing(submap: Submap) -> _Drawing:
+    free, points = submap.free, submap.surface.points
+    surface = np.zeros_like(free.cells)
+    column, row = np.floor((points - free.corner) / FREE_CELL_M).astype(np.int64).T
+    surface[row, column] = True
+    away = distance_transform_edt(~surface) * FREE_CELL_M > WELL_INSIDE_M
+    rows, columns = np.nonzero(free.cells & away)
+    middle = points.mean(axis=0)
+    inside = (np.column_stack((columns, rows)) + 0.5) * FREE_CELL_M + free.corner - middle
+    reach_m = float(np.hypot(*np.concatenate((points - middle, inside)).T).max())
+    return _Drawing(points - middle, inside, middle, reach_m)
+
+
+def _coarse_peaks(a: Submap, b: Submap) -> Iterator[tuple[float, FloatArray]]:
+    """Score and T_a_b of the best positions for every heading, by correlation of images."""
+    one, other = _drawing(a), _drawing(b)
+    cells = fft.next_fast_len(int(np.ceil(2.0 * (one.reach_m + other.reach_m) / CELL_M)) + 2, real=True)
+    smear = _smear(cells)
+    surface_a, worth_a = _spectra(one, 0.0, smear)
+    lever_m = float(np.quantile(np.hypot(*other.surface.T), 0.9))
+    headings = max(36, int(np.ceil(2.0 * np.pi * lever_m / (1.5 * CELL_M))))
+    for heading in np.arange(headings) * (2.0 * np.pi / headings):
+        surface_b, worth_b = _spectra(other, heading, smear)
+        scores = fft.irfft2(worth_a * np.conj(surface_b) + surface_a * np.conj(worth_b), (cells, cells))
+        for _ in range(PEAKS):
+            row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+            shift = np.array([column, row], dtype=np.float64)
+            shift = CELL_M * np.where(shift > cells / 2, shift - cells, shift)
+            T_middle = np.append(shift + one.middle, heading)
+            yield float(scores[row, column]), se2.compose(T_middle, np.append(-other.middle, 0.0))
+            near = np.arange(-4, 5)
+            scores[np.ix_((row + near) % cells, (column + near) % cells)] = -np.inf
+
+
+def _smear(cells: int) -> FloatArray:
+    """Spectrum of a Gaussian that is 1 on a straight wall, shape (cells, cells // 2 + 1)."""
+    y, x = np.meshgrid(fft.fftfreq(cells), fft.rfftfreq(cells), indexing="ij")
+    spectrum: FloatArray = np.exp(-2.0 * np.pi**2 * (x * x + y * y)) * np.sqrt(2.0 * np.pi)
+    return spectrum
+
+
+def _spectra(drawing: _Drawing, heading: float, smear: FloatArray) -> tuple[Spectrum, Spectrum]:
+    """Spectra of a turned map: its surface, and what a surface point of another map is worth in each cell."""
+    cells = len(smear)
+    turn = np.array([0.0, 0.0, heading])
+    counts, occupied, inside = np.zeros((3, cells, cells))
+    row, column = _cells_of(se2.transform(turn, drawing.surface), cells)
+    np.add.at(counts, (row, column), 1.0)
+    occupied[row, column] = 1.0
+    row, column = _cells_of(se2.transform(turn, drawing.inside), cells)
+    inside[row, column] = VIOLATION_WEIGHT
+    return fft.rfft2(counts), fft.rfft2(occupied) * smear - fft.rfft2(inside)
+
+
+def _cells_of(points: FloatArray, cells: int) -> NDArray[np.int64]:
+    """Row and column of each point, shape (2, N); the origin is in the middle of the image."""
+    at: NDArray[np.int64] = np.floor(points / CELL_M).astype(np.int64) + cells // 2
+    return at[:, ::-1].T

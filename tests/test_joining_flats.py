@@ -1,0 +1,45 @@
+"""Two robots in one flat end in one map; robots in look-alike flats, or behind equal doors, do not."""
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.mission import MissionConfig, run_mission
+from fcslam.records import ReasonCode
+from fcslam.runs import separations
+from tests.flats import BACK, ROUND, Drive, doors, flat, lookalike
+
+pytestmark = pytest.mark.slow
+
+
+def maps_of(run):
+    return {trajectory.map_index for trajectory in run.trajectories.values()}
+
+
+def test_robots_that_met_in_one_flat_share_a_map():
+    one, other = Drive("a", ROUND, flat(), 0), Drive("b", BACK, flat(), 1)
+    run = run_mission([one, other], MissionConfig())
+    assert maps_of(run) == {0}
+    starts = (run.trajectories[drive.name].T_map_base[0] for drive in (one, other))
+    assert np.allclose(se2.between(*starts), se2.between(one.poses[0], other.poses[0]), atol=0.05)
+
+
+def test_one_unmistakable_spot_is_enough():
+    turn = [(4.4, 3.0), (2.6, 3.6), (1.4, 3.0), (2.5, 2.2), (4.3, 2.9)]
+    run = run_mission([Drive("a", turn, flat(), 0), Drive("b", turn[::-1], flat(), 1)], MissionConfig())
+    assert maps_of(run) == {0}
+
+
+def test_flats_with_equal_walls_and_other_furniture_stay_apart():
+    run = run_mission([Drive("a", ROUND, flat(), 0), Drive("b", BACK, lookalike(), 1)], MissionConfig())
+    assert maps_of(run) == {0, 1}
+
+
+def test_robots_at_different_doors_of_a_corridor_stay_apart():
+    """They never met; every door fits every other, and the last line says so."""
+    ways = {"a": [(4.0, 0.0), (12.0, 0.1), (5.0, 0.0)], "b": [(26.0, 0.0), (34.0, 0.1), (27.0, 0.0)]}
+    run = run_mission([Drive(name, way, doors()) for name, way in ways.items()], MissionConfig())
+    assert maps_of(run) == {0, 1}
+    (apart,) = separations(run)
+    assert apart.reason is not None
+    assert apart.reason.code in (ReasonCode.NOT_UNIQUE, ReasonCode.NO_LEAD, ReasonCode.NOT_INFORMATIVE)
