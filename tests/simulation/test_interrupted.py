@@ -76,7 +76,7 @@ def test_a_recording_with_a_gap_is_made_again(tmp_path):
     """A power cut may take a scan and leave what came after it."""
     (robot,) = simulate_fleet(BLIND, 1).robots
     record_robot(robot, tmp_path / "whole")
-    with RecordingWriter.create(tmp_path / "cut", (robot.laser,)) as writer:
+    with RecordingWriter.create(tmp_path / "cut", robot.lasers) as writer:
         for scan in islice(robot.items(), 0, 40, 2):
             writer.write(scan)
         writer.write(Odometry(robot.stamps[20], robot.T_odom_base[20]))

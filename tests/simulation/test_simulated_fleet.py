@@ -48,8 +48,8 @@ def test_rays_agree_with_lines_that_cross(building):
     pieces = tuple(piece for piece in plan.pieces if piece.kind is not PieceKind.COLUMN)
     sides = [np.hstack((p.outline, np.roll(p.outline, -1, axis=0))) for p in pieces if p.kind is not PieceKind.LINTEL]
     laser = LaserModel(120, -np.pi, 2.0 * np.pi / 120, 9.0, T_base_laser=(0.1, 0.02, 0.3))
-    caster = RayCaster(bare_model(replace(plan, pieces=pieces)), laser)
-    ranges = np.array([caster.cast(pose) for pose in poses])
+    caster = RayCaster(bare_model(replace(plan, pieces=pieces)))
+    ranges = np.array([caster.cast(pose, laser) for pose in poses])
     T_building_laser = se2.compose(poses, np.array(laser.T_base_laser))
     expected = crossings(T_building_laser, laser.angles_rad(), np.concatenate(sides), 9.0)
     # Walls end a millimetre earlier: a beam that grazes a corner may go on.
@@ -61,8 +61,9 @@ def test_rays_agree_with_lines_that_cross(building):
 def test_nothing_to_hit_is_the_maximum_range():
     plan = draw_floor_plan(np.random.default_rng(0), Building.FLAT)
     column = next(piece for piece in plan.pieces if piece.kind is PieceKind.COLUMN)
-    caster = RayCaster(bare_model(replace(plan, pieces=(column,))), LaserModel(4, -np.pi, 0.5 * np.pi, 7.0))
-    assert np.all(caster.cast(np.array([*column.centre + 20.0, 0.0])) == 7.0)
+    caster = RayCaster(bare_model(replace(plan, pieces=(column,))))
+    laser = LaserModel(4, -np.pi, 0.5 * np.pi, 7.0)
+    assert np.all(caster.cast(np.array([*column.centre + 20.0, 0.0]), laser) == 7.0)
 
 
 def test_a_round_column_lies_within_its_corners():
@@ -70,8 +71,8 @@ def test_a_round_column_lies_within_its_corners():
     plan = draw_floor_plan(rng)
     column = next(piece for piece in plan.pieces if piece.kind is PieceKind.COLUMN)
     laser = LaserModel(8, -np.pi, np.pi / 4.0, 9.0)
-    caster = RayCaster(bare_model(replace(plan, pieces=(column,))), laser)
-    ahead = caster.cast(np.array([column.centre[0] - 2.0, column.centre[1], 0.0]))[4]
+    caster = RayCaster(bare_model(replace(plan, pieces=(column,))))
+    ahead = caster.cast(np.array([column.centre[0] - 2.0, column.centre[1], 0.0]), laser)[4]
     assert ahead == pytest.approx(2.0 - column.size[0] / 2.0, abs=1e-6)
 
 

@@ -12,7 +12,7 @@ import typer
 
 from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
-from fcslam.simulation.options import Building, Lighting, OdometryKind
+from fcslam.simulation.options import Building, LidarKind, Lighting, OdometryKind
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -55,6 +55,9 @@ def simulate(
     field_of_view: Annotated[
         float, typer.Option(min=10.0, max=360.0, help="Angle that a scan covers, in degrees, centred ahead.")
     ] = 360.0,
+    lidar: Annotated[
+        LidarKind, typer.Option(help="Kind of LiDAR: what varies from scan to scan, or two of half a turn each.")
+    ] = LidarKind.STEADY,
     odometry: Annotated[OdometryKind, typer.Option(help="Kind of wheel odometry.")] = OdometryKind.DEFAULT,
     no_camera: NoCamera = False,
     bag: Annotated[bool, typer.Option("--bag", help="Also write a ROS 2 bag (.mcap) of each robot.")] = False,
@@ -79,6 +82,7 @@ def simulate(
         lighting=tuple(lighting or (Lighting.DAY,)),
         moved_furniture=moved_furniture,
         lidar=LidarSettings(
+            kind=lidar,
             beams=beams,
             field_of_view_rad=math.radians(field_of_view),
             max_range_m=lidar_range or (30.0 if building is Building.YARD else 12.0),

@@ -1,6 +1,7 @@
 """Ground truth of a simulated fleet: relations between scans, and the map of all surfaces that its beams hit."""
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Protocol
 
@@ -91,9 +92,9 @@ def true_map(fleet: SimulatedFleet) -> OccupancyMap:
 def _draw_beams(robot: SimulatedRobot, passed: Cells, hit: Cells) -> None:
     import cv2
 
-    caster, laser = ray_caster(robot.plan, robot.laser), robot.laser
-    for pose in _spaced(robot.T_building_base):
-        start, ends = _beams(caster.cast(pose), laser, pose)
+    caster = ray_caster(robot.plan)
+    for pose, laser in product(_spaced(robot.T_building_base), robot.lasers):
+        start, ends = _beams(caster.cast(pose, laser), laser, pose)
         columns, rows = np.floor(ends).astype(int).T
         hit[rows, columns] = 1
         # OpenCV counts from the middle of the first cell.

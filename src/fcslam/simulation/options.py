@@ -1,4 +1,4 @@
-"""Kinds of building, odometry and lighting, for the command line. Imports no library, so that help is fast."""
+"""Kinds of building, LiDAR, odometry and lighting, for the command line. Imports no library, so that help is fast."""
 
 from enum import StrEnum
 
@@ -12,6 +12,19 @@ class Building(StrEnum):
     CORRIDOR = "corridor"
     YARD = "yard"
     """Outdoors, between buildings."""
+
+
+class LidarKind(StrEnum):
+    """Kinds of LiDAR, by what varies from scan to scan."""
+
+    STEADY = "steady"
+    """The beams never vary."""
+    INTERLEAVED = "interleaved"
+    """As a SICK: scans in cycles of four, each a quarter of an increment further, the first with one beam more."""
+    JITTERING = "jittering"
+    """As an RPLIDAR: number and increment of the beams follow the motor; now and then a beam is missing."""
+    FRONT_REAR = "front-rear"
+    """Two LiDARs of half a turn at most, one at the front and one at the rear."""
 
 
 class OdometryKind(StrEnum):

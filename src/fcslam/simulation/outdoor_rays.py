@@ -83,27 +83,27 @@ class _World(NamedTuple):
 
 
 class OutdoorRayCaster:
-    """Casts the beams of one laser in a yard."""
+    """Casts beams in a yard."""
 
-    def __init__(self, plan: FloorPlan, laser: LaserModel) -> None:
+    def __init__(self, plan: FloorPlan) -> None:
         """Index everything that stands on ``plan``, which has a terrain."""
         assert plan.terrain is not None, "a building has no terrain; use RayCaster"
-        self._laser, self._terrain = laser, plan.terrain
+        self._terrain = plan.terrain
         self._world = _world(plan, plan.terrain)
 
-    def cast(self, T_building_base: FloatArray) -> FloatArray:
+    def cast(self, T_building_base: FloatArray, laser: LaserModel) -> FloatArray:
         """Ranges (beam_count,) in metres on level ground from pose (3,), as if everything returned every beam."""
-        return self._cast(T_building_base, np.zeros(2), None)
+        return self._cast(T_building_base, laser, np.zeros(2), None)
 
-    def scan(self, T_building_base: FloatArray, rng: np.random.Generator) -> FloatArray:
+    def scan(self, T_building_base: FloatArray, laser: LaserModel, rng: np.random.Generator) -> FloatArray:
         """Ranges (beam_count,) in metres without noise, from pose (3,); ``max_range_m`` without a return."""
         tilt = self._terrain.slope(T_building_base[:2]) + rng.normal(0.0, _SHAKE_RAD, 2)
-        return self._cast(T_building_base, tilt, int(rng.integers(2**62)))
+        return self._cast(T_building_base, laser, tilt, int(rng.integers(2**62)))
 
-    def _cast(self, T_building_base: FloatArray, tilt: FloatArray, seed: int | None) -> FloatArray:
-        pose = se2.compose(T_building_base, np.array(self._laser.T_base_laser))
-        angles = pose[2] + self._laser.angles_rad()
-        ideal, far = seed is None, self._laser.max_range_m
+    def _cast(self, T_building_base: FloatArray, laser: LaserModel, tilt: FloatArray, seed: int | None) -> FloatArray:
+        pose = se2.compose(T_building_base, np.array(laser.T_base_laser))
+        angles = pose[2] + laser.angles_rad()
+        ideal, far = seed is None, laser.max_range_m
         return np.asarray(_cast_beams(pose[:2], angles, tilt, far, np.uint64(seed or 0), ideal, self._world))
 
 

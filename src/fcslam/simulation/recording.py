@@ -73,7 +73,7 @@ def _writer(robot: SimulatedRobot, folder: Path, resume: bool) -> RecordingWrite
         writer.close()
     if resume and folder.exists():
         shutil.rmtree(folder)
-    return RecordingWriter.create(folder, (robot.laser,), robot.camera)
+    return RecordingWriter.create(folder, robot.lasers, robot.camera)
 
 
 def _check_same(path: Path, wanted: dict[str, Any]) -> None:

@@ -20,29 +20,28 @@ _UNSEEN = 5
 
 
 class RayCaster:
-    """Casts the beams of one laser."""
+    """Casts beams."""
 
-    def __init__(self, model: Any, laser: LaserModel) -> None:
+    def __init__(self, model: Any) -> None:
         self._mujoco = mujoco()
-        self._model, self._laser = model, laser
+        self._model = model
         self._data = self._mujoco.MjData(model)
         self._mujoco.mj_forward(model, self._data)
         self._groups = np.zeros(6, dtype=np.uint8)
         self._groups[SOLID] = 1
-        self._hits = np.empty(laser.beam_count, dtype=np.int32)
-        self._distances = np.empty(laser.beam_count)
 
-    def cast(self, T_building_base: FloatArray) -> FloatArray:
+    def cast(self, T_building_base: FloatArray, laser: LaserModel) -> FloatArray:
         """Ranges (beam_count,) in metres without noise, from pose (3,); ``max_range_m`` without a hit."""
-        x, y, heading = se2.compose(T_building_base, np.array(self._laser.T_base_laser))
-        angles = heading + self._laser.angles_rad()
+        x, y, heading = se2.compose(T_building_base, np.array(laser.T_base_laser))
+        angles = heading + laser.angles_rad()
         directions = np.column_stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)))
-        count, far = self._laser.beam_count, self._laser.max_range_m
+        count, far = laser.beam_count, laser.max_range_m
+        hits, distances = np.empty(count, dtype=np.int32), np.empty(count)
         self._mujoco.mj_multiRay(
             self._model, self._data, np.array([x, y, LASER_HEIGHT_M]), directions.ravel(), self._groups, True, -1,
-            self._hits, self._distances, None, count, far,
+            hits, distances, None, count, far,
         )  # fmt: skip
-        return np.where(self._distances < 0.0, far, np.minimum(self._distances, far))
+        return np.where(distances < 0.0, far, np.minimum(distances, far))
 
 
 class Camera:

@@ -31,7 +31,7 @@ from fcslam.records import (
 from fcslam.simulation.decoration import Decoration, decorate
 from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
 from fcslam.simulation.lighting import light_of
-from fcslam.simulation.noise import LidarSettings, simulate_ranges
+from fcslam.simulation.noise import LidarSettings, scan_beams, simulate_ranges
 from fcslam.simulation.odometry import KINDS, OdometryNoiseSettings, simulate_odometry
 from fcslam.simulation.options import Building, Lighting, OdometryKind
 from fcslam.simulation.outdoor_rays import OutdoorRayCaster
@@ -102,10 +102,11 @@ class SimulatedRobot:
     """One robot with its route. Its sensor records are computed on demand."""
 
     name: str
-    laser: LaserModel
+    lasers: tuple[LaserModel, ...]
+    """Several lasers scan in turn."""
     camera: CameraModel | None
     stamps: FloatArray
-    """Stamps of its scans, shape (N,), seconds."""
+    """Stamps of the scans of all lasers, shape (N,), seconds."""
     T_building_base: FloatArray
     """True poses at these stamps, shape (N, 3)."""
     T_odom_base: FloatArray
@@ -155,12 +156,14 @@ class SimulatedRobot:
         Raises:
             SimulationError: MuJoCo is missing.
         """
-        caster = ray_caster(self.plan, self.laser)
+        caster, settings = ray_caster(self.plan), self.settings.lidar
         for k in range(first, len(self.stamps)):
             rng, pose = self._generator(_RandomStream.SCANS, k), self.T_building_base[k]
-            met = caster.scan(pose, rng) if isinstance(caster, OutdoorRayCaster) else caster.cast(pose)
-            ranges = simulate_ranges(met, self.laser, self.settings.lidar, rng)
-            yield LaserScan(float(self.stamps[k]), frozen(ranges, np.float32), self.laser, self.T_odom_base[k])
+            number, index = divmod(k, len(self.lasers))
+            laser = self.lasers[index].with_beams(scan_beams(settings.kind, self.lasers[index], number, rng))
+            met = caster.scan(pose, laser, rng) if isinstance(caster, OutdoorRayCaster) else caster.cast(pose, laser)
+            ranges = simulate_ranges(met, laser, settings, rng)
+            yield LaserScan(float(self.stamps[k]), frozen(ranges, np.float32), laser, self.T_odom_base[k])
 
     def _images(self, first: int) -> Generator[CameraImage, None, None]:
         settings = self.settings.camera
@@ -252,13 +255,14 @@ def _robot(
     if number:
         plan = move(plan, settings.moved_furniture, rng)
     route = schedule(find_way(plan, goals, settings.path_length_m, rng))
-    times = np.arange(0.0, route.duration_s, 1.0 / settings.lidar.rate_hz)
-    poses, lidar, camera = route.at(times), settings.lidar, settings.camera
+    lasers = settings.lidar.models(_T_BASE_LASER)
+    times = np.arange(0.0, route.duration_s, 1.0 / (settings.lidar.rate_hz * len(lasers)))
+    poses, camera = route.at(times), settings.camera
     first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
     image_times = np.arange(IMAGE_DELAY_S, times[-1], 1.0 / camera.rate_hz) if camera else np.empty(0)
     return SimulatedRobot(
         name=f"robot_{number + 1}",
-        laser=lidar.model(_T_BASE_LASER),
+        lasers=lasers,
         camera=camera.model() if camera else None,
         stamps=frozen(np.round(first_stamp + times, 6)),
         T_building_base=frozen(poses),
@@ -275,13 +279,13 @@ def _robot(
     )
 
 
-def ray_caster(plan: FloorPlan, laser: LaserModel) -> RayCaster | OutdoorRayCaster:
-    """What casts the beams of a laser in a building or in a yard.
+def ray_caster(plan: FloorPlan) -> RayCaster | OutdoorRayCaster:
+    """What casts beams in a building or in a yard.
 
     Raises:
         SimulationError: MuJoCo is missing, which buildings need.
     """
-    return RayCaster(bare_model(plan), laser) if plan.terrain is None else OutdoorRayCaster(plan, laser)
+    return RayCaster(bare_model(plan)) if plan.terrain is None else OutdoorRayCaster(plan)
 
 
 def _between(stamps: FloatArray, known: FloatArray, poses: FloatArray) -> FloatArray:
