@@ -60,6 +60,8 @@ def convert(
     print_notes(console, survey.notes)
     if survey.camera is not None and _CARMEN.search(output.name):
         print_line(console, f"{output}: a CARMEN log has no place for images, they are left out")
+    if len(survey.lasers) > 1 and _CARMEN.search(output.name):
+        print_line(console, f"{output}: a CARMEN log has a place for one laser, the scans of the others are left out")
     _write(output, survey, _with_progress(source, survey.scan_count, console))
     print_faults(console, [source])
     print_line(answers(), f"{survey.scan_count} scans: {output}")

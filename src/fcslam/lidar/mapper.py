@@ -218,7 +218,7 @@ class Mapper:
         """Add a variable to the pose graph, with a constraint to the keyscan before it."""
         points = tracked.scan or point_scan(scan.ranges_m, scan.laser)
         number = len(self._local)
-        self._tracker.insert(points, tracked.T_local_base)
+        self._tracker.insert(points, tracked.T_local_base, len(self.lasers))
         self._points[number] = points
         self._newest[laser] = number
         ranges_m, announced = _valid_ranges(scan.ranges_m, scan.laser.max_range_m), self.lasers[laser]

@@ -57,7 +57,7 @@ class TrackerConfig(Settings):
         default=0.05, gt=0, description="least distance between consecutive points of a scan that are matched [m]"
     )
     point_limit: int = Field(default=180, gt=10, description="largest number of points of a scan that are matched")
-    buffer_keyscans: int = Field(default=60, ge=4, description="keyscans in a full running buffer")
+    buffer_keyscans: int = Field(default=60, ge=4, description="keyscans of one laser in a full running buffer")
     supported: float = Field(
         default=0.30,
         ge=0,
@@ -117,6 +117,8 @@ class TrackingResult:
     """Travel since the last accepted match, by odometry; 0 if this one is accepted."""
     turned_rad: float
     """Turn since the last accepted match, by odometry; 0 if this one is accepted."""
+    matched_here: frozenset[tuple[float, float, float]]
+    """Mountings of the lasers whose scans were matched since the robot last moved."""
 
 
 class ScanTracker:
@@ -133,6 +135,7 @@ class ScanTracker:
         self._T_odom_base: FloatArray | None = None
         self._moved_m = 0.0
         self._turned_rad = 0.0
+        self._matched_here: frozenset[tuple[float, float, float]] = frozenset()
 
     def track(self, scan: LaserScan) -> TrackedScan:
         """Localize the next scan and continue from there."""
@@ -145,40 +148,46 @@ class ScanTracker:
         config = self._config
         # 1. Prediction: the last pose, moved by odometry.
         T_local_guess, moved_m, turned_rad = self._predict(scan)
-        if self._fields and moved_m < config.still_m and turned_rad < config.still_rad:
+        is_still = moved_m < config.still_m and turned_rad < config.still_rad
+        matched_here = (self._matched_here if is_still else frozenset()) | {scan.laser.T_base_laser}
+        if self._fields and is_still and matched_here == self._matched_here:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, None)
-            return TrackingResult(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad)
+            return TrackingResult(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad, matched_here)
         # 2. Scan to points.
         points = point_scan(scan.ranges_m, scan.laser)
         if not self._fields:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
-            return TrackingResult(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad)
+            return TrackingResult(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad, matched_here)
         # 3. Scan matching; a doubtful match starts a correlative search.
         prior = odometry_information(moved_m, turned_rad, config.odometry)
         match = self._match(points, T_local_guess, prior)
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < config.supported:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
-            return TrackingResult(tracked, match.explained, match.known, scan.T_odom_base, moved_m, turned_rad)
+            known = match.explained, match.known
+            return TrackingResult(tracked, *known, scan.T_odom_base, moved_m, turned_rad, self._matched_here)
         tracked = TrackedScan(match.T_field_base, match.information, points)
-        return TrackingResult(tracked, match.explained, match.known, scan.T_odom_base, 0.0, 0.0)
+        return TrackingResult(tracked, match.explained, match.known, scan.T_odom_base, 0.0, 0.0, matched_here)
 
     def commit(self, result: TrackingResult) -> None:
         """Continue from the pose that :meth:`localize` found."""
         self._T_local_base = result.tracked.T_local_base
         self._T_odom_base = result.T_odom_base
         self._moved_m, self._turned_rad = result.moved_m, result.turned_rad
+        self._matched_here = result.matched_here
 
-    def insert(self, points: PointScan, T_local_base: FloatArray) -> None:
+    def insert(self, points: PointScan, T_local_base: FloatArray, laser_count: int = 1) -> None:
         """Add a keyscan to the running buffer.
 
         Args:
             points: returns of the keyscan, in its ``base``.
             T_local_base: pose of the keyscan, shape (3,).
+            laser_count: lasers whose keyscans take turns in the buffer.
         """
-        if not self._fields or (len(self._fields) == 1 and self._fields[0][1] >= self._config.buffer_keyscans // 2):
+        capacity = laser_count * self._config.buffer_keyscans
+        if not self._fields or (len(self._fields) == 1 and self._fields[0][1] >= capacity // 2):
             self._fields.append((SurfelField(T_local_base), 0))
-        elif self._fields[0][1] >= self._config.buffer_keyscans:
+        elif self._fields[0][1] >= capacity:
             self._fields = [self._fields[1], (SurfelField(T_local_base), 0)]
         for field, _ in self._fields:
             field.insert(points, T_local_base)

@@ -33,7 +33,8 @@ BAG_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
 """Formats of bags that can be written: ROS 1, two file formats of ROS 2, and a folder of ROS 2."""
 
 _ODOM, _BASE, _LASER, _CAMERA, _BUILDING = "odom", "base_link", "laser", "camera_optical_frame", "building"
-_TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, "/scan": SCAN}
+_SCAN_TOPIC = "/scan"
+_TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, _SCAN_TOPIC: SCAN}
 """Odometry first: at equal times it is read before the scan."""
 _IMAGE_TOPIC, _CAMERA_INFO_TOPIC, _GROUND_TRUTH_TOPIC = (
     "/camera/image_raw/compressed",
@@ -51,10 +52,10 @@ def write_bag(path: Path, records: Iterable[RecordedItem]) -> None:
     """Write ``records`` to ``path``; equal records give equal bytes.
 
     ``.bag`` is a ROS 1 bag, ``.mcap`` and ``.db3`` are files of ROS 2, a path without suffix is a new folder of
-    ROS 2 with an MCAP file in it. Scans go to /scan; odometry, and that of each scan and image at its stamp, to /odom
-    and /tf (odom -> base_link); images, as they are encoded, to /camera/image_raw/compressed, each with its
-    /camera/camera_info; where laser and camera sit to /tf_static (base_link -> laser, camera_optical_frame); ground
-    truth to /ground_truth (building -> base_link). Header stamps are the records' own, to the nanosecond; the time of
+    ROS 2 with an MCAP file in it. Scans go to /scan, those of a second laser to /scan_2 and so on; odometry, and that of
+    each scan and image at its stamp, to /odom and /tf (odom -> base_link); images, as they are encoded, to
+    /camera/image_raw/compressed, each with its /camera/camera_info; where lasers and camera sit to /tf_static
+    (base_link -> laser, laser_2, camera_optical_frame); ground truth to /ground_truth (building -> base_link). Header stamps are the records' own, to the nanosecond; the time of
     recording only ever grows.
 
     Raises:
@@ -103,6 +104,8 @@ class _Bag:
         self._connections = {topic: self._connect(topic, kind) for topic, kind in _TOPICS.items()}
         self._bag_time_ns = -1
         self._mounted: set[str] = set()
+        self._mountings: list[tuple[float, float, float]] = []
+        """Of each laser."""
         self._latest_reading: tuple[float, ...] = ()
 
     def write(self, item: RecordedItem) -> None:
@@ -116,8 +119,7 @@ class _Bag:
         if item.T_odom_base is not None:
             self._put_odometry(stamp_ns, item.T_odom_base)
         if isinstance(item, LaserScan):
-            self._mount(stamp_ns, _LASER, _in_space(np.array(item.laser.T_base_laser)))
-            self._put("/scan", self._scan(self._header(stamp_ns, _LASER), item))
+            self._put_scan(stamp_ns, item)
         elif isinstance(item, CameraImage):
             self._put_image(stamp_ns, item)
 
@@ -128,6 +130,16 @@ class _Bag:
             self._put("/odom", self._odometry(odom, T_odom_base))
             self._put("/tf", self._transforms(odom, _BASE, _in_space(T_odom_base)))
             self._latest_reading = reading
+
+    def _put_scan(self, stamp_ns: int, scan: LaserScan) -> None:
+        """Write a scan to the topic of its laser: lasers with different mountings are different ones."""
+        T_base_laser = scan.laser.T_base_laser
+        if T_base_laser not in self._mountings:
+            self._mountings.append(T_base_laser)
+        number = self._mountings.index(T_base_laser) + 1
+        suffix = f"_{number}" * (number > 1)
+        self._mount(stamp_ns, _LASER + suffix, _in_space(np.array(T_base_laser)))
+        self._put(_SCAN_TOPIC + suffix, self._scan(self._header(stamp_ns, _LASER + suffix), scan), SCAN)
 
     def _put_image(self, stamp_ns: int, image: CameraImage) -> None:
         try:
@@ -149,8 +161,8 @@ class _Bag:
     def _connect(self, topic: str, kind: str) -> Any:
         return self._writer.add_connection(topic, _full(kind), typestore=self._store)
 
-    def _put(self, topic: str, message: Any) -> None:
-        kind = _TOPICS.get(topic) or _TOPICS_OF_SOME[topic]
+    def _put(self, topic: str, message: Any, kind: str = "") -> None:
+        kind = kind or _TOPICS.get(topic) or _TOPICS_OF_SOME[topic]
         if topic not in self._connections:
             self._connections[topic] = self._connect(topic, kind)
         serialize = self._store.serialize_ros1 if self._ros1 else self._store.serialize_cdr
