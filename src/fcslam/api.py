@@ -84,18 +84,22 @@ def split_recordings(recordings: list[Source], parts: int) -> list[Source]:
 
 def _opened(recordings: Recordings, options: BagOptions | None) -> list[Source]:
     """The recordings as sources, each checked as far as can be without reading the ranges."""
-    if isinstance(recordings, Mapping):
-        return [_open(path, options, name) for name, path in recordings.items()]
     if isinstance(recordings, str | os.PathLike):
         recordings = [recordings]
-    found = [_open(item, options) if isinstance(item, str | os.PathLike) else item for item in recordings]
-    if not found:
+    named: list[tuple[StrPath | Source, str | None]] = (
+        [(path, name) for name, path in recordings.items()]
+        if isinstance(recordings, Mapping)
+        else [(item, None) for item in recordings]
+    )
+    if not named:
         raise SourceError("no recording is given; give one for each robot")
-    return found
+    opened = iter(
+        sources.open_fleet([(Path(item), name) for item, name in named if isinstance(item, str | os.PathLike)], options)
+    )
+    return [_checked(next(opened)) if isinstance(item, str | os.PathLike) else item for item, _ in named]
 
 
-def _open(path: StrPath, options: BagOptions | None, name: str | None = None) -> Source:
-    source = sources.open_source(Path(path), options, name)
+def _checked(source: Source) -> Source:
     survey = source.survey()
     for note in survey.notes:
         _log.info("%s: %s", source.name, note)

@@ -17,7 +17,7 @@ from fcslam.cli.recordings import (
     OdomTopic,
     ScanTopic,
     bag_options,
-    open_recording,
+    open_recordings,
     print_faults,
     print_notes,
 )
@@ -71,7 +71,7 @@ def map_recordings(
     settings = mission_config(config, seed, no_fuse, fusion)
     vetoes = read_vetoes(veto) if veto else ()
     options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
-    sources = split_recordings([open_recording(log, options) for log in logs], split)
+    sources = split_recordings(open_recordings(logs, options), split)
     map_sources(sources, settings, output, notices(quiet), force, vetoes)
 
 

@@ -69,10 +69,26 @@ def open_recording(argument: str, options: "BagOptions | None") -> "Source":
     """
     from fcslam.sources import open_source
 
+    path, name = _named(argument)
+    return open_source(path, options, name)
+
+
+def open_recordings(arguments: Iterable[str], options: "BagOptions | None") -> "list[Source]":
+    """Open the recordings of a fleet, each as ``open_recording`` does, with topics chosen once for all bags.
+
+    Raises:
+        SourceError: one is no recording.
+    """
+    from fcslam.sources import open_fleet
+
+    return open_fleet(map(_named, arguments), options)
+
+
+def _named(argument: str) -> tuple[Path, str | None]:
     name, equals, path = argument.partition("=")
     if not equals or not name or Path(argument).exists():
-        return open_source(Path(argument), options)
-    return open_source(Path(path), options, name)
+        return Path(argument), None
+    return Path(path), name
 
 
 def print_notes(console: "Console", notes: Iterable[str]) -> None:

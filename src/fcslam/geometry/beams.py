@@ -20,7 +20,8 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
     turn are variations of one laser. Another field of view or another resolution is another laser.
 
     Args:
-        beams: at least two beams with finite angles, as ``declared``.
+        beams: those of the scan, from outside; NaN is no laser's.
+        declared: two or more beams with finite angles.
 
     Returns:
         The reason, for a message; None if the scan can be of this laser.
@@ -28,7 +29,7 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
     if beams == declared:
         return None
     increment, other = beams.angle_increment_rad, declared.angle_increment_rad
-    if increment * other <= 0.0:
+    if not increment * other > 0.0:  # every condition fails for NaN
         return "its beams turn the other way"
     wide, narrow = max(abs(increment), abs(other)), min(abs(increment), abs(other))
     if wide > LARGEST_RATIO * narrow:
@@ -38,7 +39,7 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
         return None  # a full turn has no first direction
     first_rad = remainder(beams.angle_min_rad - declared.angle_min_rad, tau)
     last_rad = first_rad + beams.span_rad - declared.span_rad
-    if max(abs(first_rad), abs(last_rad)) > tolerance_rad:
+    if not (abs(first_rad) <= tolerance_rad and abs(last_rad) <= tolerance_rad):
         return f"it looks over {_view(beams)}, the laser over {_view(declared)}"
     return None
 

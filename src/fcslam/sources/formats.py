@@ -1,13 +1,13 @@
 """The known formats of recordings, and opening a recording by its content."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from fcslam.errors import SourceError
 from fcslam.sources.bags.container import is_bag
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.rosbag import RosBag
+from fcslam.sources.bags.rosbag import RosBag, as_fleet
 from fcslam.sources.logs.archive import head, robot_name
 from fcslam.sources.logs.carmen import CARMEN
 from fcslam.sources.logs.cmu import CMU
@@ -43,6 +43,22 @@ FORMATS: tuple[Format, ...] = (
     Format("ROS bag", is_bag, RosBag, takes_options=True),
 )
 """Tried in this order. To add a format, add an entry."""
+
+
+def open_fleet(recordings: Iterable[tuple[Path, str | None]], options: BagOptions | None = None) -> list[Source]:
+    """Open the recordings of one fleet, each with its robot's name, as ``open_source`` does.
+
+    Where ``options`` leave a choice of topics, all bags are read from the same ones if all have them.
+
+    Raises:
+        SourceError: as ``open_source``, or a bag cannot be read.
+    """
+    sources = [open_source(path, options, name) for path, name in recordings]
+    bags = [source for source in sources if isinstance(source, RosBag)]
+    if len(bags) < 2:
+        return sources
+    agreed = iter(as_fleet(bags, options))
+    return [next(agreed) if isinstance(source, RosBag) else source for source in sources]
 
 
 def open_source(path: Path, options: BagOptions | None = None, name: str | None = None) -> Source:

@@ -5,7 +5,7 @@ scans are consistent; damaged messages are skipped and counted. A robot that sta
 shows that there is odometry.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from math import degrees, radians
 from pathlib import Path
@@ -20,6 +20,7 @@ from fcslam.sources.bags.messages import OdometryReading, measured_ranges
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedImage, PosedScan
 from fcslam.sources.bags.stream import BagStream, RecordedLaser
+from fcslam.sources.bags.topics import agree_on_topics
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
@@ -44,11 +45,13 @@ class _Reading(NamedTuple):
 class RosBag:
     """A bag of one robot."""
 
-    def __init__(self, path: Path, name: str, options: BagOptions | None = None) -> None:
+    def __init__(self, path: Path, name: str, options: BagOptions | None = None, notes: tuple[str, ...] = ()) -> None:
+        """``notes`` say what was chosen for this bag before."""
         self.name = name
+        self._notes = notes
         self._options = options or BagOptions()
         self._check_options(path)
-        self._stream = BagStream(path, self._options)
+        self.stream = BagStream(path, self._options)
         self._audit = _audit()
 
     @property
@@ -91,7 +94,7 @@ class RosBag:
                     yield _image(entry, camera)
 
     def _entries(self, scans: ScanRange, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
-        entries = self._stream.entries(audit, with_images=with_images)
+        entries = self.stream.entries(audit, with_images=with_images)
         return scan_window(entries, scans, lambda entry: isinstance(entry, PosedScan), audit)
 
     @cached_property
@@ -100,7 +103,7 @@ class RosBag:
         audit, tree = _audit(), TransformTree()
         scans, odometry = PathSummary(), PathSummary()
         base_frame = ""
-        for _, entry in self._stream.entries(audit, tree):
+        for _, entry in self.stream.entries(audit, tree):
             if isinstance(entry, PosedScan):
                 scans.add(entry.scan.stamp, entry.T_odom_base)
             elif isinstance(entry, OdometryReading):
@@ -111,10 +114,10 @@ class RosBag:
         mountings = self._mountings(tree, base_frame)
         camera, camera_notes = self._camera(tree, base_frame)
         tilts = (
-            self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self._stream.lasers, mountings, strict=True)
+            self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
         )
-        notes = (*self._stream.topics.notes, *filter(None, tilts), *camera_notes)
-        lasers = tuple(map(_laser_model, self._stream.lasers, mountings))
+        notes = (*self._notes, *self.stream.topics.notes, *filter(None, tilts), *camera_notes)
+        lasers = tuple(map(_laser_model, self.stream.lasers, mountings))
         survey = Survey(scans.count, scans.duration_s, scans.length_m, lasers, audit.faults(), notes, camera)
         return _Reading(survey, tuple(mounted.upside_down for mounted in mountings))
 
@@ -130,7 +133,7 @@ class RosBag:
             )
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary) -> None:
-        path, topics, (laser, *_) = self._stream.path, self._stream.topics, self._stream.lasers
+        path, topics, (laser, *_) = self.stream.path, self.stream.topics, self.stream.lasers
         check_consistency(path, faults, scans.count, odometry.count)
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
@@ -141,7 +144,7 @@ class RosBag:
             )
 
     def _mountings(self, tree: TransformTree, base_frame: str) -> list[Mounting]:
-        lasers = self._stream.lasers
+        lasers = self.stream.lasers
         if self._options.laser_poses:
             return [Mounting(pose, upside_down=False, tilt_rad=0.0) for pose in self._options.laser_poses]
         topic_of: dict[str, str] = {}
@@ -149,7 +152,7 @@ class RosBag:
             other = topic_of.setdefault(laser.first.frame, laser.topic.name)
             if other != laser.topic.name:
                 raise SourceError(
-                    f"{self._stream.path}: the scans of {other} and {laser.topic.name} have one frame, "
+                    f"{self.stream.path}: the scans of {other} and {laser.topic.name} have one frame, "
                     f"'{laser.first.frame}', so tf cannot say where each laser sits; say it by --laser-pose X,Y,THETA "
                     "for each"
                 )
@@ -160,19 +163,19 @@ class RosBag:
             mounted = mounting(tree.fixed(base_frame, laser_frame))
         except NoTransformError as error:
             raise SourceError(
-                f"{self._stream.path}: tf has {error}, so it does not say where the laser of {topic} sits; say it by "
-                f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self._stream.lasers) > 1)}"
+                f"{self.stream.path}: tf has {error}, so it does not say where the laser of {topic} sits; say it by "
+                f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}"
             ) from error
         if mounted.tilt_rad > _STEEPEST_RAD:
             raise SourceError(
-                f"{self._stream.path}: the laser of {topic} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and "
+                f"{self.stream.path}: the laser of {topic} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and "
                 "does not look along the floor; choose a level one by --scan-topic, or say its pose by --laser-pose"
             )
         return mounted
 
     def _camera(self, tree: TransformTree, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
         """The camera with its calibration and mounting; without them it is ignored, with a note."""
-        path, topic, calibration = self._stream.path, self._stream.topics.camera, self._stream.calibration
+        path, topic, calibration = self.stream.path, self.stream.topics.camera, self.stream.calibration
         if topic is None:
             return None, ()
         if calibration is None:
@@ -189,8 +192,18 @@ class RosBag:
         if mounted.tilt_rad <= _LEVEL_RAD:
             return ""
         tilt = f"tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level"
-        which = f" of {topic.name}" * (len(self._stream.lasers) > 1)
-        return f"{self._stream.path}: the laser{which} is {tilt}"
+        which = f" of {topic.name}" * (len(self.stream.lasers) > 1)
+        return f"{self.stream.path}: the laser{which} is {tilt}"
+
+
+def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]:
+    """The bags of one fleet with ``options``, read from the same topics if all of them have these.
+
+    Raises:
+        SourceError: a bag cannot be read.
+    """
+    agreed, notes = agree_on_topics([bag.stream.candidates for bag in bags], options or BagOptions())
+    return [RosBag(bag.stream.path, bag.name, agreed, () if k else notes) for k, bag in enumerate(bags)]
 
 
 def _audit() -> Audit:

@@ -27,7 +27,7 @@ from fcslam.sources.bags.messages import (
 )
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry
-from fcslam.sources.bags.topics import Topics, choose_topics
+from fcslam.sources.bags.topics import Candidates, Topics, choose_topics, find_candidates
 from fcslam.sources.bags.transforms import TransformTree, planar
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
@@ -51,6 +51,15 @@ class BagStream:
         self.path = path
         self._bag = BagFile(path)
         self._options = options
+
+    @cached_property
+    def candidates(self) -> Candidates:
+        """The topics that can be read.
+
+        Raises:
+            SourceError: the bag cannot be read.
+        """
+        return find_candidates(self._bag, self._field_of_view_rad, self._has_images)
 
     @cached_property
     def topics(self) -> Topics:
@@ -201,5 +210,6 @@ class BagStream:
         return False
 
     def _field_of_view_rad(self, topic: Topic) -> float:
+        """Of the topic's first scan; 0 if it cannot be read."""
         scan = next(self._scans_of(topic), None)
         return 0.0 if scan is None else scan.beams.span_rad

@@ -1,6 +1,9 @@
 """Chooses the topics of a bag: those that the user names, or else by fixed rules, with a note."""
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
@@ -44,6 +47,18 @@ class Topics(NamedTuple):
     notes: tuple[str, ...]
 
 
+class Candidates(NamedTuple):
+    """The topics of one bag that can be read."""
+
+    scans: Sequence[Topic]
+    views_rad: Mapping[str, float]
+    """Field of view of each topic of scans, by name."""
+    measured: Sequence[Topic]
+    """Odometry."""
+    cameras: Sequence[Topic]
+    """Images with calibration."""
+
+
 def choose_topics(
     bag: BagFile,
     options: BagOptions,
@@ -59,15 +74,14 @@ def choose_topics(
     Raises:
         SourceError: a required topic is missing, or a named topic is missing or of another type.
     """
-    heard = [topic for topic in bag.topics if topic.message_count]
-    scans = [topic for topic in heard if topic.type == SCAN]
+    heard, scans = _heard(bag), _scans(bag)
     if not scans:
         raise SourceError(f"{bag.path}: no laser scans ({SCAN}); record them; {_known(bag.topics)}")
     lasers = [topic for name in options.scan_topics for topic in _candidates(bag, scans, name, "--scan-topic")] or [
-        _widest(scans, field_of_view_rad)
+        _best_scan(scans, [_views_rad(scans, field_of_view_rad)])
     ]
     transforms = tuple(topic for topic in heard if is_transforms(topic))
-    measured = [topic for topic in heard if topic.type == ODOMETRY and (options.odom_topic or not _is_truth(topic))]
+    measured = _measured(bag) if options.odom_topic is None else [topic for topic in heard if topic.type == ODOMETRY]
     odometries = _candidates(bag, [*measured, *transforms], options.odom_topic, "--odom-topic")
     if not odometries:
         raise SourceError(
@@ -80,48 +94,126 @@ def choose_topics(
     measured = [topic for topic in odometries if topic.type == ODOMETRY]
     if not measured:
         return Topics(tuple(lasers), tuple(odometries), transforms, camera, camera_info, tuple(notes))
-    odometry = min(measured, key=lambda topic: (_basename(topic) != "odom", -topic.message_count, topic.name))
+    odometry = _best_odometry(measured)
     notes += _note(bag, "odometry", "--odom-topic", odometry, measured)
     return Topics(tuple(lasers), (odometry,), transforms, camera, camera_info, tuple(notes))
 
 
-def _widest(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], float]) -> Topic:
-    views_rad = {topic: field_of_view_rad(topic) if len(scans) > 1 else 0.0 for topic in scans}
-    wide = [topic for topic in scans if views_rad[topic] > max(views_rad.values()) - _SAME_VIEW_RAD]
+def find_candidates(
+    bag: BagFile, field_of_view_rad: Callable[[Topic], float], has_images: Callable[[Topic], bool]
+) -> Candidates:
+    """The topics of ``bag`` from which ``choose_topics`` would choose.
+
+    Raises:
+        SourceError: the bag cannot be read.
+    """
+    scans, images = _scans(bag), _images(bag)
+    calibrated = [topic for topic in images if _calibration_of(topic, bag) and has_images(topic)]
+    return Candidates(scans, _views_rad(scans, field_of_view_rad), _measured(bag), calibrated)
+
+
+def agree_on_topics(bags: Sequence[Candidates], options: BagOptions) -> tuple[BagOptions, tuple[str, ...]]:
+    """Choose the same topics for all bags of a fleet, where ``options`` name none.
+
+    The rules are those of ``choose_topics``, applied to the topics that all bags have. If there is none of a kind, each
+    bag keeps its own choice.
+
+    Returns:
+        The options with the topics, and notes about the choice.
+    """
+    notes = []
+    scans = _common([bag.scans for bag in bags])
+    measured = _common([bag.measured for bag in bags])
+    cameras = _common([bag.cameras for bag in bags])
+    if scans and not options.scan_topics:
+        scan = _best_scan(scans, [bag.views_rad for bag in bags])
+        options = replace(options, scan_topics=(scan.name,))
+        notes += _fleet_note("laser scans", "--scan-topic", scan, [bag.scans for bag in bags])
+    if measured and options.odom_topic is None:
+        odometry = _best_odometry(measured)
+        options = replace(options, odom_topic=odometry.name)
+        notes += _fleet_note("odometry", "--odom-topic", odometry, [bag.measured for bag in bags])
+    if cameras and options.camera_topic is None:
+        camera = min(cameras, key=_camera_rank)
+        options = replace(options, camera_topic=camera.name)
+        notes += _fleet_note("images", "--camera-topic", camera, [bag.cameras for bag in bags])
+    return options, tuple(notes)
+
+
+def _heard(bag: BagFile) -> list[Topic]:
+    return [topic for topic in bag.topics if topic.message_count]
+
+
+def _scans(bag: BagFile) -> list[Topic]:
+    return [topic for topic in _heard(bag) if topic.type == SCAN]
+
+
+def _measured(bag: BagFile) -> list[Topic]:
+    return [topic for topic in _heard(bag) if topic.type == ODOMETRY and not _is_truth(topic)]
+
+
+def _common(candidates: Sequence[Sequence[Topic]]) -> list[Topic]:
+    """Topics that all bags have, with the messages of all of them."""
+    names = set.intersection(*({topic.name for topic in own} for own in candidates))
+    counts = Counter[str]()
+    for topic in chain.from_iterable(candidates):
+        counts[topic.name] += topic.message_count
+    return [topic._replace(message_count=counts[topic.name]) for topic in candidates[0] if topic.name in names]
+
+
+def _views_rad(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], float]) -> dict[str, float]:
+    """Field of view of each topic by name; not looked up without a choice."""
+    return {topic.name: field_of_view_rad(topic) if len(scans) > 1 else 0.0 for topic in scans}
+
+
+def _best_scan(scans: Sequence[Topic], views_rad: Sequence[Mapping[str, float]]) -> Topic:
+    """``views_rad``: of each bag."""
+    view_rad = {topic: min(views[topic.name] for views in views_rad) for topic in scans}
+    wide = [topic for topic in scans if view_rad[topic] > max(view_rad.values()) - _SAME_VIEW_RAD]
     return min(wide, key=lambda topic: (_basename(topic) != "scan", -topic.message_count, topic.name))
+
+
+def _best_odometry(measured: Sequence[Topic]) -> Topic:
+    return min(measured, key=lambda topic: (_basename(topic) != "odom", -topic.message_count, topic.name))
+
+
+def _fleet_note(what: str, option: str, chosen: Topic, candidates: Sequence[Sequence[Topic]]) -> list[str]:
+    others = sorted({topic.name for own in candidates for topic in own} - {chosen.name})
+    if not others:
+        return []
+    return [f"all bags: reads {what} from {chosen.name}, not from {', '.join(others)} ({option} chooses)"]
 
 
 def _choose_camera(
     bag: BagFile, wanted: str | None, has_images: Callable[[Topic], bool]
 ) -> tuple[Topic | None, Topic | None, list[str]]:
     """Topics of images and of their calibration, and notes about the choice."""
-    heard = [topic for topic in bag.topics if topic.message_count]
-    images = [topic for topic in heard if topic.type in (COMPRESSED_IMAGE, IMAGE)]
+    images = _images(bag)
     cameras = [topic for topic in _candidates(bag, images, wanted, "--camera-topic") if has_images(topic)]
     if not cameras:
         names = ", ".join(topic.name for topic in images)
         return None, None, [f"{bag.path}: no images of {names} can be read, the camera is left out"] if images else []
-    infos = [topic for topic in heard if topic.type == CAMERA_INFO]
-    info_of = {camera: _calibration(camera, infos, len(images)) for camera in cameras}
-    chosen = min(
-        cameras,
-        key=lambda topic: (
-            info_of[topic] is None,
-            -topic.message_count,
-            topic.type != COMPRESSED_IMAGE,
-            topic.name,
-        ),
-    )
+    info_of = {camera: _calibration_of(camera, bag) for camera in cameras}
+    chosen = min(cameras, key=lambda topic: (info_of[topic] is None, *_camera_rank(topic)))
     if info_of[chosen] is None:
         return None, None, [f"{bag.path}: no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"]
     return chosen, info_of[chosen], _note(bag, "images", "--camera-topic", chosen, cameras)
 
 
-def _calibration(camera: Topic, infos: Sequence[Topic], camera_count: int) -> Topic | None:
+def _images(bag: BagFile) -> list[Topic]:
+    return [topic for topic in _heard(bag) if topic.type in (COMPRESSED_IMAGE, IMAGE)]
+
+
+def _camera_rank(topic: Topic) -> tuple[int, bool, str]:
+    return -topic.message_count, topic.type != COMPRESSED_IMAGE, topic.name
+
+
+def _calibration_of(camera: Topic, bag: BagFile) -> Topic | None:
     """The calibration topic beside the images, or the only one if there is only one camera."""
+    infos = [topic for topic in _heard(bag) if topic.type == CAMERA_INFO]
     name = camera.name.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
     beside = [info for info in infos if _slashed(info.name) == _slashed(name)]
-    return next(iter(beside or (infos if len(infos) == camera_count == 1 else [])), None)
+    return next(iter(beside or (infos if len(infos) == len(_images(bag)) == 1 else [])), None)
 
 
 def _candidates(bag: BagFile, candidates: Sequence[Topic], wanted: str | None, option: str) -> list[Topic]:

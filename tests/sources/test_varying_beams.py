@@ -1,0 +1,268 @@
+"""Scans whose beams vary, several lasers of one robot, and topics of a fleet, through every kind of recording."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fcslam.errors import SourceError
+from fcslam.records import Beams, LaserModel, LaserScan, frozen
+from fcslam.sources import (
+    BagOptions,
+    Fault,
+    FaultCount,
+    open_fleet,
+    open_source,
+    write_bag,
+    write_carmen,
+    write_recording,
+)
+from tests.sources.bag_messages import drive, mounted, odom, pose_at, scan, tf
+from tests.sources.bag_messages import save as save_bag
+from tests.sources.carmen_text import flaser, robotlaser, save, scans_of
+from tests.sources.carmen_text import pose_at as log_pose
+
+SICK = LaserModel(181, -math.pi / 2, math.radians(1.0), 50.0)
+TURNING = LaserModel(1100, -math.pi, math.tau / 1100, 12.0)
+REAR = LaserModel(181, -math.pi / 2, math.radians(1.0), 30.0, (-0.3, 0.0, math.pi))
+
+
+def interleaved(laser=SICK):
+    """The lasers of a cycle of four scans."""
+    count, first, increment = laser.beams
+    yield laser
+    for step in (1, 2, 3):
+        yield laser.with_beams(Beams(count - 1, first + 0.25 * step * increment, increment))
+
+
+def jittering(laser=TURNING):
+    for count in (1080, 1100, 1150, 1099):
+        yield laser.with_beams(Beams(count, laser.angle_min_rad, math.tau / count))
+
+
+def scans(lasers, cycles=6):
+    """Scans whose ranges tell the directions of their beams."""
+    lasers = list(lasers) * cycles
+    return [
+        LaserScan(100.0 + 0.25 * k, frozen(np.round(6.0 + laser.angles_rad(), 3), np.float32), laser,
+                  frozen((0.125 * k, 0.0, 0.0)))
+        for k, laser in enumerate(lasers)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", [interleaved, jittering], ids=["interleaved", "jittering"])
+@pytest.mark.parametrize("name", ["run.fcslam", "run.clf", "run.bag", "run.mcap"])
+def test_every_format_keeps_the_beams_of_each_scan(tmp_path, kind, name):
+    written = scans(kind())
+    if name.endswith(".fcslam"):
+        write_recording(tmp_path / name, [written[0].laser], None, written)
+    else:
+        (write_carmen if name.endswith(".clf") else write_bag)(tmp_path / name, written)
+    source = open_source(tmp_path / name)
+    read = scans_of(source)
+    assert source.survey().scan_count == len(read) == len(written)
+    assert not source.faults
+    for before, after in zip(written, read, strict=True):
+        np.testing.assert_allclose(after.laser.angles_rad(), before.laser.angles_rad(), atol=2e-6)
+        np.testing.assert_array_equal(after.ranges_m, before.ranges_m)
+        assert after.laser.T_base_laser == before.laser.T_base_laser
+
+
+# Logs that state no angles
+
+
+def log_of_counts(counts):
+    return [flaser(100 + 0.1 * k, log_pose(k), ranges=(1.0,) * count) for k, count in enumerate(counts)]
+
+
+def first_degrees(path):
+    return [round(math.degrees(scan.laser.angle_min_rad), 6) for scan in scans_of(open_source(path))]
+
+
+def test_a_log_that_interleaves_four_scans(tmp_path):
+    path = save(tmp_path / "run.log", log_of_counts([181, 180, 180, 180] * 8))
+    assert first_degrees(path) == [-90.0, -89.75, -89.5, -89.25] * 8
+    assert open_source(path).survey().lasers[0].beam_count == 181
+
+
+def test_a_log_that_begins_within_a_cycle_and_misses_scans_later(tmp_path):
+    path = save(tmp_path / "run.log", log_of_counts([180, 181, *[180, 180, 180, 181] * 6, 180, 181]))
+    assert first_degrees(path)[:6] == [-89.75, -90.0, -89.75, -89.5, -89.25, -90.0]
+    assert first_degrees(path)[-3:] == [-90.0, -89.75, -90.0]
+
+
+def test_a_log_with_a_part_of_the_interleaved_scans(tmp_path):
+    """The place of a scan in its cycle is not known: half an increment is wrong by a quarter of one at most."""
+    path = save(tmp_path / "run.log", log_of_counts([180, 181, 180, 181, 181, 180, 180, 181, 180, 180] * 4))
+    assert set(first_degrees(path)) == {-90.0, -89.5}
+
+
+def test_a_log_of_one_count_is_what_it_was(tmp_path):
+    lines = log_of_counts([180] * 60)
+    lines[30] = flaser(103.0, log_pose(30), ranges=(1.0,) * 181)
+    source = open_source(save(tmp_path / "run.log", lines))
+    assert [round(math.degrees(angle)) for angle in scans_of(source)[0].laser.angles_rad()[[0, -1]]] == [-90, 89]
+    assert source.faults[Fault.OTHER_BEAMS] == FaultCount(1, 31)
+
+
+def test_lines_that_state_their_angles(tmp_path):
+    def line(k, start, count):
+        return robotlaser(100 + k, log_pose(k), (0, start, math.pi, math.radians(1.0), 30.0, 0.01, 0), (1.0,) * count)
+
+    starts = [-math.pi / 2 + math.radians(0.25 * (k % 4)) for k in range(20)]
+    lines = [line(k, start, 181 - (k % 4 > 0)) for k, start in enumerate(starts)]
+    lines[7] = line(7, 0.0, 100)
+    source = open_source(save(tmp_path / "run.log", lines))
+    assert [scan.laser.angle_min_rad for scan in scans_of(source)] == pytest.approx([*starts[:7], *starts[8:]])
+    assert source.faults[Fault.OTHER_BEAMS] == FaultCount(1, 8)
+
+
+# Bags
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"angle_increment": 0.0}, "angle_increment is 0"),
+        ({"angle_increment": -math.pi / 8}, "angle_increment leads away from angle_max"),
+        ({"angle_max": 3.0}, "8 ranges, but the angles are those of 13"),
+        ({"angle_max": math.nan}, "an angle is not finite"),
+    ],
+)
+def test_angles_that_contradict_the_ranges(tmp_path, wrong, reason):
+    edge = {"angle_max": -math.pi / 2 + 7 * math.pi / 8}
+    few = [scan(100.05 + 0.2 * k, bag_time=100.08 + 0.2 * k, **{**edge, **wrong}) for k in range(5)]
+    source = open_source(save_bag(tmp_path / "few.bag", [*drive(40), *few]))
+    assert len(scans_of(source)) == 40
+    assert source.faults[Fault.BAD_BEAMS] == FaultCount(5, 2)
+    every = [mounted(), *(odom(100 + k, pose_at(k)) for k in range(5)), *few]
+    with pytest.raises(SourceError) as refusal:
+        open_source(save_bag(tmp_path / "every.bag", every)).survey()
+    assert f"none of the 5 scans in /scan can be read ({reason})" in str(refusal.value)
+
+
+def test_one_range_more_or_less_than_the_angles_say(tmp_path):
+    """The most common complaint of slam_toolbox: 361 range readings, expected 360."""
+    one_more = {"angle_max": -math.pi + 359 * math.tau / 360, "angle_min": -math.pi, "angle_increment": math.tau / 360}
+    said = [mounted(), *(odom(100 + k, pose_at(k)) for k in range(4))]
+    said += [scan(100 + k, (1.0,) * (360 + (k > 0)), **one_more) for k in range(4)]
+    source = open_source(save_bag(tmp_path / "run.bag", said))
+    assert [len(scan.ranges_m) for scan in scans_of(source)] == [360, 361, 361, 361]
+    assert not source.faults
+
+
+def test_a_scan_of_100_ranges_is_never_one_of_a_laser_with_360(tmp_path):
+    said = [mounted(), *(odom(100 + k, pose_at(k)) for k in range(9))]
+    for k in range(9):
+        count = 100 if k % 3 == 2 else 360
+        said.append(scan(100 + k, (1.0,) * count, angle_min=-math.pi, angle_increment=math.tau / count))
+    source = open_source(save_bag(tmp_path / "run.bag", said))
+    assert [len(scan.ranges_m) for scan in scans_of(source)] == [360] * 6
+    assert source.faults[Fault.OTHER_BEAMS] == FaultCount(3, 3)
+
+
+# Several lasers
+
+
+def front_and_rear(rear_frame="rear", rear_pose=True):
+    """Both at 5 Hz; each scan of the rear laser is recorded before one of the front laser that was taken earlier."""
+    said = drive(20)
+    if rear_pose:
+        said.append(tf(100.0, "base_link", "rear", (-0.3, 0.0, 0.3), (0.0, 0.0, 1.0, 0.0), topic="/tf_static"))
+    rear = [scan(100.06 + 0.2 * k, topic="/rear", bag_time=100.065 + 0.2 * k, frame=rear_frame) for k in range(20)]
+    return [*said, *rear]
+
+
+BOTH = BagOptions(scan_topics=("/scan", "/rear"))
+
+
+def test_two_lasers_are_merged_in_time(tmp_path):
+    source = open_source(save_bag(tmp_path / "run.bag", front_and_rear()), BOTH)
+    front, rear = source.survey().lasers
+    read = scans_of(source)
+    assert source.survey().scan_count == len(read) == 40
+    assert [scan.stamp for scan in read] == sorted(scan.stamp for scan in read)
+    assert [scan.laser for scan in read] == [front, rear] * 20
+    assert rear.T_base_laser == pytest.approx((-0.3, 0.0, math.pi))
+    assert not source.faults
+    assert len(scans_of(open_source(tmp_path / "run.bag", BagOptions(scan_topics=("/rear",))))) == 20
+
+
+def test_a_laser_that_falls_silent_does_not_hold_up_the_other(tmp_path):
+    said = [message for message in front_and_rear() if message.topic != "/rear" or message.bag_time < 101.0]
+    read = scans_of(open_source(save_bag(tmp_path / "run.bag", said), BOTH))
+    assert len(read) == 25
+    assert [scan.stamp for scan in read] == sorted(scan.stamp for scan in read)
+
+
+@pytest.mark.parametrize(
+    ("said", "options", "words"),
+    [
+        (front_and_rear("laser"), BOTH, "/scan and /rear have one frame, 'laser'"),
+        (front_and_rear(rear_pose=False), BOTH, "where the laser of /rear sits; say it by --laser-pose X,Y,THETA "),
+        (front_and_rear(), BagOptions(("/scan", "/rear"), laser_poses=((0.0, 0.0, 0.0),)), "1 --laser-pose for 2 --sc"),
+        (front_and_rear(), BagOptions(("/scan", "/scan")), "--scan-topic /scan is given twice"),
+    ],
+)
+def test_lasers_that_cannot_be_told_apart_are_refused_in_one_line(tmp_path, said, options, words):
+    with pytest.raises(SourceError) as refusal:
+        open_source(save_bag(tmp_path / "run.bag", said), options).survey()
+    assert words in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_poses_of_lasers_by_hand(tmp_path):
+    poses = ((0.1, 0.0, 0.0), (-0.4, 0.0, 3.0))
+    bag = save_bag(tmp_path / "run.bag", front_and_rear("laser", rear_pose=False))
+    lasers = open_source(bag, BagOptions(("/scan", "/rear"), laser_poses=poses)).survey().lasers
+    assert tuple(laser.T_base_laser for laser in lasers) == poses
+
+
+@pytest.mark.parametrize("name", ["run.fcslam", "run.mcap"])
+def test_a_recording_and_a_bag_hold_several_lasers(tmp_path, name):
+    written = scans([SICK, REAR])
+    if name.endswith(".fcslam"):
+        write_recording(tmp_path / name, [SICK, REAR], None, written)
+        source = open_source(tmp_path / name)
+    else:
+        write_bag(tmp_path / name, written)
+        source = open_source(tmp_path / name, BagOptions(scan_topics=("/scan", "/scan_2")))
+    read = scans_of(source)
+    mountings = np.array([scan.laser.T_base_laser for scan in read])
+    np.testing.assert_allclose(mountings, [(0.0, 0.0, 0.0), (-0.3, 0.0, math.pi)] * 6, atol=1e-9)
+    assert all(np.array_equal(before.ranges_m, after.ranges_m) for before, after in zip(written, read, strict=True))
+
+
+def test_a_log_holds_one_laser(tmp_path):
+    write_carmen(tmp_path / "run.clf", scans([SICK, REAR]))
+    assert len(scans_of(open_source(tmp_path / "run.clf"))) == 6
+
+
+# Topics of a fleet
+
+
+def renamed(said, **topics):
+    return [message._replace(topic=topics.get(message.topic.strip("/"), message.topic)) for message in said]
+
+
+def test_a_fleet_is_read_from_the_topics_that_all_bags_have(tmp_path):
+    more = [scan(100.05 + 0.05 * k, (1.0,) * 8, topic="/stable_scan", frame="laser") for k in range(60)]
+    bags = [
+        (save_bag(tmp_path / "anna.bag", [*drive(20), *more]), None),
+        (save_bag(tmp_path / "ben.bag", renamed([*drive(20), *more], scan="/lidar")), None),
+    ]
+    sources = open_fleet(bags)
+    notes = [note for source in sources for note in source.survey().notes]
+    assert [len(scans_of(source)) for source in sources] == [60, 60]
+    assert notes == ["all bags: reads laser scans from /stable_scan, not from /lidar, /scan (--scan-topic chooses)"]
+    assert len(scans_of(open_source(bags[0][0]))) == 20, "alone, the name decides"
+
+
+def test_a_fleet_without_a_common_topic_reads_each_bag_by_itself(tmp_path):
+    bags = [
+        (save_bag(tmp_path / "anna.bag", drive(20)), "a"),
+        (save_bag(tmp_path / "ben.bag", renamed(drive(20), scan="/lidar")), "b"),
+    ]
+    sources = open_fleet(bags)
+    assert [source.name for source in sources] == ["a", "b"]
+    assert [len(scans_of(source)) for source in sources] == [20, 20]
