@@ -29,7 +29,9 @@ _LEAST_M: Final = 1e-4
 _NOTHING: Final = -1
 _GROUND: Final = -2
 _GROUND_RETURNS: Final = 0.75
-"""Share of beams that return from the ground. The others graze it and are lost."""
+"""Share of beams that return from near ground. The others graze it and are lost."""
+_GROUND_REFLECTIVITY: Final = 0.1
+"""Of ground that beams graze."""
 _GROUND_ROUGHNESS: Final = 0.04
 """Relative error of a range to the ground."""
 _GLASS_PASSES: Final = 0.5
@@ -275,7 +277,8 @@ def _cast_beams(position, angles, tilt, far, seed, ideal, world):  # type: ignor
         if hit == _NOTHING:
             continue
         if hit == _GROUND:
-            if _uniform(seed, beam, -3) < _GROUND_RETURNS:
+            seen = before + distance < far * np.sqrt(_GROUND_REFLECTIVITY)
+            if seen and _uniform(seed, beam, -3) < _GROUND_RETURNS:
                 distance *= 1.0 + _GROUND_ROUGHNESS * (2.0 * _uniform(seed, beam, -4) - 1.0)
                 ranges[beam] = min(before + distance, far)
             continue

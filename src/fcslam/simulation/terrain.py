@@ -9,9 +9,9 @@ from fcslam.records import FloatArray, frozen
 CELL_M = 1.0
 """Distance of neighbouring heights."""
 _WAVES = 8
-_LENGTHS_M = (12.0, 60.0)
+_LENGTHS_M = (20.0, 80.0)
 """Shortest and longest wave."""
-_SLOPE = 0.015
+_SLOPE = 0.01
 """Root mean square slope in each direction."""
 
 
@@ -37,7 +37,7 @@ class Terrain:
 
 
 def draw_terrain(size_m: tuple[float, float], rng: np.random.Generator) -> Terrain:
-    """Draw gentle hills for an area from west to east and from south to north; slopes are mostly below 3 %."""
+    """Draw gentle hills for an area from west to east and from south to north; slopes are mostly below 2 %."""
     x = np.arange(0.0, size_m[0] + 2.0 * CELL_M, CELL_M)
     y = np.arange(0.0, size_m[1] + 2.0 * CELL_M, CELL_M)[:, None]
     heights = np.zeros((len(y), len(x)))

@@ -1,8 +1,8 @@
 """A yard: buildings from outside, lawns, car parks and open ground, with ways between and around them.
 
 Blocks of 20 to 32 m lie in a grid; ways run along all of them and meet at their corners. Each block is a building, a
-lawn with trees, a car park or open ground. Lamps, rows of trees, hedges and parked cars stand beside the ways. Some
-sides of the yard are closed by a hedge, a fence or a low wall; beyond the others there are a few trees, or nothing.
+lawn with trees, a car park or open ground. Lamps, rows of trees, hedges and parked cars stand beside the ways. Most
+sides of the yard are closed by houses, a hedge, a fence or a low wall; beyond the others are a few trees, or nothing.
 Everything keeps clear of the ways.
 """
 
@@ -128,12 +128,17 @@ def _building(block: _Block, site: _Site) -> None:
     for side in range(4):
         heading = turn + side * 0.5 * np.pi
         length, depth = (size[0], size[1]) if side % 2 == 0 else (size[1], size[0])
-        for a, b, offset, kind in _facade(float(length), rng):
-            outward = -0.5 * depth + offset
-            _wall_between(site, kind, (a - 0.5 * length, outward), (b - 0.5 * length, outward), heading, middle)
+        _front(site, float(length), heading, middle, -0.5 * float(depth))
         inner = -0.5 * depth + 3.5
         end = 0.5 * length - 3.5
         _wall_between(site, PieceKind.WALL, (-end, inner), (end, inner), heading, middle)
+
+
+def _front(site: _Site, length: float, heading_rad: float, middle: FloatArray, across: float) -> None:
+    """One side of a house, in axes of ``heading_rad`` around ``middle``: ``across`` from it, recesses to the left."""
+    for a, b, offset, kind in _facade(length, site.rng):
+        y = across + offset
+        _wall_between(site, kind, (a - 0.5 * length, y), (b - 0.5 * length, y), heading_rad, middle)
 
 
 def _facade(length: float, rng: np.random.Generator) -> Iterator[tuple[float, float, float, PieceKind]]:
@@ -234,15 +239,19 @@ def _around(size_m: tuple[float, float], site: _Site) -> None:
     """What closes the yard or stands beyond it."""
     rng = site.rng
     inner = _Block((_AROUND_M, _AROUND_M, size_m[0] - _AROUND_M, size_m[1] - _AROUND_M))
+    kinds = ("hedge", "fence", "low wall", "trees", "facade", "nothing")
     for side in range(4):
         start, end = _side(inner, side, -float(rng.uniform(3.5, 6.0)))
-        kind = rng.choice(("hedge", "fence", "low wall", "trees", "nothing"), p=(0.2, 0.2, 0.15, 0.15, 0.3))
+        kind = rng.choice(kinds, p=(0.2, 0.15, 0.15, 0.15, 0.2, 0.15))
         if kind == "hedge":
             _hedge(start, end, site)
         elif kind in ("fence", "low wall"):
             length = float(np.linalg.norm(end - start))
             outline = rectangle((length, 0.1 if kind == "fence" else 0.3), float(np.arctan2(*(end - start)[::-1])))
             site.stand(PieceKind(str(kind)), outline + 0.5 * (start + end))
+        elif kind == "facade":
+            heading = float(np.arctan2(*(start - end)[::-1]))
+            _front(site, float(np.linalg.norm(end - start)), heading, 0.5 * (start + end), 0.0)
         elif kind == "trees":
             for centre in _spaced(start, end, 7.0, 1.5, rng):
                 site.disc(PieceKind.TRUNK, centre, float(rng.uniform(0.1, 0.35)))
