@@ -3,8 +3,8 @@
     FCSLAM_DATA=/path/to/data python benchmarks/scanners.py
     FCSLAM_DATA=/path/to/data python benchmarks/scanners.py --logs mit-csail --seeds 0
 
-- interleaved: cycles of four scans, each a quarter of an increment further; the first has all n beams, the others n - 1.
-  A direction between two beams measures the line between their returns if both lie on one surface, else the nearer beam.
+- interleaved: cycles of four scans, each a quarter of an increment further; the first has n beams, the others n - 1.
+  A direction between two beams gets the line between their returns if both lie on one surface, else the nearer beam.
 - every second beam: the even and the odd beams of the log in turn, so each scan has half of them and nothing is
   interpolated.
 - dropped: each beam returns nothing with a probability of 10 %.

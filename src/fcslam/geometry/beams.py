@@ -13,6 +13,20 @@ SAME_VIEW_BEAMS = 1.5
 """The same in increments, if that is more: interleaved scans, one beam more or less, rounded headers."""
 
 
+FULL_TURN_RAD = 2.0 * pi
+LARGEST_SPAN_RAD = 1.01 * FULL_TURN_RAD
+"""From the first to the last beam, which may coincide; drivers round the increment."""
+
+
+def is_field_of_view(beams: Beams) -> bool:
+    """Whether some laser can have these beams: two or more, from a direction within a full turn, over one at most."""
+    return (
+        beams.beam_count >= 2
+        and abs(beams.angle_min_rad) <= FULL_TURN_RAD
+        and 0.0 < abs(beams.span_rad) <= LARGEST_SPAN_RAD
+    )
+
+
 def misfit(beams: Beams, declared: Beams) -> str | None:
     """Why a scan with ``beams`` cannot be of the laser that was declared with the beams ``declared``.
 
@@ -35,7 +49,7 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
     if wide > LARGEST_RATIO * narrow:
         return f"its beams are {degrees(abs(increment)):.3g} degrees apart, the laser's {degrees(abs(other)):.3g}"
     tolerance_rad = max(SAME_VIEW_RAD, SAME_VIEW_BEAMS * wide)
-    if all(abs(view.span_rad + view.angle_increment_rad) > 2.0 * pi - tolerance_rad for view in (beams, declared)):
+    if all(abs(view.span_rad + view.angle_increment_rad) > FULL_TURN_RAD - tolerance_rad for view in (beams, declared)):
         return None  # a full turn has no first direction
     first_rad = remainder(beams.angle_min_rad - declared.angle_min_rad, tau)
     last_rad = first_rad + beams.span_rad - declared.span_rad

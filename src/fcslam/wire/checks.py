@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
+from fcslam.geometry.beams import FULL_TURN_RAD, LARGEST_SPAN_RAD
 from fcslam.records import CODE_BYTES, NAME, Beams, Constraint, Correction, FloatArray, Keyscan, LaserModel, Place
 from fcslam.wire.limits import (
     DIGEST_BYTES,
@@ -26,8 +27,6 @@ from fcslam.wire.limits import (
 )
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise, unpack_information
-
-FULL_TURN_RAD = 2.0 * math.pi
 
 
 def check(packet: Packet) -> None:
@@ -80,8 +79,7 @@ def _check_beams(beams: Beams, what: str) -> None:
     _require(abs(first) <= FULL_TURN_RAD, f"{what}: first beam is not within a full turn")
     turns = 0.0 < abs(increment) <= FULL_TURN_RAD
     _require(turns, f"{what}: beams do not turn, or by more than a full turn")
-    # The first and last beam of a full turn may coincide, and drivers round the increment.
-    within = abs(increment) * count <= 1.01 * FULL_TURN_RAD + abs(increment)
+    within = abs(increment) * (count - 1) <= LARGEST_SPAN_RAD
     _require(within, f"{what}: beams cover over a full turn")
 
 

@@ -1,18 +1,17 @@
 """Converts the messages of a bag and checks them; invalid messages raise ValueError."""
 
 from collections.abc import Iterator
-from math import degrees, inf, isfinite, pi, radians
+from math import degrees, inf, isfinite, radians, remainder
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fcslam.geometry.beams import SAME_VIEW_BEAMS
+from fcslam.geometry.beams import FULL_TURN_RAD, SAME_VIEW_BEAMS, is_field_of_view
 from fcslam.records import Beams, Ranges, Transform
 from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.sources.pose import Pose
 
 _LONGEST_RANGE_M = 1000.0
-_FULL_TURN_RAD = 2.0 * pi + 0.1
 _COUNT_TOLERANCE = 0.01
 """Share of the ranges by which drivers that round the increment are wrong."""
 _MAX_COORDINATE_M = 1e7
@@ -73,6 +72,8 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
         raise ValueError("no sane range")
     if increment_rad < 0.0:
         first_rad, increment_rad, ranges = first_rad + span_rad, -increment_rad, ranges[::-1]
+    if abs(first_rad) > FULL_TURN_RAD:
+        first_rad = remainder(first_rad, FULL_TURN_RAD)
     stamp, frame = header_of(content.header, bag_time_ns)
     beams = Beams(count, first_rad, increment_rad)
     return ScanMessage(stamp, frame, beams, range_min_m, min(range_max_m, _LONGEST_RANGE_M), ranges)
@@ -85,7 +86,7 @@ def _check_angles(count: int, first_rad: float, increment_rad: float, last_rad: 
         raise BeamsError("an angle is not finite")
     if increment_rad == 0.0:
         raise BeamsError("angle_increment is 0")
-    if count < 2 or abs(first_rad) > _FULL_TURN_RAD or abs((count - 1) * increment_rad) >= _FULL_TURN_RAD:
+    if abs(first_rad) > 1.01 * FULL_TURN_RAD or not is_field_of_view(Beams(count, 0.0, increment_rad)):
         raise BeamsError(f"{count} ranges have no sane field of view")
     stated = (last_rad - first_rad) / increment_rad + 1.0
     if stated < 1.0:

@@ -13,8 +13,9 @@ Other messages (rear lasers, SYNC, TRUEPOS ...) are passed over; a line that sta
 
 import re
 from collections.abc import Callable
-from math import isfinite, pi
 
+from fcslam.geometry.beams import is_field_of_view
+from fcslam.records import Beams
 from fcslam.sources.logs.dialect import (
     Dialect,
     Line,
@@ -75,7 +76,7 @@ def _without_remissions(body: bytes, beam_count: int) -> bytes:
 def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> StatedLaser:
     start_rad, fov_rad, resolution_rad, max_range_m = numbers
     increment_rad = resolution_rad if resolution_rad > 0.0 else fov_rad / (beam_count - 1)
-    if not (isfinite(start_rad) and 0.0 < increment_rad * (beam_count - 1) < 2.0 * pi + 0.1):
+    if not (increment_rad > 0.0 and is_field_of_view(Beams(beam_count, start_rad, increment_rad))):
         raise ValueError("no sane field of view")
     if not 0.0 < max_range_m < float("inf"):
         max_range_m = SICK_MAX_RANGE_M

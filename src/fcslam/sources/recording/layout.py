@@ -8,7 +8,7 @@ all scans had the same beams.
 """
 
 from dataclasses import dataclass
-from math import isfinite, pi
+from math import isfinite
 from pathlib import Path
 from struct import Struct
 from typing import Any, Literal, Self
@@ -20,6 +20,7 @@ from pydantic import ValidationError, model_validator
 
 from fcslam.config import Settings
 from fcslam.errors import SourceError
+from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams, CameraModel, LaserModel
 from fcslam.sources.images import check_camera
 from fcslam.storage.files import write_file
@@ -44,7 +45,6 @@ _MAX_META_BYTES = 1 << 16
 _MAX_LASERS = 8
 _MAX_BEAMS = 1 << 16
 _MAX_RANGE_M = 1e6
-_FULL_TURN_RAD = 2.0 * pi + 0.1
 _LONGEST_REASON = 200
 
 _ENTRY: list[Any] = [("sequence", "<u8"), ("stamp", "<f8"), ("T_odom_base", "<f8", (3,))]
@@ -132,7 +132,7 @@ def check_beams(beams: Beams) -> None:
     """Raise ValueError for beams that no laser has."""
     if not 2 <= beams.beam_count <= _MAX_BEAMS:
         raise ValueError(f"a laser has 2 to {_MAX_BEAMS} beams")
-    if not (abs(beams.angle_min_rad) <= _FULL_TURN_RAD and 0.0 < beams.span_rad <= _FULL_TURN_RAD):
+    if not (is_field_of_view(beams) and beams.angle_increment_rad > 0.0):
         raise ValueError("no sane field of view of the laser")
 
 
