@@ -1,12 +1,14 @@
 """Two submaps of one room are the same place, two rooms are not; what cannot be told is not told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, agreement, build_submap
-from fcslam.lidar.verification import VerificationConfig, _information_of_inverse, verify
-from fcslam.records import ReasonCode
+from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Agreement, agreement, build_submap, self_violation
+from fcslam.lidar.verification import VerificationConfig, _information_of_inverse, _shortfall, verify
+from fcslam.records import Reason, ReasonCode
 from tests.lidar.worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
 
 CONFIG = VerificationConfig()
@@ -133,6 +135,33 @@ def test_a_box_moved_into_free_space_violates():
     assert found.violation > 0.5 * share
     assert agreement(a, a, np.zeros(3)).violation == 0.0
     assert agreement(a, a, np.zeros(3)).explained == 1.0
+
+
+def test_a_submap_of_a_noisy_scanner_contradicts_itself():
+    """Ranges that are long in every second scan put its walls behind those of the others, and theirs into its space."""
+
+    def scans(stretch):
+        rng = np.random.default_rng(4)
+        found = [(scan_at(np.array(pose), room(), noise_m=0.01, rng=rng), np.array(pose)) for pose in WEST]
+        return [
+            (replace(scan, points=scan.points * (1.0 + stretch * (k % 2))), pose)
+            for k, (scan, pose) in enumerate(found)
+        ]
+
+    assert self_violation(scans(0.0)) < 0.01
+    assert self_violation(scans(0.15)) > 0.05
+
+
+def test_a_noisy_scanner_is_allowed_more_violation_and_no_scanner_much():
+    free = Agreement(0.9, 0.08, 600, 0.9, 100.0 * np.eye(3))
+    limits = {
+        noise: _shortfall(free, CONFIG.strict, "strict", lambda noise=noise: noise) for noise in (0.0, 0.07, 0.09, 1.0)
+    }
+    assert limits[0.0] == Reason(ReasonCode.IN_FREE_SPACE, 0.08, 0.05, "strict.violation")
+    assert limits[0.07] == Reason(ReasonCode.IN_FREE_SPACE, 0.08, 0.07, "strict.violation")
+    assert limits[0.09] is None
+    much = replace(free, violation=0.11)
+    assert _shortfall(much, CONFIG.strict, "strict", lambda: 1.0) is not None
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3])

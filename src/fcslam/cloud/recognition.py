@@ -77,7 +77,9 @@ class PlaceRecognition:
     def _matcher(self, key: _VocabularyKey) -> PlaceMatcher:
         if key not in self._matchers:
             rng = np.random.default_rng(self._seed)
-            self._matchers[key] = PlaceMatcher(self._config.matcher, self._submaps.of, rng, self._forget)
+            self._matchers[key] = PlaceMatcher(
+                self._config.matcher, self._submaps.of, rng, self._forget, self._submaps.noise_of
+            )
         return self._matchers[key]
 
     def _forget(self, place: Place) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.geometry import se2
 from fcslam.lidar.field import CELL_M, EMPTY, SurfelField, field_of, label_at
 from fcslam.lidar.matching import OPPOSED
 from fcslam.lidar.scan import PointScan
@@ -170,6 +171,19 @@ def agreement(query: Submap, target: Submap, T_target_query: FloatArray) -> Agre
     )  # fmt: skip
     total = max(1, len(query.surface))
     return Agreement(explained / max(1, known), violating / max(1, known), explained, known / total, tensor)
+
+
+def self_violation(scans: Sequence[tuple[PointScan, FloatArray]]) -> float:
+    """How much a submap contradicts itself: its odd scans against its even ones, the worse of both directions.
+
+    Range errors, mixed pixels and poses that are off all raise it; it is a measure of the scanner's noise on the scale
+    of ``Agreement.violation``.
+
+    Args:
+        scans: as for ``build_submap``.
+    """
+    even, odd = build_submap(scans[::2]), build_submap(scans[1::2])
+    return max(agreement(even, odd, se2.IDENTITY).violation, agreement(odd, even, se2.IDENTITY).violation)
 
 
 @njit(cache=True)

@@ -1,5 +1,6 @@
 """Geometric verification: whether two submaps show the same place, and the transform between them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,8 @@ UNFIXED_INFORMATION = 1e-2
 """Information in a direction that no point fixes: a standard deviation of 10 m or 10 rad."""
 ALIGNED_POINTS = 400
 """Points of a submap that are aligned, at least, if it has so many."""
+NOISE_FACTOR = 2.0
+"""Noise raises the limit of a gate's violation by no more than this factor: people who walk about are no noise."""
 NO_PRIOR = np.zeros((3, 3))
 _VERIFIED = Reason(ReasonCode.VERIFIED)
 _ALIGNMENT = MatchingConfig(wide_scale_m=0.4)
@@ -137,8 +140,18 @@ class Verification:
         return 1.0 if self.strict else 0.5 * self.partial
 
 
+def no_noise() -> float:
+    """Submaps that do not contradict themselves."""
+    return 0.0
+
+
 def verify(
-    a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig, prior: FloatArray = NO_PRIOR
+    a: Submap,
+    b: Submap,
+    T_a_b_guess: FloatArray,
+    config: VerificationConfig,
+    prior: FloatArray = NO_PRIOR,
+    noise: Callable[[], float] = no_noise,
 ) -> Verification:
     """Check whether two submaps show the same place: align them in both directions and rate the worse one.
 
@@ -150,6 +163,8 @@ def verify(
         prior: information of the guess from matched keypoints, over (x, y, theta) in the coordinates of a, shape
             (3, 3). It fixes the alignment where no wall does, as along a corridor. It does not make a closure
             informative: structure that repeats along a corridor repeats in images, too.
+        noise: sum of both submaps' violation of themselves (``self_violation``), called only where it decides. Two
+            submaps cannot agree better than each agrees with itself, so a noisy scanner is allowed as much violation.
 
     Returns:
         The alignment halfway between both directions, and the gates that it passes.
@@ -176,14 +191,14 @@ def verify(
     symmetric = asymmetric is None
     informative = worse.weakest >= config.informative
     one_direction = Reason(ReasonCode.ONE_DIRECTION, worse.weakest, config.informative, "informative")
-    strict, loose = _shortfall(worse, config.strict, "strict"), _shortfall(worse, config.loose, "loose")
+    strict, loose = _shortfall(worse, config.strict, "strict", noise), _shortfall(worse, config.loose, "loose", noise)
     return Verification(
         T_a_b=T_a_b,
         information=_information(forward.information + prior, T_a_b, config),
         worse=worse,
         strict=symmetric and not strict,
         loose=symmetric and not loose,
-        partial=symmetric and informative and not _shortfall(worse, config.partial, "partial"),
+        partial=symmetric and informative and not _shortfall(worse, config.partial, "partial", no_noise),
         informative=informative,
         reason=asymmetric or strict or (_VERIFIED if informative else one_direction),
         loose_reason=asymmetric or loose or _VERIFIED,
@@ -204,17 +219,24 @@ def _asymmetry(gap: FloatArray, config: VerificationConfig) -> Reason | None:
     return None
 
 
-def _shortfall(found: Agreement, gate: Gate, name: str) -> Reason | None:
+def _shortfall(found: Agreement, gate: Gate, name: str, noise: Callable[[], float]) -> Reason | None:
     """The first threshold of the gate called ``name`` that is not reached."""
     if found.explained < gate.explained:
         return Reason(ReasonCode.NOT_ENOUGH_EXPLAINED, found.explained, gate.explained, f"{name}.explained")
-    if found.violation > gate.violation:
-        return Reason(ReasonCode.IN_FREE_SPACE, found.violation, gate.violation, f"{name}.violation")
+    if found.violation > gate.violation and found.violation > (limit := _noisy_limit(found, gate, noise)):
+        return Reason(ReasonCode.IN_FREE_SPACE, found.violation, limit, f"{name}.violation")
     if found.count < gate.count:
         return Reason(ReasonCode.FEW_POINTS, found.count, gate.count, f"{name}.count")
     if found.overlap < gate.overlap:
         return Reason(ReasonCode.LITTLE_OVERLAP, found.overlap, gate.overlap, f"{name}.overlap")
     return None
+
+
+def _noisy_limit(found: Agreement, gate: Gate, noise: Callable[[], float]) -> float:
+    """Largest violation allowed, given the noise of the submaps."""
+    if found.violation > NOISE_FACTOR * gate.violation:
+        return gate.violation
+    return min(NOISE_FACTOR * gate.violation, max(gate.violation, noise()))
 
 
 def _information_of_inverse(information: FloatArray, T_a_b: FloatArray) -> FloatArray:

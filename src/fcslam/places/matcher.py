@@ -14,7 +14,7 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.submap import Submap
-from fcslam.lidar.verification import Verification, VerificationConfig, verify
+from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig, verify
 from fcslam.places.index import PlaceIndex
 from fcslam.places.motions import Motion, MotionConfig, propose_motions
 from fcslam.places.query_result import QueryResult
@@ -94,6 +94,7 @@ class PlaceMatcher:
         submap_of: Callable[[Place], Submap],
         rng: np.random.Generator,
         on_forget: Callable[[Place], None] = lambda _: None,
+        noise_of: Callable[[Place], float] = lambda _: 0.0,
     ) -> None:
         """Start without places.
 
@@ -102,10 +103,12 @@ class PlaceMatcher:
             submap_of: the submap that a place was described on.
             rng: seeds the vocabulary.
             on_forget: called with each place that is forgotten.
+            noise_of: how much the submap of a place contradicts itself.
         """
         self._config = config
         self._submap_of = submap_of
         self._on_forget = on_forget
+        self._noise_of = noise_of
         self._places: dict[KeyscanId, Place] = {}
         self._index: PlaceIndex[KeyscanId] = PlaceIndex(config.vocabulary, rng)
         self._backlog: list[Place] = []
@@ -204,13 +207,13 @@ class PlaceMatcher:
         """
         stored = self._places[i]
         if place.channel is Channel.LIDAR:
-            check = verify(self._submap_of(stored), self._submap_of(place), T_i_j, self._config.verification)
+            check = self._verify(stored, place, T_i_j)
             return PlaceMatch(i, place.id, place.channel, result.similarity_of(i), check, predicted=True)
         proposed = propose_motions(stored, place, self._config.motions)
         motion = next((motion for motion in proposed if self._confirms(motion, T_i_j)), None)
         if motion is None:
             return self._best(stored, place, proposed, result)
-        check = self._verify(stored, place, motion)
+        check = self._verify(stored, place, motion.T_a_b, motion.information)
         return PlaceMatch(i, place.id, place.channel, result.similarity_of(i, motion.share), check, predicted=True)
 
     def _confirms(self, motion: Motion, T_i_j: FloatArray) -> bool:
@@ -230,11 +233,13 @@ class PlaceMatcher:
     ) -> PlaceMatch | None:
         if not proposed:
             return None
-        checks = [self._verify(stored, place, motion) for motion in proposed]
+        checks = [self._verify(stored, place, motion.T_a_b, motion.information) for motion in proposed]
         best = max(checks, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
         similarity = result.similarity_of(stored.id, proposed[0].share)
         return PlaceMatch(stored.id, place.id, place.channel, similarity, best, predicted=False)
 
-    def _verify(self, stored: Place, place: Place, motion: Motion) -> Verification:
+    def _verify(self, stored: Place, place: Place, guess: FloatArray, prior: FloatArray = NO_PRIOR) -> Verification:
         a, b = self._submap_of(stored), self._submap_of(place)
-        return verify(a, b, motion.T_a_b, self._config.verification, motion.information)
+        return verify(
+            a, b, guess, self._config.verification, prior, lambda: self._noise_of(stored) + self._noise_of(place)
+        )
