@@ -18,6 +18,8 @@ class Fault(StrEnum):
     BAD_BEAMS = "scans whose ranges do not fit their angles skipped"
     NO_ODOMETRY = "scans without odometry within 1 s skipped"
     HELD_ODOMETRY = "scans beyond the odometry's ends given its nearest pose"
+    FROZEN_ODOMETRY = "scans that change while the odometry stands still kept"
+    FROZEN_SCAN = "scans that stay the same while the odometry moves kept"
     ODOMETRY_GAP = "scans in gaps of the odometry of more than 1 s kept"
     MISPLACED_SCAN = "scans recorded far back in time skipped"
     TIME_REVERSAL = "steps back in time kept"

@@ -22,6 +22,7 @@ from fcslam.sources.bags.pairing import Entry, PosedImage, PosedScan
 from fcslam.sources.bags.stream import BagStream, RecordedLaser
 from fcslam.sources.bags.topics import agree_on_topics
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
+from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.images import check_image
@@ -75,6 +76,7 @@ class RosBag:
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = _audit()
+        watch = OdometryWatch(audit)
         reading = self._reading
         lasers, camera = reading.survey.lasers, reading.survey.camera
         for number, entry in self._entries(scans, audit, with_images=camera is not None):
@@ -82,7 +84,9 @@ class RosBag:
                 scan, upside_down = entry.scan, reading.upside_down[entry.scan.laser]
                 ranges_m = _turned(measured_ranges(scan), upside_down)
                 laser = lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
-                yield LaserScan(scan.stamp, ranges_m, laser, pose_array(entry.T_odom_base))
+                record = LaserScan(scan.stamp, ranges_m, laser, pose_array(entry.T_odom_base))
+                watch.add(number, record)
+                yield record
             elif isinstance(entry, OdometryReading):
                 yield Odometry(entry.stamp, pose_array(entry.T_odom_base))
             elif camera is not None:

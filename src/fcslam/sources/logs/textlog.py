@@ -17,6 +17,7 @@ import numpy as np
 
 from fcslam.errors import SourceError
 from fcslam.records import Beams, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, scan_window
 from fcslam.sources.logs.archive import numbered_lines
@@ -66,6 +67,7 @@ class TextLog:
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = Audit()
+        watch = OdometryWatch(audit)
         (laser,) = self._reading.survey.lasers
         for number, entry in self._entries(scans, audit):
             T_odom_base = pose_array(entry.T_odom_base)
@@ -77,7 +79,9 @@ class TextLog:
             except ValueError:
                 audit.add(Fault.BROKEN_LINE, number)
             else:
-                yield LaserScan(entry.line.stamp, ranges_m, laser.with_beams(entry.beams), T_odom_base)
+                scan = LaserScan(entry.line.stamp, ranges_m, laser.with_beams(entry.beams), T_odom_base)
+                watch.add(number, scan)
+                yield scan
 
     @cached_property
     def _reading(self) -> LogReading:

@@ -27,6 +27,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.runs import read_tum
+from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import ScanGate, check_consistency, scan_window
 from fcslam.sources.images import MAX_IMAGE_BYTES, check_image
@@ -87,6 +88,7 @@ class Recording:
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = _audit()
+        watch = OdometryWatch(audit)
         lasers, camera = self._survey.lasers, self._survey.camera
         with RangesFile(self._path) as ranges:
             for number, frame in self._entries(scans, audit):
@@ -97,7 +99,9 @@ class Recording:
                     except ValueError:
                         audit.add(Fault.BROKEN_RECORD, number)
                     else:
-                        yield LaserScan(frame.stamp, ranges_m, laser, pose_array(frame.T_odom_base))
+                        scan = LaserScan(frame.stamp, ranges_m, laser, pose_array(frame.T_odom_base))
+                        watch.add(number, scan)
+                        yield scan
                 elif frame.file is ODOMETRY_FILE:
                     yield Odometry(frame.stamp, pose_array(frame.T_odom_base))
                 elif camera is not None:

@@ -1,0 +1,97 @@
+"""Finds scans that contradict the odometry, so that a frozen encoder or scanner does not pass unnoticed.
+
+- The odometry stands still and the scan changes: most beams measure another range than when it began to stand.
+- The odometry moves and the scan stays: its ranges are those of the scan before to the last bit, or the odometry turned
+  and still all beams measure what they did. Travel alone proves nothing: along a corridor, scans stay the same.
+
+The scans are kept, as one sensor alone does not say which of both is wrong.
+"""
+
+from dataclasses import dataclass
+from math import hypot
+
+import numpy as np
+
+from fcslam.records import LaserScan, Ranges
+from fcslam.sources.faults import Audit, Fault
+from fcslam.sources.pose import Pose, relative_pose
+
+STILL_M, STILL_RAD = 0.005, 0.003
+"""Odometry that moved less stands still."""
+TURN_RAD = 0.35
+"""A turn that changes every scan, but in a round room."""
+CHANGE_M, CHANGE = 0.3, 0.05
+"""A range that differs by more, in metres and as a share of it, measures something else."""
+CHANGED, UNCHANGED = 0.6, 0.02
+"""Share of the beams that measure something else, if the scan changed and if it did not."""
+FEWEST_RETURNS = 20
+"""Scans with fewer common returns are not compared."""
+
+
+@dataclass(slots=True)
+class _Laser:
+    """What is remembered of one laser."""
+
+    last: LaserScan
+    rest: LaserScan
+    """The first scan where the odometry now stands."""
+    turn: LaserScan
+    """The scan from which the turn is counted."""
+
+
+class OdometryWatch:
+    """Compares the scans of one pass with their odometry."""
+
+    def __init__(self, audit: Audit) -> None:
+        self._audit = audit
+        self._lasers: dict[Pose, _Laser] = {}
+
+    def add(self, number: int, scan: LaserScan) -> None:
+        """Count what is wrong with the next scan, which is on line (or in message) ``number``."""
+        known = self._lasers.get(scan.laser.T_base_laser)
+        if known is None:
+            self._lasers[scan.laser.T_base_laser] = _Laser(scan, scan, scan)
+            return
+        if _is_still(known.rest, scan):
+            if _changed_share(known.rest, scan) > CHANGED:
+                self._audit.add(Fault.FROZEN_ODOMETRY, number)
+        else:
+            known.rest = scan
+        moved_m, turned_rad = _motion(known.turn, scan)
+        turned_without_change = turned_rad > TURN_RAD and _changed_share(known.turn, scan) < UNCHANGED
+        repeated = not _is_still(known.last, scan) and _is_repeated(known.last.ranges_m, scan.ranges_m)
+        if turned_without_change or repeated:
+            self._audit.add(Fault.FROZEN_SCAN, number)
+        if turned_rad > TURN_RAD or moved_m > CHANGE_M:
+            known.turn = scan
+        known.last = scan
+
+
+def _is_still(before: LaserScan, after: LaserScan) -> bool:
+    moved_m, turned_rad = _motion(before, after)
+    return moved_m < STILL_M and turned_rad < STILL_RAD
+
+
+def _motion(before: LaserScan, after: LaserScan) -> tuple[float, float]:
+    """Distance and turn by odometry."""
+    (x0, y0, theta0), (x1, y1, theta1) = before.T_odom_base.tolist(), after.T_odom_base.tolist()
+    x, y, theta = relative_pose((x0, y0, theta0), (x1, y1, theta1))
+    return hypot(x, y), abs(theta)
+
+
+def _is_repeated(before: Ranges, after: Ranges) -> bool:
+    returns = np.isfinite(after) & (after > 0.0)
+    return bool(np.count_nonzero(returns) >= FEWEST_RETURNS) and np.array_equal(before, after, equal_nan=True)
+
+
+def _changed_share(before: LaserScan, after: LaserScan) -> float:
+    """Share of the common returns that measure something else; NaN if there are too few."""
+    laser, was = after.laser, before.laser
+    beams = np.rint((laser.angles_rad() - was.angle_min_rad) / was.angle_increment_rad).astype(np.intp)
+    inside = (beams >= 0) & (beams < was.beam_count)
+    a, b = before.ranges_m[beams[inside]], after.ranges_m[inside]
+    with np.errstate(invalid="ignore"):  # NaN is no return
+        both = (a > 0.0) & (a < was.max_range_m) & (b > 0.0) & (b < laser.max_range_m)
+        changed = np.abs(a - b) > np.maximum(CHANGE_M, CHANGE * np.minimum(a, b))
+    count = np.count_nonzero(both)
+    return np.count_nonzero(changed & both) / count if count >= FEWEST_RETURNS else float("nan")
