@@ -19,6 +19,7 @@ from fcslam.config import Settings, dump
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.mapper import ScanPose
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.metrics.jumps import JumpLimits
 from fcslam.records import Keyscan, LaserScan, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.runs import Metric, Run, check_names
@@ -36,6 +37,7 @@ class MissionConfig(Settings):
     robot: RobotConfig = Field(default=RobotConfig(), description="settings of the robots")
     fleet: FleetConfig = Field(default=FleetConfig(), description="settings of the cloud")
     map: OccupancyConfig = Field(default=OccupancyConfig(), description="the occupancy grid")
+    jumps: JumpLimits = Field(default=JumpLimits(), description="limits of motion beyond which `fcslam map` warns")
 
 
 @dataclass(frozen=True, slots=True)

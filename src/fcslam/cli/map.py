@@ -101,7 +101,7 @@ def map_sources(
         display.start("writing")
         run.save(output, force)
     print_faults(console, sources)
-    _report(answers(), run, time.perf_counter() - began, output, settings.fleet.join_maps)
+    _report(answers(), run, time.perf_counter() - began, output, settings)
     return run
 
 
@@ -122,7 +122,7 @@ def _details(progress: "Progress", elapsed_s: float) -> str:
     return f"{speed:.0f} x real time, {sum(progress.closures.values())} closures, {progress.keyscans} keyscans"
 
 
-def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, joined: bool) -> None:
+def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, settings: "MissionConfig") -> None:
     from rich.table import Table
 
     from fcslam.cloud.sessions import robot_of
@@ -144,13 +144,24 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, join
         robot = robot_of(session.robot)
         if robot != session.robot:
             print_line(console, f"{session.robot}: {robot} was lost; this session begins at {session.stamps[0]:.3f} s")
-    maps = int(values["maps"])
+    _print_jumps(console, run, settings)
+    maps, joined = int(values["maps"]), settings.fleet.join_maps
     if maps > 1:
         print_line(console, f"{maps} maps" if joined else f"{maps} maps: one for each robot")
     if joined:
         _print_separations(console, run)
     for name in sorted(name for name in run.map_files if name.endswith(".png")):
         print_line(console, f"map: {output / name}")
+
+
+def _print_jumps(console: "Console", run: "Run", settings: "MissionConfig") -> None:
+    """Warn of every trajectory with steps that no robot can make."""
+    from fcslam.metrics.jumps import find_jumps
+
+    for trajectory in run.trajectories.values():
+        jumps = find_jumps(trajectory.stamps, trajectory.T_map_base, settings.jumps)
+        if jumps is not None:
+            print_line(console, f"warning: {trajectory.robot}: {jumps}; check the map there (limits: jumps.*)")
 
 
 def _print_separations(console: "Console", run: "Run") -> None:
