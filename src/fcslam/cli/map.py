@@ -169,8 +169,8 @@ def _print_separations(console: "Console", run: "Run") -> None:
     from fcslam.runs import separations
 
     apart = separations(run)
-    similar = [separation for separation in apart if separation.reason is not None]
-    for separation in similar:
+    unlike = [separation for separation in apart if separation.reason is None]
+    for separation in apart if len(unlike) == 1 else (one for one in apart if one not in unlike):
         print_line(console, str(separation))
-    if others := len(apart) - len(similar):
-        print_line(console, f"{others} {'other ' if similar else ''}pairs of maps: no two of their places look alike")
+    if len(unlike) > 1:
+        print_line(console, f"{len(unlike)} pairs of maps: no two of their places look alike")
