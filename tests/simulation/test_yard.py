@@ -41,8 +41,8 @@ def ahead(kind, distance_m, depth_m=0.2, wide_m=8.0):
 
 def scans(plan, count=400, laser=AHEAD):
     """The middle beam of many scans at HERE."""
-    caster, rng = OutdoorRayCaster(plan, laser), np.random.default_rng(0)
-    return np.array([caster.scan(HERE, rng)[1] for _ in range(count)])
+    caster, rng = OutdoorRayCaster(plan), np.random.default_rng(0)
+    return np.array([caster.scan(HERE, laser, rng)[1] for _ in range(count)])
 
 
 def ranges(robot):
@@ -120,10 +120,10 @@ def test_some_cars_drive_away():
 
 def test_a_trunk_is_met_at_its_bark():
     plan = meadow(Piece(PieceKind.TRUNK, disc(0.2) + HERE[:2] + (6.0, 0.0)))
-    assert OutdoorRayCaster(plan, AHEAD).cast(HERE)[1] == pytest.approx(5.8, abs=1e-9)
+    assert OutdoorRayCaster(plan).cast(HERE, AHEAD)[1] == pytest.approx(5.8, abs=1e-9)
     assert scans(plan, 20) == pytest.approx(5.8, abs=0.01)
     laser = LaserModel(3, np.pi - 0.001, 0.001, 30.0, T_base_laser=(0.3, 0.0, 0.0))
-    assert OutdoorRayCaster(plan, laser).cast(np.array([32.0, 20.0, 0.0]))[1] == pytest.approx(6.1, abs=1e-9)
+    assert OutdoorRayCaster(plan).cast(np.array([32.0, 20.0, 0.0]), laser)[1] == pytest.approx(6.1, abs=1e-9)
 
 
 def test_walls_are_met_where_lines_cross_them():
@@ -134,7 +134,7 @@ def test_walls_are_met_where_lines_cross_them():
     x, y = min(
         (np.mean(lane, axis=0) for lane in plan.lanes), key=lambda point: distances(point[None], bare.segments)[0]
     )
-    found = OutdoorRayCaster(bare, laser).cast(np.array([x, y, 0.4]))
+    found = OutdoorRayCaster(bare).cast(np.array([x, y, 0.4]), laser)
     met = found < 30.0
     assert np.sum(met) > 5
     ends = np.array([x, y]) + found[:, None] * np.column_stack([f(0.4 + laser.angles_rad()) for f in (np.cos, np.sin)])
@@ -161,8 +161,9 @@ def test_glass_returns_what_it_faces_and_else_lets_through_or_mirrors():
     assert scans(meadow(pane)) == pytest.approx(5.0, abs=0.01)
     beside = Piece(PieceKind.WALL, rectangle((9.0, 0.2), 0.0) + HERE[:2] + (0.0, 7.0))
     room = meadow(pane, ahead(PieceKind.WALL, 7.0, wide_m=14.0), beside)
-    caster, rng = OutdoorRayCaster(room, LaserModel(3, 0.499, 0.001, 30.0)), np.random.default_rng(1)
-    found = np.array([caster.scan(HERE, rng)[1] for _ in range(400)])
+    laser = LaserModel(3, 0.499, 0.001, 30.0)
+    caster, rng = OutdoorRayCaster(room), np.random.default_rng(1)
+    found = np.array([caster.scan(HERE, laser, rng)[1] for _ in range(400)])
     # The pane, what is behind it, and what stands beside the robot, seen in it.
     shares = [np.mean(np.abs(found - at) < 0.1) for at in (5.0 / np.cos(0.5), 7.0 / np.cos(0.5), 6.9 / np.sin(0.5))]
     assert shares == pytest.approx([0.2, 0.5, 0.3], abs=0.1)
@@ -211,7 +212,7 @@ def test_good_odometry_is_right_to_a_few_percent_and_slipping_odometry_slips():
 
 
 def test_scanners_of_less_than_a_turn_end_at_their_edges():
-    half, full = SICK.model((0.0, 0.0, 0.0)), LidarSettings().model((0.0, 0.0, 0.0))
+    (half,), (full,) = (settings.models((0.0, 0.0, 0.0)) for settings in (SICK, LidarSettings()))
     np.testing.assert_allclose(half.angles_rad()[[0, 90, 180]], [-np.pi / 2.0, 0.0, np.pi / 2.0], atol=1e-12)
     assert full.angles_rad()[0] == -np.pi
     assert all(a < b for a, b in pairwise(full.angles_rad()))

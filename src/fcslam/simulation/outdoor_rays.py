@@ -60,6 +60,7 @@ LAYERS: Final = {
     PieceKind.WALL: (Layer(0.0, 8.0, 1.0, 0.5),),
     PieceKind.GLASS: (Layer(0.0, 2.5, 1.0, 0.5, glass=True), Layer(2.5, 8.0, 1.0, 0.5)),
     PieceKind.COLUMN: (Layer(0.0, 4.0, 1.0, 0.5),),
+    PieceKind.CABINET: (Layer(0.0, 1.1, 1.0, 0.5),),
     PieceKind.TRUNK: (Layer(0.0, 3.0, 1.0, 0.3),),
     PieceKind.BOLLARD: (Layer(0.0, 0.9, 1.0, 0.5),),
     PieceKind.LOW_WALL: (Layer(0.0, 0.6, 1.0, 0.5),),

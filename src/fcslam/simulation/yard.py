@@ -1,7 +1,7 @@
 """A yard: buildings from outside, lawns, car parks and open ground, with ways between and around them.
 
 Blocks of 20 to 32 m lie in a grid; ways run along all of them and meet at their corners. Each block is a building, a
-lawn with trees, a car park or open ground. Lamps, rows of trees, hedges and parked cars stand beside the ways. Most
+lawn with trees, a car park or open ground. Lamps, trees, hedges, cars, signs and bins stand beside the ways. Most
 sides of the yard are closed by houses, a hedge, a fence or a low wall; beyond the others are a few trees, or nothing.
 Everything keeps clear of the ways.
 """
@@ -29,6 +29,7 @@ _FACADE_M = 0.3
 """Thickness of a facade."""
 _CAR_M, _BAY_M = (4.4, 1.8), (5.0, 2.6)
 """Length and width of a parked car and of its bay."""
+_BENCH_M = (1.8, 0.45)
 _PARKED = 0.65
 """Share of bays with a car."""
 
@@ -181,7 +182,7 @@ def _lawn(block: _Block, site: _Site) -> None:
     for centre in _scattered(block, int(rng.integers(0, 6)), 3.0, rng):
         _bush(centre, site)
     for centre in _scattered(block, int(rng.integers(0, 3)), 3.0, rng):
-        site.stand(PieceKind.LOW_WALL, rectangle((1.8, 0.45), rng.uniform(0.0, np.pi)) + centre)
+        site.stand(PieceKind.LOW_WALL, rectangle(_BENCH_M, rng.uniform(0.0, np.pi)) + centre)
     for side in rng.permutation(4)[: rng.integers(0, 3)]:
         _hedge(*_side(block, int(side), 1.0), site)
 
@@ -233,6 +234,24 @@ def _beside_ways(block: _Block, site: _Site) -> None:
             }[str(kind)]
             for centre in _spaced(start, end, spacing * rng.uniform(0.8, 1.25), spread, rng):
                 site.disc(piece, centre, radius * float(rng.uniform(0.7, 1.5)))
+        for centre in _spaced(start, end, 7.0, 2.0, rng):
+            _clutter(centre, site)
+
+
+def _clutter(centre: FloatArray, site: _Site) -> None:
+    """A traffic sign, a bin, a cabinet of a power line, a bench, a bush, or nothing."""
+    rng = site.rng
+    kind = rng.choice(("sign", "bin", "cabinet", "bench", "bush", "nothing"), p=(0.15, 0.12, 0.08, 0.08, 0.07, 0.5))
+    if kind == "sign":
+        site.disc(PieceKind.COLUMN, centre, 0.04)
+    elif kind == "bin":
+        site.disc(PieceKind.BOLLARD, centre, float(rng.uniform(0.2, 0.35)))
+    elif kind == "cabinet":
+        site.stand(PieceKind.CABINET, rectangle((float(rng.uniform(0.6, 1.4)), 0.35), rng.uniform(0.0, np.pi)) + centre)
+    elif kind == "bench":
+        site.stand(PieceKind.LOW_WALL, rectangle(_BENCH_M, rng.uniform(0.0, np.pi)) + centre)
+    elif kind == "bush":
+        _bush(centre, site)
 
 
 def _around(size_m: tuple[float, float], site: _Site) -> None:
@@ -242,7 +261,7 @@ def _around(size_m: tuple[float, float], site: _Site) -> None:
     kinds = ("hedge", "fence", "low wall", "trees", "facade", "nothing")
     for side in range(4):
         start, end = _side(inner, side, -float(rng.uniform(3.5, 6.0)))
-        kind = rng.choice(kinds, p=(0.2, 0.15, 0.15, 0.15, 0.2, 0.15))
+        kind = rng.choice(kinds, p=(0.2, 0.15, 0.15, 0.15, 0.15, 0.2))
         if kind == "hedge":
             _hedge(start, end, site)
         elif kind in ("fence", "low wall"):
