@@ -22,7 +22,7 @@ from fcslam.records import FloatArray
 Spectrum = NDArray[np.complex128]
 
 CELL_M = 0.25
-"""Cells of the exhaustive search."""
+"""Side of a cell of the exhaustive search."""
 WELL_INSIDE_M = 0.5
 """A point in free space farther than this from any surface contradicts it, in the exhaustive search."""
 VIOLATION_WEIGHT = 2.0
@@ -35,6 +35,7 @@ REFINED = 12
 """Best distinct transforms that are refined and scored exactly."""
 _REFINEMENT = MatchingConfig(wide_scale_m=0.4)
 _ALIGNED_POINTS = 800
+"""Points of a map that are aligned, about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,22 +86,23 @@ def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | No
     """
     if not len(a.surface) or not len(b.surface):
         return None
-    distinct: list[FloatArray] = []
+    middle = b.surface.points.mean(axis=0, keepdims=True)
+    distinct = [T_a_b]
     for _, pose in sorted(_coarse_peaks(a, b), key=lambda peak: -peak[0]):
-        if _is_elsewhere(pose, T_a_b, b) and all(_is_elsewhere(pose, other, b) for other in distinct):
+        if all(_is_elsewhere(pose, other, middle) for other in distinct):
             distinct.append(pose)
-        if len(distinct) == REFINED:
+        if len(distinct) > REFINED:
             break
-    refined = [align_map(a, b, pose) for pose in distinct]
-    return max((r for r in refined if _is_elsewhere(r.T_a_b, T_a_b, b)), key=lambda r: r.score_m, default=None)
+    refined = (align_map(a, b, pose) for pose in distinct[1:])
+    rivals = (rival for rival in refined if _is_elsewhere(rival.T_a_b, T_a_b, middle))
+    return max(rivals, key=lambda rival: rival.score_m, default=None)
 
 
-def _is_elsewhere(one: FloatArray, other: FloatArray, b: Submap) -> bool:
-    """Whether two transforms put the middle of b at two places, or turn it differently."""
-    middle = b.surface.points.mean(axis=0)
-    gap = se2.transform(one, middle[None]) - se2.transform(other, middle[None])
-    turn = abs((one[2] - other[2] + np.pi) % (2.0 * np.pi) - np.pi)
-    return bool(np.hypot(*gap[0]) > ELSEWHERE_M or turn > ELSEWHERE_RAD)
+def _is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool:
+    """Whether two transforms T_a_b put the middle (1, 2) of b at two places, or turn b differently."""
+    gap = se2.transform(one, middle) - se2.transform(other, middle)
+    turn = abs(se2.wrap_angle(one[2] - other[2]))
+    return bool(np.linalg.norm(gap) > ELSEWHERE_M or turn > ELSEWHERE_RAD)
 
 
 @dataclass(frozen=True, slots=True)
