@@ -214,3 +214,21 @@ def test_what_fails_does_not_count_as_received(scripted, monkeypatch):
     for _ in range(2):
         with pytest.raises(ZeroDivisionError):
             cloud.receive(data)
+
+
+def test_a_further_laser_may_be_announced_later(scripted):
+    """Keyscans of it are accepted from then on; those that were announced before stay."""
+    rear = replace(LASER, T_base_laser=(-0.2, 0.0, 3.0))
+    cloud = feed(scripted(SCRIPT), PACKETS[:HALF])
+    transport = InMemoryTransport(cloud.receive)
+    varied = replace(keyscan("a", NUMBER, NOW, beams=9), laser=1, beams=Beams(9, -np.pi, 2.0 * np.pi / 9))
+    versions = {Channel.LIDAR: "test-1"}
+    sent = [
+        (Hello("a", 0, (rear,), versions), "another laser"),
+        (Hello("a", 0, (LASER, rear), versions), None),
+        (Hello("a", 0, (LASER,), versions), "another laser"),
+        (varied, None),
+    ]
+    for after, (body, reason) in enumerate(sent):
+        refusal = transport.send(encode(next_packet(body, after))).refusal
+        assert (refusal is None) if reason is None else (reason in refusal)

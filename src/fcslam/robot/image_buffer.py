@@ -24,8 +24,8 @@ class KeyframeImage:
     keyscan: int
     encoded: bytes
     camera: CameraModel
-    surroundings: LidarView
-    """LiDAR returns in the base at the time of the image."""
+    surroundings: tuple[LidarView, ...]
+    """LiDAR returns of each laser in the base at the time of the image."""
     T_keyscan_image: FloatArray
     """Pose of the base at the time of the image in the keyscan's base, shape (3,), metres and radians."""
 

@@ -20,6 +20,9 @@ from fcslam.lidar.scan import point_scan
 from fcslam.records import CameraImage, Codes, DetectorFile, FloatArray, LaserScan, frozen
 from fcslam.robot.image_buffer import ImageBuffer, ImageBufferConfig, KeyframeImage
 
+SCAN_AGE_S = 1.0
+"""Scans of several lasers that are older than the newest by more are not combined with it."""
+
 
 class ViewsConfig(Settings):
     """Which images become places, and which are kept."""
@@ -71,6 +74,8 @@ class ViewExtractor:
         self._detector = make_detector(config.detector, config.orb, config.onnx)
         self._image_buffer = ImageBuffer(config.image_buffer)
         self._scan: LaserScan | None = None
+        self._scans: dict[tuple[float, float, float], LaserScan] = {}
+        """The newest scan of each laser, by its mounting."""
         self._pose: ScanPose | None = None
         self._last: tuple[int, FloatArray] | None = None
         """Keyscan and odometry of the last view."""
@@ -83,6 +88,7 @@ class ViewExtractor:
     def set_scan(self, scan: LaserScan, pose: ScanPose) -> None:
         """Set the newest scan and its pose."""
         self._scan, self._pose = scan, pose
+        self._scans[scan.laser.T_base_laser] = scan
 
     def describe(self, image: CameraImage) -> CameraView | None:
         """Describe the next image.
@@ -102,11 +108,11 @@ class ViewExtractor:
             return None
         self._last = self._pose.keyscan, odometry
         T_scan_image = se2.between(self._scan.T_odom_base, odometry)
-        returns = point_scan(self._scan.ranges_m, self._scan.laser)
-        spacing_rad = abs(self._scan.laser.angle_increment_rad)
-        ends = se2.transform(se2.inverse(T_scan_image), np.vstack((returns.origin, returns.points)))
         T_keyscan_image = se2.compose(self._pose.T_keyscan_base, T_scan_image)
-        surroundings = LidarView(ends[1:], ends[0], spacing_rad)
+        newest = self._scan.stamp
+        surroundings = tuple(
+            _lidar_view(scan, odometry) for scan in self._scans.values() if abs(newest - scan.stamp) <= SCAN_AGE_S
+        )
         keyframe = KeyframeImage(self._pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
         view = self._describe(keyframe, picture)
         if view is not None:
@@ -125,6 +131,7 @@ class ViewExtractor:
         """Start a new session: forget all scans and images."""
         self._image_buffer = ImageBuffer(self._config.image_buffer)
         self._scan = self._pose = self._last = None
+        self._scans = {}
 
     def describe_again(self) -> list[CameraView]:
         """Describe all buffered images with the present detector, oldest first."""
@@ -134,9 +141,11 @@ class ViewExtractor:
 
     def _describe(self, image: KeyframeImage, picture: GreyImage) -> CameraView | None:
         features = self._detector.detect(picture)
-        positions, placed = locate_keypoints(
-            features.keypoints_px, image.camera, image.surroundings, self._config.ceiling_m
-        )
+        positions, placed = np.zeros((len(features.keypoints_px), 3)), np.zeros(len(features.keypoints_px), np.bool_)
+        for seen in image.surroundings:  # what one laser does not see, another one may
+            found, is_found = locate_keypoints(features.keypoints_px, image.camera, seen, self._config.ceiling_m)
+            fresh = is_found & ~placed
+            positions[fresh], placed = found[fresh], placed | is_found
         if placed.sum() < self._config.fewest_keypoints:
             return None
         positions[:, :2] = se2.transform(image.T_keyscan_image, positions[:, :2])
@@ -151,3 +160,11 @@ class ViewExtractor:
         motion = se2.between(T_odom_last, T_odom_base)
         moved = np.hypot(motion[0], motion[1]) >= self._config.every_m or abs(motion[2]) >= self._config.every_rad
         return bool(moved) and keyscan > seen_from
+
+
+def _lidar_view(scan: LaserScan, T_odom_image: FloatArray) -> LidarView:
+    """A scan as seen from the robot's pose at an image, shape (3,), by odometry."""
+    returns = point_scan(scan.ranges_m, scan.laser)
+    T_image_scan = se2.inverse(se2.between(scan.T_odom_base, T_odom_image))
+    ends = se2.transform(T_image_scan, np.vstack((returns.origin, returns.points)))
+    return LidarView(ends[1:], ends[0], abs(scan.laser.angle_increment_rad))
