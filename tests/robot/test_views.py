@@ -91,6 +91,26 @@ def test_keypoints_lie_on_the_walls(seen):
         assert np.mean(distance < 0.08) > 0.9
 
 
+def test_a_rear_laser_does_not_hide_what_the_front_one_sees(seen):
+    """Each scan as one of half a turn ahead and one of half a turn behind, of which the newest tells nothing ahead."""
+    halves = []
+    for record in seen[0]:
+        if not isinstance(record, LaserScan):
+            halves.append(record)
+            continue
+        beams = record.laser.beam_count
+        ahead = slice(beams // 4, beams // 4 + beams // 2)
+        front = replace(record.laser, beam_count=beams // 2, angle_min_rad=-np.pi / 2)
+        rear = replace(front, T_base_laser=(0.0, 0.0, np.pi))
+        behind = np.roll(record.ranges_m, beams // 2)[ahead]
+        halves.append(replace(record, ranges_m=record.ranges_m[ahead], laser=front))
+        halves.append(replace(record, ranges_m=behind, laser=rear))
+    whole, both = (places(bodies_of(records)[0]) for records in (seen[0], halves))
+    assert len(both) >= len(whole) - 1 > 5
+    counts = [np.mean([len(place.keypoints) for place in found]) for found in (whole, both)]
+    assert counts[1] > 0.9 * counts[0]
+
+
 def test_a_robot_that_stands_still_sees_nothing_new(seen):
     records = seen[0][: EVERY + 2]
     last = records[-1]
