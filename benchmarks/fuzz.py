@@ -25,6 +25,7 @@ from google.protobuf.message import DecodeError, Message
 
 from fcslam.errors import PacketError
 from fcslam.records import (
+    Beams,
     Channel,
     Constraint,
     ConstraintKind,
@@ -165,6 +166,8 @@ def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
     walk = np.abs(np.cumsum(rng.integers(-40, 41, 2 * size)))[: min(2 * size, MAXIMUM_BEAMS)]
     yield Keyscan(KeyscanId("alice", size), 1e9, dequantise((walk % 65536).astype(np.uint16)))
     yield Keyscan(KeyscanId("alice", size), 1e9, dequantise(rng.integers(0, 65536, size).astype(np.uint16)))
+    beams = Beams(size, -3.0, 0.0009)
+    yield Keyscan(KeyscanId("alice", size), 1e9, dequantise(np.full(size, 500, np.uint16)), laser=1, beams=beams)
     spread = rng.normal(size=(3, 3))
     information = spread @ spread.T + np.eye(3)
     motion = rng.uniform(-3.0, 3.0, 3)

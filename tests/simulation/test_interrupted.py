@@ -30,7 +30,7 @@ def files(folder):
 
 def spoil(folder, tail):
     """What a crash in the middle of a write leaves."""
-    for name in ("scans.bin", "images.bin", "ground_truth.tum"):
+    for name in ("scans.bin", "ranges.bin", "images.bin", "ground_truth.tum"):
         if (folder / name).exists():
             with (folder / name).open("ab") as file:
                 file.write(tail)
@@ -45,7 +45,7 @@ def interrupted_and_resumed(robot, folder, items, tail, monkeypatch):
     made = []
     cast, take = RayCaster.cast, Camera.take
     with monkeypatch.context() as patch:
-        patch.setattr(RayCaster, "cast", lambda self, pose: made.append("scan") or cast(self, pose))
+        patch.setattr(RayCaster, "cast", lambda self, pose, laser: made.append("scan") or cast(self, pose, laser))
         patch.setattr(Camera, "take", lambda self, pose: made.append("image") or take(self, pose))
         record_robot(robot, folder, resume=True)
     return made

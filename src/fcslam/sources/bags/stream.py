@@ -186,13 +186,13 @@ class BagStream:
 
     def _reason(self, topic: Topic) -> str:
         """What is wrong with the first scan, if its angles are."""
-        message = next(iter(self._bag.messages([topic])))
-        try:
-            scan_of(self._bag.decode(message), message.bag_time_ns)
-        except BeamsError as error:
-            return f" ({error})"
-        except ValueError:
-            pass
+        for message in islice(self._bag.messages([topic]), 1):
+            try:
+                scan_of(self._bag.decode(message), message.bag_time_ns)
+            except BeamsError as error:
+                return f" ({error})"
+            except ValueError:
+                break
         return ""
 
     def _image_in(self, message: RawMessage) -> ImageMessage:
