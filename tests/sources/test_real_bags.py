@@ -27,7 +27,7 @@ def test_published_bags_hold_what_their_description_says(bag, shape, path_m, dur
     start = time.process_time()
     source = open_source(DATA / f"rosbag1/{bag}.sort.bag")
     survey = source.survey()
-    assert (survey.scan_count, survey.beam_count) == shape
+    assert (survey.scan_count, survey.lasers[0].beam_count) == shape
     assert survey.path_length_m == pytest.approx(path_m, rel=0.01)
     assert survey.duration_s == pytest.approx(duration_s, abs=1.0)
     assert survey.lasers[0].T_base_laser == pytest.approx((laser_x_m, 0.0, 0.0), abs=1e-4)

@@ -39,7 +39,7 @@ pytestmark = [
 def test_logs_hold_what_their_description_says(log, shape, path_m, duration_s, laser_x_m):
     source = open_source(DATA / log)
     survey = source.survey()
-    assert (survey.scan_count, survey.beam_count) == shape
+    assert (survey.scan_count, survey.lasers[0].beam_count) == shape
     assert survey.path_length_m == pytest.approx(path_m, rel=0.01)
     assert survey.duration_s == pytest.approx(duration_s, abs=1.0)
     assert survey.lasers[0].T_base_laser == pytest.approx((laser_x_m, 0.0, 0.0), abs=1e-4)
