@@ -6,7 +6,8 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.mapper import LidarConfig, Mapper, motion_information
-from fcslam.lidar.tracker import OdometryConfig, TrackedScan
+from fcslam.lidar.odometry import OdometryConfig
+from fcslam.lidar.tracker import TrackedScan
 from fcslam.records import ConstraintKind
 from tests.lidar.worlds import box, drifting, drive, path, pose_errors, recording, ring, ring_drive, shifted
 

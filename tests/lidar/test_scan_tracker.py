@@ -9,7 +9,19 @@ from fcslam.geometry import se2
 from fcslam.lidar.field import TABLE
 from fcslam.lidar.tracker import ScanTracker, TrackerConfig
 from fcslam.records import LaserModel, frozen
-from tests.lidar.worlds import LASER, box, corridor, drifting, drive, pose_errors, recording, ring, ring_drive
+from tests.lidar.worlds import (
+    LASER,
+    box,
+    corridor,
+    drifting,
+    drive,
+    path,
+    pose_errors,
+    recording,
+    ring,
+    ring_drive,
+    shifted,
+)
 
 KEYSCAN_M, KEYSCAN_RAD = 0.25, 0.25
 
@@ -66,6 +78,43 @@ def test_a_slip_is_recovered(truth, odometry, slip):
     shift, turn = pose_errors(track(scans)[0], truth[:260])
     assert shift[201:].max() < 0.05
     assert np.rad2deg(turn[201:].max()) < 0.5
+
+
+def true_steps(truth, rng, noise_m=0.002, noise_rad=0.001):
+    """Odometry (N, 3) that is right to a few millimetres a step."""
+    motions = se2.relative(truth) + rng.normal(size=(len(truth) - 1, 3)) * (noise_m, noise_m, noise_rad)
+    chain = [np.zeros(3)]
+    for motion in motions:
+        chain.append(se2.compose(chain[-1], motion))
+    return np.array(chain)
+
+
+def yard(moved=(0.0, 0.0)):
+    """A wall with recesses on one side; on the other a row of parked trucks, all of which may have moved on."""
+    wall = path(*[(x + dx, -4.0 - dy) for x in range(-8, 9, 4) for dx, dy in ((0, 0), (1.5, 0), (1.5, 1), (2.5, 1))])
+    trucks = [box(x, 3.0, x + 2.4, 4.5) for x in (-11.0, -7.2, -4.0, 0.3, 3.4, 7.0, 11.1, 14.4)]
+    return np.vstack((wall, *(shifted(truck, *moved) for truck in trucks)))
+
+
+@pytest.mark.parametrize("moved", [(0.6, 0.4), (0.4, 0.4)])
+def test_right_odometry_is_not_overruled_by_what_moved(moved):
+    """After the change most of what is seen fits better where the robot is not."""
+    truth = drive([(-4.0, 1.2), (4.0, 1.2)])
+    odometry = true_steps(truth, np.random.default_rng(4))
+    scans = recording(truth, odometry, yard())
+    scans[-1] = recording(truth[-1:], odometry[-1:], yard(moved), seed=9)[0]
+    shift, turn = pose_errors(track(scans)[0], truth)
+    assert shift.max() < 0.10
+    assert np.rad2deg(turn.max()) < 1.0
+
+
+@pytest.mark.parametrize("slip", [(0.7, 0.0, 0.0), (-0.4, 0.0, np.deg2rad(10)), (0.0, 0.3, np.deg2rad(-6))])
+def test_odometry_that_was_right_is_overruled_by_a_clear_scan(slip):
+    truth = drive([(-4.0, 1.2), (4.0, 1.2)])
+    odometry = slipped(true_steps(truth, np.random.default_rng(5)), 60, slip)
+    shift, turn = pose_errors(track(recording(truth, odometry, yard()))[0], truth)
+    assert shift.max() < 0.10
+    assert np.rad2deg(turn.max()) < 1.0
 
 
 @pytest.mark.slow

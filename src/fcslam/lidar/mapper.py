@@ -14,16 +14,10 @@ from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LocalClosure, LoopCloser
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.lasers import Lasers
+from fcslam.lidar.odometry import OdometryConfig, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.lidar.tracker import (
-    OdometryConfig,
-    ScanTracker,
-    TrackedScan,
-    TrackerConfig,
-    TrackingResult,
-    odometry_information,
-)
+from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackerConfig, TrackingResult
 from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import (
     Constraint,
@@ -305,7 +299,7 @@ def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: Odome
     sigma_rad = ODOMETRY_SIGMA_RAD + ODOMETRY_SIGMA_PER_TURN * turned
     prior = np.diag((sigma_m**-2, sigma_m**-2, sigma_rad**-2))
     if not tracked.information.any():  # odometry alone, and the wheels may have slipped
-        prior = odometry_information(moved, turned, odometry)
+        prior = odometry_error(moved, turned, odometry).information
     covariance = np.linalg.inv(POINT_INFORMATION_SHARE * turn.T @ tracked.information @ turn + prior)
     floor_m = FLOOR_SIGMA_M + FLOOR_SIGMA_PER_TRAVEL * moved
     floor_rad = FLOOR_SIGMA_RAD + FLOOR_SIGMA_PER_TURN * turned

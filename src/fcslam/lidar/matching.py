@@ -27,6 +27,12 @@ DAMPING: Final = 1e-6
 SMALL_STEP_M: Final = 2e-4
 SMALL_STEP_RAD: Final = 1e-4
 """A smaller step means that Gauss-Newton has converged at the present scale of the loss."""
+INLIER_SIGMA_M: Final = 0.06
+"""Standard deviation of a point's distance to its surface, for the likelihood of a scan."""
+INLIER_RATIO: Final = 20.0
+"""Density of points on their surface relative to that of outliers."""
+INDEPENDENT: Final = 0.2
+"""Share of the points' log-likelihood that counts: errors of neighbouring points are correlated, five count as one."""
 SHRINK: Final = 0.6
 FAST_SHRINK: Final = 0.35
 """Factor of the loss scale after each step; the fast one after a small step."""
@@ -209,3 +215,42 @@ def _explained(scan, pose, field, limit):  # type: ignore[no-untyped-def]
             explained += 1
     n = max(1, len(points))
     return explained / n, known / n
+
+
+def scan_log_likelihood(scan: PointScan, field: SurfelField, T_field_base: FloatArray) -> float:
+    """Log-likelihood of a scan at a pose, relative to a scan without a point on a surface.
+
+    Each point lies on its nearest surface, with a normally distributed distance, or is an outlier.
+
+    Args:
+        scan: points in ``base``.
+        field: surfaces.
+        T_field_base: the pose, shape (3,), metres and radians.
+    """
+    points = _Points(scan.points, scan.normals, scan.solitary, scan.origin)
+    return INDEPENDENT * float(_log_likelihood(points, T_field_base, field.arrays))
+
+
+@njit(cache=True)
+def _log_likelihood(scan, pose, field):  # type: ignore[no-untyped-def]
+    points, normals, surfels = scan.points, scan.normals, field.surfels
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    total = 0.0
+    for i in range(len(points)):
+        x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
+        y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
+        label = label_at(x, y, field)
+        if label == EMPTY:
+            continue
+        s = surfels[label]
+        mx = cos * normals[i, 0] - sin * normals[i, 1]
+        my = sin * normals[i, 0] + cos * normals[i, 1]
+        if s[2] * mx + s[3] * my < OPPOSED:
+            continue
+        dx, dy = x - s[0], y - s[1]
+        d2 = dx * dx + dy * dy
+        if s[2] != 0.0 or s[3] != 0.0:
+            e = s[2] * dx + s[3] * dy
+            d2 = e * e + ALONG * (d2 - e * e)
+        total += np.log1p(INLIER_RATIO * np.exp(-0.5 * d2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))
+    return total

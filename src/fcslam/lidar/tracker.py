@@ -1,6 +1,7 @@
 """Scan-to-submap tracking: every scan is matched; odometry only starts the match and steadies it."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from pydantic import Field
@@ -9,33 +10,18 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
 from fcslam.lidar.field import SurfelField
-from fcslam.lidar.matching import MatchingConfig, ScanMatch, match_scan
+from fcslam.lidar.matching import MatchingConfig, ScanMatch, match_scan, scan_log_likelihood
+from fcslam.lidar.odometry import OdometryConfig, OdometryError, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan
 
-SEARCH_GAIN = 0.05
-"""A search result replaces the match near odometry only if it explains this much more of the scan (share of points)."""
+GOOD_SHARE, GOOD_KNOWN, GOOD_SIGMA_M = 0.8, 0.5, 0.01
+"""A good match explains this share of the points in known area, which are this share of all, and its points fix the
+position to this many metres in every direction: odometry is judged by it."""
+SEARCH_GAIN = 3.0
+"""The result of a search replaces a match near odometry only if its log-probability is higher by this: the best of many
+poses explains some points by chance."""
 _NO_INFORMATION = np.zeros((3, 3))
-
-
-class OdometryConfig(Settings):
-    """Error of the wheel odometry since the last match, as the sum of a constant, a share of the travel and a share of
-    the turn. The defaults trust it little: wheels may slip by a third of the way."""
-
-    position_m: float = Field(default=0.02, gt=0, description="standard deviation of the position, constant part [m]")
-    position_per_travel: float = Field(
-        default=0.3, ge=0, description="standard deviation of the position per metre of travel [m/m]"
-    )
-    position_per_turn_m: float = Field(
-        default=0.05, ge=0, description="standard deviation of the position per radian of turn [m/rad]"
-    )
-    heading_rad: float = Field(default=0.02, gt=0, description="standard deviation of the heading, constant part [rad]")
-    heading_per_turn: float = Field(
-        default=0.2, ge=0, description="standard deviation of the heading per radian of turn [rad/rad]"
-    )
-    heading_per_travel_rad: float = Field(
-        default=0.05, ge=0, description="standard deviation of the heading per metre of travel [rad/m]"
-    )
 
 
 class TrackerConfig(Settings):
@@ -76,13 +62,11 @@ class TrackerConfig(Settings):
     search_angle_rad: float = Field(
         default=0.5, gt=0, description="half angle of the window of the correlative search [rad]"
     )
-    step_m: float = Field(
-        default=0.20, gt=0, description="a match farther than this from odometry starts a correlative search [m]"
-    )
-    step_rad: float = Field(
-        default=0.07,
+    surprise: float = Field(
+        default=4.0,
         gt=0,
-        description="a match turned by more than this from odometry starts a correlative search [rad]",
+        description="a match farther than this from odometry, in learned standard deviations of odometry's error, "
+        "starts a correlative search",
     )
     odometry: OdometryConfig = Field(default=OdometryConfig(), description="error of the wheel odometry")
     matching: MatchingConfig = Field(default=MatchingConfig(), description="Gauss-Newton scan matching")
@@ -119,6 +103,8 @@ class TrackingResult:
     """Turn since the last accepted match, by odometry; 0 if this one is accepted."""
     matched_here: frozenset[tuple[float, float, float]]
     """Mountings of the lasers whose scans were matched since the robot last moved."""
+    trust: OdometryTrust
+    """Trust in odometry, learned from all matches up to this one."""
 
 
 class ScanTracker:
@@ -136,6 +122,7 @@ class ScanTracker:
         self._moved_m = 0.0
         self._turned_rad = 0.0
         self._matched_here: frozenset[tuple[float, float, float]] = frozenset()
+        self._trust = OdometryTrust()
 
     def track(self, scan: LaserScan) -> TrackedScan:
         """Localize the next scan and continue from there."""
@@ -152,22 +139,28 @@ class ScanTracker:
         matched_here = (self._matched_here if is_still else frozenset()) | {scan.laser.T_base_laser}
         if self._fields and is_still and matched_here == self._matched_here:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, None)
-            return TrackingResult(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad, matched_here)
+            unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
+            return TrackingResult(tracked, *unmatched, matched_here, self._trust)
         # 2. Scan to points.
         points = point_scan(scan.ranges_m, scan.laser)
         if not self._fields:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
-            return TrackingResult(tracked, np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad, matched_here)
+            unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
+            return TrackingResult(tracked, *unmatched, matched_here, self._trust)
         # 3. Scan matching; a doubtful match starts a correlative search.
-        prior = odometry_information(moved_m, turned_rad, config.odometry)
-        match = self._match(points, T_local_guess, prior)
+        error = odometry_error(moved_m, turned_rad, config.odometry)
+        match = self._match(points, T_local_guess, error)
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < config.supported:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
-            known = match.explained, match.known
-            return TrackingResult(tracked, *known, scan.T_odom_base, moved_m, turned_rad, self._matched_here)
+            rejected = match.explained, match.known, scan.T_odom_base, moved_m, turned_rad
+            return TrackingResult(tracked, *rejected, self._matched_here, self._trust)
         tracked = TrackedScan(match.T_field_base, match.information, points)
-        return TrackingResult(tracked, match.explained, match.known, scan.T_odom_base, 0.0, 0.0, matched_here)
+        # 5. A good match shows how far odometry can be trusted.
+        innovation = se2.between(T_local_guess, match.T_field_base)
+        trust = self._trust.learn(innovation, error) if _is_good(match) else self._trust
+        accepted = match.explained, match.known, scan.T_odom_base, 0.0, 0.0
+        return TrackingResult(tracked, *accepted, matched_here, trust)
 
     def commit(self, result: TrackingResult) -> None:
         """Continue from the pose that :meth:`localize` found."""
@@ -175,6 +168,7 @@ class ScanTracker:
         self._T_odom_base = result.T_odom_base
         self._moved_m, self._turned_rad = result.moved_m, result.turned_rad
         self._matched_here = result.matched_here
+        self._trust = result.trust
 
     def insert(self, points: PointScan, T_local_base: FloatArray, laser_count: int = 1) -> None:
         """Add a keyscan to the running buffer.
@@ -200,39 +194,32 @@ class ScanTracker:
         moved_m = self._moved_m + float(np.hypot(motion[0], motion[1]))
         return se2.compose(self._T_local_base, motion), moved_m, self._turned_rad + abs(float(motion[2]))
 
-    def _match(self, points: PointScan, T_local_guess: FloatArray, prior: FloatArray) -> ScanMatch:
-        """Gauss-Newton from the guess; a correlative search if the result is doubtful."""
+    def _match(self, points: PointScan, T_local_guess: FloatArray, error: OdometryError) -> ScanMatch:
+        """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match."""
         config, field = self._config, self._fields[0][0]
         thinned = points.thinned(config.point_spacing_m, config.point_limit)
-        match = match_scan(thinned, field, T_local_guess, prior, config.matching)
-        if self._is_doubtful(match, T_local_guess):
-            window = SearchWindow(config.search_radius_m, config.search_angle_rad)
-            found = search(points, field, T_local_guess, window, config.search, visible_only=True)
-            other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching)
-            if other.explained > match.explained + SEARCH_GAIN:
-                match = other
-        return match
-
-    def _is_doubtful(self, match: ScanMatch, T_local_guess: FloatArray) -> bool:
-        step = se2.between(T_local_guess, match.T_field_base)
-        return bool(
-            match.explained < self._config.doubtful * match.known
-            or np.hypot(step[0], step[1]) > self._config.step_m
-            or abs(step[2]) > self._config.step_rad
-        )
+        learned = self._trust.scale(error)
+        match = match_scan(thinned, field, T_local_guess, error.information, config.matching)
+        surprise2 = learned.mahalanobis2(se2.between(T_local_guess, match.T_field_base))
+        if match.explained >= config.doubtful * match.known and surprise2 < config.surprise**2:
+            return match
+        log_posterior = partial(_log_posterior, thinned, field, T_local_guess, learned)
+        window = SearchWindow(config.search_radius_m, config.search_angle_rad)
+        found = search(points, field, T_local_guess, window, config.search, visible_only=True)
+        other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching)
+        return other if log_posterior(other) > log_posterior(match) + SEARCH_GAIN else match
 
 
-def odometry_information(moved_m: float, turned_rad: float, config: OdometryConfig) -> FloatArray:
-    """Information of a motion that only wheel odometry measured.
+def _log_posterior(
+    scan: PointScan, field: SurfelField, T_local_guess: FloatArray, error: OdometryError, match: ScanMatch
+) -> float:
+    """Log-probability of a match, from its points and from odometry, relative to one that explains nothing."""
+    innovation = se2.between(T_local_guess, match.T_field_base)
+    return scan_log_likelihood(scan, field, match.T_field_base) + error.log_likelihood(innovation)
 
-    Args:
-        moved_m: travel, metres.
-        turned_rad: turn, radians, not negative.
-        config: error of the odometry.
 
-    Returns:
-        Diagonal information matrix over (x, y, theta), shape (3, 3); the same in every coordinate frame of the plane.
-    """
-    sigma_m = config.position_m + config.position_per_travel * moved_m + config.position_per_turn_m * turned_rad
-    sigma_rad = config.heading_rad + config.heading_per_turn * turned_rad + config.heading_per_travel_rad * moved_m
-    return np.diag((sigma_m**-2, sigma_m**-2, sigma_rad**-2))
+def _is_good(match: ScanMatch) -> bool:
+    """Whether a match is clear enough to judge odometry by it."""
+    weakest = float(np.linalg.eigvalsh(match.information[:2, :2])[0])
+    explains = match.explained >= GOOD_SHARE * match.known and match.known >= GOOD_KNOWN
+    return explains and weakest * GOOD_SIGMA_M**2 >= 1.0

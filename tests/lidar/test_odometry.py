@@ -1,0 +1,62 @@
+"""Trust in odometry follows how far it was right; slips hardly change it."""
+
+import numpy as np
+import pytest
+
+from fcslam.lidar.odometry import LEAST_TRUST, OdometryConfig, OdometryError, OdometryTrust, odometry_error
+
+MODEL = OdometryError(0.05, 0.03)
+
+
+def learned(innovations):
+    trust = OdometryTrust()
+    for innovation in innovations:
+        trust = trust.learn(innovation, MODEL)
+    return trust
+
+
+def innovations(rng, position, heading, count=600):
+    return rng.normal(size=(count, 3)) * (position * 0.05, position * 0.05, heading * 0.03)
+
+
+def test_the_error_grows_with_travel_and_turn():
+    config = OdometryConfig()
+    still = odometry_error(0.0, 0.0, config)
+    assert still == (config.position_m, config.heading_rad)
+    assert odometry_error(1.0, 0.5, config) > odometry_error(0.5, 0.5, config) > still
+
+
+def test_translation_and_rotation_are_learned_separately():
+    trust = learned(innovations(np.random.default_rng(1), position=0.3, heading=1.5))
+    # The scale of a t distribution differs from the standard deviation of the normal one that it is fitted to.
+    assert 0.5 < trust.position / 0.3 < 1.3
+    assert 0.5 < trust.heading / 1.5 < 1.3
+    assert trust.matches == 600
+
+
+def test_slips_are_outliers():
+    rng = np.random.default_rng(2)
+    good = innovations(rng, position=0.3, heading=0.3)
+    slips = np.where(rng.random(len(good)) < 0.05, 1.0, 0.0)[:, None] * (0.7, 0.0, 0.2)
+    clean, slipping = learned(good), learned(good + slips)
+    assert slipping.position < 1.3 * clean.position
+    assert slipping.heading < 1.3 * clean.heading
+
+
+def test_odometry_that_gets_worse_loses_trust():
+    rng = np.random.default_rng(3)
+    trust = learned(np.vstack((innovations(rng, 0.2, 0.2), innovations(rng, 2.0, 2.0, count=1000))))
+    assert min(trust.position, trust.heading) > 0.6
+
+
+def test_trust_in_perfect_odometry_is_bounded():
+    trust = learned(np.zeros((2000, 3)))
+    assert trust.position == trust.heading == LEAST_TRUST
+
+
+def test_the_likelihood_has_heavy_tails():
+    """Ten standard deviations cost a few nats, not fifty: clear scans must be able to overrule odometry."""
+    assert MODEL.log_likelihood(np.zeros(3)) == 0.0
+    near, far = (MODEL.log_likelihood(np.array((k * 0.05, 0.0, 0.0))) for k in (1.0, 10.0))
+    assert -15.0 < far < near < 0.0
+    assert MODEL.mahalanobis2(np.array((0.05, 0.05, -0.03))) == pytest.approx(3.0)
