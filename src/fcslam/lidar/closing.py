@@ -2,11 +2,14 @@
 
 The error allowed for in the estimate grows with the shortest path through the pose graph (odometry and accepted
 closures), not with time: after a closure the search is narrow again. A wide search covers
-the whole window by branch and bound.
+the whole window by branch and bound. Where the error may exceed the largest window, place recognition proposes the
+earlier submaps and the motions to them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import combinations
+from typing import Protocol
 
 import numpy as np
 from pydantic import Field
@@ -48,6 +51,8 @@ LOOP_M, LOOP_PER_M = 0.25, 0.02
 """Two closures are consistent if their loop closes to this many metres, plus so many per metre of path in it."""
 LOOP_RAD, LOOP_RAD_PER_M = 0.05, 0.002
 """The same for the heading, in radians and radians per metre."""
+SIMILAR_PLACES = 24
+"""Most similar earlier submaps among which the places to compare are chosen."""
 
 
 class ClosingConfig(Settings):
@@ -75,6 +80,12 @@ class ClosingConfig(Settings):
     widest_rad: float = Field(default=0.7, gt=0, description="largest half angle of the search window [rad]")
     least_score: float = Field(
         default=0.5, ge=0, le=1, description="least mean likelihood of the points that a search must reach"
+    )
+    recognized_drift: float = Field(
+        default=0.25,
+        ge=0,
+        description="largest drift of the position, per metre of path through the graph, at which place recognition "
+        "still closes a loop that is out of the search's reach; 0 turns it off [m/m]",
     )
 
 
@@ -112,11 +123,31 @@ class LocalClosure:
         return self.innovation_m > SURPRISE_M or abs(self.innovation[2]) > SURPRISE_RAD
 
 
+class PlaceRecognizer(Protocol):
+    """Recognises the places of one robot by their looks. Submaps are named by the keyscan of their anchor."""
+
+    def store(self, keyscan: int, surface: FloatArray) -> None:
+        """Store a submap by the points of its surfaces in the anchor's base, shape (N, 2), metres."""
+
+    def most_similar(self, keyscan: int, among: Collection[int], most: int) -> list[int]:
+        """At most ``most`` of these stored submaps that look like a stored one, the most similar first."""
+
+    def motions(self, a: int, b: int) -> list[FloatArray]:
+        """Motions ``T_a_b``, shape (3,), that the keypoints of two stored submaps support, the best first."""
+
+
 class LoopCloser:
     """Collects the submaps of one robot and decides which closures between them are accepted."""
 
-    def __init__(self, config: ClosingConfig, search_config: SearchConfig, verification: VerificationConfig) -> None:
+    def __init__(
+        self,
+        config: ClosingConfig,
+        search_config: SearchConfig,
+        verification: VerificationConfig,
+        recognizer: PlaceRecognizer | None = None,
+    ) -> None:
         self._config = config
+        self._recognizer = recognizer
         self._search = search_config
         self._verification = verification
         self.submaps: list[AnchoredSubmap] = []
@@ -147,7 +178,7 @@ class LoopCloser:
             for earlier in self._candidates(later, anchors, paths)
             if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
         ]
-        return self._accept(found, anchors)
+        return self._accept(found, self._recognized(later, anchors, paths), anchors)
 
     def _paths_from(self, later: int) -> FloatArray:
         """Shortest path through the pose graph from one submap to every other, metres, shape (S,)."""
@@ -204,10 +235,62 @@ class LoopCloser:
             return None
         return LocalClosure(earlier, later, check, innovation, radius)
 
-    def _accept(self, found: list[LocalClosure], anchors: FloatArray) -> list[LocalClosure]:
+    def _recognized(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[LocalClosure]:
+        """The best closure that place recognition proposes beyond the search's reach.
+
+        Nothing predicts it, so a submap that fits two parts of the map proves neither, and gives none.
+        """
+        if self._recognizer is None:
+            return []
+        newest = self.submaps[later]
+        self._recognizer.store(newest.keyscan, newest.submap.surface.points)
+        found = [
+            closure
+            for earlier in self._lookalikes(self._recognizer, later, anchors, paths)
+            for guess in self._recognizer.motions(self.submaps[earlier].keyscan, newest.keyscan)
+            if (closure := self._check(earlier, later, anchors, paths[earlier], guess)) is not None
+        ]
+        if not all(self._are_consistent(a, b, anchors) for a, b in combinations(found, 2)):
+            return []
+        return sorted(found, key=lambda c: (c.check.support, c.check.worse.overlap))[-1:]
+
+    def _lookalikes(
+        self, recognizer: PlaceRecognizer, later: int, anchors: FloatArray, paths: FloatArray
+    ) -> list[int]:
+        """The most similar places beyond the search's reach, ``sight_m`` of travel apart from each other."""
+        config = self._config
+        travel = np.array([submap.travel_m for submap in self.submaps])
+        distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
+        unsure = paths > min(config.widest_m / config.drift, config.widest_rad / config.drift_rad_m)
+        possible = distance < config.sight_m + config.recognized_drift * paths
+        eligible = np.flatnonzero(unsure & possible & (travel[later] - travel > config.gap_m))
+        number = {self.submaps[k].keyscan: int(k) for k in eligible}
+        chosen: list[int] = []
+        for keyscan in recognizer.most_similar(self.submaps[later].keyscan, number, SIMILAR_PLACES) if number else ():
+            k = number[keyscan]
+            if all(abs(travel[k] - travel[other]) > config.sight_m for other in chosen):
+                chosen.append(k)
+        return chosen[: config.candidates]
+
+    def _check(
+        self, earlier: int, later: int, anchors: FloatArray, path_m: float, guess: FloatArray
+    ) -> LocalClosure | None:
+        """Verify a recognised place; None if it is another one, or if no drift explains where it is."""
+        check = verify(self.submaps[earlier].submap, self.submaps[later].submap, guess, self._verification)
+        innovation = se2.between(se2.between(anchors[earlier], anchors[later]), check.T_a_b)
+        allowed_m = self._config.recognized_drift * path_m
+        if not (check.loose or check.support) or np.hypot(innovation[0], innovation[1]) > allowed_m:
+            return None
+        return LocalClosure(earlier, later, check, innovation, allowed_m)
+
+    def _accept(
+        self, found: list[LocalClosure], recognized: list[LocalClosure], anchors: FloatArray
+    ) -> list[LocalClosure]:
         """Accept expected and conclusive closures at once; others wait until enough of them are consistent."""
         accepted = [c for c in found if self._is_expected(c) or self._is_conclusive(c)]
-        self._pending += [c for c in found if c not in accepted and c.check.support]
+        pairs = {(c.earlier, c.later) for c in found}
+        fresh = [c for c in recognized if (c.earlier, c.later) not in pairs]
+        self._pending += [c for c in (*found, *fresh) if c not in accepted and c.check.support]
         self._pending = [
             c for c in self._pending if self.submaps[-1].travel_m - self.submaps[c.later].travel_m < PENDING_M
         ]

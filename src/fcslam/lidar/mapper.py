@@ -11,7 +11,7 @@ from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LocalClosure, LoopCloser
+from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LocalClosure, LoopCloser, PlaceRecognizer
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.odometry import OdometryConfig, odometry_error
@@ -114,11 +114,12 @@ class Step:
 class Mapper:
     """SLAM of one robot. Poses are in its own ``map``, where the first keyscan has its odometry pose."""
 
-    def __init__(self, robot: str, config: LidarConfig) -> None:
+    def __init__(self, robot: str, config: LidarConfig, recognizer: PlaceRecognizer | None = None) -> None:
+        """``recognizer`` proposes loops whose drift is beyond the reach of the search; without one they stay open."""
         self.robot = robot
         self.config = config
         self._tracker = ScanTracker(config.tracker)
-        self._closer = LoopCloser(config.closing, config.search, config.verification)
+        self._closer = LoopCloser(config.closing, config.search, config.verification, recognizer)
         self._graph = PoseGraph()
         self._factors = FactorCache(self._graph)
         self._lasers = Lasers()

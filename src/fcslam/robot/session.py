@@ -5,10 +5,11 @@ from collections.abc import Iterable
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig, describe
+from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig
 from fcslam.lidar.mapper import FinishedSubmap, LidarConfig, Mapper, ScanPose, Step
 from fcslam.lidar.tracker import TrackingResult
 from fcslam.records import CameraImage, Channel, KeyscanId, LaserScan, Place
+from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
 from fcslam.wire.messages import Body, Hello, Packet
 
@@ -21,6 +22,9 @@ class SessionConfig(Settings):
         default=tuple(Channel), min_length=1, description="sensors that describe places: lidar, camera"
     )
     birdseye: BirdseyeConfig = Field(default=BirdseyeConfig(), description="binary descriptors of LiDAR submaps")
+    own_places: OwnPlacesConfig = Field(
+        default=OwnPlacesConfig(), description="place recognition on the robot, among its own LiDAR places"
+    )
     views: ViewsConfig = Field(default=ViewsConfig(), description="binary descriptors of camera images")
 
 
@@ -36,7 +40,8 @@ class RobotSession:
         self.time = time
         """The largest stamp so far."""
         self.scan_poses: list[ScanPose] = []
-        self.mapper = Mapper(robot, config.lidar)
+        self._own_places = OwnPlaces(config.own_places, config.birdseye)
+        self.mapper = Mapper(robot, config.lidar, self._own_places)
         self._config = config
         self._view_extractor = view_extractor
         self._views: list[CameraView] = []
@@ -109,7 +114,7 @@ class RobotSession:
         return [hello, *(self._camera_place(view) for view in fresh)]
 
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
-        features = describe(submap.surface, self._config.birdseye)
+        features = self._own_places.features(submap.anchor)
         return Place(
             KeyscanId(self.robot, submap.anchor), Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last,
             features.keypoints_m, features.descriptors,
