@@ -111,6 +111,8 @@ class LocalClosure:
     """Measurement relative to the prediction (x, y, theta), shape (3,), metres and radians."""
     drift_m: float
     """Drift allowance when the closure was found, metres."""
+    recognized: bool = False
+    """Whether place recognition proposed it, beyond the reach of the search."""
 
     @property
     def innovation_m(self) -> float:
@@ -254,9 +256,7 @@ class LoopCloser:
             return []
         return sorted(found, key=lambda c: (c.check.support, c.check.worse.overlap))[-1:]
 
-    def _lookalikes(
-        self, recognizer: PlaceRecognizer, later: int, anchors: FloatArray, paths: FloatArray
-    ) -> list[int]:
+    def _lookalikes(self, recognizer: PlaceRecognizer, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
         """The most similar places beyond the search's reach, ``sight_m`` of travel apart from each other."""
         config = self._config
         travel = np.array([submap.travel_m for submap in self.submaps])
@@ -281,7 +281,7 @@ class LoopCloser:
         allowed_m = self._config.recognized_drift * path_m
         if not (check.loose or check.support) or np.hypot(innovation[0], innovation[1]) > allowed_m:
             return None
-        return LocalClosure(earlier, later, check, innovation, allowed_m)
+        return LocalClosure(earlier, later, check, innovation, allowed_m, recognized=True)
 
     def _accept(
         self, found: list[LocalClosure], recognized: list[LocalClosure], anchors: FloatArray

@@ -272,10 +272,16 @@ class Mapper:
         )  # fmt: skip
 
     def _optimize_if_needed(self, closures: list[LocalClosure]) -> None:
-        """Solve at once if a closure contradicts the estimate, otherwise after ``SOLVE_AFTER`` closures."""
+        """Solve at once if a closure contradicts the estimate, otherwise after ``SOLVE_AFTER`` closures.
+
+        A recognised loop may contradict it by so much that the Cauchy loss hardly pulls; only GNC closes it.
+        """
         self._unsolved += len(closures)
         enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._local))
-        if self._unsolved >= enough or any(c.is_surprising for c in closures):
+        if any(c.recognized for c in closures):
+            self.optimized()
+            self._unsolved = 0
+        elif self._unsolved >= enough or any(c.is_surprising for c in closures):
             self._poses = list(optimize(self._graph, self._poses, loss=Loss.CAUCHY, factors=self._factors).poses)
             self._unsolved = 0
 
