@@ -111,8 +111,8 @@ class LocalClosure:
     """Measurement relative to the prediction (x, y, theta), shape (3,), metres and radians."""
     drift_m: float
     """Drift allowance when the closure was found, metres."""
-    recognized: bool = False
-    """Whether place recognition proposed it, beyond the reach of the search."""
+    beyond_search: bool = False
+    """Whether it is farther from its prediction than that, so that only place recognition finds it."""
 
     @property
     def innovation_m(self) -> float:
@@ -261,7 +261,9 @@ class LoopCloser:
         config = self._config
         travel = np.array([submap.travel_m for submap in self.submaps])
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
-        unsure = paths > min(config.widest_m / config.drift, config.widest_rad / config.drift_rad_m)
+        drift = np.array([self._drift_allowance(path) for path in paths])
+        capped = (drift >= (config.widest_m, config.widest_rad)).any(axis=1)
+        unsure = capped | (distance > config.sight_m + drift[:, 0])
         possible = distance < config.sight_m + config.recognized_drift * paths
         eligible = np.flatnonzero(unsure & possible & (travel[later] - travel > config.gap_m))
         number = {self.submaps[k].keyscan: int(k) for k in eligible}
@@ -278,10 +280,12 @@ class LoopCloser:
         """Verify a recognised place; None if it is another one, or if no drift explains where it is."""
         check = verify(self.submaps[earlier].submap, self.submaps[later].submap, guess, self._verification)
         innovation = se2.between(se2.between(anchors[earlier], anchors[later]), check.T_a_b)
-        allowed_m = self._config.recognized_drift * path_m
-        if not (check.loose or check.support) or np.hypot(innovation[0], innovation[1]) > allowed_m:
+        off_m = float(np.hypot(innovation[0], innovation[1]))
+        if not (check.loose or check.support) or off_m > self._config.recognized_drift * path_m:
             return None
-        return LocalClosure(earlier, later, check, innovation, allowed_m, recognized=True)
+        radius, angle = self._drift_allowance(path_m)
+        beyond = off_m > radius or abs(innovation[2]) > angle
+        return LocalClosure(earlier, later, check, innovation, radius, beyond)
 
     def _accept(
         self, found: list[LocalClosure], recognized: list[LocalClosure], anchors: FloatArray

@@ -278,7 +278,7 @@ class Mapper:
         """
         self._unsolved += len(closures)
         enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._local))
-        if any(c.recognized for c in closures):
+        if any(c.beyond_search for c in closures):
             self.optimized()
             self._unsolved = 0
         elif self._unsolved >= enough or any(c.is_surprising for c in closures):
