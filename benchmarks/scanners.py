@@ -14,10 +14,11 @@ Errors follow Kuemmerle et al. 2009 over all relations; one robot. The ratio is 
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import common
 import numpy as np
+from robustness import Recording
 
 from fcslam.evaluation.fleet.relations import pose_table
 from fcslam.metrics.relations import read_relations, relation_errors
@@ -46,17 +47,6 @@ def main() -> None:
     rows = [row for name in chosen.logs for row in measure(folder, name, chosen.seeds)]
     report.table("Scanners", COLUMNS, rows)
     report.write()
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A recording in memory, as a mission reads it."""
-
-    name: str
-    scans: list[LaserScan]
-
-    def records(self) -> Iterator[LaserScan]:
-        return iter(self.scans)
 
 
 def measure(folder, name: str, seeds) -> Iterator[tuple]:
