@@ -104,10 +104,7 @@ def numbered(packets: Iterable[Packet]) -> list[Packet]:
 
 def track(frontend: RobotFrontend) -> Track:
     poses = frontend.scan_poses
-    return Track(
-        np.array([pose.stamp for pose in poses]), np.array([pose.keyscan for pose in poses]),
-        np.array([pose.T_keyscan_base for pose in poses]),
-    )  # fmt: skip
+    return Track(poses.stamps, poses.keyscans, poses.T_keyscan_base)
 
 
 def mean(values: Iterable[int]) -> float:

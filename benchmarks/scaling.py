@@ -108,13 +108,13 @@ class Watches:
         """Count what runs inside."""
         from fcslam.cloud import fleet
         from fcslam.cloud.joint_graph import JointGraph
-        from fcslam.lidar import mapper
+        from fcslam.lidar import backend
 
         with ExitStack() as stack:
             for owner, name, watch in (
                 (JointGraph, "optimize", self.quick),
                 (fleet, "reevaluate", self.robust),
-                (mapper, "optimize", self.robot_solve),
+                (backend, "optimize", self.robot_solve),
             ):
                 stack.enter_context(patch.object(owner, name, watch.watch(getattr(owner, name))))
             yield self
@@ -181,12 +181,10 @@ class Repeated:
 
 def scan_poses(robot: Any, result: Any) -> Any:
     """T_map_base of every scan, shape (N, 3)."""
-    import numpy as np
-
     from fcslam.geometry import se2
 
-    keyscans = result.robots[0].T_map_base[[pose.keyscan for pose in robot.scan_poses]]
-    return se2.compose(keyscans, np.array([pose.T_keyscan_base for pose in robot.scan_poses]))
+    track = robot.scan_poses
+    return se2.compose(result.robots[0].T_map_base[track.keyscans], track.T_keyscan_base)
 
 
 def back_to_the_start(poses: Any) -> Any:

@@ -7,7 +7,6 @@ import heapq
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from pydantic import Field
 
 from fcslam.cloud.cloud import Cloud
@@ -17,11 +16,11 @@ from fcslam.cloud.sessions import check_robot, robot_of, session_name
 from fcslam.cloud.settings import FleetConfig
 from fcslam.config import Settings, dump
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
-from fcslam.lidar.mapper import ScanPose
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.metrics.jumps import JumpLimits
 from fcslam.records import Keyscan, LaserScan, Veto
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.track import ScanTrack
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.wire.checks import check_name
@@ -150,9 +149,5 @@ def _check_vetoes(vetoes: Sequence[Veto], robots: Sequence[str]) -> None:
             raise ConfigError(f"a veto names '{name}', but the robots are {', '.join(robots)}")
 
 
-def _track(poses: Sequence[ScanPose]) -> Track:
-    return Track(
-        np.array([pose.stamp for pose in poses]),
-        np.array([pose.keyscan for pose in poses], dtype=np.int64),
-        np.array([pose.T_keyscan_base for pose in poses]),
-    )
+def _track(poses: ScanTrack) -> Track:
+    return Track(poses.stamps, poses.keyscans, poses.T_keyscan_base)

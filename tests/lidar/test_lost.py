@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
-from fcslam.lidar.mapper import LidarConfig, Mapper
+from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.records import frozen
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
@@ -17,10 +17,10 @@ CONFIG = LostConfig()
 
 
 def mapped(scans):
-    mapper = Mapper("r", LidarConfig())
+    frontend = LidarFrontend("r", LidarConfig())
     for scan in scans:
-        mapper.process(scan)
-    return mapper
+        frontend.process(scan)
+    return frontend
 
 
 def moved_on(scans, before):
@@ -46,9 +46,9 @@ def elsewhere():
     return recording(poses, poses, room())
 
 
-def judged(mapper, scans):
-    tracking = mapper.localize(scans[0])
-    return is_lost(scans, tracking.tracked.T_local_base, mapper, CONFIG)
+def judged(frontend, scans):
+    tracking = frontend.localize(scans[0])
+    return is_lost(scans, tracking.tracked.T_local_base, frontend, CONFIG)
 
 
 def test_looking_leaves_no_trace(around):
@@ -63,29 +63,29 @@ def test_looking_leaves_no_trace(around):
 
 @pytest.mark.slow
 def test_scans_of_one_drive_are_hardly_doubted_and_never_lost(around):
-    mapper = mapped(around[:60])
+    frontend = mapped(around[:60])
     doubts = []
     for k in range(60, len(around) - 20):
-        doubts.append(is_doubtful(mapper.localize(around[k]), mapper, CONFIG))
+        doubts.append(is_doubtful(frontend.localize(around[k]), frontend, CONFIG))
         if k % 25 == 0:
-            assert not judged(mapper, around[k : k + 15])
-        mapper.process(around[k])
+            assert not judged(frontend, around[k : k + 15])
+        frontend.process(around[k])
     assert np.mean(doubts) < 0.02
 
 
 def test_another_place_is_doubted_and_lost(around, elsewhere):
     before = around[:120]
-    mapper, there = mapped(before), moved_on(elsewhere, before)
-    assert is_doubtful(mapper.localize(there[0]), mapper, CONFIG)
-    assert judged(mapper, there[:20])
+    frontend, there = mapped(before), moved_on(elsewhere, before)
+    assert is_doubtful(frontend.localize(there[0]), frontend, CONFIG)
+    assert judged(frontend, there[:20])
 
 
 def test_scans_that_do_not_explain_one_another_tell_nothing(around, elsewhere):
     before = around[:120]
-    mapper, there = mapped(before), moved_on(elsewhere, before)
+    frontend, there = mapped(before), moved_on(elsewhere, before)
     rng = np.random.default_rng(0)
     torn = [replace(s, ranges_m=frozen(s.ranges_m * rng.uniform(0.5, 1.0, len(s.ranges_m)), np.float32)) for s in there]
-    assert not judged(mapper, torn[:20])
+    assert not judged(frontend, torn[:20])
 
 
 @pytest.mark.slow
@@ -93,15 +93,15 @@ def test_a_box_that_was_not_there_before_makes_nobody_lost(around):
     poses = ring_drive()
     changed = recording(poses, poses, np.vstack((ring(), box(13.6, 6.0, 14.1, 6.5))))
     before = 120
-    mapper = mapped(around[:before])
-    assert not judged(mapper, changed[before : before + 20])
+    frontend = mapped(around[:before])
+    assert not judged(frontend, changed[before : before + 20])
 
 
 def test_who_has_hardly_moved_cannot_be_lost(around, elsewhere):
     before = around[:15]
-    mapper = mapped(before)
-    assert 0.0 < mapper.travel_m < CONFIG.settled_m
-    assert not is_doubtful(mapper.localize(moved_on(elsewhere, before)[0]), mapper, CONFIG)
+    frontend = mapped(before)
+    assert 0.0 < frontend.travel_m < CONFIG.settled_m
+    assert not is_doubtful(frontend.localize(moved_on(elsewhere, before)[0]), frontend, CONFIG)
 
 
 def test_it_takes_a_way_and_several_scans_or_very_many(around):
@@ -114,6 +114,6 @@ def test_it_takes_a_way_and_several_scans_or_very_many(around):
 
 
 def test_what_was_not_matched_is_not_doubted(around):
-    mapper = mapped(around[:60])
+    frontend = mapped(around[:60])
     nothing = replace(around[60], ranges_m=frozen(np.full(LASER.beam_count, LASER.max_range_m), np.float32))
-    assert not is_doubtful(mapper.localize(nothing), mapper, CONFIG)
+    assert not is_doubtful(frontend.localize(nothing), frontend, CONFIG)

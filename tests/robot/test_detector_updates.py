@@ -1,6 +1,7 @@
 """A detector is taken between two records, and a resumed recording takes it at the same one."""
 
 import os
+from concurrent.futures import Future
 from dataclasses import replace
 
 import pytest
@@ -18,9 +19,13 @@ class Frontend:
         self.took = []
 
     def set_detector(self, file, path):
+        outcome = Future()
         if path.read_bytes() == b"broken":
-            raise FeatureError("it is broken")
-        self.took.append(file.version)
+            outcome.set_exception(FeatureError("it is broken"))
+        else:
+            self.took.append(file.version)
+            outcome.set_result([])
+        return outcome
 
 
 @pytest.fixture

@@ -8,9 +8,10 @@ import pytest
 
 from fcslam.features.birdseye import BirdseyeConfig
 from fcslam.geometry import se2
+from fcslam.lidar.backend import LidarBackend
 from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LoopCloser
 from fcslam.lidar.correlative import SearchConfig
-from fcslam.lidar.mapper import LidarConfig, Mapper
+from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.tracker import OdometryConfig, TrackedScan
@@ -128,14 +129,15 @@ def test_the_map_closes_with_its_loop(recognizes):
     """25 m of drift and more bend into shape: the robust solve must not take the loop for the outlier."""
     truth = lap(225.0, FINE_M)
     poses = veering(truth)
-    mapper = Mapper("r", LidarConfig(), own_places() if recognizes else None)
-    mapper._tracker = VeeringTracker(poses)
-    mapper._tracker.config = SimpleNamespace(odometry=OdometryConfig())
+    frontend = LidarFrontend("r", LidarConfig())
+    backend = LidarBackend("r", LidarConfig(), own_places() if recognizes else None)
+    frontend._tracker = VeeringTracker(poses)
+    frontend._tracker.config = SimpleNamespace(odometry=OdometryConfig())
     segments = blocks()
     for k, pose in enumerate(poses):
-        mapper.process(*recording(truth[k : k + 1], [pose], segments, seed=k))
-    mapper.finish()
+        backend.add(frontend.process(*recording(truth[k : k + 1], [pose], segments, seed=k)).keyscan)
+    backend.finish()
     meeting = int(2 * np.pi * RADIUS_M / FINE_M)
-    for estimate in (np.array(mapper._poses), mapper.optimized()):  # during the drive, and in the end
+    for estimate in (np.array(backend._poses), backend.optimized()):  # during the drive, and in the end
         off = se2.between(se2.between(truth[0], truth[meeting]), se2.between(estimate[0], estimate[meeting]))
         assert (np.hypot(off[0], off[1]) < 0.3) == recognizes

@@ -178,6 +178,7 @@ def _agent(
 
     from fcslam.errors import StateError
     from fcslam.robot.agent import Agent
+    from fcslam.robot.beside import backend_process
     from fcslam.robot.budget import Budget
     from fcslam.robot.frontend import RobotFrontend
     from fcslam.robot.outbox import Outbox
@@ -187,14 +188,15 @@ def _agent(
         state.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StateError(f"{state}: cannot be made ({error.strerror}); give another --state") from error
-    frontend = RobotFrontend(name, settings)
     # Not the mission's seed: robots must not retry at the same moments.
     rng = np.random.default_rng()
     budget = None if budget_kbps is None else Budget(1e3 * budget_kbps)
     with (
+        backend_process(name, settings) as backend,
         closing(Outbox(state / "outbox.sqlite", name, int(outbox_mb * 1e6))) as outbox,
         closing(HttpTransport(server, name, outbox.agent, token, ca, own)) as transport,
     ):
+        frontend = RobotFrontend(name, settings, backend)
         yield Agent(frontend, outbox, transport, state, rng, time.monotonic, time.sleep, budget), outbox
 
 

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.lidar.mapper import Mapper
+from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.tracker import TrackingResult
 from fcslam.lidar.verification import verify
 from fcslam.records import FloatArray, LaserScan
@@ -66,10 +66,10 @@ class LostConfig(Settings):
     )
 
 
-def is_doubtful(tracking: TrackingResult, mapper: Mapper, config: LostConfig) -> bool:
+def is_doubtful(tracking: TrackingResult, frontend: LidarFrontend, config: LostConfig) -> bool:
     """Whether a scan may show another place than the scans before it."""
     # False for a scan that was not matched, as both are NaN.
-    return mapper.travel_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
+    return frontend.travel_m >= config.settled_m and tracking.explained < config.doubted * tracking.known
 
 
 def can_decide(scans: Sequence[LaserScan], config: LostConfig) -> bool:
@@ -79,26 +79,26 @@ def can_decide(scans: Sequence[LaserScan], config: LostConfig) -> bool:
     return bool(far) or len(scans) >= config.most_scans
 
 
-def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, mapper: Mapper, config: LostConfig) -> bool:
-    """Whether deferred scans show another place than the newest keyscans of the mapper.
+def is_lost(scans: Sequence[LaserScan], T_local_first: FloatArray, frontend: LidarFrontend, config: LostConfig) -> bool:
+    """Whether deferred scans show another place than the newest keyscans of the front end.
 
     Args:
-        scans: consecutive scans that the mapper has not processed.
+        scans: consecutive scans that the front end has not processed.
         T_local_first: pose of the first of them in the tracker's local frame, shape (3,), metres and radians.
-        mapper: the robot's mapper; it does not change.
+        frontend: the robot's front end; it does not change.
         config: thresholds.
     """
-    fresh = Mapper(mapper.robot, mapper.config)
+    fresh = LidarFrontend(frontend.robot, frontend.config)
     if not _are_consistent(scans, fresh, config):
         return False
-    (before, T_local_before), (now, T_first_now) = mapper.recent_submap(), fresh.recent_submap()
+    (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
-    worse = verify(before, now, predicted, mapper.config.verification).worse
+    worse = verify(before, now, predicted, frontend.config.verification).worse
     return worse.overlap >= config.overlap and worse.explained < config.explained and worse.violation > config.violation
 
 
-def _are_consistent(scans: Sequence[LaserScan], fresh: Mapper, config: LostConfig) -> bool:
-    """Map the scans with a fresh mapper; whether they explain one another. Otherwise nothing can be decided."""
+def _are_consistent(scans: Sequence[LaserScan], fresh: LidarFrontend, config: LostConfig) -> bool:
+    """Track the scans with a fresh front end; whether they explain one another. Otherwise nothing can be decided."""
     shares = []
     for scan in scans:
         tracking = fresh.localize(scan)

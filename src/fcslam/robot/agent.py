@@ -1,7 +1,8 @@
 """A robot in a mission over an unreliable network: mapping never depends on the network.
 
-The front end runs in the thread that calls ``run`` and puts its packets into the outbox, which is on disk. A second
-thread sends them to the cloud. The front end waits for it only if the outbox is full.
+The front end runs in the thread that calls ``run`` and puts the packets into the outbox, which is on disk. A second
+thread sends them to the cloud. The front end waits for it only if the outbox is full. The back end may run in another
+process (``fcslam.robot.beside``), so that it never delays the pose of a scan.
 """
 
 import threading
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from fcslam.errors import StateError
-from fcslam.records import Constraint, ConstraintKind, Correction, FloatArray, Keyscan, LaserScan, SensorRecord
+from fcslam.records import Correction, FloatArray, Keyscan, LaserScan, SensorRecord
 from fcslam.robot.budget import Budget
 from fcslam.robot.detector_updates import DetectorUpdates
 from fcslam.robot.frontend import RobotFrontend
@@ -26,6 +27,8 @@ from fcslam.wire.messages import Packet
 
 POLL_INTERVAL_S = 0.1
 """Interval at which the main thread checks the sender while it waits for it."""
+LARGEST_BACKLOG = 200
+"""Largest number of keyscans and images that wait for the back end; a robot in real time never has as many."""
 STOP_TIMEOUT_S = 2.0
 """Time that a running request may take when the robot stops; its packets are sent again at the next start."""
 
@@ -145,7 +148,7 @@ class Agent:
                 if isinstance(record, LaserScan) and self._put >= known:
                     pace.wait(record.stamp)
                 self._queue(self._frontend.process(record))  # map one record
-                self._wait_while(lambda: self._outbox.is_full, watch)
+                self._wait_while(lambda: self._outbox.is_full or self._is_behind(), watch)
                 watch(self.progress())
             self._queue(self._frontend.finish())
             self._wait_while(lambda: self._outbox.waiting.packets > 0, watch)  # until the cloud has everything
@@ -153,7 +156,9 @@ class Agent:
     def progress(self) -> AgentProgress:
         """The progress now."""
         sender = self._sender
-        notices = tuple(filter(None, (sender.notice, sender.refused_notice, self._detector_updates.notice)))
+        failure = self._frontend.backend_failure
+        broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
+        notices = tuple(filter(None, (sender.notice, sender.refused_notice, self._detector_updates.notice, broken)))
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
             sum(map(len, self._frontend.tracks)), self._keyscans, self._outbox.waiting, sender.confirmed,
@@ -175,10 +180,9 @@ class Agent:
             Stamps (N,) in seconds of the recording's clock, and poses (N, 3) of ``base`` in ``map``, metres and
             radians; None before the first correction.
         """
-        localizer, track = self.localizer, self._frontend.tracks[-1]
-        poses = [localizer.T_map_base(pose) for pose in track]
-        known = [pose for pose in poses if pose is not None]
-        return (np.array([pose.stamp for pose in track]), np.array(known)) if known else None
+        track = self._frontend.scan_poses
+        poses = self.localizer.T_map_base(track.T_odom_base())
+        return None if poses is None else (track.stamps, poses)
 
     def _localizer(self, part: int) -> Localizer:
         return self._localizers.setdefault(part, Localizer(self._clock))
@@ -190,14 +194,18 @@ class Agent:
 
     def _queue(self, packets: list[Packet]) -> None:
         for packet in packets:
-            body = packet.body
-            if isinstance(body, Constraint) and body.kind is ConstraintKind.ODOMETRY:
-                self._localizer(packet.epoch).extend(body)
-            self._keyscans += isinstance(body, Keyscan)
+            self._keyscans += isinstance(packet.body, Keyscan)
         chosen = packets if self._budget is None else self._budget.fit(packets)
         if chosen:
             self._crowded_out += self._outbox.put(chosen)
             self._put += len(chosen)
+
+    def _is_behind(self) -> bool:
+        """Whether the back end has to catch up, as in a recording that is played as fast as possible."""
+        behind = self._frontend.backlog > LARGEST_BACKLOG
+        if behind:
+            self._queue(self._frontend.ready())
+        return behind
 
     def _wait_while(self, condition: Callable[[], bool], watch: AgentWatch) -> None:
         """Wait while the sender works on ``condition``."""

@@ -4,13 +4,15 @@ A resumed recording switches at the same records again, so that it produces the 
 """
 
 import queue
+from concurrent.futures import Future
 from pathlib import Path
 
-from fcslam.errors import FeatureError, StateError
+from fcslam.errors import StateError
 from fcslam.records import DetectorFile
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.outbox import Outbox
 from fcslam.storage.files import write_file
+from fcslam.wire.messages import Body
 
 
 class DetectorUpdates:
@@ -23,8 +25,18 @@ class DetectorUpdates:
         self._frontend = frontend
         self._fetched: queue.SimpleQueue[DetectorFile] = queue.SimpleQueue()
         self._applied: dict[int, DetectorFile] = {}
-        self.notice: str | None = None
-        """Outcome of the last update."""
+        self._last: tuple[DetectorFile, Future[list[Body]]] | None = None
+        """The last update, and whether the back end took it."""
+
+    @property
+    def notice(self) -> str | None:
+        """Outcome of the last update, once it is known."""
+        if self._last is None or not self._last[1].done():
+            return None
+        file, error = self._last[0], self._last[1].exception()
+        if error is not None:
+            return f"detector {file.version} not taken: {error}"
+        return f"detector {file.version} from now on"
 
     def resume(self) -> None:
         """Load the updates that this recording applied before it was interrupted."""
@@ -55,13 +67,8 @@ class DetectorUpdates:
                 return
             self._outbox.record_detector_update(record, file)
             self._applied[record] = file
-        if file is None:
-            return
-        try:
-            self._frontend.set_detector(file, self._path(file))
-            self.notice = f"detector {file.version} from now on"
-        except FeatureError as error:
-            self.notice = f"detector {file.version} not taken: {error}"
+        if file is not None:
+            self._last = file, self._frontend.set_detector(file, self._path(file))
 
     def _path(self, file: DetectorFile) -> Path:
         return self._folder / f"{file.channel.value}-{file.version}.onnx"

@@ -1,22 +1,38 @@
 """The front end of one robot: sensor records in, packets out. It knows no network and no other robot.
 
+It localises every scan at once. Everything else is the work of the back end (``fcslam.robot.backend``), which may run
+beside it: packets then come out later, but in the same order and with the same contents.
+
 While scans are doubtful (``fcslam.lidar.lost``), records are deferred. If they show the same place as before, they are
 processed normally. If they show another place, the robot is lost: its session ends before the doubtful scans, and a new
 one begins with them, as after a restart. So no unmeasured motion enters a map.
 """
 
-from dataclasses import replace
+from collections import deque
+from concurrent.futures import BrokenExecutor, Future
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pydantic import Field
 
 from fcslam.errors import FeatureError
+from fcslam.lidar.frontend import LidarFrontend, ScanPose
 from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
-from fcslam.lidar.mapper import ScanPose
+from fcslam.lidar.tracker import TrackingResult
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord
-from fcslam.robot.session import RobotSession, SessionConfig
-from fcslam.robot.views import ViewExtractor
-from fcslam.wire.messages import Packet
+from fcslam.robot.backend import (
+    BackendInput,
+    NewDetector,
+    NewImage,
+    NewKeyscan,
+    RobotBackend,
+    SessionConfig,
+    SessionEnd,
+    essential,
+)
+from fcslam.robot.beside import BackendRunner, Inline
+from fcslam.robot.track import ScanTrack
+from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.quantisation import dequantise, quantise
 
 
@@ -26,96 +42,182 @@ class RobotConfig(SessionConfig):
     lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost and starts a new session")
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """An input that the back end has not handled yet."""
+
+    input: BackendInput
+    output: "Future[list[Body]]"
+    epoch: int
+    time: float
+    """The largest stamp so far."""
+
+
 class RobotFrontend:
     """Turns the sensor records of a robot into packets; the poses of all scans stay on the robot.
 
     The epoch of a packet is the number of its session, from 0.
     """
 
-    def __init__(self, robot: str, config: RobotConfig) -> None:
+    def __init__(self, robot: str, config: RobotConfig, backend: BackendRunner | None = None) -> None:
+        """``backend`` runs the back end beside this front end; None: it runs inline.
+
+        Raises:
+            FeatureError: the detector of camera images is a network whose weights cannot be used.
+        """
         self.robot = robot
-        self.tracks: list[list[ScanPose]] = []
+        self.tracks: list[ScanTrack] = []
         """Poses of the scans, by session."""
+        self.backend_failure: str | None = None
+        """Why the back end ended early; from then on the robot sends neither closures nor places. None if it works."""
         self._config = config
-        self._view_extractor = ViewExtractor(config.views)
+        self._backend = Inline(RobotBackend(robot, config)) if backend is None else backend
+        self._waiting: deque[_Waiting] = deque()
+        self._time = float("-inf")
+        self._sequence = 0
+        self._hello: Hello | None = None
+        """The last hello of the present session."""
+        self._newest: tuple[LaserScan, ScanPose] | None = None
+        """The newest scan of the present session."""
+        self._scans: dict[tuple[float, float, float], LaserScan] = {}
+        """The newest scan of each laser, by its mounting."""
         self._deferred: list[LaserScan | CameraImage] = []
         """Records since the first doubtful scan."""
         self._T_local_deferred: FloatArray | None = None
         """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
-        self._session = self._begin(float("-inf"))
+        self._begin()
 
     @property
-    def scan_poses(self) -> list[ScanPose]:
+    def scan_poses(self) -> ScanTrack:
         """Poses of the scans of the present session."""
         return self.tracks[-1]
 
+    @property
+    def backlog(self) -> int:
+        """Number of inputs that the back end has not handled yet."""
+        return len(self._waiting)
+
     def process(self, record: SensorRecord) -> list[Packet]:
-        """Process the next record of the recording; returns its packets."""
+        """Process the next record of the recording; returns the packets that are ready."""
         match record:
             case LaserScan():
                 # The robot maps with the quantised ranges, so robot and cloud see the same numbers.
-                return self._process_scan(replace(record, ranges_m=dequantise(quantise(record.ranges_m))))
+                self._process_scan(replace(record, ranges_m=dequantise(quantise(record.ranges_m))))
             case CameraImage() if Channel.CAMERA in self._config.channels and self._deferred:
                 self._deferred.append(record)
             case CameraImage() if Channel.CAMERA in self._config.channels:
-                self._session.process_image(record)
-        return []  # scans carry their odometry; images never leave the robot
+                self._describe(record)
+        return self.ready()  # scans carry their odometry; images never leave the robot
 
-    def set_detector(self, file: DetectorFile, path: Path) -> None:
-        """Use another network for camera images from now on; the next scan describes buffered images again.
+    def ready(self, wait: bool = False) -> list[Packet]:
+        """The next packets, without those that the back end still works on, or after it has handled everything."""
+        packets = []
+        while self._waiting and (wait or self._waiting[0].output.done()):
+            done = self._waiting.popleft()
+            for body in self._bodies(done):
+                if isinstance(body, Hello):
+                    self._hello = body
+                packets.append(Packet(self.robot, done.epoch, self._sequence, done.time, body))
+                self._sequence += 1
+            if isinstance(done.input, SessionEnd):
+                self._sequence, self._hello = 0, None
+        return packets
+
+    def set_detector(self, file: DetectorFile, path: Path) -> "Future[list[Body]]":
+        """Use another network for camera images from now on; the next keyscan describes buffered images again.
 
         Args:
             file: the detector as the cloud announced it.
             path: the downloaded file.
 
-        Raises:
-            FeatureError: the file is not the announced one, cannot be used, or describes a channel that this robot does
-                not use; nothing has changed.
+        Returns:
+            Done when the back end uses it, or refuses it with the ``FeatureError`` of :meth:`RobotBackend.process`.
         """
-        if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
-            raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
-        if file.version != self._view_extractor.detector_version:
-            self._view_extractor.set_detector(file, path)
+        return self._submit(NewDetector(file, path))
 
     def finish(self) -> list[Packet]:
-        """End the recording; returns the packets of open submaps."""
-        return [*self._process_deferred(), *self._session.finish()]
+        """End the recording; returns all packets that are left."""
+        self._process_deferred()
+        self._submit(SessionEnd())
+        return self.ready(wait=True)
 
-    def _process_scan(self, scan: LaserScan) -> list[Packet]:
-        mapper, config = self._session.mapper, self._config.lost
+    def _process_scan(self, scan: LaserScan) -> None:
+        config = self._config.lost
         # 1. Localize the scan; unless it is doubtful, process it.
-        tracking = mapper.localize(scan)
-        if not is_doubtful(tracking, mapper, config):
+        tracking = self._lidar.localize(scan)
+        if not is_doubtful(tracking, self._lidar, config):
             if self._deferred:
-                return [*self._process_deferred(), *self._session.process_scan(scan)]
-            return self._session.process_scan(scan, tracking)
+                self._process_deferred()
+                tracking = self._lidar.localize(scan)
+            self._map(scan, tracking)
+            return
         # 2. Defer a doubtful scan until there are enough of them for a decision.
         if self._T_local_deferred is None:
             self._T_local_deferred = tracking.tracked.T_local_base
         self._deferred.append(scan)
         scans = [record for record in self._deferred if isinstance(record, LaserScan)]
         if not can_decide(scans, config):
-            return []
-        # 3. Same place: process them. Another place: the robot is lost, and a new session begins with them.
-        if not is_lost(scans, self._T_local_deferred, mapper, config):
-            return self._process_deferred()
-        rest = self._session.finish()
-        self._view_extractor.reset()
-        self._session = self._begin(self._session.time)
-        return [*rest, *self._process_deferred()]
+            return
+        # 3. Another place: the robot is lost, and a new session begins with them. Same place: process them.
+        if is_lost(scans, self._T_local_deferred, self._lidar, config):
+            self._submit(SessionEnd())
+            self._begin()
+        self._process_deferred()
 
-    def _begin(self, time: float) -> RobotSession:
-        session = RobotSession(self.robot, len(self.tracks), time, self._view_extractor, self._config)
-        self.tracks.append(session.scan_poses)
-        return session
+    def _begin(self) -> None:
+        """Begin a session."""
+        self._lidar = LidarFrontend(self.robot, self._config.lidar)
+        self._newest, self._scans = None, {}
+        self.tracks.append(ScanTrack())
 
-    def _process_deferred(self) -> list[Packet]:
+    def _process_deferred(self) -> None:
         """Process the deferred records normally."""
         records, self._deferred, self._T_local_deferred = self._deferred, [], None
-        packets: list[Packet] = []
         for record in records:
             if isinstance(record, LaserScan):
-                packets += self._session.process_scan(record)
+                self._map(record, self._lidar.localize(record))
             else:
-                self._session.process_image(record)
-        return packets
+                self._describe(record)
+
+    def _map(self, scan: LaserScan, tracking: TrackingResult) -> None:
+        """Continue from a localized scan."""
+        self._time = max(self._time, scan.stamp)
+        step = self._lidar.process(scan, tracking)
+        keyscan = step.keyscan
+        if keyscan is not None:
+            if keyscan.odometry is not None:
+                self.scan_poses.extend(keyscan.odometry.T_i_j)
+            self._submit(NewKeyscan(keyscan, self._lidar.lasers))
+        self.scan_poses.add(step.pose)
+        self._newest = scan, step.pose
+        self._scans[scan.laser.T_base_laser] = scan
+
+    def _describe(self, image: CameraImage) -> None:
+        if self._newest is not None:
+            self._submit(NewImage(image, *self._newest, tuple(self._scans.values())))
+
+    def _submit(self, input: BackendInput) -> "Future[list[Body]]":
+        try:
+            output = self._backend.submit(input)
+        except BrokenExecutor as error:
+            output = Future()
+            output.set_exception(error)
+        self._waiting.append(_Waiting(input, output, len(self.tracks) - 1, self._time))
+        return output
+
+    def _bodies(self, done: _Waiting) -> list[Body]:
+        """What the back end made of an input; once it has failed, what the map cannot do without."""
+        try:
+            bodies = done.output.result()
+        except FeatureError:  # told by ``set_detector``
+            return []
+        except Exception as error:  # tracking must go on, whatever ended the back end
+            self.backend_failure = self.backend_failure or f"{type(error).__name__}: {error}"
+        if self.backend_failure is None:
+            return bodies
+        if not isinstance(done.input, NewKeyscan):
+            return []
+        lasers, last = done.input.lasers, self._hello
+        is_known = last is not None and last.lasers == lasers
+        hello = Hello(self.robot, done.epoch, lasers, {} if last is None else last.detector_versions)
+        return [*([] if is_known else [hello]), *essential(done.input)]

@@ -2,11 +2,8 @@
 
 from collections.abc import Callable
 
-import numpy as np
-
 from fcslam.geometry import se2
-from fcslam.lidar.mapper import ScanPose
-from fcslam.records import Constraint, Correction, FloatArray, frozen
+from fcslam.records import Correction, FloatArray
 
 
 class Localizer:
@@ -15,14 +12,8 @@ class Localizer:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._T_odom_keyscan: list[FloatArray] = [frozen(np.zeros(3))]
-        """Pose of every keyscan, shape (3,) each; the first is the origin of ``odom``."""
         self._corrected: tuple[Correction, float] | None = None
         """The newest correction and the time of its arrival."""
-
-    def extend(self, motion: Constraint) -> None:
-        """Append the motion to the next keyscan, as it is sent to the cloud."""
-        self._T_odom_keyscan.append(se2.compose(self._T_odom_keyscan[motion.i], motion.T_i_j))
 
     def correct(self, correction: Correction) -> None:
         """Apply a correction unless a newer one was applied before. Any thread may call this."""
@@ -44,12 +35,7 @@ class Localizer:
         """Time since the newest correction, seconds; None before the first one."""
         return None if self._corrected is None else self._clock() - self._corrected[1]
 
-    def T_odom_base(self, pose: ScanPose) -> FloatArray:
-        """Pose of a scan in ``odom``, shape (3,), metres and radians."""
-        return se2.compose(self._T_odom_keyscan[pose.keyscan], pose.T_keyscan_base)
-
-    def T_map_base(self, pose: ScanPose) -> FloatArray | None:
-        """Pose of a scan in the fleet's map, shape (3,), metres and radians; None before the first correction."""
-        if self._corrected is None:
-            return None
-        return se2.compose(self._corrected[0].T_map_odom, self.T_odom_base(pose))
+    def T_map_base(self, T_odom_base: FloatArray) -> FloatArray | None:
+        """Poses of ``base`` in the fleet's map, given those in ``odom``, shape (..., 3), metres and radians; None
+        before the first correction."""
+        return None if self._corrected is None else se2.compose(self._corrected[0].T_map_odom, T_odom_base)

@@ -1,5 +1,6 @@
 """Camera views: descriptors of keyframe images with metric positions. The images stay on the robot."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.factory import make_detector
 from fcslam.features.lidar_depth import LidarView, locate_keypoints
 from fcslam.geometry import se2
-from fcslam.lidar.mapper import ScanPose
+from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.scan import point_scan
 from fcslam.records import CameraImage, Codes, DetectorFile, FloatArray, LaserScan, frozen
 from fcslam.robot.image_buffer import ImageBuffer, ImageBufferConfig, KeyframeImage
@@ -73,10 +74,6 @@ class ViewExtractor:
         self._config = config
         self._detector = make_detector(config.detector, config.orb, config.onnx)
         self._image_buffer = ImageBuffer(config.image_buffer)
-        self._scan: LaserScan | None = None
-        self._scans: dict[tuple[float, float, float], LaserScan] = {}
-        """The newest scan of each laser, by its mounting."""
-        self._pose: ScanPose | None = None
         self._last: tuple[int, FloatArray] | None = None
         """Keyscan and odometry of the last view."""
 
@@ -85,35 +82,35 @@ class ViewExtractor:
         """Version of the detector."""
         return self._detector.version
 
-    def set_scan(self, scan: LaserScan, pose: ScanPose) -> None:
-        """Set the newest scan and its pose."""
-        self._scan, self._pose = scan, pose
-        self._scans[scan.laser.T_base_laser] = scan
-
-    def describe(self, image: CameraImage) -> CameraView | None:
+    def describe(
+        self, image: CameraImage, scan: LaserScan, pose: ScanPose, scans: Sequence[LaserScan]
+    ) -> CameraView | None:
         """Describe the next image.
 
         The motion between the last scan and the image is that of the odometry, or zero if the image has none.
 
+        Args:
+            image: the image.
+            scan: the newest scan before it.
+            pose: pose of this scan.
+            scans: the newest scan of each laser.
+
         Returns:
             The view, or None if the image has too few keypoints, cannot be decoded, or shows little that is new.
         """
-        if self._scan is None or self._pose is None:
-            return None
-        odometry = self._scan.T_odom_base if image.T_odom_base is None else image.T_odom_base
-        if not self._is_new(self._pose.keyscan, odometry):
+        odometry = scan.T_odom_base if image.T_odom_base is None else image.T_odom_base
+        if not self._is_new(pose.keyscan, odometry):
             return None
         picture = decode_grey(image.encoded)
         if picture is None or picture.shape != (image.camera.height, image.camera.width):
             return None
-        self._last = self._pose.keyscan, odometry
-        T_scan_image = se2.between(self._scan.T_odom_base, odometry)
-        T_keyscan_image = se2.compose(self._pose.T_keyscan_base, T_scan_image)
-        newest = self._scan.stamp
+        self._last = pose.keyscan, odometry
+        T_scan_image = se2.between(scan.T_odom_base, odometry)
+        T_keyscan_image = se2.compose(pose.T_keyscan_base, T_scan_image)
         surroundings = tuple(
-            _lidar_view(scan, odometry) for scan in self._scans.values() if abs(newest - scan.stamp) <= SCAN_AGE_S
+            _lidar_view(other, odometry) for other in scans if abs(scan.stamp - other.stamp) <= SCAN_AGE_S
         )
-        keyframe = KeyframeImage(self._pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
+        keyframe = KeyframeImage(pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
         view = self._describe(keyframe, picture)
         if view is not None:
             self._image_buffer.add(keyframe)
@@ -128,10 +125,9 @@ class ViewExtractor:
         self._detector = open_detector_file(file, path, self._config.onnx)
 
     def reset(self) -> None:
-        """Start a new session: forget all scans and images."""
+        """Start a new session: forget all images."""
         self._image_buffer = ImageBuffer(self._config.image_buffer)
-        self._scan = self._pose = self._last = None
-        self._scans = {}
+        self._last = None
 
     def describe_again(self) -> list[CameraView]:
         """Describe all buffered images with the present detector, oldest first."""

@@ -1,6 +1,10 @@
-"""LiDAR SLAM of one robot, as in Karto: scan tracking, a pose graph of keyscans, loop closures between submaps."""
+"""Front end of one robot's LiDAR SLAM: the pose of every scan, keyscans and the motions between them.
 
-from bisect import bisect_left, bisect_right
+It works in the smooth local frame of the tracker and never reads the pose graph, so the back end
+(``fcslam.lidar.backend``) may run later or in another process without changing a result.
+"""
+
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,10 +12,7 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.graph.factors import FactorCache, Loss
-from fcslam.graph.optimizer import optimize, optimize_gnc
-from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.lidar.closing import AnchoredSubmap, ClosingConfig, LocalClosure, LoopCloser, PlaceRecognizer
+from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.correlative import SearchConfig
 from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.odometry import OdometryConfig, odometry_error
@@ -31,9 +32,6 @@ from fcslam.records import (
     frozen,
 )
 
-SOLVE_AFTER, SOLVE_AFTER_SHARE = 20, 0.08
-"""The graph is solved once this many closures wait, or this share of the number of keyscans if that is more. The time
-of a solve grows with the graph, so solves become rarer and the mean cost per scan stays constant."""
 TURN_AS_TRAVEL_M = 0.1
 """Travel that one radian of turning counts as, metres: a robot that only turns completes submaps, too."""
 
@@ -87,18 +85,21 @@ class ScanPose:
     """Shape (3,), metres and radians."""
 
 
-@dataclass(frozen=True, slots=True)
-class FinishedSubmap:
-    """A complete submap: its surfaces, and the closures that were accepted with it."""
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedKeyscan:
+    """A keyscan as the back end needs it."""
 
-    anchor: int
-    first: int
-    """First keyscan of the submap."""
-    last: int
-    """Last one (inclusive)."""
-    surface: FloatArray
-    """Points of the surfaces in the anchor's base, shape (N, 2), metres."""
-    closures: tuple[Constraint, ...]
+    record: Keyscan
+    odometry: Constraint | None
+    """Motion from the keyscan before; None for the first."""
+    points: PointScan
+    """Returns in its base."""
+    T_odom_base: FloatArray
+    """Pose by wheel odometry, shape (3,), metres and radians."""
+    T_local_base: FloatArray
+    """Pose in the tracker's smooth frame, shape (3,), metres and radians."""
+    travel_m: float
+    """Path length up to it, metres; turns count as ``TURN_AS_TRAVEL_M`` per radian."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,30 +107,23 @@ class Step:
     """Everything that one scan added."""
 
     pose: ScanPose
-    keyscan: Keyscan | None = None
-    odometry: Constraint | None = None
-    submap: FinishedSubmap | None = None
+    keyscan: MappedKeyscan | None = None
 
 
-class Mapper:
-    """SLAM of one robot. Poses are in its own ``map``, where the first keyscan has its odometry pose."""
+class LidarFrontend:
+    """Tracks one robot scan by scan and selects keyscans."""
 
-    def __init__(self, robot: str, config: LidarConfig, recognizer: PlaceRecognizer | None = None) -> None:
-        """``recognizer`` proposes loops whose drift is beyond the reach of the search; without one they stay open."""
+    def __init__(self, robot: str, config: LidarConfig) -> None:
         self.robot = robot
         self.config = config
         self._tracker = ScanTracker(config.tracker)
-        self._closer = LoopCloser(config.closing, config.search, config.verification, recognizer)
-        self._graph = PoseGraph()
-        self._factors = FactorCache(self._graph)
         self._lasers = Lasers()
-        self._newest: dict[int, int] = {}  # number of the newest keyscan of each laser
-        self._poses: list[FloatArray] = []  # T_map_base of each keyscan, optimised
-        self._local: list[FloatArray] = []  # T_local_base of each keyscan, smooth
-        self._travel: list[float] = []
-        self._points: dict[int, PointScan] = {}
-        self._next_anchor_m = 0.0
-        self._unsolved = 0
+        self._count = 0
+        self._newest: MappedKeyscan | None = None
+        self._T_local_newest: dict[int, FloatArray] = {}
+        """Pose of the newest keyscan of each laser."""
+        self._recent: deque[MappedKeyscan] = deque()
+        """The keyscans of the last ``submap_reach_m`` of travel."""
 
     def localize(self, scan: LaserScan) -> TrackingResult:
         """Find the pose of the next scan; nothing changes before :meth:`process`."""
@@ -143,7 +137,7 @@ class Mapper:
             tracking: its result of :meth:`localize`, if that was called before.
 
         Returns:
-            The pose of the scan, and what it added to the map.
+            The pose of the scan, and the keyscan that it became.
         """
         # 1. Scan matching against the running buffer.
         tracking = self._tracker.localize(scan) if tracking is None else tracking
@@ -151,12 +145,8 @@ class Mapper:
         tracked = tracking.tracked
         # 2. Keyscan: after enough motion the scan becomes a variable of the pose graph.
         laser = self._lasers.index(scan.laser)
-        if not self._is_keyscan(tracked, laser):
-            return Step(self._scan_pose(scan.stamp, tracked))
-        keyscan, odometry = self._add_keyscan(scan, tracked, laser)
-        # 3. Submap and loop closing: a complete submap is compared with earlier ones; closures start a solve.
-        submap = self._finish_submap()
-        return Step(self._scan_pose(scan.stamp, tracked), keyscan, odometry, submap)
+        keyscan = self._add_keyscan(scan, tracked, laser) if self._is_keyscan(tracked, laser) else None
+        return Step(self._scan_pose(scan.stamp, tracked), keyscan)
 
     @property
     def lasers(self) -> tuple[LaserModel, ...]:
@@ -166,7 +156,7 @@ class Mapper:
     @property
     def travel_m(self) -> float:
         """Path length up to the newest keyscan, metres; turns count as ``TURN_AS_TRAVEL_M`` per radian."""
-        return self._travel[-1] if self._travel else 0.0
+        return 0.0 if self._newest is None else self._newest.travel_m
 
     def recent_submap(self) -> tuple[Submap, FloatArray]:
         """The submap of the last ``submap_reach_m`` of travel.
@@ -174,31 +164,16 @@ class Mapper:
         Returns:
             The submap, in the base of the newest keyscan, and ``T_local_base`` of this keyscan, shape (3,).
         """
-        anchor = self._local[-1]
-        first = bisect_left(self._travel, self._travel[-1] - self.config.keyscans.submap_reach_m)
-        numbers = range(first, len(self._local))
-        return build_submap([(self._points[k], se2.between(anchor, self._local[k])) for k in numbers]), anchor
-
-    def finish(self) -> list[FinishedSubmap]:
-        """Complete the submaps that are still open at the end of the recording."""
-        rest = []
-        while submap := self._finish_submap(at_end=True):
-            rest.append(submap)
-        return rest
-
-    def optimized(self) -> FloatArray:
-        """``T_map_base`` of every keyscan after a robust solve (GNC), shape (N, 3), metres and radians."""
-        if self._closer.has_closures:
-            self._poses = list(optimize_gnc(self._graph, self._poses, factors=self._factors).poses)
-        return np.array(self._poses).reshape(-1, 3)
+        anchor = self._recent[-1].T_local_base
+        return build_submap([(k.points, se2.between(anchor, k.T_local_base)) for k in self._recent]), anchor
 
     def _is_keyscan(self, tracked: TrackedScan, laser: int) -> bool:
         """Whether the robot moved enough since the last keyscan of this laser; so each of them maps what it sees."""
         if tracked.scan is None:
             return False
-        if laser not in self._newest:
+        if laser not in self._T_local_newest:
             return True
-        motion = se2.between(self._local[self._newest[laser]], tracked.T_local_base)
+        motion = se2.between(self._T_local_newest[laser], tracked.T_local_base)
         gate = self.config.keyscans
         return bool(
             np.hypot(motion[0], motion[1]) >= gate.minimum_travel_distance_m
@@ -206,84 +181,38 @@ class Mapper:
         )
 
     def _scan_pose(self, stamp: float, tracked: TrackedScan) -> ScanPose:
-        number = len(self._local) - 1
-        return ScanPose(stamp, number, se2.between(self._local[number], tracked.T_local_base))
+        assert self._newest is not None  # the first scan is a keyscan
+        return ScanPose(stamp, self._count - 1, se2.between(self._newest.T_local_base, tracked.T_local_base))
 
-    def _add_keyscan(self, scan: LaserScan, tracked: TrackedScan, laser: int) -> tuple[Keyscan, Constraint | None]:
-        """Add a variable to the pose graph, with a constraint to the keyscan before it."""
+    def _add_keyscan(self, scan: LaserScan, tracked: TrackedScan, laser: int) -> MappedKeyscan:
+        """Add the scan to the running buffer, with a constraint to the keyscan before it."""
         points = tracked.scan or point_scan(scan.ranges_m, scan.laser)
-        number = len(self._local)
         self._tracker.insert(points, tracked.T_local_base, len(self.lasers))
-        self._points[number] = points
-        self._newest[laser] = number
+        self._T_local_newest[laser] = tracked.T_local_base
         ranges_m, announced = _valid_ranges(scan.ranges_m, scan.laser.max_range_m), self.lasers[laser]
         beams = None if scan.laser == announced else scan.laser.beams
-        keyscan = Keyscan(KeyscanId(self.robot, number), scan.stamp, ranges_m, laser, beams)
-        if number == 0:
-            start = np.array(scan.T_odom_base)
-            self._local.append(tracked.T_local_base)
-            self._poses.append(start)
-            self._travel.append(0.0)
-            self._graph.add_variable(start)
-            return keyscan, None
-        motion = se2.between(self._local[-1], tracked.T_local_base)
+        record = Keyscan(KeyscanId(self.robot, self._count), scan.stamp, ranges_m, laser, beams)
+        odometry, travel_m = self._odometry(tracked)
+        T_odom_base = np.array(scan.T_odom_base)
+        newest = MappedKeyscan(record, odometry, points, T_odom_base, tracked.T_local_base, travel_m)
+        self._newest = newest
+        self._count += 1
+        self._recent.append(newest)
+        while self._recent[0].travel_m < travel_m - self.config.keyscans.submap_reach_m:
+            self._recent.popleft()
+        return newest
+
+    def _odometry(self, tracked: TrackedScan) -> tuple[Constraint | None, float]:
+        """The constraint from the newest keyscan to the next one, and the path length up to that."""
+        if self._newest is None:
+            return None, 0.0
+        motion = se2.between(self._newest.T_local_base, tracked.T_local_base)
         constraint = Constraint(
-            self.robot, number - 1, number, ConstraintKind.ODOMETRY, frozen(motion),
+            self.robot, self._count - 1, self._count, ConstraintKind.ODOMETRY, frozen(motion),
             frozen(motion_information(motion, tracked, self.config.tracker.odometry)),
         )  # fmt: skip
-        self._local.append(tracked.T_local_base)
-        self._poses.append(se2.compose(self._poses[-1], motion))
         progress = float(np.hypot(motion[0], motion[1])) + TURN_AS_TRAVEL_M * abs(float(motion[2]))
-        self._travel.append(self._travel[-1] + progress)
-        self._graph.add_variable(self._poses[-1])
-        self._graph.add_edge(Edge(number - 1, number, constraint.T_i_j, constraint.information, robust=False))
-        return keyscan, constraint
-
-    def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
-        """Build the next submap once the robot is far enough past its anchor, and close loops to earlier ones."""
-        gate, travel = self.config.keyscans, self._travel
-        anchor = bisect_left(travel, self._next_anchor_m)
-        if anchor == len(travel) or (not at_end and travel[-1] < travel[anchor] + gate.submap_reach_m):
-            return None
-        self._next_anchor_m = travel[anchor] + gate.submap_every_m
-        first = bisect_left(travel, travel[anchor] - gate.submap_reach_m)
-        last = bisect_right(travel, travel[anchor] + gate.submap_reach_m) - 1
-        T_anchor = [se2.between(self._local[anchor], self._local[k]) for k in range(first, last + 1)]
-        submap = build_submap([(self._points[first + k], pose) for k, pose in enumerate(T_anchor)])
-        for number in [k for k in self._points if k < first]:
-            del self._points[number]
-        closures = self._close_loops(AnchoredSubmap(anchor, travel[anchor], submap))
-        return FinishedSubmap(anchor, first, last, submap.surface.points, closures)
-
-    def _close_loops(self, submap: AnchoredSubmap) -> tuple[Constraint, ...]:
-        """Compare a new submap with earlier ones; accepted closures become constraints."""
-        closures = self._closer.add(submap, self._poses)
-        constraints = tuple(self._constraint(closure) for closure in closures)
-        for c in constraints:
-            self._graph.add_edge(Edge(c.i, c.j, c.T_i_j, c.information, robust=True))
-        self._optimize_if_needed(closures)
-        return constraints
-
-    def _constraint(self, closure: LocalClosure) -> Constraint:
-        submaps = self._closer.submaps
-        return Constraint(
-            self.robot, submaps[closure.earlier].keyscan, submaps[closure.later].keyscan, ConstraintKind.CLOSURE,
-            frozen(closure.check.T_a_b), frozen(closure.check.information),
-        )  # fmt: skip
-
-    def _optimize_if_needed(self, closures: list[LocalClosure]) -> None:
-        """Solve at once if a closure contradicts the estimate, otherwise after ``SOLVE_AFTER`` closures.
-
-        A recognised loop may contradict it by so much that the Cauchy loss hardly pulls; only GNC closes it.
-        """
-        self._unsolved += len(closures)
-        enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._local))
-        if any(c.beyond_search for c in closures):
-            self.optimized()
-            self._unsolved = 0
-        elif self._unsolved >= enough or any(c.is_surprising for c in closures):
-            self._poses = list(optimize(self._graph, self._poses, loss=Loss.CAUCHY, factors=self._factors).poses)
-            self._unsolved = 0
+        return constraint, self._newest.travel_m + progress
 
 
 def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: OdometryConfig) -> FloatArray:

@@ -5,7 +5,8 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.closing import ClosingConfig
-from fcslam.lidar.mapper import LidarConfig, Mapper, motion_information
+from fcslam.lidar.backend import LidarBackend
+from fcslam.lidar.frontend import LidarConfig, LidarFrontend, motion_information
 from fcslam.lidar.odometry import OdometryConfig
 from fcslam.lidar.tracker import TrackedScan
 from fcslam.records import ConstraintKind
@@ -18,13 +19,16 @@ class Mapped:
     """A recording mapped to the end."""
 
     def __init__(self, scans, config=None):
-        self.mapper = Mapper("r", config or LidarConfig())
-        self.steps, self.stored = [], []
+        config = config or LidarConfig()
+        frontend, self.backend = LidarFrontend("r", config), LidarBackend("r", config)
+        self.steps, self.stored, self.submaps = [], [], []
         for scan in scans:
-            self.steps.append(self.mapper.process(scan))
-            self.stored.append(len(self.mapper._points))
-        self.rest = self.mapper.finish()
-        self.keyscans = self.mapper.optimized()
+            self.steps.append(step := frontend.process(scan))
+            if step.keyscan is not None:
+                self.submaps += filter(None, [self.backend.add(step.keyscan)])
+            self.stored.append(len(self.backend._points))
+        self.submaps += self.backend.finish()
+        self.keyscans = self.backend.optimized()
 
     @property
     def poses(self):
@@ -32,12 +36,8 @@ class Mapped:
         return se2.compose(self.keyscans[[p.keyscan for p in poses]], np.array([p.T_keyscan_base for p in poses]))
 
     @property
-    def submaps(self):
-        return [step.submap for step in self.steps if step.submap is not None] + self.rest
-
-    @property
     def odometry(self):
-        return [step.odometry for step in self.steps if step.odometry is not None]
+        return [k.odometry for step in self.steps if (k := step.keyscan) is not None and k.odometry is not None]
 
     @property
     def closures(self):
@@ -78,7 +78,7 @@ def test_a_loop_is_closed(truth, scans, mapped):
 
 def test_every_scan_has_a_pose_and_every_keyscan_a_place_in_the_chain(scans, mapped):
     assert [step.pose.stamp for step in mapped.steps] == [scan.stamp for scan in scans]
-    numbers = [step.keyscan.id.number for step in mapped.steps if step.keyscan is not None]
+    numbers = [step.keyscan.record.id.number for step in mapped.steps if step.keyscan is not None]
     assert numbers == list(range(len(mapped.keyscans)))
     assert {c.kind for c in mapped.odometry} == {ConstraintKind.ODOMETRY}
     assert {c.kind for c in mapped.closures} == {ConstraintKind.CLOSURE}
@@ -101,7 +101,7 @@ def test_the_map_starts_at_the_first_odometry_pose(truth):
 def test_submaps_cover_the_drive(mapped):
     anchors = [submap.anchor for submap in mapped.submaps]
     assert anchors == sorted(set(anchors))
-    travel = np.array(mapped.mapper._travel)
+    travel = np.array(mapped.backend._travel)
     assert np.diff(travel[anchors]).max() < 2.0 + 0.5
     for submap in mapped.submaps:
         assert submap.first <= submap.anchor <= submap.last

@@ -1,0 +1,207 @@
+"""The back end of one robot: keyscans and images in, records for the cloud out.
+
+It builds submaps, closes loops, solves the pose graph and describes places. Its output is a function of its inputs in
+their order, so it gives the same records wherever and whenever it runs (``fcslam.robot.beside``).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.errors import FeatureError
+from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig
+from fcslam.lidar.backend import FinishedSubmap, LidarBackend
+from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
+from fcslam.records import CameraImage, Channel, DetectorFile, KeyscanId, LaserModel, LaserScan, Place
+from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
+from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
+from fcslam.wire.messages import Body, Hello
+
+
+class SessionConfig(Settings):
+    """Settings of everything that turns sensor records into packets."""
+
+    lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM of one robot")
+    channels: tuple[Channel, ...] = Field(
+        default=tuple(Channel), min_length=1, description="sensors that describe places: lidar, camera"
+    )
+    birdseye: BirdseyeConfig = Field(default=BirdseyeConfig(), description="binary descriptors of LiDAR submaps")
+    own_places: OwnPlacesConfig = Field(
+        default=OwnPlacesConfig(), description="place recognition on the robot, among its own LiDAR places"
+    )
+    views: ViewsConfig = Field(default=ViewsConfig(), description="binary descriptors of camera images")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewKeyscan:
+    """The next keyscan of the present session."""
+
+    keyscan: MappedKeyscan
+    lasers: tuple[LaserModel, ...]
+    """All lasers so far."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewImage:
+    """The next camera image of the present session, between two scans."""
+
+    image: CameraImage
+    scan: LaserScan
+    """The newest scan."""
+    pose: ScanPose
+    """Its pose."""
+    scans: tuple[LaserScan, ...]
+    """The newest scan of each laser."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewDetector:
+    """Another network for camera images, from the next keyscan on."""
+
+    file: DetectorFile
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class SessionEnd:
+    """The present session ends; the next keyscan begins another one."""
+
+
+BackendInput = NewKeyscan | NewImage | NewDetector | SessionEnd
+
+
+class RobotBackend:
+    """Handles the inputs of one robot, session after session. The epoch is the number of the session, from 0."""
+
+    def __init__(self, robot: str, config: SessionConfig) -> None:
+        """Load the detector of camera images.
+
+        Raises:
+            FeatureError: the detector is a network whose weights cannot be used.
+        """
+        self._robot = robot
+        self._config = config
+        self._view_extractor = ViewExtractor(config.views)
+        self._session = _Session(robot, 0, self._view_extractor, config)
+
+    def process(self, input: BackendInput) -> list[Body]:
+        """Handle the next input; returns what the robot sends because of it.
+
+        Raises:
+            FeatureError: the file of a new detector is not the announced one, cannot be used, or describes a channel
+                that this robot does not use; nothing has changed.
+        """
+        match input:
+            case NewKeyscan():
+                return self._session.add(input)
+            case NewImage():
+                self._session.describe(input)
+            case NewDetector():
+                self._set_detector(input.file, input.path)
+            case SessionEnd():
+                rest = self._session.finish()
+                self._view_extractor.reset()
+                self._session = _Session(self._robot, self._session.epoch + 1, self._view_extractor, self._config)
+                return rest
+        return []
+
+    def _set_detector(self, file: DetectorFile, path: Path) -> None:
+        if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
+            raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
+        if file.version != self._view_extractor.detector_version:
+            self._view_extractor.set_detector(file, path)
+
+
+class _Session:
+    """Maps one session of a robot."""
+
+    def __init__(self, robot: str, epoch: int, view_extractor: ViewExtractor, config: SessionConfig) -> None:
+        self.epoch = epoch
+        self._robot = robot
+        self._config = config
+        self._own_places = OwnPlaces(config.own_places, config.birdseye)
+        self._lidar = LidarBackend(robot, config.lidar, self._own_places)
+        self._lasers: tuple[LaserModel, ...] = ()
+        self._view_extractor = view_extractor
+        self._views: list[CameraView] = []
+        """Views that wait until the submap around them is complete."""
+        self._submaps: dict[int, tuple[int, int]] = {}
+        """By keyscan of a camera place: first and last keyscan of the submap that it was sent with."""
+        self._described: set[tuple[int, str]] = set()
+        """Keyscan and detector version of every camera place that was sent."""
+        self._announced: Hello | None = None
+        """The last hello."""
+
+    def add(self, input: NewKeyscan) -> list[Body]:
+        """Add the next keyscan; returns it with its odometry, and the submap that it completes."""
+        self._lasers = input.lasers
+        bodies = [*self._announcement(), *essential(input)]
+        submap = self._lidar.add(input.keyscan)
+        return bodies if submap is None else [*bodies, *self._submap_bodies(submap)]
+
+    def describe(self, input: NewImage) -> None:
+        """Describe an image and keep the view until the submap around it is complete."""
+        view = self._view_extractor.describe(input.image, input.scan, input.pose, input.scans)
+        if view is not None:
+            self._views.append(view)
+
+    def finish(self) -> list[Body]:
+        """End the session; returns the open submaps."""
+        announcement, rest = self._announcement(), self._lidar.finish()
+        last = rest[-1:]
+        return [*announcement, *(body for submap in rest for body in self._submap_bodies(submap, submap in last))]
+
+    def _submap_bodies(self, submap: FinishedSubmap, at_end: bool = False) -> list[Body]:
+        """Closures of a submap within this robot, its LiDAR place, and the camera places up to its anchor."""
+        bodies: list[Body] = list(submap.closures)
+        if Channel.LIDAR in self._config.channels:
+            bodies.append(self._lidar_place(submap))
+        complete = [view for view in self._views if at_end or view.keyscan <= submap.anchor]
+        self._views = self._views[len(complete) :]
+        # A view outside of every submap is no place: the robot may have jumped between two scans.
+        shown = [view for view in complete if submap.first <= view.keyscan <= submap.last]
+        self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
+        return [*bodies, *(self._camera_place(view) for view in shown)]
+
+    def _announcement(self) -> list[Body]:
+        """A hello at the start and if there is one more laser or another detector, then the camera places that this
+        detector describes again."""
+        hello, before = self._hello(), self._announced
+        if not hello.lasers or hello == before:
+            return []
+        self._announced = hello
+        if before is not None and hello.detector_versions == before.detector_versions:
+            return [hello]
+        views = {view.keyscan: view for view in self._view_extractor.describe_again()} if self._submaps else {}
+        self._views = [views.get(view.keyscan, view) for view in self._views]
+        sent = [view for view in views.values() if view.keyscan in self._submaps]
+        fresh = [view for view in sent if (view.keyscan, view.detector_version) not in self._described]
+        return [hello, *(self._camera_place(view) for view in fresh)]
+
+    def _lidar_place(self, submap: FinishedSubmap) -> Place:
+        features = self._own_places.features(submap.anchor)
+        return Place(
+            KeyscanId(self._robot, submap.anchor), Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last,
+            features.keypoints_m, features.descriptors,
+        )  # fmt: skip
+
+    def _camera_place(self, view: CameraView) -> Place:
+        first, last = self._submaps[view.keyscan]
+        self._described.add((view.keyscan, view.detector_version))
+        return Place(
+            KeyscanId(self._robot, view.keyscan), Channel.CAMERA, view.detector_version, first, last, view.keypoints,
+            view.descriptors,
+        )  # fmt: skip
+
+    def _hello(self) -> Hello:
+        versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
+        chosen = {channel: versions[channel] for channel in self._config.channels}
+        return Hello(self._robot, self.epoch, self._lasers, chosen)
+
+
+def essential(input: NewKeyscan) -> list[Body]:
+    """What the map cannot do without: the keyscan and its odometry."""
+    keyscan = input.keyscan
+    return [keyscan.record] if keyscan.odometry is None else [keyscan.record, keyscan.odometry]

@@ -1,0 +1,98 @@
+"""Where a robot's back end runs: in the process of the front end, or in another one beside it.
+
+A recording waits for the back end at every keyscan. A live robot must not: the pose of a scan is due before the next
+scan comes, and a solve of a large graph takes longer than that. Both get the same records in the same order.
+"""
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+from typing import Protocol
+
+from fcslam.errors import FeatureError
+from fcslam.robot.backend import BackendInput, RobotBackend, SessionConfig
+from fcslam.wire.messages import Body
+
+YIELD_TO_TRACKER = 5
+"""Increment of the worker's niceness: where cores are few, the tracker goes first."""
+
+
+class BackendRunner(Protocol):
+    """Handles the inputs of one robot's back end in their order."""
+
+    def submit(self, input: BackendInput) -> "Future[list[Body]]":
+        """Start to handle the next input; see :meth:`RobotBackend.process`."""
+
+
+class Inline:
+    """Runs the back end at once; its errors are errors of the caller."""
+
+    def __init__(self, backend: RobotBackend) -> None:
+        self._backend = backend
+
+    def submit(self, input: BackendInput) -> "Future[list[Body]]":
+        """Handle the next input; the result is ready."""
+        done: Future[list[Body]] = Future()
+        try:
+            done.set_result(self._backend.process(input))
+        except FeatureError as error:
+            done.set_exception(error)
+        return done
+
+
+class Beside:
+    """Runs the back end in the only worker of an executor, which may be another process."""
+
+    def __init__(self, robot: str, config: SessionConfig, executor: Executor) -> None:
+        """Start the back end.
+
+        Raises:
+            FeatureError: the detector is a network whose weights cannot be used.
+        """
+        self._robot = robot
+        self._executor = executor
+        executor.submit(_begin, robot, config).result()
+
+    def submit(self, input: BackendInput) -> "Future[list[Body]]":
+        """Queue the next input."""
+        return self._executor.submit(_process, self._robot, input)
+
+
+@contextmanager
+def backend_process(robot: str, config: SessionConfig) -> Iterator[Beside]:
+    """A back end in a process of its own, which ends with this block."""
+    executor = ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+    try:
+        yield Beside(robot, config, executor)
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+_backends: dict[str, RobotBackend] = {}
+"""The back ends that run in this worker, by robot."""
+
+
+def _begin(robot: str, config: SessionConfig) -> None:
+    _backends[robot] = RobotBackend(robot, config)
+
+
+def _process(robot: str, input: BackendInput) -> list[Body]:
+    return _backends[robot].process(input)
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the robot ends this one
+    os.nice(YIELD_TO_TRACKER)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A robot that is killed cannot shut its worker down."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

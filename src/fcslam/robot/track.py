@@ -1,0 +1,65 @@
+"""The poses of a robot's scans in one session. They stay on the robot."""
+
+from array import array
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.geometry import se2
+from fcslam.lidar.frontend import ScanPose
+from fcslam.records import FloatArray
+
+
+class ScanTrack:
+    """Each scan has a fixed offset to a keyscan, and each keyscan a pose in ``odom``, the frame of the session's first
+    keyscan. It grows by 36 bytes a scan."""
+
+    def __init__(self) -> None:
+        self._stamps, self._keyscans, self._T_keyscan_base = array("d"), array("i"), array("d")
+        self._T_odom_keyscan = array("d", np.zeros(3))
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def __iter__(self) -> Iterator[ScanPose]:
+        return map(self.__getitem__, range(len(self)))
+
+    def __getitem__(self, index: int) -> ScanPose:
+        number = range(len(self))[index]
+        offset = np.array(self._T_keyscan_base[3 * number : 3 * number + 3])
+        return ScanPose(self._stamps[number], self._keyscans[number], offset)
+
+    def add(self, pose: ScanPose) -> None:
+        """Append the pose of the next scan."""
+        self._stamps.append(pose.stamp)
+        self._keyscans.append(pose.keyscan)
+        self._T_keyscan_base.extend(pose.T_keyscan_base)
+
+    def extend(self, motion: FloatArray) -> None:
+        """Append the next keyscan by the motion to it from the one before, shape (3,), as it is sent to the cloud."""
+        self._T_odom_keyscan.extend(se2.compose(np.array(self._T_odom_keyscan[-3:]), motion))
+
+    @property
+    def stamps(self) -> FloatArray:
+        """Stamp of each scan, shape (N,), seconds."""
+        return np.array(self._stamps)
+
+    @property
+    def keyscans(self) -> NDArray[np.int64]:
+        """Number of each scan's keyscan, shape (N,)."""
+        return np.array(self._keyscans, dtype=np.int64)
+
+    @property
+    def T_keyscan_base(self) -> FloatArray:
+        """Pose of each scan in its keyscan's base, shape (N, 3), metres and radians."""
+        return np.array(self._T_keyscan_base).reshape(-1, 3)
+
+    def T_odom_base(self) -> FloatArray:
+        """Pose of each scan in ``odom``, shape (N, 3), metres and radians."""
+        return se2.compose(np.array(self._T_odom_keyscan).reshape(-1, 3)[self.keyscans], self.T_keyscan_base)
+
+    def newest(self) -> FloatArray:
+        """Pose of the newest scan in ``odom``, shape (3,), metres and radians."""
+        first = 3 * self._keyscans[-1]
+        return se2.compose(np.array(self._T_odom_keyscan[first : first + 3]), np.array(self._T_keyscan_base[-3:]))
