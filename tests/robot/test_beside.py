@@ -1,0 +1,125 @@
+"""A back end that runs beside the tracker: the same packets, only later, and no scan waits for it."""
+
+import os
+import signal
+from concurrent.futures import BrokenExecutor, Executor, Future
+
+import pytest
+
+from fcslam.records import Channel, Constraint, ConstraintKind, Keyscan, Place
+from fcslam.robot.beside import Beside, backend_process
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.wire.messages import Hello
+from fcslam.wire.packets import encode
+from tests import small_fleet
+from tests.robot.kidnapping import kidnapping
+
+CONFIG = RobotConfig(channels=(Channel.LIDAR,))
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return list(small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
+
+
+class Held(Executor):
+    """Works when it is told to, and breaks after so many tasks."""
+
+    def __init__(self, breaks_after=10**9):
+        self._left = breaks_after
+        self._tasks = []
+        self.holds = False
+
+    def submit(self, function, /, *arguments):
+        future = Future()
+        self._tasks.append((future, function, arguments))
+        if not self.holds:
+            self.work()
+        return future
+
+    def work(self):
+        for future, function, arguments in self._tasks:
+            self._left -= 1
+            if self._left < 0:
+                future.set_exception(BrokenExecutor("it was killed"))
+            else:
+                future.set_result(function(*arguments))
+        self._tasks.clear()
+
+
+def driven(scans, backend=None):
+    robot = RobotFrontend("r", CONFIG, backend)
+    return robot, [packet for scan in scans for packet in robot.process(scan)] + robot.finish()
+
+
+def contents(packets):
+    return [encode(packet) for packet in packets]
+
+
+def test_poses_are_known_while_the_back_end_is_busy(scans):
+    inline, expected = driven(scans)
+    executor = Held()
+    robot = RobotFrontend("r", CONFIG, Beside("r", CONFIG, executor))
+    executor.holds = True
+    for number, scan in enumerate(scans, start=1):
+        assert robot.process(scan) == []
+        assert len(robot.scan_poses) == number
+    assert robot.scan_poses.T_odom_base().tobytes() == inline.scan_poses.T_odom_base().tobytes()
+    assert robot.backlog == sum(isinstance(packet.body, Keyscan) for packet in expected)
+    executor.work()
+    executor.holds = False
+    assert contents([*robot.ready(), *robot.finish()]) == contents(expected)
+    assert robot.backlog == 0
+
+
+@pytest.mark.slow
+def test_sessions_of_a_lost_robot_come_in_order_when_the_back_end_is_late():
+    scans, _ = kidnapping()
+    executor = Held()
+    backend = Beside("r", CONFIG, executor)
+    robot, packets = RobotFrontend("r", CONFIG, backend), []
+    for number, scan in enumerate(scans):
+        executor.holds = number % 40 != 0
+        packets += robot.process(scan)
+    executor.holds = False
+    executor.work()
+    assert contents(packets + robot.finish()) == contents(driven(scans)[1])
+
+
+def test_a_back_end_that_breaks_costs_closures_and_places_but_no_keyscan(scans):
+    expected = driven(scans)[1]
+    robot, packets = driven(scans, Beside("r", CONFIG, Held(breaks_after=10)))
+    assert robot.backend_failure == "BrokenExecutor: it was killed"
+    assert contents(packets[:10]) == contents(expected[:10])
+    kept = [p.body for p in expected if not isinstance(p.body, Place) and not is_closure(p.body)]
+    assert contents_of([packet.body for packet in packets]) == contents_of(kept)
+    assert [packet.sequence for packet in packets] == list(range(len(packets)))
+
+
+def test_a_back_end_that_breaks_at_once_leaves_a_map(scans):
+    robot, packets = driven(scans, Beside("r", CONFIG, Held(breaks_after=1)))
+    assert packets[0].body == Hello("r", 0, (scans[0].laser,), {})
+    keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
+    assert len(keyscans) > max(pose.keyscan for pose in robot.scan_poses)
+    assert len(contents(packets)) == 2 * len(keyscans)
+
+
+def is_closure(body):
+    return isinstance(body, Constraint) and body.kind is ConstraintKind.CLOSURE
+
+
+def contents_of(bodies):
+    """Which records, without their numbers."""
+    return [(type(body), getattr(body, "id", None), getattr(body, "j", None)) for body in bodies]
+
+
+@pytest.mark.slow
+def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothing(scans):
+    expected = driven(scans)[1]
+    with backend_process("r", CONFIG) as backend:
+        assert contents(driven(scans, backend)[1]) == contents(expected)
+        worker = backend._executor.submit(os.getpid).result()
+        os.kill(worker, signal.SIGKILL)
+        robot, packets = driven(scans, backend)
+        assert "BrokenProcessPool" in robot.backend_failure
+        assert sum(isinstance(p.body, Keyscan) for p in packets) == sum(isinstance(p.body, Keyscan) for p in expected)
