@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.backend import LidarBackend
+from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend, motion_information
 from fcslam.lidar.odometry import OdometryConfig
 from fcslam.lidar.tracker import TrackedScan

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
+from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
 from fcslam.records import frozen
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
