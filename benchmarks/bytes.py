@@ -2,7 +2,7 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/bytes.py
 
-Counted by the transport's ledger on the split logs: encoded packets, without what a network adds to them. Keyscans,
+Counted on the split logs: encoded packets, without what a network adds to them. Keyscans,
 constraints and places go up; corrections and acknowledgements come down. Seconds are those of the recordings, paths the
 odometry's. "A place with 300 descriptors" is every place that has as many, cut to its 300 strongest and encoded.
 
@@ -30,10 +30,9 @@ from fcslam.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import Source, open_source, split
-from fcslam.wire.ledger import Ledger
+from fcslam.wire.ledger import Counter, Ledger
 from fcslam.wire.messages import UPLINK, Packet, PacketKind
-from fcslam.wire.packets import encode
-from fcslam.wire.transport import InMemoryTransport
+from fcslam.wire.packets import encode, measure
 
 STATED_DESCRIPTORS = 300
 SPACINGS_M = (2.0, 4.0, 8.0, 16.0)
@@ -79,14 +78,16 @@ def fly(sources: list[Source]) -> tuple[Ledger, list[Packet]]:
     """The whole traffic of a mission, and the packets that carried places."""
     config = MissionConfig()
     robots = [RobotFrontend(source.name, config.robot) for source in sources]
-    transport = InMemoryTransport(Cloud(config.fleet, config.seed).receive)
+    cloud, traffic = Cloud(config.fleet, config.seed), Counter()
     streams = [packets(source, robot) for source, robot in zip(sources, robots, strict=True)]
     places = []
     for packet in heapq.merge(*streams, key=lambda packet: packet.order):
-        transport.send(encode(packet))
+        sent = measure(packet)
+        for sized in (sent, *map(measure, cloud.apply(sent.packet))):
+            traffic.accept(sized.label, sized.size)
         if isinstance(packet.body, Place):
             places.append(packet)
-    return transport.ledger(), places
+    return traffic.ledger(), places
 
 
 def packets(source: Source, robot: RobotFrontend) -> Iterator[Packet]:

@@ -11,7 +11,7 @@ reference if it is more than 1 m off.
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import common
 import numpy as np
@@ -22,6 +22,7 @@ from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import ClosureStatus, FloatArray, LaserScan, frozen
 from fcslam.runs import Run
 from fcslam.sources import Source, open_source
+from fcslam.sources.faults import Faults
 
 LOGS = ("acapulco", "belgioioso", "csail", "edmonton", "fhw", "freiburg-101", "freiburg-campus", "orebro", "seattle",
         "intel", "freiburg-079")  # fmt: skip
@@ -58,6 +59,7 @@ class Recording:
 
     name: str
     scans: list[LaserScan]
+    faults: Faults = field(default_factory=lambda: Faults({}))
 
     def records(self) -> Iterator[LaserScan]:
         return iter(self.scans)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fcslam.sources.faults import Faults
 from tests.lidar.worlds import box, drifting, drive, path, recording
 
 WALLS = np.vstack(
@@ -57,6 +58,8 @@ def doors(count=16, period_m=2.5):
 
 class Drive:
     """A recording of one robot that drives through a drawn world, with drifting odometry."""
+
+    faults = Faults({})
 
     def __init__(self, name, waypoints, segments, seed=0, **options):
         poses = drive(waypoints)

@@ -35,6 +35,7 @@ ROOMS = [
     "learning",
     "federated",
     "simulation",
+    "driving",
     "mission",
     "api",
     "evaluation",

@@ -11,6 +11,7 @@ from fcslam.errors import FcslamError, PacketError, SourceError
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus, Veto
 from fcslam.sources import open_source, write_carmen
+from fcslam.sources.faults import Faults
 from tests.robot.kidnapping import kidnapping
 
 
@@ -46,6 +47,7 @@ class Kidnapped:
     """A recording of a robot that was put down elsewhere."""
 
     name = "r"
+    faults = Faults({})
 
     def records(self):
         return iter(kidnapping()[0])
@@ -189,9 +191,9 @@ def test_two_recordings_of_one_name_are_refused(logs, tmp_path):
 
 
 def test_a_refusal_by_the_cloud_is_not_lost(logs, monkeypatch):
-    def refuse(_self, _data):
+    def refuse(_self, _packet):
         raise PacketError("no room")
 
-    monkeypatch.setattr(mission.Cloud, "receive", refuse)
+    monkeypatch.setattr(mission.Cloud, "apply", refuse)
     with pytest.raises(FcslamError, match=r"robot_1.*no room"):
         run_mission([open_source(logs[0])], MissionConfig())

@@ -1,6 +1,6 @@
 """Scanners whose beams vary, and several on one robot, from the sensor to the map."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from fcslam.geometry import se2
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import Beams, LaserModel, LaserScan, frozen
 from fcslam.runs.map_files import Occupancy, parse_map
+from fcslam.sources.faults import Faults
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
 from tests.lidar.worlds import box, drifting, drive, path, pose_errors, ranges, ring, ring_drive
@@ -33,6 +34,7 @@ class Recording:
 
     scans: list
     name: str = "r"
+    faults: Faults = field(default_factory=lambda: Faults({}))
 
     def records(self):
         return iter(self.scans)

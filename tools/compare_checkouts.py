@@ -33,18 +33,21 @@ DOWNLINK = re.compile(r"downlink|acknowledgement|correction|release|detector_upd
 RUN = """
 import hashlib, sys
 import fcslam.mission as mission
-encode, path = mission.encode, sys.argv.pop(1)
-with open(path, "w") as packets:
+from fcslam.wire import packets as wire
+coder, path = mission if hasattr(mission, "encode") else wire, sys.argv.pop(1)
+uplink, encode = {"Hello", "Keyscan", "Constraint", "Place"}, coder.encode
+with open(path, "w", buffering=1) as packets:
     def recorded(packet):
         data = encode(packet)
-        packets.write(f"{hashlib.sha256(data).hexdigest()} {len(data)}\\n")
+        if type(packet.body).__name__ in uplink:
+            packets.write(f"{hashlib.sha256(data).hexdigest()} {len(data)}\\n")
         return data
-    mission.encode = recorded
+    coder.encode = recorded
     from fcslam.cli import main
     code = main(sys.argv[1:])
 sys.exit(code)
 """
-"""Runs the command line and writes down a digest of every packet that a robot sends."""
+"""Runs the command line and writes down a digest of every packet that a robot sends, in processes of any number."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,8 @@ def contents(place: Path, case: Case, ignore_downlink: bool) -> dict[str, str]:
     found = {}
     for path in sorted(files):
         content = path.read_bytes()
+        if path.suffix == ".packets":
+            content = b"".join(sorted(content.splitlines()))
         if path.name == "metrics.json" and ignore_downlink:
             rows = [row for row in json.loads(content) if not DOWNLINK.search(row["name"])]
             content = json.dumps(rows).encode()

@@ -8,6 +8,7 @@ from typing import Any
 
 from fcslam import sources
 from fcslam.config import load, parse
+from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
 from fcslam.mission import MissionConfig, Watch, run_mission
 from fcslam.records import Veto
@@ -32,6 +33,7 @@ def map_recordings(
     bag_options: BagOptions | None = None,
     progress: Watch | None = None,
     force: bool = False,
+    processes: int = 1,
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
@@ -52,6 +54,7 @@ def map_recordings(
         bag_options: topics and the pose of the laser, where a ROS bag leaves a choice.
         progress: called every 50 scans, and before the maps are fused, with the state of the mission.
         force: replace a run that is at ``output``.
+        processes: number of robots that are mapped at a time, each in a process of its own; it does not change the run.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -61,7 +64,7 @@ def map_recordings(
         prepare_output(Path(output), force)
     settings = _settings(config, seed, join_maps)
     robots = split_recordings(_opened(recordings, bag_options), split)
-    run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes))
+    run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes), side_by_side(processes))
     if output is not None:
         run.save(output, force)
     return run

@@ -4,8 +4,8 @@ sources -> robot (LiDAR SLAM, features) -> packets -> cloud (places -> graph -> 
 """
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from pydantic import Field
 
@@ -15,18 +15,18 @@ from fcslam.cloud.report import Track, run_of, traffic_metrics
 from fcslam.cloud.sessions import check_robot, robot_of, session_name
 from fcslam.cloud.settings import FleetConfig
 from fcslam.config import Settings, dump
+from fcslam.driving import Drive, Leg, one_by_one
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.metrics.jumps import JumpLimits
-from fcslam.records import Keyscan, LaserScan, Veto
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.track import ScanTrack
+from fcslam.records import Veto
+from fcslam.robot.frontend import RobotConfig
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
+from fcslam.sources.faults import Faults
 from fcslam.wire.checks import check_name
-from fcslam.wire.messages import Packet
-from fcslam.wire.packets import encode
-from fcslam.wire.transport import InMemoryTransport
+from fcslam.wire.ledger import Counter
+from fcslam.wire.packets import SizedPacket, measure
 
 
 class MissionConfig(Settings):
@@ -50,15 +50,21 @@ class Progress:
     closures: dict[str, int]
     fusing: bool = False
     """Whether all packets are sent, and the cloud decides and fuses."""
+    faults: Mapping[str, Faults] = field(default_factory=dict)
+    """What was wrong with the recordings, by robot; of those that were read to their end."""
 
 
 Watch = Callable[[Progress], None]
 
 
 def run_mission(
-    sources: Sequence[Source], config: MissionConfig, watch: Watch = lambda _: None, vetoes: Sequence[Veto] = ()
+    sources: Sequence[Source],
+    config: MissionConfig,
+    watch: Watch = lambda _: None,
+    vetoes: Sequence[Veto] = (),
+    drive: Drive = one_by_one,
 ) -> Run:
-    """Map recordings together, one robot each, without the closures of ``vetoes``.
+    """Map recordings together, one robot each, without the closures of ``vetoes``; ``drive`` runs the robots.
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
@@ -67,65 +73,72 @@ def run_mission(
     """
     _check_robots(sources)
     _check_vetoes(vetoes, [source.name for source in sources])
-    robots = [RobotFrontend(source.name, config.robot) for source in sources]
     cloud = Cloud(config.fleet, config.seed)
     for veto in vetoes:
         cloud.fleet.veto(veto)
-    transport = InMemoryTransport(cloud.receive)
-    meter = _Meter(watch, cloud.fleet)
-    streams = [_packets(source, robot, meter) for source, robot in zip(sources, robots, strict=True)]
-    for packet in heapq.merge(*streams, key=lambda packet: packet.order):
-        reply = transport.send(encode(packet))
-        if reply.refusal:
-            raise FcslamError(f"{packet.robot}: the cloud refused a packet: {reply.refusal}")
+    traffic = Counter()
+    meter = _Meter(watch, cloud.fleet, [source.name for source in sources])
+    with drive(sources, config.robot) as robots:
+        streams = [_packets(legs, meter) for legs in robots]
+        for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
+            try:
+                replies = cloud.apply(sent.packet)
+            except PacketError as error:
+                raise FcslamError(f"{sent.packet.robot}: the cloud refused a packet: {error}") from error
+            for packet in (sent, *map(measure, replies)):
+                traffic.accept(packet.label, packet.size)
     meter.report(fusing=True)
     scans = (Metric("scans", meter.scans, "1"), Metric("recorded_time", meter.recorded_s, "s"))
     tracks = {
-        session_name(robot.robot, epoch): _track(poses) for robot in robots for epoch, poses in enumerate(robot.tracks)
+        session_name(robot, epoch): track
+        for robot, sessions in meter.tracks.items()
+        for epoch, track in enumerate(sessions)
     }
-    metrics = (*scans, *traffic_metrics(transport.ledger(), tracks))
+    metrics = (*scans, *traffic_metrics(traffic.ledger(), tracks))
     return run_of(cloud.finalize(), tracks, metrics, dump(config), config.map)
 
 
-def _packets(source: Source, robot: RobotFrontend, meter: "_Meter") -> Iterator[Packet]:
+def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
     """The packets that one robot sends over its recording."""
-    for record in source.records():
-        packets = robot.process(record)
-        if isinstance(record, LaserScan):
-            meter.count(robot.robot, record.stamp, packets)
-        yield from packets
-    yield from robot.finish()
+    for leg in legs:
+        meter.count(leg)
+        yield from leg.packets
 
 
 class _Meter:
     """Counts scans, keyscans and recorded time, and reports the progress."""
 
-    EVERY = 50
-
-    def __init__(self, watch: Watch, fleet: Fleet) -> None:
+    def __init__(self, watch: Watch, fleet: Fleet, robots: Sequence[str]) -> None:
         self._watch = watch
         self._fleet = fleet
         self._span: dict[str, tuple[float, float]] = {}
+        self._faults: dict[str, Faults] = {}
         self.scans = self.keyscans = 0
+        self.tracks: dict[str, Sequence[Track]] = dict.fromkeys(robots, ())
+        """By robot and session, of the robots that are done."""
 
     @property
     def recorded_s(self) -> float:
         """Time between the first and the last scan, of all robots together."""
         return sum(last - first for first, last in self._span.values())
 
-    def count(self, robot: str, stamp: float, packets: Sequence[Packet]) -> None:
-        """One more scan."""
-        first, last = self._span.get(robot, (stamp, stamp))
-        self._span[robot] = min(first, stamp), max(last, stamp)
-        self.scans += 1
-        self.keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
-        if self.scans % self.EVERY == 0:
+    def count(self, leg: Leg) -> None:
+        """One more leg of a robot."""
+        if leg.stamps:
+            first, last = self._span.get(leg.robot, (leg.stamps[0], leg.stamps[0]))
+            self._span[leg.robot] = min(first, *leg.stamps), max(last, *leg.stamps)
+        self.scans += len(leg.stamps)
+        self.keyscans += leg.keyscans
+        if leg.faults is None:
             self.report()
+        else:
+            self.tracks[leg.robot] = leg.tracks
+            self._faults[leg.robot] = leg.faults
 
     def report(self, fusing: bool = False) -> None:
         """Report the progress now."""
         closures = self._fleet.closure_counts()
-        self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing))
+        self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing, self._faults.copy()))
 
 
 def _check_robots(sources: Sequence[Source]) -> None:
@@ -147,7 +160,3 @@ def _check_vetoes(vetoes: Sequence[Veto], robots: Sequence[str]) -> None:
     for name in (name for veto in vetoes for name in (veto.robot_i, veto.robot_j)):
         if robot_of(name) not in robots:
             raise ConfigError(f"a veto names '{name}', but the robots are {', '.join(robots)}")
-
-
-def _track(poses: ScanTrack) -> Track:
-    return Track(poses.stamps, poses.keyscans, poses.T_keyscan_base)

@@ -1,4 +1,4 @@
-"""Packets through the in-memory transport: what is refused, why, and that the fleet is none the worse for it."""
+"""Packets that do not fit: what is refused, why, and that the fleet is none the worse for it."""
 
 from dataclasses import replace
 
@@ -9,10 +9,10 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.replies import is_news
 from fcslam.cloud.settings import FleetConfig
+from fcslam.errors import PacketError
 from fcslam.records import Beams, Channel, ConstraintKind, Correction, KeyscanId, frozen
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
-from fcslam.wire.transport import InMemoryTransport
 from tests.scripted import LASER, closures, keyscan, motion, place, rectangle, stream
 from tests.small_fleet import feed, fingerprint, in_order
 
@@ -58,6 +58,15 @@ HOSTILE = {
 }
 
 
+def refusal_of(cloud, data):
+    """Why the cloud refuses these bytes; None if it accepts them."""
+    try:
+        cloud.receive(data)
+    except PacketError as error:
+        return str(error)
+    return None
+
+
 @pytest.fixture
 def reference(scripted):
     return fingerprint(feed(scripted(SCRIPT), PACKETS).finalize())
@@ -79,14 +88,10 @@ def rest(body, refused):
 @pytest.mark.parametrize(("body", "reason"), HOSTILE.values(), ids=HOSTILE)
 def test_what_does_not_fit_is_refused_and_leaves_no_trace(scripted, reference, body, reason):
     cloud = scripted(SCRIPT)
-    transport = InMemoryTransport(cloud.receive)
     feed(cloud, PACKETS[:HALF])
     before = fingerprint(feed(scripted(SCRIPT), PACKETS[:HALF]).finalize())
     for attempt in range(2):  # a second attempt fares no better
-        reply = transport.send(encode(next_packet(body, attempt)))
-        assert reason in (reply.refusal or "")
-        assert not reply.packets
-    assert transport.ledger().refused.count == 2
+        assert reason in refusal_of(cloud, encode(next_packet(body, attempt)))
     assert fingerprint(cloud.finalize()) == before
     assert fingerprint(feed(cloud, rest(body, refused=2)).finalize()) == reference
 
@@ -96,10 +101,9 @@ def test_what_does_not_fit_is_refused_and_leaves_no_trace(scripted, reference, b
 def test_what_comes_early_and_does_not_fit_does_no_harm_either(scripted, reference, body, reason):
     """It waits for the packets before it; the packet that lets it speak is not blamed."""
     cloud = scripted(SCRIPT)
-    transport = InMemoryTransport(cloud.receive)
-    transport.send(encode(next_packet(body)))
+    refusal_of(cloud, encode(next_packet(body)))
     for packet in PACKETS[:HALF]:
-        assert transport.send(encode(packet)).refusal is None
+        assert refusal_of(cloud, encode(packet)) is None
     assert fingerprint(feed(cloud, rest(body, refused=1)).finalize()) == reference
 
 
@@ -107,16 +111,15 @@ def test_what_comes_early_and_does_not_fit_does_no_harm_either(scripted, referen
 def test_a_robot_that_is_called_like_a_session_is_refused(scripted, reference, name):
     cloud = feed(scripted(SCRIPT), PACKETS[:HALF])
     again = Packet(name, 0, 0, NOW, Hello(name, 0, (LASER,), {}))
-    assert "without '+" in (InMemoryTransport(cloud.receive).send(encode(again)).refusal or "")
+    assert "without '+" in refusal_of(cloud, encode(again))
     assert fingerprint(feed(cloud, PACKETS[HALF:]).finalize()) == reference
 
 
 def test_bytes_that_are_no_packet_are_refused(scripted, reference):
     cloud = feed(scripted(SCRIPT), PACKETS[:HALF])
-    transport = InMemoryTransport(cloud.receive)
     good = encode(PACKETS[HALF])
     for data in (b"", b"\x00" * 50, good[:-3], good + b"\x00", b"GET / HTTP/1.1\r\n"):
-        assert transport.send(data).refusal
+        assert refusal_of(cloud, data)
     assert fingerprint(feed(cloud, PACKETS[HALF:]).finalize()) == reference
 
 
@@ -124,18 +127,17 @@ def test_a_keyscan_waits_for_the_motion_to_the_one_before(scripted):
     packets = stream("a", POSES, start_s=0.0)
     cloud = feed(scripted(), packets[:3])  # hello, keyscan 0, place 0
     feed(cloud, [Packet("a", 0, 3, 1.0, keyscan("a", 1, 1.0))])
-    transport = InMemoryTransport(cloud.receive)
-    skipped = transport.send(encode(Packet("a", 0, 4, 2.0, keyscan("a", 2, 2.0))))
-    assert "before the motion to keyscan 1" in (skipped.refusal or "")
-    dangling = transport.send(encode(Packet("a", 0, 5, 2.0, place("a", 1))))
-    assert "names keyscan 1" in (dangling.refusal or "")
+    skipped = encode(Packet("a", 0, 4, 2.0, keyscan("a", 2, 2.0)))
+    assert "before the motion to keyscan 1" in refusal_of(cloud, skipped)
+    dangling = encode(Packet("a", 0, 5, 2.0, place("a", 1)))
+    assert "names keyscan 1" in refusal_of(cloud, dangling)
     (robot,) = cloud.finalize().robots
     assert [k.id.number for k in robot.keyscans] == [0]
 
 
 def test_a_robot_without_a_keyscan_is_no_part_of_the_result(scripted):
     cloud = feed(scripted(), stream("a", POSES, start_s=0.0)[:1])
-    assert InMemoryTransport(cloud.receive).send(encode(Packet("a", 0, 1, 0.0, keyscan("a", 7, 0.0)))).refusal
+    assert refusal_of(cloud, encode(Packet("a", 0, 1, 0.0, keyscan("a", 7, 0.0))))
     assert cloud.finalize().robots == ()
 
 
@@ -220,7 +222,6 @@ def test_a_further_laser_may_be_announced_later(scripted):
     """Keyscans of it are accepted from then on; those that were announced before stay."""
     rear = replace(LASER, T_base_laser=(-0.2, 0.0, 3.0))
     cloud = feed(scripted(SCRIPT), PACKETS[:HALF])
-    transport = InMemoryTransport(cloud.receive)
     varied = replace(keyscan("a", NUMBER, NOW, beams=9), laser=1, beams=Beams(9, -np.pi, 2.0 * np.pi / 9))
     versions = {Channel.LIDAR: "test-1"}
     sent = [
@@ -230,5 +231,5 @@ def test_a_further_laser_may_be_announced_later(scripted):
         (varied, None),
     ]
     for after, (body, reason) in enumerate(sent):
-        refusal = transport.send(encode(next_packet(body, after))).refusal
+        refusal = refusal_of(cloud, encode(next_packet(body, after)))
         assert (refusal is None) if reason is None else (reason in refusal)

@@ -24,28 +24,28 @@ BITS = st.lists(st.tuples(st.integers(1, 65535), st.booleans()), max_size=200)
 
 
 def write(code, contents):
-    coder, data = writer(ROOM)
+    coder, data = writer(), np.zeros(ROOM, np.uint8)
     for content in contents:
-        code(coder, data, content)
+        coder, _ = code(coder, data, content)
     return data[: written(coder, data)]
 
 
 def read(code, data, count):
     """What a stream says, and whether it ends there."""
     data = np.frombuffer(bytearray(data), np.uint8)
-    coder = reader(data)
-    return [code(coder, data, 0) for _ in range(count)], is_at_end(coder, data)
+    coder, contents = reader(data), []
+    for _ in range(count):
+        coder, content = code(coder, data, 0)
+        contents.append(content)
+    return contents, is_at_end(coder, data)
 
 
 @given(BITS)
 def test_bits_come_back_and_cost_what_they_are_worth(bits):
-    coder, data = writer(ROOM)
-    for probability, bit in bits:
-        code_bit(coder, data, probability, int(bit))
-    stream = data[: written(coder, data)].copy()
-    coder = reader(stream)
-    assert [code_bit(coder, stream, probability, 0) for probability, _ in bits] == [bit for _, bit in bits]
-    assert is_at_end(coder, stream)
+    stream = write(lambda coder, data, content: code_bit(coder, data, content[0], int(content[1])), bits)
+    probabilities = iter([probability for probability, _ in bits])
+    again = read(lambda coder, data, _: code_bit(coder, data, next(probabilities), 0), stream, len(bits))
+    assert again == ([bit for _, bit in bits], True)
     worth = sum(-math.log2((p if bit else 65536 - p) / 65536) for p, bit in bits)
     assert len(stream) <= worth / 8 + 1 + 0.01 * len(bits)
 
@@ -87,9 +87,9 @@ def test_what_repeats_is_learnt():
 
 
 def test_what_has_no_room_is_not_written():
-    coder, data = writer(2)
+    coder, data = writer(), np.zeros(2, np.uint8)
     for _ in range(100):
-        code_bit(coder, data, 65535, 0)
+        coder, _ = code_bit(coder, data, 65535, 0)
     assert written(coder, data) == -1
 
 

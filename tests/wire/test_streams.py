@@ -123,7 +123,7 @@ def test_a_bit_is_expected_by_earlier_ones_alone(channel):
     predictor = predictor_of(channel)
     assert not np.tril(predictor.own).any()
     assert [table.shape for table in predictor] == [(256,), (256, 256), (256, 256)]
-    assert sum(np.abs(table).sum(axis=0 if table.ndim == 2 else None).max() for table in predictor) < 2**31
+    assert sum(np.abs(table).sum(axis=0 if table.ndim == 2 else None).max() for table in predictor) < 2**15
     assert predictor.neighbour.diagonal().mean() > 0, "neighbours look alike"
 
 

@@ -63,7 +63,7 @@ def convert(
     if len(survey.lasers) > 1 and _CARMEN.search(output.name):
         print_line(console, f"{output}: a CARMEN log has a place for one laser, the scans of the others are left out")
     _write(output, survey, _with_progress(source, survey.scan_count, console))
-    print_faults(console, [source])
+    print_faults(console, {source.name: source.faults})
     print_line(answers(), f"{survey.scan_count} scans: {output}")
 
 

@@ -1,6 +1,7 @@
 """`fcslam map`: recordings of several robots in, one map out."""
 
 import gc
+import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from fcslam.records import Veto
     from fcslam.runs import Run
     from fcslam.sources import Source
+    from fcslam.sources.faults import Faults
 
 
 def map_recordings(
@@ -96,21 +98,24 @@ def map_sources(
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     with ProgressDisplay(console) as display:
-        progress = _watch(display, sum(survey.scan_count for survey in surveys))
-        run = api.map_recordings(sources, config=settings, vetoes=vetoes, progress=progress)
+        faults: dict[str, Faults] = {}
+        progress = _watch(display, sum(survey.scan_count for survey in surveys), faults)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        run = api.map_recordings(sources, config=settings, vetoes=vetoes, progress=progress, processes=cores)
         display.start("writing")
         run.save(output, force)
-    print_faults(console, sources)
+    print_faults(console, faults)
     _report(answers(), run, time.perf_counter() - began, output, settings)
     return run
 
 
-def _watch(display: "ProgressDisplay", total: int) -> "Callable[[Progress], None]":
-    """Show the mission's progress: ``total`` scans, then the fusion."""
+def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") -> "Callable[[Progress], None]":
+    """Show the mission's progress: ``total`` scans, then the fusion; ``faults`` gets those of the recordings."""
     began = time.perf_counter()
 
     def watch(now: "Progress") -> None:
         display.show("mapping", now.scans, total, _details(now, time.perf_counter() - began))
+        faults.update(now.faults)
         if now.fusing:
             display.start("fusing")
 

@@ -1,7 +1,7 @@
 """Commands that read recordings: the options of ROS bags, opening, and notices about a recording."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.sources import BagOptions, Source
+    from fcslam.sources.faults import Faults
 
 _BAGS = "ROS bags"
 
@@ -97,11 +98,11 @@ def print_notes(console: "Console", notes: Iterable[str]) -> None:
         print_line(console, note)
 
 
-def print_faults(console: "Console", sources: "Iterable[Source]") -> None:
-    """Print the faults that were tolerated in recordings."""
-    for source in sources:
-        if source.faults:
-            print_line(console, f"{source.name}: {source.faults}")
+def print_faults(console: "Console", faults: "Mapping[str, Faults]") -> None:
+    """Print the faults that were tolerated in recordings, by their names."""
+    for name, found in faults.items():
+        if found:
+            print_line(console, f"{name}: {found}")
 
 
 def _pose(text: str) -> tuple[float, float, float]:

@@ -157,7 +157,7 @@ def robot(
                 f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume",
             )
             raise
-        print_faults(console, [recording])
+        print_faults(console, {recording.name: recording.faults})
         _report(agent, state, server)
 
 

@@ -1,4 +1,4 @@
-"""The cloud within one process: encoded packets in, replies out, one map in the end."""
+"""The cloud within one process: packets in, replies out, one map in the end."""
 
 from dataclasses import replace
 
@@ -20,44 +20,47 @@ class Cloud:
     def __init__(self, config: FleetConfig, seed: int) -> None:
         self.fleet = Fleet(config, seed)
         self._log = PacketLog()
-        self._packets: dict[PacketNumber, tuple[float, bytes]] = {}
-        """Time and bytes."""
+        self._packets: dict[PacketNumber, Packet] = {}
         self._corrections: dict[str, SessionCorrection] = {}
         """The newest that was sent, by session."""
         self._sent = 0
         """How many corrections were sent: the version of the next one."""
 
     def receive(self, data: bytes) -> list[bytes]:
-        """Apply an encoded packet, and those that waited for it; returns encoded replies to its sender.
+        """As ``apply``, with encoded packets.
 
         Raises:
-            PacketError: the packet is invalid or does not fit what its robot sent before; then it has no effect and
-                its number is used up.
+            PacketError: as there, or ``data`` is not a packet.
         """
-        packet = decode(data)
+        return [encode(reply) for reply in self.apply(decode(data))]
+
+    def apply(self, packet: Packet) -> list[Packet]:
+        """Apply a packet as it was received, and those that waited for it; returns the replies to its sender.
+
+        Raises:
+            PacketError: the packet does not fit what its robot sent before; then it has no effect and its number is
+                used up.
+        """
         number = PacketNumber(in_session(packet).robot, packet.sequence)
         if number not in self._log:
-            self._packets[number] = packet.time, data
+            self._packets[number] = packet
         self._log.add(number, packet.time)
         refusal = None
         for ready in self._log.ready(number.session):
             try:
-                self.fleet.apply(packet if self._packets[ready][1] is data else self._read(ready))
+                self.fleet.apply(self._packets[ready])
             except PacketError as error:
                 self._log.refuse(ready)
                 del self._packets[ready]
                 refusal = error if ready == number else refusal
         if refusal is not None:
             raise refusal
-        return [encode(reply) for reply in self._replies(packet, number.session)]
+        return self._replies(packet, number.session)
 
     def finalize(self) -> FleetResult:
         """The result of all packets so far; it depends on their set alone."""
-        arrived = ((time_s, number) for number, (time_s, _) in self._packets.items())
-        return self.fleet.finalize(self._log, arrived, self._read)
-
-    def _read(self, number: PacketNumber) -> Packet:
-        return decode(self._packets[number][1])
+        arrived = ((packet.time, number) for number, packet in self._packets.items())
+        return self.fleet.finalize(self._log, arrived, self._packets.__getitem__)
 
     def _replies(self, packet: Packet, session: str) -> list[Packet]:
         robot, epoch = packet.robot, packet.epoch

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from types import MappingProxyType
 
 
 class Fault(StrEnum):
@@ -81,4 +80,4 @@ class Audit:
 
     def faults(self) -> Faults:
         """The faults counted so far."""
-        return Faults(MappingProxyType(dict(self._counts)), self._unit)
+        return Faults(dict(self._counts), self._unit)

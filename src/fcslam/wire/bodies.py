@@ -1,6 +1,7 @@
 """Conversion between records and protobuf messages, with writing and reading side by side."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from fcslam.errors import PacketError
 from fcslam.records import (
     Beams,
     Channel,
+    Codes,
     Constraint,
     ConstraintKind,
     Correction,
@@ -34,6 +36,7 @@ from fcslam.wire.quantisation import (
     unpack_information,
 )
 from fcslam.wire.streams import (
+    KeypointCodes,
     ascending,
     pack_descriptors,
     pack_keypoints,
@@ -131,10 +134,12 @@ def _read_constraint(message: pb.Constraint, envelope: pb.Packet) -> Constraint:
     return Constraint(envelope.robot, message.i, message.j, kind, _read_pose(message, "t_i_j"), information)
 
 
+def _round_constraint(constraint: Constraint) -> Constraint:
+    return replace(constraint, information=unpack_information(pack_information(constraint.information)))
+
+
 def _write_place(place: Place) -> pb.Place:
-    """Keypoints are sent in ascending order, with their descriptors."""
-    codes = quantise_keypoints(place.keypoints)
-    order = ascending(codes)
+    codes, descriptors = _in_order(place)
     return pb.Place(
         number=place.id.number,
         channel=_CHANNELS[place.channel],
@@ -142,9 +147,21 @@ def _write_place(place: Place) -> pb.Place:
         first=place.first,
         last=place.last,
         count=len(codes),
-        keypoints=pack_keypoints(codes[order]),
-        descriptors=pack_descriptors(place.descriptors[order], codes[order], place.channel),
+        keypoints=pack_keypoints(codes),
+        descriptors=pack_descriptors(descriptors, codes, place.channel),
     )
+
+
+def _in_order(place: Place) -> tuple[KeypointCodes, Codes]:
+    """Keypoints in ascending order, as they are sent, and their descriptors."""
+    codes = quantise_keypoints(place.keypoints)
+    order = ascending(codes)
+    return codes[order], place.descriptors[order]
+
+
+def _round_place(place: Place) -> Place:
+    codes, descriptors = _in_order(place)
+    return replace(place, keypoints=dequantise_keypoints(codes), descriptors=frozen(descriptors, np.uint8))
 
 
 def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
@@ -234,13 +251,15 @@ class Codec(NamedTuple):
     type: type
     write: Callable[[Any], Message]
     read: Callable[[Any, pb.Packet], Any]
+    round: Callable[[Any], Any] = lambda body: body
+    """What reading gives of a record that was written, without writing it; most kinds keep every number."""
 
 
 CODECS = {
     PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello),
     PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan),
-    PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint),
-    PacketKind.PLACE: Codec(Place, _write_place, _read_place),
+    PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_constraint),
+    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),

@@ -8,19 +8,30 @@ each bit, and leading bytes that its ends share are output. A stream ends with t
 the last interval, without trailing zeros; any other ending is refused. So each content has exactly one stream.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Coder = NDArray[np.int64]
-"""State: [reads, low, high, number read or length without zeros at the end, position, bytes available]."""
+
+class Coder(NamedTuple):
+    """State of a coder. Functions return the next one: compiled code then keeps it in registers."""
+
+    reads: bool
+    low: int
+    high: int
+    """Ends of the interval."""
+    number: int
+    """Reading: the number read. Writing: length of the stream without zeros at its end."""
+    position: int
+    """Bytes read or written."""
+
+
 Bytes = NDArray[np.uint8]
 Model = NDArray[np.int64]
 """Shape (contexts, 2): probability of a one in 1/65536, and how many bits it was learnt from."""
 
-_READS, _LOW, _HIGH, _NUMBER, _POSITION, _SIZE = range(6)
 _ONE: Final = 65536
 _LEAST: Final = 32
 """Least probability of a bit: none is impossible."""
@@ -31,18 +42,18 @@ CONTEXTS_OF_NUMBER: Final = 2 * _MOST_DIGITS + 2
 
 
 @njit(cache=True, nogil=True)
-def writer(size: int) -> tuple[Coder, Bytes]:
-    """A coder that writes at most ``size`` bytes, and where it writes them."""
-    return np.array([0, 0, 0xFFFFFFFF, 0, 0, size]), np.zeros(size, np.uint8)
+def writer() -> Coder:
+    """A coder that writes."""
+    return Coder(False, 0, 0xFFFFFFFF, 0, 0)
 
 
 @njit(cache=True, nogil=True)
 def reader(data: Bytes) -> Coder:
     """A coder that reads ``data``."""
-    coder = np.array([1, 0, 0xFFFFFFFF, 0, 0, len(data)])
-    for _ in range(4):
-        _next_byte(coder, data)
-    return coder
+    number = 0
+    for position in range(4):
+        number = number << 8 | _byte_at(data, position)
+    return Coder(True, 0, 0xFFFFFFFF, number, 4)
 
 
 @njit(cache=True, nogil=True)
@@ -54,87 +65,88 @@ def fresh_model(contexts: int) -> Model:
 
 
 @njit(cache=True, nogil=True)
-def code_bit(coder: Coder, data: Bytes, probability: int, bit: int) -> int:
+def code_bit(coder: Coder, data: Bytes, probability: int, bit: int) -> tuple[Coder, int]:
     """One bit that is 1 with ``probability`` in 1/65536, between 1 and 65535."""
-    middle = coder[_LOW] + (((coder[_HIGH] - coder[_LOW]) * probability) >> 16)
-    if coder[_READS]:
-        bit = int(coder[_NUMBER] <= middle)
-    if bit:
-        coder[_HIGH] = middle
-    else:
-        coder[_LOW] = middle + 1
-    while (coder[_LOW] ^ coder[_HIGH]) >> 24 == 0:
-        if coder[_READS]:
-            _next_byte(coder, data)
+    reads, low, high, number, position = coder
+    middle = low + (((high - low) * probability) >> 16)
+    if reads:
+        bit = int(number <= middle)
+    # Selections instead of a branch, which a processor could not predict.
+    high = middle if bit else high
+    low = low if bit else middle + 1
+    while (low ^ high) >> 24 == 0:
+        if reads:
+            number = (number & 0xFFFFFF) << 8 | _byte_at(data, position)
         else:
-            _put_byte(coder, data, coder[_LOW] >> 24)
-        coder[_LOW] = (coder[_LOW] & 0xFFFFFF) << 8
-        coder[_HIGH] = (coder[_HIGH] & 0xFFFFFF) << 8 | 0xFF
-    return bit
+            number = _put_byte(data, position, low >> 24, number)
+        position += 1
+        low = (low & 0xFFFFFF) << 8
+        high = (high & 0xFFFFFF) << 8 | 0xFF
+    return Coder(reads, low, high, number, position), bit
 
 
 @njit(cache=True, nogil=True)
-def code_learnt(coder: Coder, data: Bytes, model: Model, context: int, bit: int) -> int:
+def code_learnt(coder: Coder, data: Bytes, model: Model, context: int, bit: int) -> tuple[Coder, int]:
     """One bit by the probability that its context has had so far."""
     probability, seen = model[context]
-    bit = code_bit(coder, data, min(max(probability, _LEAST), _ONE - _LEAST), bit)
+    coder, bit = code_bit(coder, data, min(max(probability, _LEAST), _ONE - _LEAST), bit)
     model[context, 0] += (2 * (bit * _ONE - probability)) // (2 * seen + 3)
     model[context, 1] = min(seen + 1, _MEMORY)
-    return bit
+    return coder, bit
 
 
 @njit(cache=True, nogil=True)
-def code_number(coder: Coder, data: Bytes, model: Model, context: int, value: int) -> int:
+def code_number(coder: Coder, data: Bytes, model: Model, context: int, value: int) -> tuple[Coder, int]:
     """A number in [0, 2^20), in ``CONTEXTS_OF_NUMBER`` contexts: Elias' gamma code, whose first bits are learnt."""
     value += 1
-    digits = 0
-    while digits < _MOST_DIGITS and code_learnt(coder, data, model, context + digits, int(value >> (digits + 1) > 0)):
-        digits += 1
+    digits, more = 0, 1
+    while more and digits < _MOST_DIGITS:
+        coder, more = code_learnt(coder, data, model, context + digits, int(value >> (digits + 1) > 0))
+        digits += more
     result = 1
     for digit in range(digits - 1, -1, -1):
         bit = (value >> digit) & 1
         if digit == digits - 1:
-            bit = code_learnt(coder, data, model, context + _MOST_DIGITS + digits, bit)
+            coder, bit = code_learnt(coder, data, model, context + _MOST_DIGITS + digits, bit)
         else:
-            bit = code_bit(coder, data, _ONE // 2, bit)
+            coder, bit = code_bit(coder, data, _ONE // 2, bit)
         result = 2 * result + bit
-    return result - 1
+    return coder, result - 1
 
 
 @njit(cache=True, nogil=True)
-def code_signed(coder: Coder, data: Bytes, model: Model, context: int, value: int) -> int:
+def code_signed(coder: Coder, data: Bytes, model: Model, context: int, value: int) -> tuple[Coder, int]:
     """A number in (-2^19, 2^19): 0, -1, 1, -2, 2 ... as 0, 1, 2, 3, 4 ..."""
-    number = code_number(coder, data, model, context, (value << 1) ^ (value >> 63))
-    return int((number >> 1) ^ -(number & 1))
+    coder, number = code_number(coder, data, model, context, (value << 1) ^ (value >> 63))
+    return coder, int((number >> 1) ^ -(number & 1))
 
 
 @njit(cache=True, nogil=True)
 def written(coder: Coder, data: Bytes) -> int:
     """End the stream: how many bytes it has, or -1 if it has more than there was room for."""
-    if coder[_LOW] > 0:
-        _put_byte(coder, data, coder[_HIGH] >> 24)
-    return int(coder[_NUMBER]) if coder[_NUMBER] <= coder[_SIZE] else -1
+    size = coder.number
+    if coder.low > 0:
+        size = _put_byte(data, coder.position, coder.high >> 24, size)
+    return int(size) if size <= len(data) else -1
 
 
 @njit(cache=True, nogil=True)
 def is_at_end(coder: Coder, data: Bytes) -> bool:
     """Whether the stream that was read has this end and no other."""
-    ending = coder[_HIGH] >> 24 << 24 if coder[_LOW] > 0 else 0
+    ending = coder.high >> 24 << 24 if coder.low > 0 else 0
     shortest = len(data) == 0 or data[len(data) - 1] != 0
-    return bool(shortest and coder[_NUMBER] == ending and coder[_POSITION] - 4 >= len(data) - 1)
+    return bool(shortest and coder.number == ending and coder.position - 4 >= len(data) - 1)
 
 
 @njit(cache=True, nogil=True)
-def _next_byte(coder: Coder, data: Bytes) -> None:
-    byte = np.int64(data[coder[_POSITION]]) if coder[_POSITION] < coder[_SIZE] else np.int64(0)
-    coder[_NUMBER] = (coder[_NUMBER] & 0xFFFFFF) << 8 | byte
-    coder[_POSITION] += 1
+def _byte_at(data: Bytes, position: int) -> int:
+    """A byte of a stream, which zeros follow."""
+    return int(data[position]) if position < len(data) else 0
 
 
 @njit(cache=True, nogil=True)
-def _put_byte(coder: Coder, data: Bytes, byte: int) -> None:
-    if coder[_POSITION] < coder[_SIZE]:
-        data[coder[_POSITION]] = byte
-    coder[_POSITION] += 1
-    if byte != 0:
-        coder[_NUMBER] = coder[_POSITION]
+def _put_byte(data: Bytes, position: int, byte: int, size: int) -> int:
+    """Write a byte if there is room; returns the length without zeros at the end, which was ``size`` before."""
+    if position < len(data):
+        data[position] = byte
+    return position + 1 if byte != 0 else size

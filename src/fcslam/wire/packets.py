@@ -1,11 +1,12 @@
 """Encoding and decoding of packets (format: docs/wire.md)."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Channel
+from fcslam.records import CODE_BYTES, Channel, Place
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
@@ -49,6 +50,32 @@ def encode(packet: Packet) -> bytes:
         **body,
     )
     return message.SerializeToString(deterministic=True)
+
+
+class SizedPacket(NamedTuple):
+    """A packet as its receiver reads it, and its size."""
+
+    packet: Packet
+    size: int
+    """Bytes."""
+
+    @property
+    def label(self) -> Label:
+        """By which its traffic is counted."""
+        body = self.packet.body
+        kind, _ = CODEC_OF_TYPE[type(body)]
+        return Label(self.packet.robot, kind, body.channel if isinstance(body, Place) else None)
+
+
+def measure(packet: Packet) -> SizedPacket:
+    """What a receiver reads and a network carries: the same as ``encode`` and ``decode``, but nothing is decoded.
+
+    Raises:
+        PacketError: as ``encode``.
+    """
+    size = len(encode(packet))
+    _, codec = CODEC_OF_TYPE[type(packet.body)]
+    return SizedPacket(replace(packet, body=codec.round(packet.body)), size)
 
 
 def decode(data: bytes) -> Packet:

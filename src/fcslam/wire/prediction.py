@@ -16,24 +16,25 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fcslam.records import Channel, frozen
+from fcslam.records import CODE_BYTES, Channel, frozen
 from fcslam.wire.entropy import Bytes, Coder, code_bit
 
 WEIGHT_UNIT: Final = 1 / 64
 """Unit of ``own``, ``neighbour`` and z."""
 BIAS_UNIT: Final = 1 / 16
+_BITS: Final = 8 * CODE_BYTES
 _LARGEST: Final = 512
 """|z| is limited to 8: no bit is impossible."""
 
 
 class Predictor(NamedTuple):
-    """The weights of one channel, in units of z."""
+    """The weights of one channel, in units of z. No sum of them leaves 16 bits, which a test checks."""
 
-    bias: NDArray[np.int32]
+    bias: NDArray[np.int16]
     """Shape (256,)."""
-    own: NDArray[np.int32]
+    own: NDArray[np.int16]
     """Shape (256, 256): row j is the weight of bit j for the later bits."""
-    neighbour: NDArray[np.int32]
+    neighbour: NDArray[np.int16]
     """Shape (256, 256): row j is the weight of bit j of the neighbour."""
 
 
@@ -41,9 +42,9 @@ class Predictor(NamedTuple):
 def predictor_of(channel: Channel) -> Predictor:
     """The weights of one channel."""
     with resources.as_file(resources.files(__package__) / "predictors" / f"{channel}.npy") as path:
-        table = np.load(path, allow_pickle=False).astype(np.int32)
+        table = np.load(path, allow_pickle=False).astype(np.int16)
     scale = round(BIAS_UNIT / WEIGHT_UNIT)
-    return Predictor(frozen(scale * table[0], np.int32), frozen(table[1:257], np.int32), frozen(table[257:], np.int32))
+    return Predictor(frozen(scale * table[0], np.int16), frozen(table[1:257], np.int16), frozen(table[257:], np.int16))
 
 
 PROBABILITIES: Final = frozen(
@@ -58,21 +59,25 @@ def code_descriptors(
     data: Bytes,
     bits: NDArray[np.uint8],
     keypoints: NDArray[np.int64],
-    bias: NDArray[np.int32],
-    own: NDArray[np.int32],
-    neighbour: NDArray[np.int32],
+    bias: NDArray[np.int16],
+    own: NDArray[np.int16],
+    neighbour: NDArray[np.int16],
     probabilities: NDArray[np.int64],
-) -> None:
+) -> Coder:
     """Write ``bits`` (N, 256), or read them in place; both sides know ``keypoints`` (N, axes)."""
     for i in range(len(bits)):
         expected = bias.copy()
         if i > 0:
-            for j, bit in enumerate(bits[nearest_before(keypoints, i)]):
-                _add(expected, neighbour[j], bit)
-        for b in range(len(expected)):
-            z = min(max(expected[b], -_LARGEST), _LARGEST)
-            bits[i, b] = code_bit(coder, data, probabilities[z + _LARGEST], bits[i, b])
-            _add(expected, own[b], bits[i, b])
+            _add(expected, neighbour, bits[nearest_before(keypoints, i)])
+        if not coder.reads:
+            _add(expected, own, bits[i])
+        for b in range(_BITS):
+            z = min(max(int(expected[b]), -_LARGEST), _LARGEST)
+            coder, bit = code_bit(coder, data, probabilities[z + _LARGEST], bits[i, b])
+            if coder.reads:
+                bits[i, b] = bit
+                _add(expected, own[b : b + 1], bits[i, b : b + 1])
+    return coder
 
 
 @njit(cache=True, nogil=True)
@@ -90,11 +95,9 @@ def nearest_before(keypoints: NDArray[np.int64], i: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _add(expected: NDArray[np.int32], weights: NDArray[np.int32], bit: int) -> None:
-    """Add the weights of one bit. Earlier bits are included, as one loop without a condition is fastest."""
-    if bit:
-        for b in range(len(expected)):
-            expected[b] += weights[b]
-    else:
-        for b in range(len(expected)):
-            expected[b] -= weights[b]
+def _add(expected: NDArray[np.int16], weights: NDArray[np.int16], bits: NDArray[np.uint8]) -> None:
+    """Add the weights (K, 256) of some bits (K,). A bit has no weight for itself and earlier ones."""
+    for j in range(len(bits)):
+        sign = np.int16(1) if bits[j] else np.int16(-1)
+        for b in range(_BITS):  # a constant, so that the loop is unrolled
+            expected[b] += sign * weights[j, b]

@@ -114,56 +114,57 @@ def _expectation(keypoints: KeypointCodes, channel: Channel) -> tuple[NDArray[An
     return (keypoints.astype(np.int64), *predictor_of(channel), PROBABILITIES)
 
 
-def _pack(plain: bytes, code: Callable[..., None], *content: NDArray[Any]) -> bytes:
-    coder, data = writer(len(plain))
-    code(coder, data, *content)
-    size = written(coder, data)
+def _pack(plain: bytes, code: Callable[..., Coder], *content: NDArray[Any]) -> bytes:
+    data = np.zeros(len(plain), np.uint8)
+    size = written(code(writer(), data, *content), data)
     return data[:size].tobytes() if 0 <= size < len(plain) else plain
 
 
-def _unpack(data: bytes, plain: int, what: str, code: Callable[..., None], *content: NDArray[Any]) -> None:
+def _unpack(data: bytes, plain: int, what: str, code: Callable[..., Coder], *content: NDArray[Any]) -> None:
     """Decode ``data`` into the first array of ``content``."""
     if len(data) > plain:
         raise PacketError(f"{what}: {len(data)} bytes, at most {plain}")
     stream = np.frombuffer(bytearray(data), np.uint8)
-    coder = reader(stream)
-    code(coder, stream, *content)
-    if not is_at_end(coder, stream):
+    if not is_at_end(code(reader(stream), stream, *content), stream):
         raise PacketError(f"{what}: the stream is cut off or goes on after its end")
 
 
 @njit(cache=True, nogil=True)
-def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
+def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> Coder:
     """Code whether each range is a return, in the context of the beam before, and its difference from the last one."""
     model = fresh_model(2 + CONTEXTS_OF_NUMBER)
     last, none = np.int64(0), 0
     for k in range(len(codes)):
-        none = code_learnt(coder, data, model, none, int(codes[k] == 0))
+        coder, none = code_learnt(coder, data, model, none, int(codes[k] == 0))
         if none:
             codes[k] = 0
         else:
-            last += code_signed(coder, data, model, 2, codes[k] - last)
+            coder, difference = code_signed(coder, data, model, 2, codes[k] - last)
+            last += difference
             codes[k] = last if last > 0 else _REFUSED
+    return coder
 
 
 @njit(cache=True, nogil=True)
-def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> None:
+def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> Coder:
     """Code the grid of each axis, then the differences of consecutive keypoints in steps of the grid."""
     axes = codes.shape[1]
     model = fresh_model((2 + _MOST_AXES * (1 + _APART)) * CONTEXTS_OF_NUMBER)
     grid = np.ones(axes, np.int64)
     for axis in range(axes if len(codes) > 0 else 0):
-        grid[axis] += code_number(coder, data, model, 0, max(_common_divisor(codes[:, axis]), 1) - 1)
-        codes[0, axis] = code_signed(coder, data, model, CONTEXTS_OF_NUMBER, codes[0, axis])
+        coder, beyond = code_number(coder, data, model, 0, max(_common_divisor(codes[:, axis]), 1) - 1)
+        grid[axis] += beyond
+        coder, codes[0, axis] = code_signed(coder, data, model, CONTEXTS_OF_NUMBER, codes[0, axis])
     for k in range(1, len(codes)):
         steps = (codes[k] - codes[k - 1]) // grid
         context = 2 * CONTEXTS_OF_NUMBER
-        steps[0] = code_number(coder, data, model, context, steps[0])
+        coder, steps[0] = code_number(coder, data, model, context, steps[0])
         context += min(steps[0], _APART) * CONTEXTS_OF_NUMBER
         for axis in range(1, axes):
             context += (1 + _APART) * CONTEXTS_OF_NUMBER
-            steps[axis] = code_signed(coder, data, model, context, steps[axis])
+            coder, steps[axis] = code_signed(coder, data, model, context, steps[axis])
         codes[k] = codes[k - 1] + steps * grid
+    return coder
 
 
 @njit(cache=True, nogil=True)

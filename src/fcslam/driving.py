@@ -1,0 +1,187 @@
+"""The robots of a mission, each over its own recording: one after another in this process, or side by side in others.
+
+Either way a robot gives the same packets, as it knows no other robot.
+"""
+
+import multiprocessing
+import os
+import pickle
+import queue
+import signal
+import sys
+import threading
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
+from typing import Any, Final
+
+from fcslam.cloud.report import Track
+from fcslam.errors import FcslamError
+from fcslam.records import Keyscan, LaserScan
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.track import ScanTrack
+from fcslam.sources import Source
+from fcslam.sources.faults import Faults
+from fcslam.wire.packets import SizedPacket, measure
+
+SCANS_PER_LEG: Final = 50
+_POLL_S: Final = 1.0
+"""Interval at which the cloud's process looks whether one that owes it something still runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """What a robot did over some consecutive scans of its recording."""
+
+    robot: str
+    packets: tuple[SizedPacket, ...]
+    stamps: tuple[float, ...]
+    """Of the scans, seconds."""
+    tracks: tuple[Track, ...] = ()
+    """All scans by session; empty before the last leg."""
+    faults: Faults | None = None
+    """What was wrong with the recording; None before the last leg."""
+
+    @property
+    def keyscans(self) -> int:
+        """Number of keyscans."""
+        return sum(isinstance(sized.packet.body, Keyscan) for sized in self.packets)
+
+
+Drive = Callable[[Sequence[Source], RobotConfig], AbstractContextManager[Sequence[Iterator[Leg]]]]
+"""Starts the robots and gives the legs of each; whatever still runs ends with the context."""
+
+
+def one_by_one(sources: Sequence[Source], config: RobotConfig) -> AbstractContextManager[Sequence[Iterator[Leg]]]:
+    """Drive each robot in this process, as far as its next leg is asked for."""
+    return nullcontext([_legs(source, config) for source in sources])
+
+
+def side_by_side(processes: int) -> Drive:
+    """Drive every robot in a process of its own, ``processes`` at a time.
+
+    One robot, or one process, needs none. A robot's error is raised where its legs are read.
+    """
+
+    @contextmanager
+    def drive(sources: Sequence[Source], config: RobotConfig) -> Iterator[Sequence[Iterator[Leg]]]:
+        if min(processes, len(sources)) == 1:
+            with one_by_one(sources, config) as robots:
+                yield robots
+            return
+        # A copy of this process has loaded all code. Elsewhere copies are not safe.
+        context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+        channel = context.Queue()
+        turns = context.BoundedSemaphore(processes)
+        workers = [
+            context.Process(target=_work, args=(number, source, config, channel, turns), daemon=True)
+            for number, source in enumerate(sources)
+        ]
+        for worker in workers:
+            worker.start()
+        try:
+            inbox = _Inbox(channel, workers)
+            yield [inbox.legs(number) for number in range(len(sources))]
+        finally:
+            for worker in workers:
+                worker.terminate()
+                worker.join()
+
+    return drive
+
+
+def _legs(source: Source, config: RobotConfig) -> Iterator[Leg]:
+    """Drive one robot over its whole recording."""
+    robot = RobotFrontend(source.name, config)
+    packets: list[SizedPacket] = []
+    stamps: list[float] = []
+    for record in source.records():
+        packets += map(measure, robot.process(record))
+        if isinstance(record, LaserScan):
+            stamps.append(record.stamp)
+        if len(stamps) == SCANS_PER_LEG:
+            yield Leg(robot.robot, tuple(packets), tuple(stamps))
+            packets, stamps = [], []
+    packets += map(measure, robot.finish())
+    yield Leg(robot.robot, tuple(packets), tuple(stamps), tuple(map(_track, robot.tracks)), source.faults)
+
+
+def _track(poses: ScanTrack) -> Track:
+    return Track(poses.stamps, poses.keyscans, poses.T_keyscan_base)
+
+
+class _Inbox:
+    """Sorts what all robots send through one channel."""
+
+    def __init__(self, channel: Any, workers: Sequence[BaseProcess]) -> None:
+        self._channel = channel
+        self._workers = workers
+        self._waiting: list[deque[Leg | _Failure]] = [deque() for _ in workers]
+
+    def legs(self, number: int) -> Iterator[Leg]:
+        """The legs of one robot, up to its last one."""
+        waiting = self._waiting[number]
+        while True:
+            while not waiting:
+                self._receive(number)
+            leg = waiting.popleft()
+            if isinstance(leg, _Failure):
+                raise leg.error from _WorkerError(leg.traceback)
+            yield leg
+            if leg.faults is not None:
+                return
+
+    def _receive(self, number: int) -> None:
+        """Wait for something from any robot, or for the end of the process of robot ``number``."""
+        worker = self._workers[number]
+        was_alive = worker.is_alive()
+        try:
+            sender, leg = pickle.loads(self._channel.get(timeout=_POLL_S))
+        except queue.Empty:
+            if not was_alive:
+                raise FcslamError(
+                    f"the process of a robot ended with code {worker.exitcode}; if memory ran out, use fewer cores "
+                    "(taskset) or map fewer robots together"
+                ) from None
+        else:
+            self._waiting[sender].append(leg)
+
+
+@dataclass(frozen=True, slots=True)
+class _Failure:
+    """An error that ended a robot."""
+
+    error: Exception
+    traceback: str
+
+
+class _WorkerError(Exception):
+    """The traceback of an error in another process."""
+
+
+def _work(number: int, source: Source, config: RobotConfig, channel: Any, turns: Any) -> None:
+    """Drive one robot when it is its turn, in a process of its own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with turns:
+        try:
+            for leg in _legs(source, config):
+                channel.put(_packed(number, leg))
+        except Exception as error:
+            channel.put(_packed(number, _Failure(error, traceback.format_exc())))
+
+
+def _packed(number: int, leg: Leg | _Failure) -> bytes:
+    """With the newest protocol, which keeps arrays read-only."""
+    return pickle.dumps((number, leg), pickle.HIGHEST_PROTOCOL)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
