@@ -1,54 +1,128 @@
-"""Whether a scan takes longer as the map grows: one robot's whole work on the intel log, scan by scan, in one process.
+"""How long a scan takes as the map grows: one robot on the intel log, scan by scan.
 
-    FCSLAM_DATA=/path/to/data python benchmarks/time_per_scan.py
+    FCSLAM_DATA=/path/to/data python benchmarks/time_per_scan.py [--rounds 8]
 
-A pass over mit-csail before it compiles (or loads) every kernel and is not counted. CPU is the process's user and
-system time, all threads. Memory is the resident set, so it holds the reader, the robot and its map.
+- Inline, as in a recording: front end, back end and encoding in one process, once over the log.
+- Live, as in `fcslam robot`: the back end in a process beside, the log many times over with odometry that goes on. A
+  scan's time is that of the front end, until its pose and the packets that are ready are known. It is played as fast as
+  the back end can follow; the waits for that are not counted, as a robot in real time has none. With fewer than two
+  free cores the wall time includes that of the other process: CPU is that of the front end's thread.
+
+Inline, a pass over mit-csail before compiles (or loads) every kernel and is not counted; live, the warm-up of
+`fcslam robot` does. Memory is the resident set: with
+the reader, the robot and its map inline; of each process live.
 """
 
 import gc
 import os
 import time
+from collections.abc import Iterator
+from multiprocessing import active_children
 from pathlib import Path
+from typing import Any
 
 import common
 import numpy as np
+from scaling import Repeated, alone, back_to_the_start, scan_poses
 
+from fcslam.cloud.cloud import Cloud
+from fcslam.mission import MissionConfig
 from fcslam.records import LaserScan
+from fcslam.robot.agent import LARGEST_BACKLOG
+from fcslam.robot.beside import backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.warmup import warm_up_tracking
 from fcslam.sources import open_source
 from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import encode, read_label
 
 TENTHS = {"tenth": "", "scans": "", "odometry so far, m": ".0f", "keyscans so far": "", "mean CPU, ms": ".3f",
           "median CPU, ms": ".3f", "99 %, ms": ".2f", "max, ms": ".1f", "memory at its end, MB": ".1f"}  # fmt: skip
+QUANTILES = (50, 95, 99, 99.9, 100)
+SCAN = {"": "", "mean, ms": ".3f", **{f"{q:g} %, ms": ".2f" for q in QUANTILES}, "longest at scan": ","}
+ROUNDS = {"round": "", "scans": ",", "keyscans so far": ",", "mean, ms": ".3f", "99 %, ms": ".2f", "max, ms": ".1f",
+          "front end, MB": ".0f", "back end, MB": ".0f"}  # fmt: skip
 
 
 def main() -> None:
-    chosen = common.options(__doc__).parse_args()
+    parser = common.options(__doc__ or "")
+    parser.add_argument("--rounds", type=int, default=8, help="of the log, live")
+    chosen = parser.parse_args()
     folder = common.recordings(*common.slam_benchmark_files())
-    report = common.Report(__file__, __doc__, chosen)
-    drive(common.log_path(folder, "mit-csail"))
+    report = common.Report(__file__, __doc__ or "", chosen)
+    report_inline(report, common.log_path(folder, "mit-csail"), common.log_path(folder, "intel"))
+    report_live(report, common.log_path(folder, "intel"), chosen.rounds)
+    report.write()
+
+
+def report_inline(report: common.Report, first: Path, log: Path) -> None:
+    drive(first)
     gc.collect()
-    cpu_ms, wall_ms, state = drive(common.log_path(folder, "intel"))
+    cpu_ms, wall_ms, state = drive(log)
     fifth = len(cpu_ms) // 5
-    first, last = cpu_ms[:fifth], cpu_ms[-fifth:]
+    early, late = cpu_ms[:fifth], cpu_ms[-fifth:]
     report.table(
-        "Growth",
+        "Inline: growth",
         {"": "", "first 20 %": ".3f", "last 20 %": ".3f", "ratio": ".2f"},
-        [(f"{what} CPU, ms", f(first), f(last), f(last) / f(first)) for what, f in
+        [(f"{what} CPU, ms", f(early), f(late), f(late) / f(early)) for what, f in
          (("mean", np.mean), ("median", np.median))],
     )  # fmt: skip
-    quantiles = (50, 90, 99, 99.9, 100)
-    report.table(
-        "A scan",
-        {"": "", "mean, ms": ".3f", **{f"{q:g} %, ms": ".2f" for q in quantiles}},
-        [(what, ms.mean(), *np.percentile(ms, quantiles)) for what, ms in (("CPU", cpu_ms), ("wall", wall_ms))],
-    )
-    report.table("Along the log", TENTHS, tenths(cpu_ms, state))
+    report.table("Inline: a scan", SCAN, [scan_row("CPU", cpu_ms), scan_row("wall", wall_ms)])
+    report.table("Inline: along the log", TENTHS, tenths(cpu_ms, state))
     grown_mb, path_m = state[-1, [2, 0]] - state[len(state) // 10, [2, 0]]
     report.say(f"Memory grew by {grown_mb:.1f} MB over the last nine tenths, {1e3 * grown_mb / path_m:.0f} kB a metre.")
-    report.write()
+
+
+def report_live(report: common.Report, log: Path, rounds: int) -> None:
+    said, rows = alone(drive_live, log, rounds, alone(way_back, log))
+    report.table(f"Live: a scan, intel {rounds} times over", SCAN, said)
+    report.table("Live: round by round, wall", ROUNDS, rows)
+
+
+def drive_live(log: Path, rounds: int, back: Any) -> tuple[list[tuple], list[tuple]]:
+    """Rows of all scans and of each round; ``back``: as in ``Repeated``."""
+    source, repeated = open_source(log), Repeated()
+    repeated.back = back
+    warm_up_tracking(RobotConfig())
+    timed, rows = [], []
+    with backend_process("robot", RobotConfig()) as backend:
+        robot = RobotFrontend("robot", RobotConfig(), backend)
+        (worker,) = active_children()
+        for number in range(1, rounds + 1):
+            part = np.array(list(live(repeated.scans(source.records()), robot)))
+            repeated.end_round()
+            timed.append(part)
+            wall = part[:, 1]
+            keyscans = robot.scan_poses[-1].keyscan + 1
+            memory = resident_mb(), resident_mb(worker.pid)
+            rows.append((number, len(part), keyscans, wall.mean(), np.percentile(wall, 99), wall.max(), *memory))
+    cpu_ms, wall_ms = np.concatenate(timed).T
+    return [scan_row("CPU", cpu_ms), scan_row("wall", wall_ms)], rows
+
+
+def live(records: Any, robot: RobotFrontend) -> Iterator[tuple[float, float]]:
+    """CPU milliseconds of the thread and wall milliseconds of each scan."""
+    for record in records:
+        if isinstance(record, LaserScan):
+            wall, cpu = time.perf_counter(), time.thread_time()
+            robot.process(record)
+            yield 1e3 * (time.thread_time() - cpu), 1e3 * (time.perf_counter() - wall)
+            while robot.backlog > LARGEST_BACKLOG:
+                time.sleep(0.01)
+                robot.ready()
+
+
+def way_back(log: Path) -> Any:
+    """T_last_first of the log's optimised trajectory, shape (3,)."""
+    source = open_source(log)
+    config = MissionConfig()
+    robot, cloud = RobotFrontend("robot", config.robot), Cloud(config.fleet, config.seed)
+    for record in source.records():
+        for packet in robot.process(record):
+            cloud.receive(encode(packet))
+    for packet in robot.finish():
+        cloud.receive(encode(packet))
+    return back_to_the_start(scan_poses(robot, cloud.finalize()))
 
 
 def drive(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -70,6 +144,10 @@ def drive(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(cpu_ms), np.array(wall_ms), np.array(state)
 
 
+def scan_row(what: str, ms: np.ndarray) -> tuple:
+    return what, ms.mean(), *np.percentile(ms, QUANTILES), int(ms.argmax()) + 1
+
+
 def tenths(cpu_ms: np.ndarray, state: np.ndarray) -> list[tuple]:
     rows = []
     for number, part in enumerate(np.array_split(np.arange(len(cpu_ms)), 10), start=1):
@@ -79,8 +157,8 @@ def tenths(cpu_ms: np.ndarray, state: np.ndarray) -> list[tuple]:
     return rows
 
 
-def resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+def resident_mb(process: int | str = "self") -> float:
+    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 

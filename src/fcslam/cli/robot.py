@@ -182,12 +182,14 @@ def _agent(
     from fcslam.robot.budget import Budget
     from fcslam.robot.frontend import RobotFrontend
     from fcslam.robot.outbox import Outbox
+    from fcslam.robot.warmup import warm_up_tracking
     from fcslam.wire.http_transport import HttpTransport
 
     try:
         state.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StateError(f"{state}: cannot be made ({error.strerror}); give another --state") from error
+    warm_up_tracking(settings)
     # Not the mission's seed: robots must not retry at the same moments.
     rng = np.random.default_rng()
     budget = None if budget_kbps is None else Budget(1e3 * budget_kbps)

@@ -69,7 +69,7 @@ def backend_process(robot: str, config: SessionConfig) -> Iterator[Beside]:
     try:
         yield Beside(robot, config, executor)
     finally:
-        executor.shutdown(wait=False, cancel_futures=True)
+        executor.shutdown(cancel_futures=True)
 
 
 _backends: dict[str, RobotBackend] = {}
