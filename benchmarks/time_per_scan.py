@@ -50,8 +50,9 @@ def main() -> None:
     chosen = parser.parse_args()
     folder = common.recordings(*common.slam_benchmark_files())
     report = common.Report(__file__, __doc__ or "", chosen)
-    report_inline(report, common.log_path(folder, "mit-csail"), common.log_path(folder, "intel"))
-    report_live(report, common.log_path(folder, "intel"), chosen.rounds)
+    log = common.log_path(folder, "intel")
+    report_live(report, log, chosen.rounds)
+    report_inline(report, common.log_path(folder, "mit-csail"), log)
     report.write()
 
 
@@ -74,7 +75,7 @@ def report_inline(report: common.Report, first: Path, log: Path) -> None:
 
 
 def report_live(report: common.Report, log: Path, rounds: int) -> None:
-    said, rows = alone(drive_live, log, rounds, alone(way_back, log))
+    said, rows = drive_live(log, rounds, alone(way_back, log))
     report.table(f"Live: a scan, intel {rounds} times over", SCAN, said)
     report.table("Live: round by round, wall", ROUNDS, rows)
 

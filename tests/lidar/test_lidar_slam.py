@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.backend import LidarBackend
+from fcslam.graph.optimizer import optimize
+from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.lidar.backend import LidarBackend, chained
 from fcslam.lidar.closing import ClosingConfig
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend, motion_information
 from fcslam.lidar.odometry import OdometryConfig
 from fcslam.lidar.tracker import TrackedScan
-from fcslam.records import ConstraintKind
+from fcslam.records import Constraint, ConstraintKind
 from tests.lidar.worlds import box, drifting, drive, path, pose_errors, recording, ring, ring_drive, shifted
 
 DRIFT = {"scale": 1.03, "veer_rad_m": 0.015, "noise": 0.02}
@@ -26,9 +28,15 @@ class Mapped:
             self.steps.append(step := frontend.process(scan))
             if step.keyscan is not None:
                 self.submaps += filter(None, [self.backend.add(step.keyscan)])
-            self.stored.append(len(self.backend._points))
+            self.stored.append(len(self.backend._window))
         self.submaps += self.backend.finish()
-        self.keyscans = self.backend.optimized()
+        anchors = [submap.anchor for submap in self.submaps]
+        mapped = [step.keyscan for step in self.steps if step.keyscan is not None]
+        self.travel = np.array([keyscan.travel_m for keyscan in mapped])
+        local = np.array([keyscan.T_local_base for keyscan in mapped])
+        before = np.searchsorted(anchors, np.arange(len(local)), side="right") - 1
+        offsets = se2.between(local[np.array(anchors)[before]], local)
+        self.keyscans = se2.compose(self.backend.optimized()[before], offsets)
 
     @property
     def poses(self):
@@ -101,7 +109,7 @@ def test_the_map_starts_at_the_first_odometry_pose(truth):
 def test_submaps_cover_the_drive(mapped):
     anchors = [submap.anchor for submap in mapped.submaps]
     assert anchors == sorted(set(anchors))
-    travel = np.array(mapped.backend._travel)
+    travel = mapped.travel
     assert np.diff(travel[anchors]).max() < 2.0 + 0.5
     for submap in mapped.submaps:
         assert submap.first <= submap.anchor <= submap.last
@@ -166,3 +174,44 @@ def test_rooms_that_look_alike_stay_apart(drift):
     assert mapped.false_closures(truth) == []
     assert len(mapped.closures) > 0
     assert pose_errors(mapped.poses, truth)[0].max() < 0.15
+
+
+def test_motions_combined_solve_as_the_keyscans_between_would():
+    """A chain, one motion of which is loose, and a closure between its ends that disagrees."""
+    rng = np.random.default_rng(0)
+    motions = []
+    for k in range(6):
+        root = rng.normal(size=(3, 3))
+        information = root @ root.T + np.diag((4e2, 4e2, 4e4)) * (0.01 if k == 2 else 1.0)
+        motions.append(Constraint("r", k, k + 1, ConstraintKind.ODOMETRY, np.array([0.3, 0.02 * k, 0.25]), information))
+    T, information = chained(motions)
+    closure = se2.compose(T, np.array([0.02, -0.03, 0.01]))
+    trust = np.diag((5e2, 3e2, 1e4))
+
+    def end(edges, poses):
+        graph = PoseGraph(poses, [*edges, Edge(0, len(poses) - 1, closure, trust, robust=False)])
+        return optimize(graph).poses[-1]
+
+    poses = [np.zeros(3)]
+    for motion in motions:
+        poses.append(se2.compose(poses[-1], motion.T_i_j))
+    whole = end([Edge(m.i, m.j, m.T_i_j, m.information, robust=False) for m in motions], poses)
+    reduced = end([Edge(0, 1, T, information, robust=False)], [poses[0], T])
+    assert np.abs(se2.between(T, whole)).max() > 3e-3
+    np.testing.assert_allclose(reduced, whole, atol=3e-4)
+
+
+def test_a_well_known_area_holds_no_more_submaps_however_often_it_is_crossed():
+    """A robot that goes to and fro on one spot's surroundings; what it forgets costs no closure of the newest visit."""
+    truth = drive([(1.5, 1.5), (6.0, 1.5)] * 8)
+    there = recording(truth, truth, ring())
+    few = LidarConfig(closing=ClosingConfig(most_nearby=3))
+    mapped, unlimited = Mapped(there, few), Mapped(there)
+    anchors = mapped.backend._poses[list(mapped.backend._closer._held)]
+    squares, counts = np.unique(np.floor(anchors[:, :2] / 2.0 + 0.5), axis=0, return_counts=True)
+    assert counts.max() <= 3
+    assert len(anchors) < len(mapped.submaps) == len(unlimited.submaps)
+    newest = mapped.submaps[-6:]
+    assert len(squares) >= 3
+    assert all(submap.closures for submap in newest)
+    assert pose_errors(mapped.poses, truth)[0].max() < 0.05

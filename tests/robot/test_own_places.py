@@ -71,13 +71,14 @@ def submaps_of(world, length_m):
     for anchor in range(0, len(truth), 2):
         near = range(max(0, anchor - 5), min(len(truth), anchor + 6))
         submap = build_submap([(scans[k], se2.between(truth[anchor], truth[k])) for k in near])
-        submaps.append(AnchoredSubmap(anchor, anchor * STEP_M, submap))
+        submaps.append((AnchoredSubmap(anchor, anchor * STEP_M), submap))
     return truth, submaps
 
 
 def closures(submaps, poses, recognizer, config=None):
     closer = LoopCloser(config or ClosingConfig(), SearchConfig(), VerificationConfig(), recognizer)
-    found = [closer.add(submap, poses[: submap.keyscan + 1]) for submap in submaps]
+    anchors = np.array([poses[anchored.keyscan] for anchored, _ in submaps])
+    found = [closer.add(anchored, submap, anchors[: k + 1]) for k, (anchored, submap) in enumerate(submaps)]
     return [(2 * c.earlier, 2 * c.later, c) for closures in found for c in closures]
 
 
@@ -97,6 +98,18 @@ def test_a_loop_whose_drift_is_beyond_the_search_is_closed():
     for i, j, closure in found:
         error = se2.between(se2.between(truth[i], truth[j]), closure.check.T_a_b)
         assert np.hypot(error[0], error[1]) < 0.2
+
+
+def test_what_is_forgotten_is_not_recognised():
+    _, submaps = submaps_of(blocks, 60.0)
+    places = own_places()
+    for anchored, submap in submaps[:10]:
+        places.store(anchored.keyscan, submap.surface.points)
+    keyscans = [anchored.keyscan for anchored, _ in submaps[:10]]
+    places.forget(keyscans[0])  # before the index has it, and after
+    assert set(places.most_similar(keyscans[9], keyscans, 10)) <= set(keyscans[1:])
+    places.forget(keyscans[9 - 1])
+    assert keyscans[8] not in places.most_similar(keyscans[9], keyscans, 10)
 
 
 @pytest.mark.parametrize("drift", [ClosingConfig().recognized_drift, 2.0])
@@ -138,6 +151,9 @@ def test_the_map_closes_with_its_loop(recognizes):
         backend.add(frontend.process(*recording(truth[k : k + 1], [pose], segments, seed=k)).keyscan)
     backend.finish()
     meeting = int(2 * np.pi * RADIUS_M / FINE_M)
-    for estimate in (np.array(backend._poses), backend.optimized()):  # during the drive, and in the end
-        off = se2.between(se2.between(truth[0], truth[meeting]), se2.between(estimate[0], estimate[meeting]))
+    anchors = [submap.keyscan for submap in backend._closer.submaps]
+    end = min(anchors, key=lambda keyscan: abs(keyscan - meeting))
+    for estimate in (backend._poses, backend.optimized()):  # during the drive, and in the end
+        moved = se2.between(estimate[0], estimate[anchors.index(end)])
+        off = se2.between(se2.between(truth[0], truth[end]), moved)
         assert (np.hypot(off[0], off[1]) < 0.3) == recognizes

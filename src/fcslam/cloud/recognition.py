@@ -13,8 +13,8 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.submaps import SubmapCache
 from fcslam.cloud.visits import Visit, visits_near
 from fcslam.geometry import se2
+from fcslam.geometry.thinning import surplus_places
 from fcslam.places.matcher import PlaceMatch, PlaceMatcher
-from fcslam.places.thinning import surplus_places
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 
 

@@ -4,6 +4,7 @@ Its state is a function of the keyscans in their order, whenever it gets them.
 """
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +13,10 @@ from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.graph.trajectory import transport_covariance
 from fcslam.lidar.closing import AnchoredSubmap, LocalClosure, LoopCloser, PlaceRecognizer
 from fcslam.lidar.frontend import LidarConfig, MappedKeyscan
-from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import build_submap
+from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import Constraint, ConstraintKind, FloatArray, frozen
 
 SOLVE_AFTER, SOLVE_AFTER_SHARE = 20, 0.08
@@ -38,33 +39,31 @@ class FinishedSubmap:
 
 
 class LidarBackend:
-    """Maps the keyscans of one robot. Poses are in its own ``map``, where the first keyscan has its odometry pose."""
+    """Maps the keyscans of one robot. Poses are in its own ``map``, where the first keyscan has its odometry pose.
+
+    The variables of the pose graph are the anchors of the submaps. The keyscans between two anchors are marginalised:
+    their odometry is one constraint. So a solve is ten times cheaper than with a variable for each keyscan.
+    """
 
     def __init__(self, robot: str, config: LidarConfig, recognizer: PlaceRecognizer | None = None) -> None:
         """``recognizer`` proposes loops whose drift is beyond the reach of the search; without one they stay open."""
         self.robot = robot
-        self._keyscans = config.keyscans
+        self._gate = config.keyscans
         self._closer = LoopCloser(config.closing, config.search, config.verification, recognizer)
         self._graph = PoseGraph()
         self._factors = FactorCache(self._graph)
-        self._poses: list[FloatArray] = []  # T_map_base of each keyscan, optimised
-        self._local: list[FloatArray] = []  # T_local_base of each keyscan, smooth
-        self._travel: list[float] = []
-        self._points: dict[int, PointScan] = {}
+        self._poses = np.empty((0, 3))
+        """``T_map_base`` of each anchor, optimised."""
+        self._window: list[MappedKeyscan] = []
+        """The newest keyscans, as far back as the next submaps need them."""
+        self._count = 0
         self._next_anchor_m = 0.0
         self._unsolved = 0
 
     def add(self, keyscan: MappedKeyscan) -> FinishedSubmap | None:
         """Add the next keyscan; returns the submap that it completes, if it completes one."""
-        self._points[len(self._local)] = keyscan.points
-        self._local.append(keyscan.T_local_base)
-        self._travel.append(keyscan.travel_m)
-        motion = keyscan.odometry
-        pose = keyscan.T_odom_base if motion is None else se2.compose(self._poses[-1], motion.T_i_j)
-        self._poses.append(pose)
-        self._graph.add_variable(pose)
-        if motion is not None:
-            self._graph.add_edge(Edge(motion.i, motion.j, motion.T_i_j, motion.information, robust=False))
+        self._window.append(keyscan)
+        self._count += 1
         return self._finish_submap()
 
     def finish(self) -> list[FinishedSubmap]:
@@ -75,35 +74,53 @@ class LidarBackend:
         return rest
 
     def optimized(self) -> FloatArray:
-        """``T_map_base`` of every keyscan after a robust solve (GNC), shape (N, 3), metres and radians."""
+        """``T_map_base`` of every anchor after a robust solve (GNC), shape (S, 3), metres and radians."""
         if self._closer.has_closures:
-            self._poses = list(optimize_gnc(self._graph, self._poses, factors=self._factors).poses)
-        return np.array(self._poses).reshape(-1, 3)
+            self._poses = optimize_gnc(self._graph, self._poses, factors=self._factors).poses
+        return self._poses
 
     def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
         """Build the next submap once the robot is far enough past its anchor, and close loops to earlier ones."""
-        gate, travel = self._keyscans, self._travel
-        anchor = bisect_left(travel, self._next_anchor_m)
-        if anchor == len(travel) or (not at_end and travel[-1] < travel[anchor] + gate.submap_reach_m):
+        gate, window = self._gate, self._window
+        travel = [keyscan.travel_m for keyscan in window]
+        middle = bisect_left(travel, self._next_anchor_m)
+        if middle == len(window) or (not at_end and travel[-1] < travel[middle] + gate.submap_reach_m):
             return None
-        self._next_anchor_m = travel[anchor] + gate.submap_every_m
-        first = bisect_left(travel, travel[anchor] - gate.submap_reach_m)
-        last = bisect_right(travel, travel[anchor] + gate.submap_reach_m) - 1
-        T_anchor = [se2.between(self._local[anchor], self._local[k]) for k in range(first, last + 1)]
-        submap = build_submap([(self._points[first + k], pose) for k, pose in enumerate(T_anchor)])
-        for number in [k for k in self._points if k < first]:
-            del self._points[number]
-        closures = self._close_loops(AnchoredSubmap(anchor, travel[anchor], submap))
-        return FinishedSubmap(anchor, first, last, submap.surface.points, closures)
+        anchor = window[middle]
+        self._next_anchor_m = anchor.travel_m + gate.submap_every_m
+        first = bisect_left(travel, anchor.travel_m - gate.submap_reach_m)
+        last = bisect_right(travel, anchor.travel_m + gate.submap_reach_m) - 1
+        submap = build_submap(
+            [(k.points, se2.between(anchor.T_local_base, k.T_local_base)) for k in window[first : last + 1]]
+        )
+        self._add_anchor(anchor)
+        self._window = window[first:]
+        number = anchor.record.id.number
+        closures = self._close_loops(AnchoredSubmap(number, anchor.travel_m), submap)
+        ends = number + first - middle, number + last - middle
+        return FinishedSubmap(number, *ends, submap.surface.points, closures)
 
-    def _close_loops(self, submap: AnchoredSubmap) -> tuple[Constraint, ...]:
+    def _add_anchor(self, anchor: MappedKeyscan) -> None:
+        """Add a variable to the pose graph, with a constraint to the anchor before it."""
+        if not self._closer.submaps:
+            self._poses = anchor.T_odom_base[None]
+            self._graph.add_variable(anchor.T_odom_base)
+            return
+        between = range(self._closer.submaps[-1].keyscan + 1, anchor.record.id.number + 1)
+        motions = [k.odometry for k in self._window if k.odometry is not None and k.record.id.number in between]
+        T_before_anchor, information = chained(motions)
+        pose = se2.compose(self._poses[-1], T_before_anchor)
+        variable = self._graph.add_variable(pose)
+        self._graph.add_edge(Edge(variable - 1, variable, T_before_anchor, information, robust=False))
+        self._poses = np.vstack((self._poses, pose))
+
+    def _close_loops(self, anchored: AnchoredSubmap, submap: Submap) -> tuple[Constraint, ...]:
         """Compare a new submap with earlier ones; accepted closures become constraints."""
-        closures = self._closer.add(submap, self._poses)
-        constraints = tuple(self._constraint(closure) for closure in closures)
-        for c in constraints:
-            self._graph.add_edge(Edge(c.i, c.j, c.T_i_j, c.information, robust=True))
+        closures = self._closer.add(anchored, submap, self._poses)
+        for c in closures:
+            self._graph.add_edge(Edge(c.earlier, c.later, c.check.T_a_b, c.check.information, robust=True))
         self._optimize_if_needed(closures)
-        return constraints
+        return tuple(self._constraint(closure) for closure in closures)
 
     def _constraint(self, closure: LocalClosure) -> Constraint:
         submaps = self._closer.submaps
@@ -118,10 +135,25 @@ class LidarBackend:
         A recognised loop may contradict it by so much that the Cauchy loss hardly pulls; only GNC closes it.
         """
         self._unsolved += len(closures)
-        enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._local))
+        enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * self._count)
         if any(c.beyond_search for c in closures):
             self.optimized()
             self._unsolved = 0
         elif self._unsolved >= enough or any(c.is_surprising for c in closures):
-            self._poses = list(optimize(self._graph, self._poses, loss=Loss.CAUCHY, factors=self._factors).poses)
+            self._poses = optimize(self._graph, self._poses, loss=Loss.CAUCHY, factors=self._factors).poses
             self._unsolved = 0
+
+
+def chained(motions: Sequence[Constraint]) -> tuple[FloatArray, FloatArray]:
+    """Combine consecutive motions of a chain, one or more, into one.
+
+    Returns:
+        The motion from the first pose to the last, shape (3,), and its information in the tangent space at it (x, y,
+        theta of the last pose), shape (3, 3), to first order in the errors.
+    """
+    T_first_last, covariance = np.zeros(3), np.zeros((3, 3))
+    for motion in motions:
+        T_first_last = se2.compose(T_first_last, motion.T_i_j)
+        covariance = transport_covariance(covariance, motion.T_i_j) + np.linalg.inv(motion.information)
+    information = np.linalg.inv(covariance)
+    return T_first_last, 0.5 * (information + information.T)

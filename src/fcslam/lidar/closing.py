@@ -6,18 +6,20 @@ the whole window by branch and bound. Where the error may exceed the largest win
 earlier submaps and the motions to them.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.geometry.thinning import surplus_places
 from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
 from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import Verification, VerificationConfig, verify
@@ -87,17 +89,25 @@ class ClosingConfig(Settings):
         description="largest drift of the position, per metre of path through the graph, at which place recognition "
         "still closes a loop that is out of the search's reach; 0 turns it off [m/m]",
     )
+    most_nearby: int = Field(
+        default=12,
+        gt=0,
+        description="most submaps in a square of nearby_m that later ones are compared with; beyond, the oldest is "
+        "forgotten",
+    )
+    nearby_m: float = Field(
+        default=2.0, gt=0, description="side of the squares of the map in which most_nearby limits the submaps [m]"
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class AnchoredSubmap:
-    """A submap and the keyscan that anchors it in the pose graph."""
+    """Where a submap is on the robot's path."""
 
     keyscan: int
     """Number of the anchor."""
     travel_m: float
     """Path length up to the anchor, metres (turns count a little)."""
-    submap: Submap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +144,9 @@ class PlaceRecognizer(Protocol):
     def most_similar(self, keyscan: int, among: Collection[int], most: int) -> list[int]:
         """At most ``most`` of these stored submaps that look like a stored one, the most similar first."""
 
+    def forget(self, keyscan: int) -> None:
+        """Forget a stored submap."""
+
     def motions(self, a: int, b: int) -> list[FloatArray]:
         """Motions ``T_a_b``, shape (3,), that the keypoints of two stored submaps support, the best first."""
 
@@ -153,7 +166,11 @@ class LoopCloser:
         self._search = search_config
         self._verification = verification
         self.submaps: list[AnchoredSubmap] = []
-        self._accepted: list[LocalClosure] = []
+        """All submaps so far."""
+        self._held: dict[int, Submap] = {}
+        """The submaps that others are compared with, by index; the oldest of a well-known area are forgotten."""
+        self._accepted: list[tuple[int, int]] = []
+        """Earlier and later submap of each accepted closure."""
         self._pending: list[LocalClosure] = []
 
     @property
@@ -161,33 +178,51 @@ class LoopCloser:
         """Whether any closure was accepted."""
         return bool(self._accepted)
 
-    def add(self, submap: AnchoredSubmap, poses: Sequence[FloatArray]) -> list[LocalClosure]:
+    def add(self, anchored: AnchoredSubmap, submap: Submap, anchors: FloatArray) -> list[LocalClosure]:
         """Compare the next submap with earlier ones.
 
         Args:
-            submap: the next submap.
-            poses: ``T_map_base`` of every keyscan so far, shape (3,) each.
+            anchored: where the next submap is on the path.
+            submap: its surfaces.
+            anchors: ``T_map_base`` of the anchors of all submaps with this one, shape (S, 3).
 
         Returns:
             The closures that are accepted now: of this submap, and pending ones that it supports.
         """
-        self.submaps.append(submap)
-        later = len(self.submaps) - 1
+        later = len(self.submaps)
+        self.submaps.append(anchored)
+        self._held[later] = submap
         paths = self._paths_from(later)
-        anchors = np.array([poses[submap.keyscan] for submap in self.submaps])
         found = [
             closure
             for earlier in self._candidates(later, anchors, paths)
             if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
         ]
-        return self._accept(found, self._recognized(later, anchors, paths), anchors)
+        accepted = self._accept(found, self._recognized(later, anchors, paths), anchors)
+        self._thin(anchors)
+        return accepted
+
+    def _thin(self, anchors: FloatArray) -> None:
+        """Forget the oldest submaps around the newest one, if there are enough of them."""
+        held = np.array(list(self._held))
+        for row in surplus_places(anchors[held, :2], self._config.nearby_m, self._config.most_nearby):
+            index = int(held[row])
+            del self._held[index]
+            if self._recognizer is not None:
+                self._recognizer.forget(self.submaps[index].keyscan)
+
+    def _is_held(self) -> NDArray[np.bool_]:
+        """Which submaps others are compared with, shape (S,)."""
+        held = np.zeros(len(self.submaps), np.bool_)
+        held[list(self._held)] = True
+        return held
 
     def _paths_from(self, later: int) -> FloatArray:
         """Shortest path through the pose graph from one submap to every other, metres, shape (S,)."""
         n = len(self.submaps)
         travel = np.array([submap.travel_m for submap in self.submaps])
-        rows = [*range(n - 1), *(c.earlier for c in self._accepted)]
-        columns = [*range(1, n), *(c.later for c in self._accepted)]
+        rows = [*range(n - 1), *(earlier for earlier, _ in self._accepted)]
+        columns = [*range(1, n), *(later for _, later in self._accepted)]
         lengths = [*(np.diff(travel) + _MINIMUM_PATH_M), *(CLOSURE_PATH_M for _ in self._accepted)]
         links = coo_array((np.array(lengths), (np.array(rows), np.array(columns))), shape=(n, n))
         paths: FloatArray = dijkstra(links.tocsr(), directed=False, indices=[later])[0]
@@ -207,7 +242,7 @@ class LoopCloser:
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
         drift = np.array([self._drift_allowance(path)[0] for path in paths])
         near = (travel[later] - travel > self._config.gap_m) & (distance < self._config.sight_m + drift)
-        indices = np.flatnonzero(near)
+        indices = np.flatnonzero(near & self._is_held())
         if not len(indices):
             return []
         visits = np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
@@ -217,7 +252,7 @@ class LoopCloser:
 
     def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> LocalClosure | None:
         """Search where the drift allowance is wide, then verify; None if the submaps do not show the same place."""
-        a, b = self.submaps[earlier].submap, self.submaps[later].submap
+        a, b = self._held[earlier], self._held[later]
         predicted = se2.between(anchors[earlier], anchors[later])
         radius, angle = self._drift_allowance(path_m)
         guess = predicted
@@ -245,7 +280,7 @@ class LoopCloser:
         if self._recognizer is None:
             return []
         newest = self.submaps[later]
-        self._recognizer.store(newest.keyscan, newest.submap.surface.points)
+        self._recognizer.store(newest.keyscan, self._held[later].surface.points)
         found = [
             closure
             for earlier in self._lookalikes(self._recognizer, later, anchors, paths)
@@ -265,7 +300,7 @@ class LoopCloser:
         capped = (drift >= (config.widest_m, config.widest_rad)).any(axis=1)
         unsure = capped | (distance > config.sight_m + drift[:, 0])
         possible = distance < config.sight_m + config.recognized_drift * paths
-        eligible = np.flatnonzero(unsure & possible & (travel[later] - travel > config.gap_m))
+        eligible = np.flatnonzero(unsure & possible & (travel[later] - travel > config.gap_m) & self._is_held())
         number = {self.submaps[k].keyscan: int(k) for k in eligible}
         chosen: list[int] = []
         for keyscan in recognizer.most_similar(self.submaps[later].keyscan, number, SIMILAR_PLACES) if number else ():
@@ -278,7 +313,7 @@ class LoopCloser:
         self, earlier: int, later: int, anchors: FloatArray, path_m: float, guess: FloatArray
     ) -> LocalClosure | None:
         """Verify a recognised place; None if it is another one, or if no drift explains where it is."""
-        check = verify(self.submaps[earlier].submap, self.submaps[later].submap, guess, self._verification)
+        check = verify(self._held[earlier], self._held[later], guess, self._verification)
         innovation = se2.between(se2.between(anchors[earlier], anchors[later]), check.T_a_b)
         off_m = float(np.hypot(innovation[0], innovation[1]))
         if not (check.loose or check.support) or off_m > self._config.recognized_drift * path_m:
@@ -301,7 +336,7 @@ class LoopCloser:
         cluster = self._cluster(anchors)
         accepted += cluster
         self._pending = [c for c in self._pending if c not in cluster]
-        self._accepted += accepted
+        self._accepted += [(c.earlier, c.later) for c in accepted]
         return accepted
 
     @staticmethod

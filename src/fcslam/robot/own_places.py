@@ -50,6 +50,14 @@ class OwnPlaces:
         result = self._index.compare(self._features[keyscan].descriptors)
         return [found.id for found in result.best(most, lambda place: place in among)]
 
+    def forget(self, keyscan: int) -> None:
+        """Forget a stored submap."""
+        del self._features[keyscan]
+        if keyscan in self._index:
+            self._index.forget(keyscan)
+        else:
+            self._backlog.remove(keyscan)
+
     def motions(self, a: int, b: int) -> list[FloatArray]:
         """Motions ``T_a_b``, shape (3,), that enough keypoints of two stored submaps support, the best first."""
         config, (of_a, of_b) = self._config.motions, (self._features[a], self._features[b])

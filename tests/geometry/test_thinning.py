@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.places.thinning import surplus_places
+from fcslam.geometry.thinning import surplus_places
 
 coordinates = st.floats(-4.0, 4.0)
 ways = st.lists(st.tuples(coordinates, coordinates), max_size=60)
