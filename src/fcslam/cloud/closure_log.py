@@ -39,6 +39,8 @@ class ClosureLog:
         """Entries by pair of robots, because every place queries its pairs."""
         self._ties: dict[str, list[ClosureEntry]] = {}
         """Verified entries between each robot and others; a candidate never changes its status."""
+        self._at: dict[KeyscanId, list[ClosureEntry]] = {}
+        """Verified entries between robots, by each of their two places."""
         self._confirmed: set[tuple[frozenset[KeyscanId], Channel]] = set()
         """Pairs of places with a verified closure, and its channel."""
 
@@ -70,6 +72,8 @@ class ClosureLog:
             self._between.setdefault(frozenset((match.i.robot, match.j.robot)), []).append(entry)
             for robot in (match.i.robot, match.j.robot) if match.M else ():
                 self._ties.setdefault(robot, []).append(entry)
+            for place in (match.i, match.j) if match.M else ():
+                self._at.setdefault(place, []).append(entry)
         return entry
 
     def add_local(self, constraint: Constraint, edge: int) -> ClosureEntry:
@@ -90,6 +94,10 @@ class ClosureLog:
             for entry in self._between.get(frozenset((a, b)), ())
             if entry.independent and not entry.vetoed and entry.closure.status is not ClosureStatus.CANDIDATE
         ]
+
+    def ties_at(self, place: KeyscanId) -> Iterator[ClosureEntry]:
+        """The accepted closures between this place and those of other robots."""
+        return (entry for entry in self._at.get(place, ()) if entry.closure.status is ClosureStatus.ACCEPTED)
 
     def ties(self, robot: str) -> Iterator[ClosureEntry]:
         """The accepted closures between a robot and others, newest first."""

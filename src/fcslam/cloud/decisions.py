@@ -81,7 +81,10 @@ class ClosureDecisions:
         self._apply_vetoes(entries)
         undecided = [entry for entry in entries if not entry.vetoed and not self._accept_if_consistent(entry)]
         for other in dict.fromkeys(entry.closure.i.robot for entry in undecided):
-            self._decide_pair(other, session)
+            between = [entry for entry in undecided if entry.closure.i.robot == other]
+            # A pair decided just before may have joined these two as well.
+            if [entry for entry in between if not self._accept_if_consistent(entry)]:
+                self._decide_pair(other, session)
 
     def optimize_if_due(self) -> None:
         """Solve the joint graph if enough closures are new; re-evaluate if evidence turned against a join."""

@@ -41,8 +41,8 @@ class Fleet:
         self._seed = seed
         self._sessions = SessionStore()
         self._graph = JointGraph()
-        self._recognition = PlaceRecognition(config, seed, self._sessions, self._graph)
         self._decisions = ClosureDecisions(config, self._sessions, self._graph)
+        self._recognition = PlaceRecognition(config, seed, self._sessions, self._graph, self._decisions.closures)
         self._quality = CorrectionQuality(self._graph, config.surprise_m, config.surprise_rad)
         self._needs_replay = False
         """Whether something besides the packets, such as a veto or an earlier result, changed the graph."""

@@ -1,6 +1,6 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.trajectory import DriftSettings, Trajectory, build_trajectory
 from fcslam.records import Constraint, FloatArray, KeyscanId
+
+SOLVED_SHARE = 0.05
+"""Share of all closures that comes in between two solves, at least."""
 
 
 class JointGraph:
@@ -24,7 +27,8 @@ class JointGraph:
         self._step_covariance: dict[str, list[FloatArray]] = {}
         self._poses = np.zeros((256, 3))
         self._left_out: set[int] = set()
-        self._unsolved = 0
+        self._closures = self._unsolved = 0
+        """Closures in the graph, and those that came in since the last solve."""
 
     def variable(self, keyscan: KeyscanId) -> int:
         """Number of the keyscan's variable."""
@@ -38,6 +42,11 @@ class JointGraph:
         """T_map_base (3,) of the keyscan in its robot's current map."""
         pose: FloatArray = self._poses[self.variable(keyscan)]
         return pose
+
+    def poses(self, keyscans: Iterable[KeyscanId]) -> FloatArray:
+        """T_map_base of the keyscans, each in its robot's current map, shape (N, 3)."""
+        poses: FloatArray = self._poses[[self._variables[robot][number] for robot, number in keyscans]].reshape(-1, 3)
+        return poses
 
     def trajectory(self, robot: str) -> FloatArray:
         """T_map_base of the robot's keyscans, shape (N, 3)."""
@@ -81,6 +90,7 @@ class JointGraph:
     def close(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray, information: FloatArray) -> int:
         """A closure; returns the number of its edge."""
         self._unsolved += 1
+        self._closures += 1
         return self.graph.add_edge(Edge(self.variable(i), self.variable(j), T_i_j, information, robust=True))
 
     def innovation(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray) -> FloatArray:
@@ -94,8 +104,11 @@ class JointGraph:
             self._poses[variables] = se2.compose(T_new_old, self._poses[variables])
 
     def is_due(self, closures: int) -> bool:
-        """Whether that many closures came in since the last solve."""
-        return self._unsolved >= closures
+        """Whether that many closures came in since the last solve, and the graph has grown noticeably.
+
+        A solve costs as much as the graph is large: growth by a constant share keeps the cost per closure constant.
+        """
+        return self._unsolved >= max(closures, SOLVED_SHARE * self._closures)
 
     def count(self, edge: int, *, holds: bool) -> None:
         """Include the closure in the next solves, or exclude it."""

@@ -1,17 +1,18 @@
 """Place recognition of the fleet: which stored places may a new one show again, and which are kept."""
 
-from collections.abc import Callable, Collection
-from operator import itemgetter
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from fcslam.cloud.closure_log import ClosureLog
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import robot_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.submaps import SubmapCache
-from fcslam.cloud.visits import Visit, visits_near
+from fcslam.cloud.visits import NEWEST_PLACES, Visit, visits_near, worth_comparing
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.places.matcher import PlaceMatch, PlaceMatcher
@@ -35,11 +36,14 @@ _VocabularyKey = tuple[Channel, str]
 class PlaceRecognition:
     """One matcher for each channel and detector version."""
 
-    def __init__(self, config: FleetConfig, seed: int, sessions: SessionStore, graph: JointGraph) -> None:
+    def __init__(
+        self, config: FleetConfig, seed: int, sessions: SessionStore, graph: JointGraph, closures: ClosureLog
+    ) -> None:
         self._config = config
         self._seed = seed
         self._sessions = sessions
         self._graph = graph
+        self._closures = closures
         self._submaps = SubmapCache(sessions, graph, config.submaps_kept)
         self._matchers: dict[_VocabularyKey, PlaceMatcher] = {}
         self._places: dict[tuple[_VocabularyKey, str], list[KeyscanId]] = {}
@@ -63,7 +67,7 @@ class PlaceRecognition:
             return
         sessions = {session for session in mates if robot_of(session) == robot_of(place.id.robot)}
         ids = [i for i in matcher if i.robot in sessions]
-        positions = np.array([self._graph.pose(i)[:2] for i in ids])
+        positions = self._graph.poses(ids)[:, :2]
         for row in surplus_places(positions, settings.nearby_m, settings.most_nearby):
             matcher.forget(ids[row])
 
@@ -89,15 +93,28 @@ class PlaceRecognition:
         self._sessions.release(place)
 
     def _predicted(self, place: Place, mates: Collection[str]) -> dict[KeyscanId, FloatArray]:
-        """T_i_j (3,) to the nearest places of other sessions in the map: one for each visit, few for each robot."""
+        """T_i_j (3,) to the nearest places of other sessions in the map: one for each visit, few for each group."""
         pose, key = self._graph.pose(place.id), (place.channel, place.detector_version)
         visits: dict[str, list[Visit]] = {}
         for session in mates:
             ids = self._places.get((key, session), []) if session != place.id.robot else []
-            poses = np.array([self._graph.pose(i) for i in ids]).reshape(-1, 3)
-            visits.setdefault(robot_of(session), []).extend(visits_near(ids, poses, pose[:2], self._config.sight_m))
-        nearest = (sorted(found, key=itemgetter(0))[: self._config.near_visits] for found in visits.values())
-        return {i: se2.between(self._graph.pose(i), pose) for found in nearest for _, i in found}
+            found = visits_near(ids, self._graph.poses(ids), pose[:2], self._config.sight_m)
+            if found:
+                visits.setdefault(robot_of(session), []).extend(found)
+        chosen = worth_comparing(visits, self._closures_near(visits), self._config.near_visits)
+        return {visit.nearest: se2.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
+
+    def _closures_near(self, visits: Mapping[str, Sequence[Visit]]) -> Counter[frozenset[str]]:
+        """Number of accepted closures at the newest places of each robot's visits, by pair of robots."""
+        near = (
+            place
+            for found in visits.values()
+            for place in [place for visit in found for place in visit.places][-NEWEST_PLACES:]
+        )
+        entries = {entry for place in near for entry in self._closures.ties_at(place)}
+        return Counter(
+            frozenset((robot_of(entry.closure.i.robot), robot_of(entry.closure.j.robot))) for entry in entries
+        )
 
 
 def _outside(mates: Collection[str]) -> Callable[[KeyscanId], bool]:

@@ -23,7 +23,10 @@ class FleetConfig(Settings):
         default=6.0, gt=0, description="largest distance, in metres, at which places in the same map are compared"
     )
     near_visits: int = Field(
-        default=2, ge=0, description="number of earlier visits of each robot that are compared with a new place"
+        default=2,
+        ge=0,
+        description="number of earlier visits of each robot that are compared with a new place; of robots that "
+        "closures nearby tie together, two count",
     )
     surprise_m: float = Field(
         default=0.5,
@@ -36,7 +39,9 @@ class FleetConfig(Settings):
         description="a closure that differs from the joint map by this much, in radians, needs a cluster of closures",
     )
     solve_every: int = Field(
-        default=40, gt=0, description="number of new closures after which the joint graph is solved"
+        default=40,
+        gt=0,
+        description="number of new closures after which the joint graph is solved; 5 % of all closures if that is more",
     )
     submaps_kept: int = Field(
         default=300, gt=1, description="number of submaps in the cache; others are rebuilt from their keyscans"
