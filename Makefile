@@ -38,10 +38,11 @@ help:
 install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
-	@echo "Installing fcslam[$(EXTRAS)] into $(VENV); the first time takes about a minute."
+	@echo "Installing fcslam[$(EXTRAS)] into $(VENV); the first time takes about two minutes."
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) -e ".[$(EXTRAS)]"
 	@find src -name '*.nb[ic]' -delete  # compiled code that names classes by where they were
+	@$(BIN)/fcslam warm-up
 	@touch $@
 
 # Never fails: without a GL library there are LiDARs.

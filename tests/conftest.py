@@ -12,14 +12,11 @@ from fcslam.simulation.simulated_fleet import SimulatedFleet
 from fcslam.sources import write_carmen
 from fcslam.wire.messages import Packet
 from tests import small_fleet
-from tests.numba_cache import lock_numba_cache
 from tests.scripted import ScriptedMatcher
 
 # How long an example takes says something of the machine, and of code that is compiled at its first call.
 settings.register_profile("fcslam", deadline=None)
 settings.load_profile("fcslam")
-
-lock_numba_cache()
 
 
 SIMULATED = frozenset({"drawn", "packets", "logs"})

@@ -12,6 +12,7 @@ from fcslam.cli import certificates, config, demo, evaluate, extract, federate, 
 from fcslam.cli import convert as conversion
 from fcslam.cli import map as mapping
 from fcslam.cli import robot as robots
+from fcslam.cli import warm_up as warming
 from fcslam.cli.examples import examples
 from fcslam.errors import FcslamError
 
@@ -72,6 +73,7 @@ app.command(
     "certificates",
     epilog=examples("fcslam certificates --host cloud.local --robot robot1 --admin boss"),
 )(certificates.certificates)
+app.command("warm-up", epilog=examples("fcslam warm-up"))(warming.warm_up)
 app.add_typer(federate.app, name="federate")
 app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(config.app, name="config")

@@ -1,7 +1,6 @@
 """`fcslam map`: recordings of several robots in, one map out."""
 
 import gc
-import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from fcslam.cli.recordings import (
     print_faults,
     print_notes,
 )
+from fcslam.cli.warm_up import compiled, cores
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -97,11 +97,10 @@ def map_sources(
     began = time.perf_counter()
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
-    with ProgressDisplay(console) as display:
+    with compiled(console), ProgressDisplay(console) as display:
         faults: dict[str, Faults] = {}
         progress = _watch(display, sum(survey.scan_count for survey in surveys), faults)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        run = api.map_recordings(sources, config=settings, vetoes=vetoes, progress=progress, processes=cores)
+        run = api.map_recordings(sources, config=settings, vetoes=vetoes, progress=progress, processes=cores())
         display.start("writing")
         run.save(output, force)
     print_faults(console, faults)

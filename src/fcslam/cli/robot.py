@@ -22,6 +22,7 @@ from fcslam.cli.recordings import (
     print_faults,
     print_notes,
 )
+from fcslam.cli.warm_up import compiled
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -148,7 +149,7 @@ def robot(
     with _agent(recording.name, settings, server, state, token, ca, own, outbox_mb, budget_kbps) as (agent, outbox):
         known = outbox.begin(_fingerprint(recording.name, survey, settings, budget_kbps), resume)
         try:
-            with _interruptible(), ProgressDisplay(console) as display:
+            with compiled(console), _interruptible(), ProgressDisplay(console) as display:
                 agent.run(recording.records(), known, pace, _watch(display, console, survey.scan_count))
         except KeyboardInterrupt:
             left = outbox.waiting

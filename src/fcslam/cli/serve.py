@@ -8,6 +8,8 @@ import typer
 
 from fcslam.cli.mission_options import ConfigFile, mission_config
 from fcslam.cli.options import Quiet
+from fcslam.cli.output import notices
+from fcslam.cli.warm_up import tell_uncached
 
 if TYPE_CHECKING:
     import socket
@@ -65,6 +67,7 @@ def serve(
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with _listen(host, port) as listening:
         state = _state(data, _authenticator(tokens, client_ca), _cloud_config(config))
+        tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
         server = _server(create_app(state, docs=docs), tls_certificate, tls_key, client_ca)

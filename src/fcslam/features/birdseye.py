@@ -14,10 +14,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.features.codes import CODE_BITS
 from fcslam.records import CODE_BYTES, Codes, FloatArray, frozen
@@ -150,7 +150,7 @@ def _comparison_pattern(radius_cells: float) -> FloatArray:
     return frozen(radius_cells * pairs[:CODE_BITS])
 
 
-@njit(cache=True)
+@njit
 def _stamp(cells: FloatArray, discs: NDArray[np.uint8], side: int) -> Picture:
     """Pixelwise maximum of the discs around ``cells`` (N, 2: column, row; whole numbers are corners of cells).
 
@@ -171,7 +171,7 @@ def _stamp(cells: FloatArray, discs: NDArray[np.uint8], side: int) -> Picture:
     return padded[reach : reach + side, reach : reach + side].copy()
 
 
-@njit(cache=True)
+@njit
 def _directions(picture: Picture, pixels: NDArray[np.int64], radius: int) -> FloatArray:
     """Direction [rad] from each pixel (K, 2) to the intensity centroid of a disc around it, shape (K,)."""
     directions = np.empty(pixels.shape[0])
@@ -188,7 +188,7 @@ def _directions(picture: Picture, pixels: NDArray[np.int64], radius: int) -> Flo
     return directions
 
 
-@njit(cache=True)
+@njit
 def _compare(
     picture: Picture, pixels: NDArray[np.int64], directions: FloatArray, pattern: FloatArray
 ) -> NDArray[np.bool_]:
@@ -205,7 +205,7 @@ def _compare(
     return darker
 
 
-@njit(cache=True)
+@njit
 def _level(picture: Picture, column: float, row: float) -> int:
     """Grey level of the cell that contains a point (whole numbers are corners of cells); 0 outside the picture."""
     if 0.0 <= row < picture.shape[0] and 0.0 <= column < picture.shape[1]:

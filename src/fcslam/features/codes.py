@@ -6,10 +6,11 @@ A set of codes has shape (N, 32), uint8. Compiled code sees it as (N, 4) uint64 
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.records import CODE_BYTES, Codes
 
 CODE_BITS = 8 * CODE_BYTES
@@ -85,13 +86,13 @@ def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches
     return Matches(np.stack((rows, column_of[rows]), axis=1), distances[rows])
 
 
-@njit(cache=True)
+@njit
 def hamming(a: CodeWords, b: CodeWords) -> Any:
     """Hamming distance between two codes, shape (4,) each, in bits; for use in compiled code."""
     return popcount(a[0] ^ b[0]) + popcount(a[1] ^ b[1]) + popcount(a[2] ^ b[2]) + popcount(a[3] ^ b[3])
 
 
-@njit(cache=True)
+@njit
 def _hamming_matrix(a: CodeWords, b: CodeWords) -> NDArray[np.uint16]:
     distances = np.empty((a.shape[0], b.shape[0]), np.uint16)
     for i in range(a.shape[0]):
@@ -100,7 +101,7 @@ def _hamming_matrix(a: CodeWords, b: CodeWords) -> NDArray[np.uint16]:
     return distances
 
 
-@njit(cache=True)
+@njit
 def _nearest_keys(a: CodeWords, b: CodeWords) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     """Nearest neighbours of ``a`` (N, 4) in ``b`` (M, 4) and back in one pass, as keys (N,) and (M,).
 

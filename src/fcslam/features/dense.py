@@ -7,9 +7,9 @@ then: a bit is 1 if the logit is not negative (FC-SLAM, eq. (1)).
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.features.nms import box_nms
 from fcslam.records import Codes
 
@@ -68,7 +68,7 @@ def sample_logits(logits: Logits, positions_px: NDArray[np.float32]) -> NDArray[
     return sampled
 
 
-@njit(cache=True)
+@njit
 def _interpolate(
     cells: NDArray[np.float32], corners: NDArray[np.int64], u: NDArray[np.float32], v: NDArray[np.float32]
 ) -> NDArray[np.float32]:

@@ -10,9 +10,9 @@ the submaps reject them.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraModel, FloatArray
 
@@ -72,7 +72,7 @@ def _rays(keypoints_px: FloatArray, camera: CameraModel) -> FloatArray:
     return np.column_stack((x, y, np.ones(len(x)))) @ rotation_matrix(camera.T_base_camera.rotation).T
 
 
-@njit(cache=True)
+@njit
 def _distances(
     eye: FloatArray, directions: FloatArray, returns: FloatArray, origin: FloatArray, widest_gap_rad: float
 ) -> FloatArray:
@@ -103,7 +103,7 @@ def _distances(
     return np.where(np.isfinite(nearest), nearest, np.nan)
 
 
-@njit(cache=True)
+@njit
 def _crossing(eye: FloatArray, direction: FloatArray, side: tuple[float, float, float, float]) -> float:
     """Distance along the ray to a segment (start x, y and vector x, y); infinite if they do not intersect."""
     x, y, dx, dy = side

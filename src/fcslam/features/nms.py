@@ -1,8 +1,9 @@
 """Non-maximum suppression by boxes around keypoints, as in SuperPoint's evaluation."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from fcslam.compiled import njit
 
 MOST_OVERLAP = 0.1
 """Largest intersection over union of two boxes. With integer pixels and boxes of side 4, keypoints 4 px apart along an
@@ -27,7 +28,7 @@ def box_nms(positions_px: ArrayLike, side_px: float) -> NDArray[np.int64]:
     return rows
 
 
-@njit(cache=True)
+@njit
 def _keep(points: NDArray[np.float64], cells: NDArray[np.int64], side: float) -> NDArray[np.bool_]:
     """Mask of the remaining keypoints. Only boxes in neighbouring cells can overlap; each cell chains its keypoints."""
     columns, rows = cells[:, 0].max() + 3, cells[:, 1].max() + 3

@@ -7,10 +7,10 @@ look-up bounds the score of a whole square of shifts. Squares whose bound is bel
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
@@ -88,7 +88,7 @@ def likelihood_pyramid(
     points = field.points
     if visible_only:
         points = points[np.einsum("ij,ij->i", field.normals, T_field_guess[:2] - points) >= 0.0]
-    base = _draw(points, corner, size, config.cell_m, config.smear_m)
+    base = _draw(np.ascontiguousarray(points), corner, size, config.cell_m, config.smear_m)
     return LikelihoodPyramid(_pyramid(base, config.levels), corner, config.cell_m)
 
 
@@ -141,7 +141,7 @@ def search_pyramid(
     return SearchResult(pose, score)
 
 
-@njit(cache=True)
+@njit
 def _draw(points, corner, size, cell, smear):  # type: ignore[no-untyped-def]
     grid = np.zeros((size, size), np.uint8)
     half = int(np.ceil(2.5 * smear / cell))
@@ -157,12 +157,14 @@ def _draw(points, corner, size, cell, smear):  # type: ignore[no-untyped-def]
     return grid
 
 
-@njit(cache=True)
+@njit
 def _pyramid(base, count):  # type: ignore[no-untyped-def]
     """Level h at (y, x) is the maximum of ``base`` over [y, y + 2^h) x [x, x + 2^h)."""
     levels = np.empty((count, base.shape[0], base.shape[1]), np.uint8)
-    levels[0] = base
     rows, columns = base.shape
+    for y in range(rows):
+        for x in range(columns):
+            levels[0, y, x] = base[y, x]
     for h in range(1, count):
         half = 1 << (h - 1)
         lower, upper = levels[h - 1], levels[h]
@@ -174,7 +176,7 @@ def _pyramid(base, count):  # type: ignore[no-untyped-def]
     return levels
 
 
-@njit(cache=True)
+@njit
 def _bound(cells, level, width, sx, sy):  # type: ignore[no-untyped-def]
     """Sum of the points' largest likelihoods over shifts from (sx, sy) on, ``width`` cells; off the grid they are 0."""
     total = 0
@@ -187,7 +189,7 @@ def _bound(cells, level, width, sx, sy):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True)
+@njit
 def _cells_of(points, pose, corner, cell, turn):  # type: ignore[no-untyped-def]
     cos, sin = np.cos(pose[2] + turn), np.sin(pose[2] + turn)
     cells = np.empty((len(points), 2), np.int64)
@@ -199,21 +201,21 @@ def _cells_of(points, pose, corner, cell, turn):  # type: ignore[no-untyped-def]
     return cells
 
 
-@njit(cache=True)
+@njit
 def _penalty(near, shifts, turn, turns, distance_penalty, angle_penalty):  # type: ignore[no-untyped-def]
     """Least penalty factor of a square of shifts whose nearest squared distance is ``near``."""
     away = distance_penalty * min(1.0, near / max(1, shifts * shifts))
     return (1.0 - away) * (1.0 - angle_penalty * (turn / max(1, turns)) ** 2)
 
 
-@njit(cache=True)
+@njit
 def _nearest(low, high):  # type: ignore[no-untyped-def]
     if low > 0:
         return low
     return -high if high < 0 else 0
 
 
-@njit(cache=True)
+@njit
 def _branch_and_bound(  # type: ignore[no-untyped-def]
     points, levels, corner, cell, guess, shifts, turns, step, distance_penalty, angle_penalty
 ):
@@ -231,7 +233,7 @@ def _branch_and_bound(  # type: ignore[no-untyped-def]
         cells = _cells_of(points, guess, corner, cell, turn * step)
         for y0 in range(-shifts, shifts + 1, width):
             for x0 in range(-shifts, shifts + 1, width):
-                stack[0] = (x0, y0, top)
+                stack[0, 0], stack[0, 1], stack[0, 2] = x0, y0, top
                 size = 1
                 while size > 0:
                     size -= 1
@@ -252,7 +254,9 @@ def _branch_and_bound(  # type: ignore[no-untyped-def]
                         continue
                     half = 1 << (h - 1)
                     for k in range(4):
-                        stack[size] = (sx + half * (k & 1), sy + half * (k >> 1), h - 1)
+                        stack[size, 0] = sx + half * (k & 1)
+                        stack[size, 1] = sy + half * (k >> 1)
+                        stack[size, 2] = h - 1
                         size += 1
     best_pose[2] = (best_pose[2] + np.pi) % (2.0 * np.pi) - np.pi
     return best_pose, best_raw

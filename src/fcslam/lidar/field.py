@@ -8,9 +8,9 @@ look-up. Tiles exist only near surfaces: memory follows what was seen, not the r
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
@@ -114,7 +114,7 @@ class SurfelField:
             self.arrays = self.arrays._replace(surfels=np.concatenate([surfels, np.zeros_like(surfels)]))
 
 
-@njit(cache=True)
+@njit
 def label_at(x, y, field):  # type: ignore[no-untyped-def]
     """Surfel nearest to the cell of (x, y), or EMPTY."""
     cx = int(np.floor((x - field.corner[0]) / CELL_M))
@@ -128,7 +128,7 @@ def label_at(x, y, field):  # type: ignore[no-untyped-def]
     return field.labels[tile, cy - ty * TILE, cx - tx * TILE]
 
 
-@njit(cache=True)
+@njit
 def _labels_at(points, field):  # type: ignore[no-untyped-def]
     result = np.empty(len(points), np.int32)
     for i in range(len(points)):
@@ -136,7 +136,7 @@ def _labels_at(points, field):  # type: ignore[no-untyped-def]
     return result
 
 
-@njit(cache=True)
+@njit
 def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-untyped-def]
     """Insert returns from index ``start`` on, until all are inserted or storage must grow; returns the next index."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
@@ -156,13 +156,15 @@ def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-unty
             continue
         if field.used[1] == len(field.surfels) or len(field.labels) - field.used[0] < MOST_NEW_TILES:
             return i
-        field.surfels[field.used[1]] = (x, y, nx, ny, 1.0, 1.0 if solitary[i] else 0.0)
+        surfel = field.surfels[field.used[1]]
+        surfel[0], surfel[1], surfel[2], surfel[3] = x, y, nx, ny
+        surfel[4], surfel[5] = 1.0, 1.0 if solitary[i] else 0.0
         _spread(x, y, field.used[1], field)
         field.used[1] += 1
     return len(points)
 
 
-@njit(cache=True)
+@njit
 def _within(x, y, field):  # type: ignore[no-untyped-def]
     """Whether the table holds every cell within reach of (x, y)."""
     side = field.table.shape[0] * TILE * CELL_M
@@ -171,7 +173,7 @@ def _within(x, y, field):  # type: ignore[no-untyped-def]
     return cx > margin and cy > margin and cx < side - margin and cy < side - margin
 
 
-@njit(cache=True)
+@njit
 def _merge(x, y, nx, ny, solitary, label, field):  # type: ignore[no-untyped-def]
     """Merge a return into a surfel that is near and does not face away; returns whether it did.
 
@@ -207,7 +209,7 @@ def _merge(x, y, nx, ny, solitary, label, field):  # type: ignore[no-untyped-def
     return True
 
 
-@njit(cache=True)
+@njit
 def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
     """Label every cell within reach that has no nearer surfel, row by row of the disc and tile by tile."""
     corner, labels, surfels = field.corner, field.labels, field.surfels
@@ -233,7 +235,7 @@ def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
                     labels[tile, row, gx - tx * TILE] = label
 
 
-@njit(cache=True)
+@njit
 def _tile_at(tx, ty, field):  # type: ignore[no-untyped-def]
     """Storage number of a tile; allocates it if it had none."""
     tile = field.table[ty, tx]

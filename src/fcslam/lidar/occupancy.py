@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, LaserModel, Ranges
@@ -144,7 +144,7 @@ def _layout(groups: list[_Beams], config: OccupancyConfig) -> _Layout:
         resolution_m *= 2.0
 
 
-@njit(cache=True)
+@njit
 def _bounds(beams, usable):  # type: ignore[no-untyped-def]
     """Lowest and highest (x, y) of the lasers and of all returns in usable range."""
     reach = min(usable, beams.max_range_m)
@@ -164,7 +164,7 @@ def _bounds(beams, usable):  # type: ignore[no-untyped-def]
     return low, high
 
 
-@njit(cache=True)
+@njit
 def _cast(beams, layout, usable, hits, passes):  # type: ignore[no-untyped-def]
     for k in range(len(beams.ranges_m)):
         pose = beams.T_map_laser[k]
@@ -181,7 +181,7 @@ def _cast(beams, layout, usable, hits, passes):  # type: ignore[no-untyped-def]
                 hits[int(np.floor(y1)), int(np.floor(x1))] += np.uint32(1)
 
 
-@njit(cache=True)
+@njit
 def _traverse(x0, y0, x1, y1, passes):  # type: ignore[no-untyped-def]
     """Count a pass for each cell of a beam, including the first and the last; returns whether the last is in the grid.
 
@@ -208,7 +208,7 @@ def _traverse(x0, y0, x1, y1, passes):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True)
+@njit
 def _classify(hits, passes, minimum_passes, occupied_ratio):  # type: ignore[no-untyped-def]
     cells = np.zeros(hits.shape, np.uint8)
     for row in range(hits.shape[0]):

@@ -5,9 +5,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.records import FloatArray, LaserModel, Ranges
 
 NORMAL_REACH = 3
@@ -80,7 +80,7 @@ def _beams(laser: LaserModel) -> FloatArray:
     return np.stack((np.cos(angles), np.sin(angles)), axis=1)
 
 
-@njit(cache=True)
+@njit
 def _project(ranges, beams, spacing, max_range, T_base_laser):  # type: ignore[no-untyped-def]
     count = len(ranges)
     kept = np.empty(count, np.int64)
@@ -103,7 +103,7 @@ def _project(ranges, beams, spacing, max_range, T_base_laser):  # type: ignore[n
     return points, normals, solitary
 
 
-@njit(cache=True)
+@njit
 def _in_row(points, k):  # type: ignore[no-untyped-def]
     """Whether return k and two neighbours lie in a row, as the far returns from a wall seen at a grazing angle do."""
     for first in range(max(0, k - 2), min(k, len(points) - 3) + 1):
@@ -116,7 +116,7 @@ def _in_row(points, k):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True)
+@njit
 def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # type: ignore[no-untyped-def]
     """Total least squares through the neighbours of return k on the same surface; facing the laser."""
     first = last = k
@@ -151,7 +151,7 @@ def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # typ
     normals[k, 1] = ny
 
 
-@njit(cache=True)
+@njit
 def _connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def]
     """Whether returns i and i + 1 lie on one surface."""
     if kept[i + 1] - kept[i] > 2:
@@ -162,7 +162,7 @@ def _connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def
     return dx * dx + dy * dy < limit * limit
 
 
-@njit(cache=True)
+@njit
 def _thin(points, spacing):  # type: ignore[no-untyped-def]
     keep = np.empty(len(points), np.int64)
     n = 0

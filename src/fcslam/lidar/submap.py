@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.lidar.field import CELL_M, EMPTY, SurfelField, field_of, label_at
 from fcslam.lidar.matching import OPPOSED
 from fcslam.lidar.scan import PointScan
@@ -94,7 +94,7 @@ def _beam_counts(
     return passes, hits, corner
 
 
-@njit(cache=True)
+@njit
 def _count_beams(points, origin, T, corner, number, latest, passes, hits):  # type: ignore[no-untyped-def]
     """Count a scan once in each cell between the laser and a return, short of the return, and in the return's."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
@@ -186,7 +186,7 @@ def self_violation(scans: Sequence[tuple[PointScan, FloatArray]]) -> float:
     return max(agreement(even, odd, here).violation, agreement(odd, even, here).violation)
 
 
-@njit(cache=True)
+@njit
 def _agreement(points, normals, T, field, free, free_corner):  # type: ignore[no-untyped-def]
     cos, sin = np.cos(T[2]), np.sin(T[2])
     known = explained = violating = 0

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.features.codes import Matches
 from fcslam.records import FloatArray, frozen
@@ -106,7 +106,7 @@ def rigid_hypotheses(
     ]
 
 
-@njit(cache=True)
+@njit
 def _trials(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64], tolerance_m: float) -> FloatArray:
     """Motions of every two seeds whose keypoints are equally far apart in both places: rows x, y, theta, score.
 
@@ -133,7 +133,7 @@ def _trials(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64], tolerance_m:
     return trials[:count]
 
 
-@njit(cache=True)
+@njit
 def _score(a: FloatArray, b: FloatArray, motion: tuple[float, float, float, float], tolerance_m: float) -> float:
     """Sum over the inliers of 1 - (distance / tolerance)^2 (MSAC): smaller residuals break ties of the inlier count."""
     x, y, cos, sin = motion
@@ -146,7 +146,7 @@ def _score(a: FloatArray, b: FloatArray, motion: tuple[float, float, float, floa
     return score
 
 
-@njit(cache=True)
+@njit
 def _best(a: FloatArray, b: FloatArray, trials: FloatArray, limits: _Limits) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Refine the best trials one after another and suppress trials near a hypothesis that was found before."""
     scores = trials[:, 3].copy()
@@ -169,7 +169,7 @@ def _best(a: FloatArray, b: FloatArray, trials: FloatArray, limits: _Limits) -> 
     return poses[:found], agreeing[:found]
 
 
-@njit(cache=True)
+@njit
 def _near(pose: FloatArray, others: FloatArray, limits: _Limits) -> bool:
     for index in range(others.shape[0]):
         turn = abs(pose[2] - others[index, 2])
@@ -182,7 +182,7 @@ def _near(pose: FloatArray, others: FloatArray, limits: _Limits) -> bool:
     return False
 
 
-@njit(cache=True)
+@njit
 def _refine(a: FloatArray, b: FloatArray, pose: FloatArray, tolerance_m: float) -> tuple[FloatArray, NDArray[np.bool_]]:
     agrees = _agreeing(a, b, pose, tolerance_m)
     for _ in range(_REFINEMENTS):
@@ -197,7 +197,7 @@ def _refine(a: FloatArray, b: FloatArray, pose: FloatArray, tolerance_m: float) 
     return pose, agrees
 
 
-@njit(cache=True)
+@njit
 def _agreeing(a: FloatArray, b: FloatArray, pose: FloatArray, tolerance_m: float) -> NDArray[np.bool_]:
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     dx = pose[0] + cos * b[:, 0] - sin * b[:, 1] - a[:, 0]
@@ -206,7 +206,7 @@ def _agreeing(a: FloatArray, b: FloatArray, pose: FloatArray, tolerance_m: float
     return agrees
 
 
-@njit(cache=True)
+@njit
 def _least_squares(a: FloatArray, b: FloatArray, agrees: NDArray[np.bool_]) -> FloatArray:
     """The rigid motion with the least squared distances, from the centred sums of products."""
     n = agrees.sum()

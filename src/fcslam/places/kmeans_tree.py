@@ -6,9 +6,9 @@ The centres are binary: each bit is the majority of its cluster.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.features.codes import CODE_BITS, CODE_WORDS, CodeWords, popcount
 from fcslam.places.prefetch import prefetch
 
@@ -50,7 +50,7 @@ def bare_root() -> Tree:
     return Tree(np.zeros((1, CODE_WORDS), np.uint64), np.zeros((1, 2), np.int32))
 
 
-@njit(cache=True)
+@njit
 def find_leaves(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
     """Find the leaf of every code (N, 4), shape (N,); of equally near children the first is taken."""
     reached = np.zeros(codes.shape[0], np.int32)
@@ -62,7 +62,7 @@ def find_leaves(tree: Tree, codes: CodeWords) -> NDArray[np.int32]:
     return reached
 
 
-@njit(cache=True)
+@njit
 def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
     """Find at most ``beam`` leaves near each code (K, 4) by beam search; the first is that of ``find_leaves``.
 
@@ -83,7 +83,7 @@ def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
     return kept
 
 
-@njit(cache=True)
+@njit
 def _prefetch_children(tree: Tree, kept: NDArray[np.int32]) -> int:
     """Prefetch the centres of the children of these vertices (-1: none); returns how many vertices have children."""
     parents = 0
@@ -97,7 +97,7 @@ def _prefetch_children(tree: Tree, kept: NDArray[np.int32]) -> int:
     return parents
 
 
-@njit(cache=True)
+@njit
 def _go_down(
     tree: Tree,
     codes: CodeWords,
@@ -131,7 +131,7 @@ def _go_down(
             kept[k, place], distances[k, place] = candidate, distance
 
 
-@njit(cache=True)
+@njit
 def grow_tree(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
     """Train a tree on codes (N, 4): split them level by level. ``members`` keeps the codes of a vertex together."""
     most = 1 + shape.branching * (1 + shape.depth * (codes.shape[0] // shape.smallest_split))
@@ -157,7 +157,7 @@ def grow_tree(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
     return Tree(centres[:used].copy(), families[:used].copy())
 
 
-@njit(cache=True)
+@njit
 def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tuple[CodeWords, NDArray[np.int64]]:
     """Cluster codes (N, 4) by Hamming distance.
 
@@ -181,7 +181,7 @@ def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tu
     return centres[sizes > 0], (np.cumsum(sizes > 0) - 1)[labels]
 
 
-@njit(cache=True)
+@njit
 def _distance(codes: CodeWords, k: int, centres: CodeWords, vertex: int) -> Any:
     """Hamming distance of code k and a centre. Takes indices, because slicing rows costs more than comparing them."""
     bits = popcount(codes[k, 0] ^ centres[vertex, 0]) + popcount(codes[k, 1] ^ centres[vertex, 1])
@@ -189,7 +189,7 @@ def _distance(codes: CodeWords, k: int, centres: CodeWords, vertex: int) -> Any:
     return np.int32(bits)
 
 
-@njit(cache=True)
+@njit
 def _nearest(codes: CodeWords, k: int, centres: CodeWords, first: int, end: int) -> Any:
     """Index of the centre nearest to code k, from ``first`` (included) to ``end`` (excluded)."""
     best, best_distance = first, np.int32(CODE_BITS + 1)
@@ -200,7 +200,7 @@ def _nearest(codes: CodeWords, k: int, centres: CodeWords, first: int, end: int)
     return best
 
 
-@njit(cache=True)
+@njit
 def _assign(codes: CodeWords, centres: CodeWords, labels: NDArray[np.int64]) -> int:
     changed = 0
     for k in range(codes.shape[0]):
@@ -210,7 +210,7 @@ def _assign(codes: CodeWords, centres: CodeWords, labels: NDArray[np.int64]) -> 
     return changed
 
 
-@njit(cache=True)
+@njit
 def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -> CodeWords:
     """k-means++ (Arthur and Vassilvitskii 2007): draw each next centre by its squared distance to those so far."""
     centres = np.empty((branching, CODE_WORDS), np.uint64)
@@ -228,7 +228,7 @@ def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -
     return centres[:count]
 
 
-@njit(cache=True)
+@njit
 def _majorities(codes: CodeWords, labels: NDArray[np.int64], count: int) -> CodeWords:
     """Majority of every bit in every cluster; 0 in a tie and in a cluster without members.
 
@@ -258,7 +258,7 @@ def _majorities(codes: CodeWords, labels: NDArray[np.int64], count: int) -> Code
     return centres
 
 
-@njit(cache=True)
+@njit
 def _uniform(state: NDArray[np.uint64]) -> float:
     """Next number in [0, 1) of splitmix64 (Steele, Lea, Flood 2014), so that the tree depends on the seed alone."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.features.codes import CODE_WORDS, CodeWords
 from fcslam.places.prefetch import prefetch
 from fcslam.records import FloatArray, Scalar
@@ -199,13 +199,13 @@ def _heads(vertices: int) -> NDArray[np.int32]:
     return np.tile(np.array([-1, 0], np.int32), (vertices, 1))
 
 
-@njit(cache=True)
+@njit
 def newest_block(entries: Entries, leaf: int) -> tuple[int, int]:
     """The newest block of a leaf, -1 for none, and the number of its entries."""
     return entries.heads[leaf, 0], (entries.heads[leaf, 1] - 1) % BLOCK + 1
 
 
-@njit(cache=True)
+@njit
 def prefetch_block(entries: Entries, block: int) -> None:
     """Prefetch the part of a block that a query reads; blocks are not aligned to cache lines."""
     for number in range(0, OLDER, _LINE):
@@ -213,7 +213,7 @@ def prefetch_block(entries: Entries, block: int) -> None:
     prefetch(entries.numbers, block, OLDER)
 
 
-@njit(cache=True)
+@njit
 def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int32]) -> None:
     """Append a new place's descriptors and update the norms of the other places."""
     for leaf in leaves:
@@ -232,7 +232,7 @@ def _enter(entries: Entries, row: int, codes: CodeWords, leaves: NDArray[np.int3
         norms[row] = np.log(entries.documents[leaves]).sum()
 
 
-@njit(cache=True)
+@njit
 def _fill(entries: Entries, places: int, codes: CodeWords, first: NDArray[np.int64]) -> None:
     """Write all entries. ``first`` (V,): position of each leaf's next entry, in entries; it is advanced."""
     latest = np.full(first.shape[0], -1, np.int32)
@@ -252,7 +252,7 @@ def _fill(entries: Entries, places: int, codes: CodeWords, first: NDArray[np.int
             entries.log_documents[row] = log_documents[entries.leaves[begin : begin + entries.counts[row]]].sum()
 
 
-@njit(cache=True)
+@njit
 def _put(entries: Entries, block: int, place: int, row: int, index: int, codes: CodeWords, k: int) -> None:
     """Write an entry: descriptor ``index`` of a row, with code k of ``codes``."""
     entries.numbers[block, ROWS + place], entries.numbers[block, _INDICES + place] = row, index
@@ -260,7 +260,7 @@ def _put(entries: Entries, block: int, place: int, row: int, index: int, codes: 
         entries.blocks[block, CODE_WORDS * place + word] = codes[k, word]
 
 
-@njit(cache=True)
+@njit
 def _append(entries: Entries, leaf: int, row: int, index: int, codes: CodeWords, k: int) -> Any:
     """Append an entry; returns whether it is the first of its place in the leaf. A place's entries come in a row."""
     block, filled = newest_block(entries, leaf)
@@ -281,7 +281,7 @@ def _append(entries: Entries, leaf: int, row: int, index: int, codes: CodeWords,
     return is_new
 
 
-@njit(cache=True)
+@njit
 def _shift(entries: Entries, leaf: int, change: float, but: int) -> None:
     """Add ``change`` to ``log_documents`` for every descriptor in a leaf, except those of row ``but``."""
     if not len(entries.log_documents):
@@ -294,7 +294,7 @@ def _shift(entries: Entries, leaf: int, change: float, but: int) -> None:
         block, filled = entries.numbers[block, OLDER], BLOCK
 
 
-@njit(cache=True)
+@njit
 def _remove(entries: Entries, leaves: NDArray[np.int32], row: int) -> None:
     """Remove the entries of a row, from the end, so that the last entry, which fills each gap, is one that stays."""
     for leaf in leaves:
@@ -311,7 +311,7 @@ def _remove(entries: Entries, leaves: NDArray[np.int32], row: int) -> None:
             _shift(entries, leaf, np.log(left / (left + 1)), -1)
 
 
-@njit(cache=True)
+@njit
 def _drop(entries: Entries, leaf: int, block: int, place: int) -> None:
     last, filled = newest_block(entries, leaf)
     row, index = entries.numbers[last, ROWS + filled - 1], entries.numbers[last, _INDICES + filled - 1]
@@ -324,7 +324,7 @@ def _drop(entries: Entries, leaf: int, block: int, place: int) -> None:
         entries.free[0] = last
 
 
-@njit(cache=True)
+@njit
 def _read(entries: Entries, leaves: NDArray[np.int32], content: Content) -> None:
     count = 0
     for leaf in leaves:
@@ -339,7 +339,7 @@ def _read(entries: Entries, leaves: NDArray[np.int32], content: Content) -> None
             block, filled = entries.numbers[block, OLDER], BLOCK
 
 
-@njit(cache=True)
+@njit
 def _move(
     entries: Entries,
     leaves: NDArray[np.int32],
@@ -357,7 +357,7 @@ def _move(
         _shift(entries, leaf, np.log(entries.documents[leaf]), -1)
 
 
-@njit(cache=True)
+@njit
 def _gather(entries: Entries, begins: NDArray[np.int64], codes: CodeWords) -> None:
     for leaf in range(entries.heads.shape[0]):
         block, filled = newest_block(entries, leaf)
@@ -371,7 +371,7 @@ def _gather(entries: Entries, begins: NDArray[np.int64], codes: CodeWords) -> No
             block, filled = entries.numbers[block, OLDER], BLOCK
 
 
-@njit(cache=True)
+@njit
 def _clear(entries: Entries, leaf: int) -> None:
     block = entries.heads[leaf, 0]
     while block >= 0:

@@ -6,9 +6,9 @@ Compiled.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.features.codes import CodeWords, popcount
 from fcslam.places.kmeans_tree import Tree, near_leaves
 from fcslam.places.postings import BLOCK, OLDER, ROWS, Entries, newest_block, prefetch_block
@@ -42,7 +42,7 @@ def empty_buffers(rows: int) -> ScoreBuffers:
     return ScoreBuffers(np.zeros(rows), np.zeros(rows, np.int32), np.empty(rows, np.int32), np.empty(rows, np.int32))
 
 
-@njit(cache=True)
+@njit
 def score_words(
     entries: Entries, buffers: ScoreBuffers, place_count: int, leaves: NDArray[np.int32], weights: FloatArray
 ) -> tuple[NDArray[np.int32], FloatArray]:
@@ -84,7 +84,7 @@ def score_words(
     return taken
 
 
-@njit(cache=True)
+@njit
 def score_matches(
     entries: Entries, tree: Tree, buffers: ScoreBuffers, place_count: int, codes: CodeWords, beam: int, near_bits: int
 ) -> tuple[NDArray[np.int32], FloatArray]:
@@ -146,7 +146,7 @@ def score_matches(
     return rows, shares
 
 
-@njit(cache=True)
+@njit
 def _taken(buffers: ScoreBuffers, total: int) -> tuple[NDArray[np.int32], FloatArray]:
     """The touched rows (M,) and their scores (M,); clears the scores."""
     rows = buffers.touched[:total].copy()
@@ -155,7 +155,7 @@ def _taken(buffers: ScoreBuffers, total: int) -> tuple[NDArray[np.int32], FloatA
     return rows, scores
 
 
-@njit(cache=True)
+@njit
 def _distance(codes: CodeWords, k: int, blocks: NDArray[np.uint64], block: int, place: int) -> Any:
     """Hamming distance of code k and the code of an entry."""
     bits = popcount(codes[k, 0] ^ blocks[block, 4 * place]) + popcount(codes[k, 1] ^ blocks[block, 4 * place + 1])
@@ -163,7 +163,7 @@ def _distance(codes: CodeWords, k: int, blocks: NDArray[np.uint64], block: int, 
     return np.int32(bits)
 
 
-@njit(cache=True)
+@njit
 def _prefetch_leaves(entries: Entries, leaves: NDArray[np.int32]) -> None:
     """Prefetch the blocks of these leaves (-1: none).
 

@@ -1,18 +1,33 @@
-"""Compiles, or loads from the cache, all code that packets will need, before the first one comes.
+"""Compiles, or loads from the cache, all code that scans and packets will need, before the first one comes.
 
 Compiling takes half a minute on a machine that has never done it, loading a second or two: no packet should wait for
-that. Two made-up robots cross a made-up room; nothing of it reaches any mission.
+that. Made-up robots cross a made-up room; nothing of it reaches any mission.
 """
 
-from collections.abc import Iterator
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Final
 
 import numpy as np
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
+from fcslam.compiled import is_compiled, uncached
+from fcslam.features.birdseye import BirdseyeConfig
 from fcslam.geometry import se2
+from fcslam.lidar import correlative, matching
+from fcslam.lidar import field as field_code
+from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
+from fcslam.lidar.field import SurfelField, field_of
+from fcslam.lidar.matching import MatchingConfig, match_scan, scan_log_likelihood
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.lidar.scan import PointScan, point_scan
+from fcslam.lidar.submap import build_submap
 from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import (
@@ -24,12 +39,15 @@ from fcslam.records import (
     Keyscan,
     KeyscanId,
     LaserModel,
+    LaserScan,
     Place,
     frozen,
 )
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Body, Hello, Packet
-from fcslam.wire.packets import decode, encode
+from fcslam.wire.packets import decode, encode, measure
 from fcslam.wire.quantisation import dequantise, quantise
 
 _WALLS = np.array([
@@ -39,11 +57,51 @@ _WALLS = np.array([
 """x, y of both ends, metres."""
 _LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
 _STEP_M, _STEPS, _PLACE_EVERY, _AROUND = 0.4, 31, 3, 3
+_EMPTY_SCAN = PointScan(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(2))
+_ROUND = 60
+"""Scans of one round."""
 _LANDMARKS = 120
 _DETECTOR = "made-up-1"
 _MOTION = np.diag((1e4, 1e4, 1e5))
 _CLOSURE_AFTER = 15
 """Keyscans between the ends of a robot's own closure."""
+
+
+def warm_up_scanning() -> None:
+    """Compile what the first scan of a robot needs: points, normals and the field."""
+    scan = next(_scans(1))
+    field_of([(point_scan(scan.ranges_m, scan.laser), np.zeros(3))])
+
+
+def warm_up_matching() -> None:
+    """Compile what the second scan needs. Arrays without content: nothing else is compiled for them."""
+    match_scan(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), np.zeros((3, 3)), MatchingConfig())
+    scan_log_likelihood(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3))
+
+
+def warm_up_searching() -> None:
+    """Compile the search of doubtful scans, and packets of keyscans."""
+    search(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), SearchWindow(0.5, 0.1), SearchConfig())
+    measure(Packet("r", 0, 0, 0.0, Keyscan(KeyscanId("r", 0), 0.0, dequantise(np.ones(9, np.uint16)))))
+
+
+def warm_up_robot() -> None:
+    """Compile submaps, their description, loop closing, and packets of places."""
+    robot = RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,)))
+    for scan in _scans(2 * _ROUND):
+        for packet in robot.process(scan):
+            measure(packet)
+
+
+def warm_up_recognition() -> None:
+    """Compile the vocabulary, and what compares places."""
+    vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
+    places = OwnPlaces(OwnPlacesConfig(vocabulary=vocabulary), BirdseyeConfig())
+    surface = build_submap([(point_scan(s.ranges_m, s.laser), s.T_odom_base) for s in _scans(9)]).surface.points
+    for k in range(4):
+        places.store(k, surface)
+        places.most_similar(k, range(k), 3)
+    places.motions(0, 1)
 
 
 def warm_up_decoding() -> None:
@@ -61,6 +119,63 @@ def warm_up_fleet() -> None:
     result = cloud.finalize()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False)
+
+
+WARM_UPS: Final = (
+    warm_up_scanning, warm_up_matching, warm_up_searching, warm_up_robot, warm_up_recognition, warm_up_fleet,
+)  # fmt: skip
+"""In the order in which a mission needs them."""
+
+
+def is_cold() -> bool:
+    """Whether the first scans of a robot would have to wait for the compiler."""
+    return not all(map(is_compiled, (matching._match, field_code._insert, correlative._branch_and_bound)))
+
+
+@contextmanager
+def compiling(processes: int, needed: Sequence[Callable[[], None]]) -> Iterator[None]:
+    """Run all warm-ups on several cores; begins as soon as those that are ``needed`` are done.
+
+    The first one runs in this process. The others run in processes beside it, which fill the cache and end with the
+    context. Without a cache nothing does: no process can hand over what it compiled. With one process nothing runs
+    beside this one, which compiles the rest when it needs it.
+    """
+    here, *beside = WARM_UPS
+    context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    turns = context.BoundedSemaphore(max(1, processes - 1))
+    workers = {
+        run: context.Process(target=_compile, args=(run, turns), daemon=True)
+        for run in (beside if processes > 1 and not uncached() else ())
+    }
+    for worker in workers.values():
+        worker.start()
+    try:
+        here()
+        for run in needed:
+            if run in workers:
+                workers[run].join()
+        yield
+    finally:
+        for worker in workers.values():
+            worker.terminate()
+            worker.join()
+
+
+def _compile(run: Callable[[], None], turns: Any) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+    sys.stderr = open(os.devnull, "w")  # noqa: SIM115  who needs the code compiles it and reports why it fails
+    with turns:
+        run()
+
+
+def _scans(count: int) -> Iterator[LaserScan]:
+    """What a robot sees that drives around in the room, 0.4 m at a time."""
+    turn = 2.0 * np.pi / _ROUND
+    for k in range(count):
+        x, y = 8.0 + 5.0 * np.cos(k * turn), 4.5 + 2.0 * np.sin(k * turn)
+        heading = float(np.arctan2(2.0 * np.cos(k * turn), -5.0 * np.sin(k * turn)))
+        pose = np.array((x, y, heading))
+        yield LaserScan(float(k), dequantise(quantise(_ranges(pose))), _LASER, frozen(pose))
 
 
 def _packets() -> Iterator[bytes]:

@@ -8,9 +8,9 @@ that reaches the ground ends there. Far, dark or grazed surfaces return too litt
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, LaserModel
 from fcslam.simulation.floorplan import ROUND, FloorPlan, Piece, PieceKind
@@ -148,7 +148,7 @@ def _box(disc: list[float]) -> FloatArray:
     return np.array([[x - radius, y - radius], [x + radius, y + radius]])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _uniform(seed, beam, number):  # type: ignore[no-untyped-def]
     """A number in [0, 1) that depends on nothing else: SplitMix64 of its arguments."""
     z = seed + np.uint64(beam) * np.uint64(0xD1342543DE82EF95) + np.uint64(number + 8) * np.uint64(0x9E3779B97F4A7C15)
@@ -159,7 +159,7 @@ def _uniform(seed, beam, number):  # type: ignore[no-untyped-def]
     return (z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _ground_m(heights, x, y):  # type: ignore[no-untyped-def]
     """Height of the ground."""
     column = min(max(x / TERRAIN_CELL_M, 0.0), heights.shape[1] - 1.001)
@@ -171,7 +171,7 @@ def _ground_m(heights, x, y):  # type: ignore[no-untyped-def]
     return below + up * (above - below)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _meet(surface, x, y, dx, dy, depth):  # type: ignore[no-untyped-def]
     """Distance along a beam and cosine of the incidence where it meets a surface; infinite where it does not."""
     if surface[0] > 0.0:
@@ -197,7 +197,7 @@ def _meet(surface, x, y, dx, dy, depth):  # type: ignore[no-untyped-def]
     return distance, abs(determinant) / np.hypot(ex, ey)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _passes(surface, above_m, facing, chance):  # type: ignore[no-untyped-def]
     """Whether a beam goes on where it meets a surface, ``above_m`` over the ground; ``chance`` lies in [0, 1)."""
     if above_m < surface[5] or above_m > surface[6]:
@@ -206,7 +206,7 @@ def _passes(surface, above_m, facing, chance):  # type: ignore[no-untyped-def]
     return chance < (_GLASS_PASSES if glass and facing < _GLASS_FACED else 1.0 - surface[7])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _first_hit(start, direction, far, seed, beam, ideal, world):  # type: ignore[no-untyped-def]
     """Distance, surface and cosine of the incidence where a beam ends: cell after cell along it."""
     x, y, z = start
@@ -254,7 +254,7 @@ def _first_hit(start, direction, far, seed, beam, ideal, world):  # type: ignore
     return best, hit, cosine
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _cast_beams(position, angles, tilt, far, seed, ideal, world):  # type: ignore[no-untyped-def]
     ranges = np.full(len(angles), far)
     height = _ground_m(world.heights_m, position[0], position[1]) + LASER_HEIGHT_M

@@ -13,9 +13,9 @@ from importlib import resources
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.records import CODE_BYTES, Channel, frozen
 from fcslam.wire.entropy import Bytes, Coder, code_bit
 
@@ -53,7 +53,7 @@ PROBABILITIES: Final = frozen(
 """Probability of a 1 in units of 1/65536, for z from the smallest to the largest."""
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def code_descriptors(
     coder: Coder,
     data: Bytes,
@@ -80,7 +80,7 @@ def code_descriptors(
     return coder
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def nearest_before(keypoints: NDArray[np.int64], i: int) -> int:
     """Index of the nearest of the ``keypoints`` (N, axes) before keypoint i > 0; of several the first."""
     nearest, least = 0, np.int64(1) << 62
@@ -94,7 +94,7 @@ def nearest_before(keypoints: NDArray[np.int64], i: int) -> int:
     return nearest
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _add(expected: NDArray[np.int16], weights: NDArray[np.int16], bits: NDArray[np.uint8]) -> None:
     """Add the weights (K, 256) of some bits (K,). A bit has no weight for itself and earlier ones."""
     for j in range(len(bits)):

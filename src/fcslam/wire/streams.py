@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.errors import PacketError
 from fcslam.records import CODE_BYTES, Channel, Codes
 from fcslam.wire.entropy import (
@@ -129,7 +129,7 @@ def _unpack(data: bytes, plain: int, what: str, code: Callable[..., Coder], *con
         raise PacketError(f"{what}: the stream is cut off or goes on after its end")
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> Coder:
     """Code whether each range is a return, in the context of the beam before, and its difference from the last one."""
     model = fresh_model(2 + CONTEXTS_OF_NUMBER)
@@ -145,7 +145,7 @@ def _code_ranges(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> Coder:
     return coder
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> Coder:
     """Code the grid of each axis, then the differences of consecutive keypoints in steps of the grid."""
     axes = codes.shape[1]
@@ -156,18 +156,19 @@ def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> Code
         grid[axis] += beyond
         coder, codes[0, axis] = code_signed(coder, data, model, CONTEXTS_OF_NUMBER, codes[0, axis])
     for k in range(1, len(codes)):
-        steps = (codes[k] - codes[k - 1]) // grid
         context = 2 * CONTEXTS_OF_NUMBER
-        coder, steps[0] = code_number(coder, data, model, context, steps[0])
-        context += min(steps[0], _APART) * CONTEXTS_OF_NUMBER
+        coder, ahead = code_number(coder, data, model, context, (codes[k, 0] - codes[k - 1, 0]) // grid[0])
+        codes[k, 0] = codes[k - 1, 0] + ahead * grid[0]
+        context += min(ahead, _APART) * CONTEXTS_OF_NUMBER
         for axis in range(1, axes):
             context += (1 + _APART) * CONTEXTS_OF_NUMBER
-            coder, steps[axis] = code_signed(coder, data, model, context, steps[axis])
-        codes[k] = codes[k - 1] + steps * grid
+            step = (codes[k, axis] - codes[k - 1, axis]) // grid[axis]
+            coder, step = code_signed(coder, data, model, context, step)
+            codes[k, axis] = codes[k - 1, axis] + step * grid[axis]
     return coder
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _common_divisor(values: NDArray[np.int64]) -> int:
     """Greatest common divisor of all differences; 0 if there are none."""
     divisor = np.int64(0)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.evaluation.places.sets import PlaceSet
 from fcslam.features.codes import code_words, mutual_matches
 from fcslam.places.index import PlaceIndex
@@ -141,7 +141,7 @@ def choose_scorers(
     return scorers
 
 
-@njit(cache=True)
+@njit
 def _common(query: FloatArray, ends: NDArray[np.int64], words: NDArray[np.int64], values: FloatArray) -> FloatArray:
     """Sum of min(query, place) for every place, whose words and values are from ``ends[k]`` to ``ends[k + 1]``."""
     scores = np.zeros(len(ends) - 1)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.records import FloatArray
 
 DEPTH_AGREEMENT = 0.1
@@ -58,7 +58,7 @@ def view_overlap(depths_m: FloatArray, T_world_camera: FloatArray, camera: Depth
     return np.asarray(np.minimum(seen, seen.T))
 
 
-@njit(cache=True)
+@njit
 def _seen_again(
     depths_m: FloatArray,
     T_world_camera: FloatArray,
@@ -104,7 +104,7 @@ def _seen_again(
     return shares
 
 
-@njit(cache=True)
+@njit
 def _distorted(x: float, y: float, lens: FloatArray, limit: float) -> tuple[float, float]:
     """Project a ray (x, y, 1) to a pixel; (-2, -2) outside the validity of the distortion model."""
     r2 = x * x + y * y

@@ -1,0 +1,65 @@
+"""`fcslam warm-up`, and how other commands wait for code that is not compiled yet."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from fcslam.cli.options import Quiet
+from fcslam.cli.output import notices, print_line
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+FIRST_SCANS_S, EVERYTHING_S = 10, 45
+"""About what compiling takes on a laptop: what first scans need, in two processes; everything, in one."""
+
+
+def warm_up(*, quiet: Quiet = False) -> None:
+    """Compile the code of robots and cloud ahead, on all cores, so that the first run does not have to."""
+    from fcslam.service.warmup import WARM_UPS, compiling
+
+    console = notices(quiet)
+    if tell_uncached(console):
+        return
+    print_line(console, f"compiling, about {EVERYTHING_S} s on one core")
+    if cores() == 1:
+        for run in WARM_UPS:
+            run()
+    else:
+        with compiling(cores() + 1, WARM_UPS):  # this process waits most of the time
+            pass
+    print_line(console, "the code is compiled")
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def tell_uncached(console: "Console") -> bool:
+    """Say so if compiled code cannot be kept; returns whether that is so."""
+    from fcslam.compiled import uncached
+
+    if uncached():
+        print_line(
+            console,
+            f"compiled code cannot be kept, so every start takes about {EVERYTHING_S} s longer; "
+            "set NUMBA_CACHE_DIR to a folder that can be written",
+        )
+    return uncached()
+
+
+@contextmanager
+def compiled(console: "Console") -> Iterator[None]:
+    """Wait until the code for the first scans is compiled and say why; the rest is compiled meanwhile."""
+    from fcslam.service.warmup import compiling, is_cold, warm_up_matching
+
+    if tell_uncached(console) or not is_cold():
+        yield
+        return
+    processes = cores()
+    about_s = EVERYTHING_S if processes == 1 else FIRST_SCANS_S
+    print_line(console, f"compiling, first run only, about {about_s} s")
+    with compiling(processes, (warm_up_matching,)):
+        yield

@@ -1,0 +1,67 @@
+"""Compiled functions and the cache of their machine code, which works without a folder for it as well.
+
+Compiling takes half a minute, loading from the cache less than a second. The cache is beside the sources, else in the
+user's cache folder; ``NUMBA_CACHE_DIR`` names another one. If none of them can be written, every process compiles.
+"""
+
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.caching import FunctionCache
+
+_uncached: list[str] = []
+
+
+def uncached() -> bool:
+    """Whether there is no folder for the machine code of the functions that are loaded so far."""
+    return bool(_uncached)
+
+
+def is_compiled(function: Any) -> bool:
+    """Whether the cache has machine code for a compiled function as its source is now."""
+    cache = function._cache
+    return isinstance(cache, _Cache) and cache.has_code()
+
+
+def njit(function: Any = None, *, nogil: bool = False) -> Any:
+    """As ``numba.njit`` with a cache, if there can be one."""
+    if function is None:
+        return lambda function: njit(function, nogil=nogil)
+    dispatcher = numba.njit(nogil=nogil)(function)
+    try:
+        dispatcher._cache = _Cache(function)
+    except RuntimeError:  # no locator available: no folder can be written
+        _uncached.append(function.__name__)
+    return dispatcher
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """A cache that several processes may use at a time, and that may fail."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        with suppress(OSError), self._locked():
+            return super().load_overload(sig, target_context)
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError), self._locked():
+            super().save_overload(sig, data)
+
+    def has_code(self) -> bool:
+        """Whether anything is stored for the present source."""
+        with suppress(OSError):
+            return bool(self._cache_file._load_index())
+        return False
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """numba writes the index before the machine code: another process could load the code of an older source."""
+        folder = Path(self.cache_path)
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "numba.lock").open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield

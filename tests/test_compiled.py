@@ -1,0 +1,103 @@
+"""Compiled functions work without a folder for their machine code, and warm-ups compile all that a robot needs."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+WITHOUT_FOLDER = """
+from numba.core.caching import FunctionCache
+FunctionCache._impl_class._locator_classes = []  # as where nothing can be written
+from fcslam.cli.warm_up import tell_uncached
+from fcslam.cli.output import notices
+from fcslam.service.warmup import warm_up_searching, warm_up_matching, is_cold
+warm_up_matching()
+assert is_cold()
+assert tell_uncached(notices(False))
+"""
+
+AFTER_ALL = """
+import json, sys
+from numba.core.dispatcher import Dispatcher
+from fcslam.driving import one_by_one
+from fcslam.robot.frontend import RobotConfig
+from fcslam.service.warmup import WARM_UPS, is_cold
+from fcslam.sources import open_source
+
+def compiled():
+    return {
+        f"{value.py_func.__module__}.{value.py_func.__name__}": sorted(map(str, value.signatures))
+        for name, module in list(sys.modules.items()) if name.startswith("fcslam.")
+        for value in vars(module).values() if isinstance(value, Dispatcher)
+    }
+
+for run in WARM_UPS:
+    run()
+before = compiled()
+with one_by_one([open_source(path) for path in sys.argv[1:]], RobotConfig()) as robots:
+    legs = [leg for robot in robots for leg in robot]
+after = compiled()
+print(json.dumps([is_cold(), len(legs), [name for name in after if after[name] != before.get(name)]]))
+"""
+
+
+def run(script, *arguments, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", script, *map(str, arguments)],
+        env={**os.environ, **environment}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_without_a_folder_every_process_compiles_and_says_so():
+    done = run(WITHOUT_FOLDER)
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert "NUMBA_CACHE_DIR" in line
+
+
+def test_a_cache_folder_that_cannot_be_made_does_no_harm(tmp_path):
+    (tmp_path / "file").touch()
+    script = "from fcslam.compiled import njit\nprint(njit(lambda x: x + 1)(1))"
+    done = run(script, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
+    assert (done.stdout, done.returncode) == ("2\n", 0), done.stderr
+
+
+def test_a_cache_folder_that_fails_later_does_no_harm(tmp_path):
+    (tmp_path / "module.py").write_text(
+        "from fcslam.compiled import is_compiled, njit\n@njit\ndef f(x):\n    return x + 1\n"
+    )
+    script = (
+        f"import os, shutil, sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "import module\n"
+        "cache = os.environ['NUMBA_CACHE_DIR']\n"
+        "shutil.rmtree(cache); open(cache, 'w').close()\n"
+        "print(module.f(1), module.is_compiled(module.f))"
+    )
+    done = run(script, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    assert (done.stdout, done.returncode) == ("2 False\n", 0), done.stderr
+
+
+def test_the_cache_holds_what_was_compiled(tmp_path):
+    (tmp_path / "module.py").write_text(
+        "from fcslam.compiled import is_compiled, njit\n@njit\ndef f(x):\n    return x + 1\n"
+    )
+    script = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "from module import f, is_compiled\n"
+        "print(is_compiled(f), f(1), is_compiled(f), sum(f.stats.cache_hits.values()))"
+    )
+    outputs = [run(script, NUMBA_CACHE_DIR=str(tmp_path / "cache")).stdout for _ in range(2)]
+    assert outputs == ["False 2 True 0\n", "True 2 True 1\n"]
+
+
+@pytest.mark.slow
+def test_after_the_warm_ups_a_robot_finds_all_its_code_compiled(logs):
+    done = run(AFTER_ALL, *logs)
+    assert done.returncode == 0, done.stderr
+    is_cold, legs, compiled = json.loads(done.stdout)
+    assert not is_cold
+    assert legs > 3
+    assert compiled == []
