@@ -1,12 +1,14 @@
 """A robot in a mission over an unreliable network: mapping never depends on the network.
 
-The front end runs in the thread that calls ``run`` and puts the packets into the outbox, which is on disk. A second
-thread sends them to the cloud. The front end waits for it only if the outbox is full. The back end may run in another
-process (``fcslam.robot.beside``), so that it never delays the pose of a scan.
+The front end runs in the thread that calls ``run``. A second thread encodes the packets and puts them into the outbox,
+which is on disk, and a third one sends them to the cloud. The front end waits for them only if the outbox is full. The
+back end may run in another process (``fcslam.robot.beside``). So neither it nor a disk delays the pose of a scan.
 """
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
@@ -129,9 +131,12 @@ class Agent:
         self._refused_files: int | None = None
         """Number of files of refused packets; None until they are counted, as there may be many."""
         self._known = self._put = self._keyscans = self._crowded_out = 0
+        self._storing = ThreadPoolExecutor(1, "outbox")
+        self._unstored: deque[Future[None]] = deque()
+        """Packets on their way into the outbox."""
 
     def run(self, records: Iterable[SensorRecord], known: int, pace: PlaybackPace, watch: AgentWatch) -> None:
-        """Map a whole recording and send all packets.
+        """Map a whole recording and send all packets. An agent runs once.
 
         The outbox knows the first ``known`` packets from before an interruption; up to them nothing is paced.
 
@@ -142,7 +147,7 @@ class Agent:
         """
         self._known = known
         self._detector_updates.resume()
-        with self._sending():
+        with self._sending(), self._storing:
             for number, record in enumerate(records):
                 self._detector_updates.apply_due(number, self._put < known)
                 if isinstance(record, LaserScan) and self._put >= known:
@@ -151,6 +156,7 @@ class Agent:
                 self._wait_while(lambda: self._outbox.is_full or self._is_behind(), watch)
                 watch(self.progress())
             self._queue(self._frontend.finish())
+            self._wait_while(lambda: bool(self._unstored), watch)
             self._wait_while(lambda: self._outbox.waiting.packets > 0, watch)  # until the cloud has everything
 
     def progress(self) -> AgentProgress:
@@ -193,6 +199,11 @@ class Agent:
             self._localizer(part).correct(correction)
 
     def _queue(self, packets: list[Packet]) -> None:
+        if packets:
+            self._unstored.append(self._storing.submit(self._store, packets))
+
+    def _store(self, packets: list[Packet]) -> None:
+        """Put packets into the outbox."""
         for packet in packets:
             self._keyscans += isinstance(packet.body, Keyscan)
         chosen = packets if self._budget is None else self._budget.fit(packets)
@@ -201,21 +212,24 @@ class Agent:
             self._put += len(chosen)
 
     def _is_behind(self) -> bool:
-        """Whether the back end has to catch up, as in a recording that is played as fast as possible."""
-        behind = self._frontend.backlog > LARGEST_BACKLOG
+        """Whether back end or disk have to catch up, as in a recording that is played as fast as possible."""
+        behind = max(self._frontend.backlog, len(self._unstored)) > LARGEST_BACKLOG
         if behind:
             self._queue(self._frontend.ready())
         return behind
 
     def _wait_while(self, condition: Callable[[], bool], watch: AgentWatch) -> None:
-        """Wait while the sender works on ``condition``."""
-        self._require_sender()
+        """Wait while the other threads work on ``condition``."""
+        self._raise_failures()
         while condition():
             watch(self.progress())
             self._sleep(POLL_INTERVAL_S)
-            self._require_sender()
+            self._raise_failures()
 
-    def _require_sender(self) -> None:
+    def _raise_failures(self) -> None:
+        """Raise what ended another thread."""
+        while self._unstored and self._unstored[0].done():
+            self._unstored.popleft().result()
         if self._sender.failure is not None:
             raise self._sender.failure
 
