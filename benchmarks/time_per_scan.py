@@ -38,6 +38,8 @@ from fcslam.wire.packets import encode, read_label
 
 TENTHS = {"tenth": "", "scans": "", "odometry so far, m": ".0f", "keyscans so far": "", "mean CPU, ms": ".3f",
           "median CPU, ms": ".3f", "99 %, ms": ".2f", "max, ms": ".1f", "memory at its end, MB": ".1f"}  # fmt: skip
+FEW_ROUNDS = 5
+"""Memory is compared with that after so many rounds."""
 QUANTILES = (50, 95, 99, 99.9, 100)
 SCAN = {"": "", "mean, ms": ".3f", **{f"{q:g} %, ms": ".2f" for q in QUANTILES}, "longest at scan": ","}
 ROUNDS = {"round": "", "scans": ",", "keyscans so far": ",", "mean, ms": ".3f", "99 %, ms": ".2f", "max, ms": ".1f",
@@ -78,6 +80,12 @@ def report_live(report: common.Report, log: Path, rounds: int) -> None:
     said, rows = drive_live(log, rounds, alone(way_back, log))
     report.table(f"Live: a scan, intel {rounds} times over", SCAN, said)
     report.table("Live: round by round, wall", ROUNDS, rows)
+    if rounds > FEW_ROUNDS:
+        few, all_of_them = (sum(rows[number - 1][-2:]) for number in (FEW_ROUNDS, rounds))
+        report.say(
+            f"Both processes hold {few:.0f} MB after {FEW_ROUNDS} rounds and {all_of_them:.0f} MB after {rounds}, "
+            f"{all_of_them / few:.2f} times as much, code included."
+        )
 
 
 def drive_live(log: Path, rounds: int, back: Any) -> tuple[list[tuple], list[tuple]]:

@@ -53,6 +53,9 @@ LOOP_M, LOOP_PER_M = 0.25, 0.02
 """Two closures are consistent if their loop closes to this many metres, plus so many per metre of path in it."""
 LOOP_RAD, LOOP_RAD_PER_M = 0.05, 0.002
 """The same for the heading, in radians and radians per metre."""
+KNOWN_CANDIDATES = 1
+"""Earlier visits that a submap in a square with more than ``most_nearby`` is compared with: one closure ties it to a
+well-known area."""
 SIMILAR_PLACES = 24
 """Most similar earlier submaps among which the places to compare are chosen."""
 
@@ -90,10 +93,10 @@ class ClosingConfig(Settings):
         "still closes a loop that is out of the search's reach; 0 turns it off [m/m]",
     )
     most_nearby: int = Field(
-        default=12,
+        default=10,
         gt=0,
         description="most submaps in a square of nearby_m that later ones are compared with; beyond, the oldest is "
-        "forgotten",
+        "forgotten, and the newest is compared with one earlier visit instead of `candidates`",
     )
     nearby_m: float = Field(
         default=2.0, gt=0, description="side of the squares of the map in which most_nearby limits the submaps [m]"
@@ -192,24 +195,26 @@ class LoopCloser:
         later = len(self.submaps)
         self.submaps.append(anchored)
         self._held[later] = submap
+        is_known = self._forget_surplus(anchors)
         paths = self._paths_from(later)
+        candidates = self._candidates(later, anchors, paths)
         found = [
             closure
-            for earlier in self._candidates(later, anchors, paths)
+            for earlier in candidates[: KNOWN_CANDIDATES if is_known else self._config.candidates]
             if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
         ]
-        accepted = self._accept(found, self._recognized(later, anchors, paths), anchors)
-        self._thin(anchors)
-        return accepted
+        return self._accept(found, self._recognized(later, anchors, paths), anchors)
 
-    def _thin(self, anchors: FloatArray) -> None:
-        """Forget the oldest submaps around the newest one, if there are enough of them."""
+    def _forget_surplus(self, anchors: FloatArray) -> bool:
+        """Forget the oldest submaps around the newest one beyond the limit; returns whether there were any."""
         held = np.array(list(self._held))
-        for row in surplus_places(anchors[held, :2], self._config.nearby_m, self._config.most_nearby):
+        surplus = surplus_places(anchors[held, :2], self._config.nearby_m, self._config.most_nearby)
+        for row in surplus:
             index = int(held[row])
             del self._held[index]
             if self._recognizer is not None:
                 self._recognizer.forget(self.submaps[index].keyscan)
+        return len(surplus) > 0
 
     def _is_held(self) -> NDArray[np.bool_]:
         """Which submaps others are compared with, shape (S,)."""
@@ -248,7 +253,7 @@ class LoopCloser:
         visits = np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
         best = [int(visit[np.argmin(distance[visit])]) for visit in visits]
         best.sort(key=lambda k: distance[k])
-        return best[: self._config.candidates]
+        return best
 
     def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> LocalClosure | None:
         """Search where the drift allowance is wide, then verify; None if the submaps do not show the same place."""
