@@ -119,6 +119,9 @@ def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothi
     with backend_process("r", CONFIG) as backend:
         assert contents(driven(scans, backend)[1]) == contents(expected)
         worker = backend._executor.submit(os.getpid).result()
+        for stop in (signal.SIGINT, signal.SIGTERM):  # meant for the robot, which ends the worker itself
+            os.kill(worker, stop)
+        assert backend._executor.submit(os.getpid).result() == worker
         os.kill(worker, signal.SIGKILL)
         robot, packets = driven(scans, backend)
         assert "BrokenProcessPool" in robot.backend_failure

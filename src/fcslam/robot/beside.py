@@ -85,7 +85,8 @@ def _process(robot: str, input: BackendInput) -> list[Body]:
 
 
 def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the robot ends this one
+    for stop in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and service managers stop both; the robot ends this one
+        signal.signal(stop, signal.SIG_IGN)
     os.nice(YIELD_TO_TRACKER)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
