@@ -58,6 +58,15 @@ class ScriptedMatcher:
     def __len__(self):
         return 0
 
+    def __iter__(self):
+        return iter(())
+
+    def state(self):
+        return {}
+
+    def restore(self, *_):
+        pass
+
     def match(self, place, predicted, is_unaligned) -> list[PlaceMatch]:
         self.predictions[place.id] = dict(predicted)
         found = [line for line in self.script if line.j == place.id]

@@ -16,9 +16,10 @@ from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import ClosureStatus, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
+from fcslam.service import worker as worker_module
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, MissionStore, StoredPacket
-from fcslam.service.worker import AT_ONCE, Worker
+from fcslam.service.worker import AT_ONCE, SNAPSHOT_EVERY_S, Worker
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, read_label
@@ -154,6 +155,71 @@ def test_a_worker_says_nothing_old_while_it_catches_up(cloud):
         assert cloud.store.applied() == len(packets)
     assert cloud.folder.live.resolve() != live, "when it has caught up, it publishes once"
     assert open_run(cloud.folder.live).pose_graph_g2o == open_run(live).pose_graph_g2o
+
+
+def counted(cloud, monkeypatch):
+    """The packets that fleets apply from now on."""
+    fleet, applied = type(cloud.worker._fleet), []
+    apply = fleet.apply
+
+    def counting(self, packet):
+        applied.append((packet.robot, packet.sequence))
+        apply(self, packet)
+
+    monkeypatch.setattr(fleet, "apply", counting)
+    return applied
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_worker_goes_on_from_its_snapshot_with_the_same_result(cloud, monkeypatch, tmp_path, seed):
+    packets = two_robots()
+    whole = Cloud(tmp_path / "whole")
+    whole.put(packets)
+    expected = whole.finalize()
+    whole.store.close()
+    cut = int(np.random.default_rng(seed).integers(AT_ONCE, len(packets)))
+    cloud.put(packets[:cut])
+    cloud.work()
+    cloud.now += SNAPSHOT_EVERY_S
+    cloud.work()
+    applied = counted(cloud, monkeypatch)
+    cloud.restart()
+    cloud.put(packets[cut:])
+    cloud.work()
+    assert applied == [(packet.robot, packet.sequence) for packet in packets[cut:]]
+    run = cloud.finalize()
+    assert applied == [(packet.robot, packet.sequence) for packet in packets[cut:]], "no packet twice"
+    assert run.pose_graph_g2o == expected.pose_graph_g2o
+    assert run.map_files == expected.map_files
+    assert [str(closure) for closure in run.closures] == [str(closure) for closure in expected.closures]
+
+
+@pytest.mark.parametrize("fault", ["damage", "other packets", "other program"])
+def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, monkeypatch, tmp_path, caplog, fault):
+    packets = two_robots()
+    cloud.put(packets)
+    cloud.now += SNAPSHOT_EVERY_S
+    expected = cloud.finalize()
+    assert cloud.folder.snapshot.exists()
+    if fault == "damage":
+        data = bytearray(cloud.folder.snapshot.read_bytes())
+        data[len(data) // 2] ^= 4
+        cloud.folder.snapshot.write_bytes(data)
+    elif fault == "other packets":
+        other = Cloud(tmp_path / "other")
+        other.put([*packets[:-2], packets[-1], packets[-2]])
+        cloud.folder.snapshot.rename(other.folder.snapshot)
+        cloud.store.close()
+        cloud.store, cloud.folder = other.store, other.folder
+    else:
+        monkeypatch.setattr(worker_module, "code_version", lambda: "another one")
+    applied = counted(cloud, monkeypatch)
+    cloud.restart()
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert str(cloud.folder.snapshot) in line
+    assert "applies all packets again" in line
+    assert cloud.finalize().pose_graph_g2o == expected.pose_graph_g2o
+    assert len(applied) >= len(packets)
 
 
 def test_a_packet_that_does_not_fit_is_refused_with_its_reason_and_the_session_goes_on(cloud):

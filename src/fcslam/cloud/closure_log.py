@@ -1,10 +1,13 @@
 """The log of all closures that were considered, with their status and its reason."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+
+import numpy as np
 
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import Channel, ClosureStatus, Constraint, KeyscanId, LoopClosure, Reason, ReasonCode, frozen
+from fcslam.storage.state_file import State
 
 VERIFICATION = "fleet.matcher.verification"
 """Section of the configuration that holds the thresholds of the cloud's verification."""
@@ -60,21 +63,11 @@ class ClosureLog:
     def add(self, match: PlaceMatch) -> ClosureEntry:
         """Add a match, as verified or, if its verification failed, as a candidate."""
         status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
-        if match.M:
-            self._confirmed.add((frozenset((match.i, match.j)), match.channel))
         closure = LoopClosure(
             match.i, match.j, match.channel, match.similarity, frozen(match.check.T_a_b),
             frozen(match.check.information), status, match.reason.under(VERIFICATION), match.check.informative,
         )  # fmt: skip
-        entry = ClosureEntry(closure, independent=not match.predicted)
-        self._entries.append(entry)
-        if entry.is_between:
-            self._between.setdefault(frozenset((match.i.robot, match.j.robot)), []).append(entry)
-            for robot in (match.i.robot, match.j.robot) if match.M else ():
-                self._ties.setdefault(robot, []).append(entry)
-            for place in (match.i, match.j) if match.M else ():
-                self._at.setdefault(place, []).append(entry)
-        return entry
+        return self._add(ClosureEntry(closure, independent=not match.predicted))
 
     def add_local(self, constraint: Constraint, edge: int) -> ClosureEntry:
         """Add a closure that a robot found within its own map; it is accepted until the joint graph contradicts it."""
@@ -83,9 +76,45 @@ class ClosureLog:
             i, j, Channel.LIDAR, 0.0, constraint.T_i_j, constraint.information, ClosureStatus.ACCEPTED,
             Reason(ReasonCode.FOUND_BY_ROBOT),
         )  # fmt: skip
-        entry = ClosureEntry(closure, independent=False, edge=edge)
+        return self._add(ClosureEntry(closure, independent=False, edge=edge))
+
+    def _add(self, entry: ClosureEntry) -> ClosureEntry:
         self._entries.append(entry)
+        if not entry.is_between:
+            return entry
+        i, j = entry.closure.i, entry.closure.j
+        self._between.setdefault(frozenset((i.robot, j.robot)), []).append(entry)
+        if entry.closure.status is not ClosureStatus.CANDIDATE:
+            self._confirmed.add((frozenset((i, j)), entry.closure.channel))
+            for robot in (i.robot, j.robot):
+                self._ties.setdefault(robot, []).append(entry)
+            for place in (i, j):
+                self._at.setdefault(place, []).append(entry)
         return entry
+
+    def state(self) -> State:
+        """What ``restore`` needs."""
+        closures = [entry.closure for entry in self._entries]
+        return {
+            "T_i_j": np.array([closure.T_i_j for closure in closures]).reshape(-1, 3),
+            "information": np.array([closure.information for closure in closures]).reshape(-1, 3, 3),
+            "facts": [
+                (c.i, c.j, c.channel, c.similarity, c.status, astuple(c.reason), c.informative,
+                 entry.independent, entry.edge, entry.vetoed)
+                for entry, c in zip(self._entries, closures, strict=True)
+            ],
+        }  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        """Take over a ``state``."""
+        rows = zip(state["facts"], frozen(state["T_i_j"]), frozen(state["information"]), strict=True)
+        for (i, j, channel, similarity, status, reason, informative, *entry), T_i_j, information in rows:
+            code, *details = reason
+            closure = LoopClosure(
+                KeyscanId(*i), KeyscanId(*j), Channel(channel), similarity, T_i_j, information, ClosureStatus(status),
+                Reason(ReasonCode(code), *details), informative,
+            )  # fmt: skip
+            self._add(ClosureEntry(closure, *entry))
 
     def evidence(self, a: str, b: str) -> list[ClosureEntry]:
         """The verified closures between two robots that the joint map did not predict and no veto excludes."""

@@ -8,6 +8,7 @@ import numpy as np
 from fcslam.cloud.closure_log import ClosureLog
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.places.matcher import PlaceMatch
+from fcslam.storage.state_file import State
 
 MOST_TIES = 10
 """Number of closures after which more make no difference: 1 - 2^-10 is close to 1."""
@@ -34,6 +35,14 @@ class CorrectionQuality:
                 for session in (match.i.robot, match.j.robot):
                     shares[session] = max(share, shares.get(session, 0.0))
         self._share |= shares
+
+    def state(self) -> State:
+        """What ``restore`` needs."""
+        return {"share": dict(self._share)}
+
+    def restore(self, state: State) -> None:
+        """Take over a ``state``."""
+        self._share = state["share"]
 
     def of(self, session: str, robots: Collection[str], closures: ClosureLog) -> float:
         """In [0, 1], as in ``Correction``; ``robots`` share the session's map."""

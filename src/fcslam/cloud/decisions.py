@@ -1,6 +1,7 @@
 """Decisions about closures: which are accepted, which maps they join, and what is revoked when evidence turns."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import astuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.trajectory import Trajectory
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import ClosureStatus, Constraint, KeyscanId, Reason, ReasonCode, Veto
+from fcslam.storage.state_file import State
 
 EXAMINED_GROWTH = 2.0
 """The maps of two sessions are compared again when their cluster has grown by this factor: at each place, it would take
@@ -113,6 +115,26 @@ class ClosureDecisions:
         self._contested, self._postponed_until = False, int(CONTESTED_GROWTH * len(self.closures))
         self.version += 1
         return fusion
+
+    def state(self) -> State:
+        """What ``restore`` needs."""
+        return {
+            "closures": self.closures.state(),
+            "examined": [(sorted(pair), size) for pair, size in self._examined.items()],
+            "maps": self.maps,
+            "version": self.version,
+            "vetoes": [astuple(veto) for veto in self._vetoes],
+            "contested": self._contested,
+            "postponed_until": self._postponed_until,
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over a ``state``."""
+        self.closures.restore(state["closures"])
+        self._examined = {frozenset(pair): size for pair, size in state["examined"]}
+        self.maps, self.version = state["maps"], state["version"]
+        self._vetoes = [Veto(i, j, stamps and tuple(stamps)) for i, j, stamps in state["vetoes"]]
+        self._contested, self._postponed_until = state["contested"], state["postponed_until"]
 
     def _apply_vetoes(self, entries: Sequence[ClosureEntry]) -> list[ClosureEntry]:
         """Mark the entries that a veto excludes, and return them."""

@@ -5,6 +5,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 """
 
 from collections.abc import Callable, Iterable
+from typing import Self
 
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
@@ -30,16 +31,18 @@ from fcslam.records import (
     Veto,
     frozen,
 )
+from fcslam.storage.state_file import State
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 
 
 class Fleet:
     """Applies packets; place recognition and decisions about closures have classes of their own."""
 
-    def __init__(self, config: FleetConfig, seed: int) -> None:
+    def __init__(self, config: FleetConfig, seed: int, read: Callable[[PacketNumber], Packet] | None = None) -> None:
+        """``read`` gives stored packets by their numbers, for ``restored``."""
         self._config = config
         self._seed = seed
-        self._sessions = SessionStore()
+        self._sessions = SessionStore(read)
         self._graph = JointGraph()
         self._decisions = ClosureDecisions(config, self._sessions, self._graph)
         self._recognition = PlaceRecognition(config, seed, self._sessions, self._graph, self._decisions.closures)
@@ -58,9 +61,9 @@ class Fleet:
         packet = in_session(packet)
         match packet.body:
             case Hello() as hello:
-                self._sessions.add_hello(hello)
+                self._sessions.add_hello(hello, packet.sequence)
             case Keyscan() as keyscan:
-                self._add_keyscan(keyscan)
+                self._add_keyscan(keyscan, packet.sequence)
             case Constraint(kind=ConstraintKind.ODOMETRY) as motion:
                 self._sessions.add_motion(motion)
                 self._graph.extend(motion)
@@ -72,6 +75,32 @@ class Fleet:
                 self._add_place(place)  # place recognition and map fusion
             case Correction() | Acknowledgement() | DetectorUpdate():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
+
+    def state(self) -> State:
+        """The state after the packets so far, without what those hold; ``restored`` makes an equal fleet of it."""
+        return {
+            "sessions": self._sessions.state(),
+            "graph": self._graph.state(),
+            "decisions": self._decisions.state(),
+            "recognition": self._recognition.state(),
+            "quality": self._quality.state(),
+            "needs_replay": self._needs_replay,
+        }
+
+    @classmethod
+    def restored(cls, config: FleetConfig, seed: int, state: State, read: Callable[[PacketNumber], Packet]) -> Self:
+        """The fleet of a ``state`` under the same configuration and seed.
+
+        ``read`` gives the packets that it applied; the fleet reads keyscans when it needs them.
+        """
+        fleet = cls(config, seed, read)
+        fleet._sessions.restore(state["sessions"])
+        fleet._graph.restore(state["graph"])
+        fleet._decisions.restore(state["decisions"])
+        fleet._recognition.restore(state["recognition"])
+        fleet._quality.restore(state["quality"])
+        fleet._needs_replay = state["needs_replay"]
+        return fleet
 
     def veto(self, veto: Veto) -> None:
         """Exclude closures from now on; maps that only they joined are separated."""
@@ -134,8 +163,8 @@ class Fleet:
         """Accepted closures so far, by kind."""
         return self._decisions.counts()
 
-    def _add_keyscan(self, keyscan: Keyscan) -> None:
-        self._sessions.add_keyscan(keyscan)
+    def _add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:
+        self._sessions.add_keyscan(keyscan, sequence)
         if keyscan.id.number == 0:
             self._graph.start(keyscan.id.robot)
             self._decisions.start_map(keyscan.id.robot)

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize
-from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph
 from fcslam.graph.trajectory import DriftSettings, Trajectory, build_trajectory
 from fcslam.records import Constraint, FloatArray, KeyscanId
+from fcslam.storage.state_file import State
 
 SOLVED_SHARE = 0.05
 """Share of all closures that comes in between two solves, at least."""
@@ -136,6 +137,39 @@ class JointGraph:
     def robots(self) -> dict[str, NDArray[np.int64]]:
         """Variables of every robot in the order of its path; robots in the order in which they started."""
         return {robot: np.array(variables, dtype=np.int64) for robot, variables in self._variables.items()}
+
+    def state(self) -> State:
+        """What ``restore`` needs."""
+        count, edges = len(self.graph), self.graph.given()
+        return {
+            "initial": self.graph.poses(),
+            "poses": self._poses[:count],
+            "edges": {"i": edges.i, "j": edges.j, "T_i_j": edges.T_i_j, "information": edges.information,
+                      "robust": edges.robust},
+            "left_out": sorted(self._left_out),
+            "unsolved": self._unsolved,
+            "robots": list(self._variables),
+            "paths": {
+                robot: {
+                    "variables": np.array(variables, np.int64),
+                    "chain": np.array(self._chains[robot]),
+                    "steps": np.array(self._step_covariance[robot]).reshape(-1, 3, 3),
+                }
+                for robot, variables in self._variables.items()
+            },
+        }  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        """Take over a ``state``."""
+        self.graph = PoseGraph.restored(state["initial"], EdgeArrays(**state["edges"]))
+        self._factors = FactorCache(self.graph)
+        self._poses = np.concatenate([state["poses"], np.zeros((max(256, len(self.graph)), 3))])
+        self._left_out, self._unsolved = set(state["left_out"]), state["unsolved"]
+        self._closures = int(state["edges"]["robust"].sum())
+        for robot in state["robots"]:
+            path = state["paths"][robot]
+            self._variables[robot] = path["variables"].tolist()
+            self._chains[robot], self._step_covariance[robot] = list(path["chain"]), list(path["steps"])
 
     def _add_variable(self, pose: FloatArray) -> int:
         variable = self.graph.add_variable(pose)

@@ -6,7 +6,9 @@ keeps its sequence number, so later packets take effect without it.
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import NamedTuple, Self
+
+from fcslam.storage.state_file import State
 
 
 class PacketNumber(NamedTuple):
@@ -96,6 +98,29 @@ class PacketLog:
     def waiting_count(self, session: str) -> int:
         """How many packets of the session wait for one before them."""
         return len(self._waiting.get(session, ()))
+
+    def state(self) -> State:
+        """All that is known, for ``restored``."""
+        return {
+            "next": dict(self._next),
+            "waiting": {session: sorted(numbers) for session, numbers in self._waiting.items()},
+            "refused": sorted(self._refused),
+            "released": self._released,
+            "newest": self._newest,
+            "is_canonical": self._is_canonical,
+        }
+
+    @classmethod
+    def restored(cls, state: State) -> Self:
+        """The log of a ``state``."""
+        log = cls()
+        log._next = state["next"]
+        log._waiting = {session: set(numbers) for session, numbers in state["waiting"].items()}
+        log._refused = {PacketNumber(*number) for number in state["refused"]}
+        log._released, log._is_canonical = state["released"], state["is_canonical"]
+        time_s, session, sequence = state["newest"]
+        log._newest = time_s, session, sequence
+        return log
 
     def canonical(self, arrived: Iterable[tuple[float, PacketNumber]]) -> Iterator[PacketNumber]:
         """The packets that took effect, in the order that depends on the set of packets alone.

@@ -17,6 +17,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.places.matcher import PlaceMatch, PlaceMatcher
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
+from fcslam.storage.state_file import State
 
 
 class VocabularyState(NamedTuple):
@@ -77,6 +78,20 @@ class PlaceRecognition:
             VocabularyState(channel, version, matcher.word_count, len(matcher))
             for (channel, version), matcher in self._matchers.items()
         )
+
+    def state(self) -> State:
+        """What ``restore`` needs; submaps are built again when they are needed."""
+        return {f"{channel} {version}": matcher.state() for (channel, version), matcher in self._matchers.items()}
+
+    def restore(self, state: State) -> None:
+        """Take over a ``state``."""
+        for name, kept in state.items():
+            channel, _, version = name.partition(" ")
+            key = Channel(channel), version
+            matcher = self._matcher(key)
+            matcher.restore(kept, *key)
+            for place in matcher:
+                self._places.setdefault((key, place.robot), []).append(place)
 
     def _matcher(self, key: _VocabularyKey) -> PlaceMatcher:
         if key not in self._matchers:

@@ -1,16 +1,22 @@
 """What the cloud keeps of each session, and the checks of a packet against the earlier ones of its session."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import numpy as np
 
+from fcslam.cloud.packet_log import PacketNumber
+from fcslam.cloud.sessions import in_session
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.geometry.beams import misfit
-from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, Place
+from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, Place, frozen
+from fcslam.storage.state_file import State
 from fcslam.wire.limits import MAXIMUM_COORDINATE_M
-from fcslam.wire.messages import Hello
+from fcslam.wire.messages import Hello, Packet
+
+_Body = TypeVar("_Body", Hello, Keyscan)
 
 FARTHEST_M = MAXIMUM_COORDINATE_M / 4.0
 """Largest distance of a robot from its start, in metres. Joining and optimising maps moves poses further away; a
@@ -23,12 +29,18 @@ class SessionStore:
     Packets of a session come in the order of their numbers. A refused packet changes nothing.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, read: Callable[[PacketNumber], Packet] | None = None) -> None:
+        """``read`` gives the packets of keyscans that ``restore`` names; None: nothing is restored."""
+        self._read = read
         self._hellos: dict[str, Hello] = {}
+        self._hello_sequences: dict[str, int] = {}
+        """Number of the packet of the newest hello."""
         self._stamps: dict[str, list[float]] = {}
         """Of every keyscan, in seconds."""
-        self._keyscans: dict[str, list[Keyscan | None]] = {}
-        """None where it was released."""
+        self._keyscans: dict[str, list[Keyscan | int | None]] = {}
+        """None where it was released, the number of its packet where that was not read yet."""
+        self._sequences: dict[str, list[int]] = {}
+        """Number of every keyscan's packet."""
         self._holders: dict[str, list[int]] = {}
         """How many places hold each keyscan."""
         self._connected: dict[str, int] = {}
@@ -45,8 +57,10 @@ class SessionStore:
         """Robots with at least one keyscan, in the order of their first."""
         return tuple(self._connected)
 
-    def add_hello(self, hello: Hello) -> None:
+    def add_hello(self, hello: Hello, sequence: int) -> None:
         """Note how to read the session's packets: at its start, or because there is a new detector or one more laser.
+
+        ``sequence`` is the number of its packet.
 
         Raises:
             PacketError: a laser of before is missing or different.
@@ -55,10 +69,11 @@ class SessionStore:
         if before is not None and before.lasers != hello.lasers[: len(before.lasers)]:
             raise PacketError(f"{hello.robot}: says hello again with another laser")
         self._hellos[hello.robot] = hello
+        self._hello_sequences[hello.robot] = sequence
         self._announced.setdefault(hello.robot, set()).update(hello.detector_versions.items())
 
-    def add_keyscan(self, keyscan: Keyscan) -> None:
-        """The robot's next keyscan.
+    def add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:
+        """The robot's next keyscan; ``sequence`` is the number of its packet.
 
         Raises:
             PacketError: it is not the next, does not fit the laser, or the motion to the one before is missing.
@@ -73,6 +88,7 @@ class SessionStore:
             raise PacketError(f"{robot}: keyscan {number} before the motion to keyscan {number - 1}")
         self._check_laser(keyscan)
         self._keyscans.setdefault(robot, []).append(keyscan)
+        self._sequences.setdefault(robot, []).append(sequence)
         self._stamps.setdefault(robot, []).append(keyscan.stamp)
         self._holders.setdefault(robot, []).append(0)
         if number == 0:
@@ -142,7 +158,11 @@ class SessionStore:
     def keyscans(self, robot: str, first: int = 0, last: int | None = None) -> tuple[Keyscan, ...]:
         """Connected keyscans first to last (inclusive) of a robot, without released ones."""
         end = self._connected[robot] if last is None else last + 1
-        return tuple(keyscan for keyscan in self._keyscans[robot][first:end] if keyscan is not None)
+        keyscans = self._keyscans[robot]
+        for number in range(first, end):
+            if isinstance(sequence := keyscans[number], int):
+                keyscans[number] = self._stored(PacketNumber(robot, sequence), Keyscan)
+        return tuple(keyscan for keyscan in keyscans[first:end] if isinstance(keyscan, Keyscan))
 
     def stamp(self, keyscan: KeyscanId) -> float:
         """When the keyscan was taken."""
@@ -159,6 +179,49 @@ class SessionStore:
     def lasers(self, robot: str) -> tuple[LaserModel, ...]:
         """The lasers that the robot announced."""
         return self._hellos[robot].lasers
+
+    def state(self) -> State:
+        """What ``restore`` needs. Keyscans are named by their packets, which are stored anyway."""
+        return {
+            "robots": list(self._connected),
+            "hellos": dict(self._hello_sequences),
+            "announced": {robot: sorted(announced) for robot, announced in self._announced.items()},
+            "places": sorted(self._places),
+            "keyscans": {
+                robot: {
+                    "stamps": np.array(self._stamps[robot]),
+                    "sequences": np.array(sequences, np.int64),
+                    "held": np.array([keyscan is not None for keyscan in self._keyscans[robot]]),
+                    "holders": np.array(self._holders[robot], np.int64),
+                }
+                for robot, sequences in self._sequences.items()
+            },
+            "connected": list(self._connected.values()),
+            "T_odom_base": {robot: np.array(pose) for robot, pose in self._T_odom_base.items()},
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over a ``state``; keyscans are read when they are needed."""
+        self._hello_sequences = state["hellos"]
+        for robot, sequence in self._hello_sequences.items():
+            self._hellos[robot] = self._stored(PacketNumber(robot, sequence), Hello)
+        for robot, announced in state["announced"].items():
+            self._announced[robot] = {(Channel(channel), version) for channel, version in announced}
+        self._places = {(KeyscanId(*place), Channel(channel), version) for place, channel, version in state["places"]}
+        for robot, kept in state["keyscans"].items():
+            self._stamps[robot], self._holders[robot] = kept["stamps"].tolist(), kept["holders"].tolist()
+            self._sequences[robot] = kept["sequences"].tolist()
+            held = zip(self._sequences[robot], kept["held"].tolist(), strict=True)
+            self._keyscans[robot] = [sequence if is_held else None for sequence, is_held in held]
+        self._connected = dict(zip(state["robots"], state["connected"], strict=True))
+        self._T_odom_base = {robot: frozen(pose) for robot, pose in state["T_odom_base"].items()}
+
+    def _stored(self, number: PacketNumber, kind: type[_Body]) -> _Body:
+        """The content of a stored packet."""
+        assert self._read is not None, "only a restored store names packets"
+        body = in_session(self._read(number)).body
+        assert isinstance(body, kind), "a packet never changes"
+        return body
 
     def _check_laser(self, keyscan: Keyscan) -> None:
         robot, lasers = keyscan.id.robot, self.lasers(keyscan.id.robot)

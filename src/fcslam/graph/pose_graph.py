@@ -1,7 +1,8 @@
 """A pose graph in the plane: variables numbered from 0, measured motions between them. It only grows."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,6 +71,17 @@ class PoseGraph:
         for edge in edges:
             self.add_edge(edge)
 
+    @classmethod
+    def restored(cls, poses: FloatArray, edges: EdgeArrays) -> Self:
+        """A graph from the poses (N, 3) and edges of another one, which were checked when they were added to it."""
+        graph = cls()
+        graph._poses = list(frozen(poses))
+        ends, robust = zip(edges.i.tolist(), edges.j.tolist(), strict=True), edges.robust.tolist()
+        measured = zip(frozen(edges.T_i_j), frozen(edges.information), strict=True)
+        rows = zip(ends, measured, robust, strict=True)
+        graph._edges = [_checked_edge(i, j, T, information, closes) for (i, j), (T, information), closes in rows]
+        return graph
+
     def __len__(self) -> int:
         return len(self._poses)
 
@@ -101,6 +113,12 @@ class PoseGraph:
     def poses(self) -> FloatArray:
         """Initial poses, shape (N, 3)."""
         return np.array(self._poses, dtype=np.float64).reshape(-1, 3)
+
+    def given(self) -> EdgeArrays:
+        """Edges as arrays with the information that was given, for ``restored``."""
+        bounded = self.arrays()
+        information = np.array([edge.information for edge in self._edges], dtype=np.float64).reshape(-1, 3, 3)
+        return replace(bounded, information=information)
 
     def arrays(self) -> EdgeArrays:
         """Edges as arrays; only those added since the last call are converted."""
@@ -143,6 +161,14 @@ class PoseGraph:
 def anchors(components: NDArray[np.int64]) -> NDArray[np.int64]:
     """First variable of each connected component, shape (C,); ``components`` as from ``PoseGraph.components``, (N,)."""
     return np.unique(components, return_index=True)[1].astype(np.int64)
+
+
+def _checked_edge(i: int, j: int, T_i_j: FloatArray, information: FloatArray, robust: bool) -> Edge:
+    """An edge without a new check."""
+    edge = object.__new__(Edge)
+    for name, value in (("i", i), ("j", j), ("T_i_j", T_i_j), ("information", information), ("robust", robust)):
+        object.__setattr__(edge, name, value)
+    return edge
 
 
 def _stack(edges: Sequence[Edge]) -> EdgeArrays:

@@ -41,6 +41,9 @@ class IndexState(Generic[PlaceId]):
     """Shape (D, 4): codes of all descriptors, place by place."""
     leaves: NDArray[np.int32]
     """Shape (D,): leaf of each descriptor, as a vertex of ``tree``."""
+    norms: FloatArray | None = None
+    """Shape (P,): norms of the places under ``Scoring.WORDS``, whose rounding depends on their history; None: they are
+    computed."""
 
 
 class PlaceIndex(Generic[PlaceId]):
@@ -161,6 +164,7 @@ class PlaceIndex(Generic[PlaceId]):
         return IndexState(
             self._config, self._descriptor_version, self._training, self._places_seen, tree, list(self._row_of),
             self._postings.entries.counts[rows], self._postings.gather(rows), number_of[leaves],
+            self._postings.entries.log_documents[rows] if self._config.scoring is Scoring.WORDS else None,
         )  # fmt: skip
 
     @classmethod
@@ -171,6 +175,8 @@ class PlaceIndex(Generic[PlaceId]):
         index._vocabulary = Vocabulary.restored(_shape(state.config), state.tree)
         index._postings = index._no_postings()
         index._postings.fill(state.codes, state.leaves, state.counts)
+        if state.norms is not None:
+            index._postings.entries.log_documents[: len(state.norms)] = state.norms
         index._ids = list(state.ids)
         index._row_of = {place: row for row, place in enumerate(index._ids)}
         return index

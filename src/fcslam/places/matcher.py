@@ -17,9 +17,13 @@ from fcslam.lidar.submap import Submap
 from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig, verify
 from fcslam.places.index import PlaceIndex
 from fcslam.places.motions import Motion, MotionConfig, propose_motions
+from fcslam.places.persistence import index_state, restored_index
 from fcslam.places.query_result import QueryResult
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason
+from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, frozen
+from fcslam.storage.state_file import State
+
+NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
 
 
 class MatcherConfig(Settings):
@@ -150,6 +154,31 @@ class PlaceMatcher:
         self._backlog.append(place)
         self._forget_oldest()
         return [match for match in (*near, *far) if match is not None]
+
+    def state(self) -> State:
+        """What ``restore`` needs."""
+        places = list(self._places.values())
+        return {
+            "ids": [place.id for place in places],
+            "spans": np.array([(place.first, place.last) for place in places], np.int64).reshape(-1, 2),
+            "counts": np.array([len(place.descriptors) for place in places], np.int64),
+            "keypoints": np.concatenate([place.keypoints for place in places]) if places else np.zeros((0, 2)),
+            "descriptors": np.concatenate([NO_DESCRIPTORS, *(place.descriptors for place in places)]),
+            "index": index_state(self._index),
+        }
+
+    def restore(self, state: State, channel: Channel, detector_version: str) -> None:
+        """Take over a ``state`` of places of this channel and detector version."""
+        ids = [KeyscanId(*identifier) for identifier in state["ids"]]
+        ends = np.cumsum(state["counts"])[:-1]
+        keypoints = np.split(frozen(state["keypoints"], np.float32), ends)
+        descriptors = np.split(frozen(state["descriptors"], np.uint8), ends)
+        for row in zip(ids, state["spans"].tolist(), keypoints, descriptors, strict=True):
+            identifier, (first, last), points, codes = row
+            self._places[identifier] = Place(identifier, channel, detector_version, first, last, points, codes)
+        indexed = state["index"]["size"]  # the oldest ones
+        self._index = restored_index(self._config.vocabulary, state["index"], ids[:indexed], descriptors[:indexed])
+        self._backlog = list(self._places.values())[indexed:]
 
     def _query(self, place: Place) -> QueryResult[KeyscanId]:
         for stored in self._backlog:  # a single robot never needs the vocabulary

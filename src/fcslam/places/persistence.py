@@ -6,7 +6,7 @@ numbers, the seed and the data of the last training, so a loaded index behaves e
 
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from fcslam.config import parse
 from fcslam.errors import InputError, OutputError
-from fcslam.features.codes import CODE_WORDS
+from fcslam.features.codes import CODE_WORDS, code_words
 from fcslam.places.index import IndexState, PlaceIndex
 from fcslam.places.query_result import PlaceId
 from fcslam.places.vocabulary import Training, TreeState, VocabularyConfig
+from fcslam.records import Codes
 from fcslam.storage.files import replacing
+from fcslam.storage.state_file import State
 
 FORMAT = "fcslam place index 1"
 
@@ -64,6 +66,48 @@ def save_index(index: PlaceIndex[Any], path: Path) -> None:
             np.savez(file, allow_pickle=False, **portable)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error}); make room or choose another place") from error
+
+
+def index_state(index: PlaceIndex[Any]) -> State:
+    """The state of an index without what the stored places hold, for ``restored_index``."""
+    state = index.state()
+    return {
+        "size": len(state.ids),
+        "training": asdict(state.training) if state.training else None,
+        "places_seen": state.places_seen,
+        "seed": state.tree.seed,
+        "version": state.tree.version,
+        "words_given": state.tree.words_given,
+        "centres": state.tree.centres,
+        "child_count": state.tree.child_count,
+        "words": state.tree.words,
+        "leaves": state.leaves,
+        "norms": state.norms,
+    }
+
+
+def restored_index(
+    config: VocabularyConfig, state: State, ids: Sequence[PlaceId], descriptors: Sequence[Codes]
+) -> PlaceIndex[PlaceId]:
+    """The index of a state: it behaves exactly like the original.
+
+    Args:
+        config: that of the original.
+        state: from ``index_state``.
+        ids: the stored places, in the order in which they were added.
+        descriptors: of each place, shape (N, 32).
+    """
+    training = Training(**state["training"]) if state["training"] else None
+    tree = TreeState(
+        state["seed"], state["version"], state["words_given"], state["centres"], state["child_count"], state["words"]
+    )
+    codes = np.concatenate([np.empty((0, CODE_WORDS), np.uint64), *map(code_words, descriptors)])
+    counts = np.array([len(each) for each in descriptors], np.int32)
+    return PlaceIndex.restored(
+        IndexState(
+            config, "", training, state["places_seen"], tree, ids, counts, codes, state["leaves"], state["norms"]
+        )
+    )
 
 
 def load_index(path: Path, place_id: Callable[[Any], PlaceId], descriptor_version: str = "") -> PlaceIndex[PlaceId]:

@@ -129,10 +129,10 @@ def score_matches(
                             found += 1
                         closeness[row] = max(closeness[row], close)
                 block, filled = entries.numbers[block, OLDER], BLOCK
-        everywhere = 0.0
+        votes = 0  # whole numbers: the sum must not depend on the order of the entries in memory
         for row in here[:found]:
-            everywhere += gives[closeness[row]]
-        weight = np.log((place_count + 1) / max(everywhere, 1.0))
+            votes += closeness[row] * (2 * near_bits + 2 - closeness[row])
+        weight = np.log((place_count + 1) / max(votes / (near_bits + 1.0) ** 2, 1.0))
         whole += weight
         for row in here[:found]:
             if scores[row] == 0.0:

@@ -4,6 +4,7 @@ detectors/<channel>/<version>.onnx   networks that robots may fetch
 missions/<name>/mission.sqlite       what was received: all that must not be lost
                 live/                the run folder of what is believed now
                 runs/<number>/       the run folders that were asked for
+                worker.state         the worker's state some packets ago, for a quick restart; may be deleted
                 worker.lock          held by the mission's worker
 open                                 name of the open mission
 lock                                 held by the service that uses the folder
@@ -37,6 +38,11 @@ class MissionFolder:
     def live(self) -> Path:
         """The run folder of the current estimate: a link that is replaced atomically."""
         return self.path / "live"
+
+    @property
+    def snapshot(self) -> Path:
+        """The worker's state, from which the next worker goes on; it may be deleted."""
+        return self.path / "worker.state"
 
     @property
     def worker_lock(self) -> Path:

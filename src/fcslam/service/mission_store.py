@@ -5,7 +5,7 @@ Packets are numbered by **arrival**. The order in which they take effect follows
 """
 
 import sqlite3
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +27,8 @@ CONFIG = "config"
 
 _VERSION = 4
 """Version of the schema and of the packets."""
+_AT_ONCE = 10_000
+"""Packets that are read at once."""
 _COLUMNS = "robot, epoch, sequence, time, kind, channel, data, refusal"
 
 _SCHEMA = """
@@ -133,6 +135,13 @@ class MissionStore:
         """At most ``limit`` packets with their arrival, in its order; the first arrival is 1."""
         statement = f"SELECT arrival, {_COLUMNS} FROM packets WHERE arrival > ? ORDER BY arrival LIMIT ?"
         return [(arrival, _packet(*row)) for arrival, *row in self._database.rows(statement, (after, limit))]
+
+    def contents(self, until: int) -> Iterator[bytes]:
+        """The packets that arrived first until arrival ``until``, encoded, in that order."""
+        statement = "SELECT data FROM packets WHERE arrival > ? AND arrival <= ? ORDER BY arrival"
+        for after in range(0, until, _AT_ONCE):
+            for (data,) in self._database.rows(statement, (after, min(after + _AT_ONCE, until))):
+                yield data
 
     def packet(self, robot: str, epoch: int, sequence: int) -> StoredPacket:
         """A stored packet."""

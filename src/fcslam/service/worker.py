@@ -1,8 +1,8 @@
 """The worker: the process in which the fleet of one mission lives. Taking packets in never waits for it.
 
 It reads the store by turn, keeps the fleet in memory, and leaves what it made of the packets on disk: corrections in
-the store, the live run folder, the run folders that were asked for. Killed at any moment it begins again at turn 0,
-and says nothing new before it is where it was.
+the store, the live run folder, the run folders that were asked for. From time to time it writes its state as well.
+Killed at any moment it goes on from there, or from turn 0, and says nothing new before it is where it was.
 
     python -m fcslam.service.worker MISSION_FOLDER
 
@@ -21,9 +21,12 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import cache
+from hashlib import blake2b
 from pathlib import Path
 from typing import IO
 
+import fcslam
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import SessionCorrection
@@ -32,12 +35,13 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump
-from fcslam.errors import PacketError
+from fcslam.errors import InputError, PacketError
 from fcslam.runs import Metric, Run
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.service.supervisor import READY
 from fcslam.service.warmup import warm_up_fleet
+from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode
 
@@ -49,6 +53,10 @@ LIVE_SHARE = 0.1
 """Of the worker's time, for the live run folder."""
 PAUSE_S = 30.0
 """After the live run folder could not be written."""
+SNAPSHOT_SHARE = 0.05
+"""Of the worker's time, for its snapshots: the next worker repeats no more than this part's inverse."""
+SNAPSHOT_EVERY_S = 5.0
+"""The snapshot is not written more often than this."""
 LIVE_EVERY_S = 1.0
 """The live run folder is not written more often than this."""
 
@@ -65,22 +73,28 @@ class Worker:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._tell = folder, store, clock, tell
-        self._fleet = Fleet(self._config.fleet, self._config.seed)
-        self._log = PacketLog()
         self._ready: deque[StoredPacket] = deque()
         """Packets that may take effect and did not yet."""
+        self._fleet = Fleet(self._config.fleet, self._config.seed)
+        self._log = PacketLog()
         self._arrivals = self._vetoes = 0
         """How many packets and vetoes were read."""
+        self._read_hash = b""
+        """Of all packets that were read, in their order."""
         self._resumed_at = store.applied()
         """How many packets took effect before a restart: their results are stored already."""
         self._times: dict[tuple[str, int], float] = {}
         """Newest time of each session."""
         self._published = -1
         self._publish_at = clock()
+        self._resume()
+        self._written, self._write_at = self._applied, clock() + SNAPSHOT_EVERY_S
 
     def step(self) -> bool:
         """Do one piece of work; False: there is none."""
-        return self._take_vetoes() or self._take_packets() or self._finalize() or self._publish()
+        return (
+            self._take_vetoes() or self._take_packets() or self._write_snapshot() or self._finalize() or self._publish()
+        )
 
     def wait_s(self) -> float:
         """How long there is nothing to do unless something comes in."""
@@ -119,6 +133,7 @@ class Worker:
         read = self._store.arrivals(self._arrivals, AT_ONCE)
         arrived = {(packet.robot, packet.epoch, packet.sequence): packet for _, packet in read}
         for self._arrivals, packet in read:
+            self._read_hash = _chained(self._read_hash, packet.data)
             session = session_name(packet.robot, packet.epoch)
             number = PacketNumber(session, packet.sequence)
             if packet.refusal is None:
@@ -128,6 +143,50 @@ class Worker:
             for _, sequence in self._log.ready(session):
                 key = (packet.robot, packet.epoch, sequence)
                 self._ready.append(arrived.get(key) or self._store.packet(*key))
+
+    def _write_snapshot(self) -> bool:
+        """Write the worker's state, if it is new, no packet waits and the last time is long enough ago."""
+        began = self._clock()
+        if self._ready or self._written == self._applied or began < self._write_at:
+            return False
+        state = {
+            "fleet": self._fleet.state(),
+            "log": self._log.state(),
+            "arrivals": self._arrivals,
+            "vetoes": self._vetoes,
+            "hash": self._read_hash.hex(),
+            "times": [(*session, time_s) for session, time_s in self._times.items()],
+        }
+        try:
+            write_state(self._folder.snapshot, self._fits(), state)
+        except OSError as error:  # a restart takes longer then, and no more
+            _log.error("no snapshot of the worker was written: %s", error)
+        self._written = self._applied
+        self._write_at = self._clock() + max((self._clock() - began) / SNAPSHOT_SHARE, SNAPSHOT_EVERY_S)
+        return True
+
+    def _resume(self) -> None:
+        """Go on from the snapshot if there is one that fits this program, configuration and mission."""
+        try:
+            state = read_state(self._folder.snapshot, self._fits())
+            if state is None:
+                return
+            read_hash = b""
+            for data in self._store.contents(state["arrivals"]):
+                read_hash = _chained(read_hash, data)
+            if read_hash.hex() != state["hash"] or state["vetoes"] > len(self._store.vetoes()):
+                raise InputError(f"{self._folder.snapshot}: is of other packets")
+            fleet = Fleet.restored(self._config.fleet, self._config.seed, state["fleet"], self._read)
+            log = PacketLog.restored(state["log"])
+        except Exception as error:  # a mission must never depend on its snapshot
+            _log.warning("%s; the worker applies all packets again", str(error) or type(error).__name__)
+            return
+        self._fleet, self._log = fleet, log
+        self._arrivals, self._vetoes, self._read_hash = state["arrivals"], state["vetoes"], read_hash
+        self._times = {(robot, epoch): time_s for robot, epoch, time_s in state["times"]}
+
+    def _fits(self) -> str:
+        return f"{code_version()} {self._config.model_dump_json()}"
 
     def _apply(self, packet: StoredPacket) -> None:
         """One packet takes effect, or is refused and from now on counts as refused."""
@@ -216,6 +275,21 @@ class Worker:
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
         metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(self._store.traffic(), tracks)]
         return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)
+
+
+def _chained(before: bytes, data: bytes) -> bytes:
+    """Hash of a sequence of packets, by that of all but the last one."""
+    return blake2b(before + data, digest_size=16).digest()
+
+
+@cache
+def code_version() -> str:
+    """Hash of the program: a snapshot fits no other one, because another program may decide otherwise."""
+    root = Path(fcslam.__file__).parent
+    hashed = blake2b(digest_size=16)
+    for path in sorted(root.rglob("*.py")):
+        hashed.update(path.read_bytes())
+    return hashed.hexdigest()
 
 
 def main(arguments: Sequence[str]) -> int:
