@@ -74,7 +74,7 @@ def test_faults_of_a_recording_arrive(logs, tmp_path):
 
 
 def test_one_robot_needs_no_process(monkeypatch):
-    monkeypatch.setattr(driving.multiprocessing, "get_context", lambda _: pytest.fail("a process"))
+    monkeypatch.setattr(driving, "start_method", lambda: pytest.fail("a process"))
     with side_by_side(4)([Broken("a", refuse)], RobotConfig()) as (legs,), pytest.raises(SourceError):
         next(legs)
 

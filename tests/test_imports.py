@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).parents[1] / "src" / "fcslam"
 ROOMS = [
     "errors",
     "compiled",
+    "processes",
     "records",
     "config",
     "geometry",

@@ -3,24 +3,19 @@
 Either way a robot gives the same packets, as it knows no other robot.
 """
 
-import multiprocessing
-import os
 import pickle
 import queue
-import signal
-import sys
-import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Final
 
 from fcslam.cloud.report import Track
 from fcslam.errors import FcslamError
+from fcslam.processes import obey_parent, start_method
 from fcslam.records import Keyscan, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
@@ -73,8 +68,7 @@ def side_by_side(processes: int) -> Drive:
             with one_by_one(sources, config) as robots:
                 yield robots
             return
-        # A copy of this process has loaded all code. Elsewhere copies are not safe.
-        context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+        context = start_method()
         channel = context.Queue()
         turns = context.BoundedSemaphore(processes)
         workers = [
@@ -165,8 +159,7 @@ class _WorkerError(Exception):
 
 def _work(number: int, source: Source, config: RobotConfig, channel: Any, turns: Any) -> None:
     """Drive one robot when it is its turn, in a process of its own."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    obey_parent()
     with turns:
         try:
             for leg in _legs(source, config):
@@ -178,10 +171,3 @@ def _work(number: int, source: Source, config: RobotConfig, channel: Any, turns:
 def _packed(number: int, leg: Leg | _Failure) -> bytes:
     """With the newest protocol, which keeps arrays read-only."""
     return pickle.dumps((number, leg), pickle.HIGHEST_PROTOCOL)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)

@@ -126,7 +126,7 @@ def solve_jointly(
         within_maps = _edges_within_maps(evidence, maps)
         # 4. Solve with the supported closures, then decide all closures within maps by that solution.
         supported = within_maps & _supported_edges(evidence, [weights for _, weights in own], joining)
-        solution = _solve_supported(evidence, supported, paths, frames, gnc)
+        solution = _solve_supported(evidence, supported, paths, frames, bool(joining), gnc)
         solution = _refine_inliers(evidence.graph, within_maps, solution, gnc)
         # 5. Withdraw isolated closures and decide once more.
         isolated = _isolated_closures(evidence, paths, solution, consistency)
@@ -155,7 +155,9 @@ def _solve_own_graph(
     own_graph = PoseGraph(
         graph.poses()[robot],
         [
-            Edge(int(number[e.i]), int(number[e.j]), e.T_i_j, e.information, e.robust)
+            e
+            if (number[e.i], number[e.j]) == (e.i, e.j)  # as with one robot: an edge that is checked already
+            else Edge(int(number[e.i]), int(number[e.j]), e.T_i_j, e.information, e.robust)
             for e in (graph.edges[k] for k in mine.tolist())
         ],
     )
@@ -245,19 +247,22 @@ def _solve_supported(
     supported: NDArray[np.bool_],
     own: Sequence[Trajectory],
     frames: Sequence[FloatArray],
+    joined: bool,
     gnc: GncSettings | None,
 ) -> Solution:
     """Graduated non-convexity with supported closures only, so that false ones cannot distort its start.
 
-    It starts from the robots' own solutions and from the chordal initialization, which does not depend on drift; the
-    cheaper result counts. Other closures have weight 0.
+    It starts from the robots' own solutions and, if robots are ``joined``, from the chordal initialization as well,
+    which does not depend on drift; the cheaper result counts. A robot's own solution is already the best of several
+    starts. Other closures have weight 0.
     """
     graph = evidence.graph
     start = graph.poses()
     for robot, path, frame in zip(evidence.robots, own, frames, strict=True):
         start[robot] = se2.compose(frame, path.poses)
     subgraph = _subgraph(graph, start, supported)
-    solutions = [optimize_gnc(subgraph, poses, settings=gnc) for poses in (start, initialize(subgraph))]
+    starts = (start, initialize(subgraph)) if joined else (start,)
+    solutions = [optimize_gnc(subgraph, poses, settings=gnc) for poses in starts]
     best = min(solutions, key=lambda solution: solution.stats.final_cost)
     return _expand_weights(best, supported)
 

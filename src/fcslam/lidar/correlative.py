@@ -168,11 +168,17 @@ def _pyramid(base, count):  # type: ignore[no-untyped-def]
     for h in range(1, count):
         half = 1 << (h - 1)
         lower, upper = levels[h - 1], levels[h]
+        inner = max(0, columns - half)
+        highest = np.empty(columns, np.uint8)
         for y in range(rows):
-            y2 = min(y + half, rows - 1)
-            for x in range(columns):
-                x2 = min(x + half, columns - 1)
-                upper[y, x] = max(lower[y, x], lower[y, x2], lower[y2, x], lower[y2, x2])
+            this, other, result = lower[y], lower[min(y + half, rows - 1)], upper[y]
+            for x in range(columns):  # neither loop has a condition, so many cells are computed at a time
+                highest[x] = max(this[x], other[x])
+            right = highest[half:]
+            for x in range(inner):
+                result[x] = max(highest[x], right[x])
+            for x in range(inner, columns):
+                result[x] = max(highest[x], highest[columns - 1])
     return levels
 
 

@@ -6,14 +6,14 @@ scan comes, and a solve of a large graph takes longer than that. Both get the sa
 
 import os
 import signal
-import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from typing import Protocol
 
 from fcslam.errors import FeatureError
+from fcslam.processes import obey_parent
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionConfig
 from fcslam.wire.messages import Body
 
@@ -85,15 +85,6 @@ def _process(robot: str, input: BackendInput) -> list[Body]:
 
 
 def _start_worker() -> None:
-    for stop in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and service managers stop both; the robot ends this one
-        signal.signal(stop, signal.SIG_IGN)
+    obey_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # service managers stop both; the robot ends this one
     os.nice(YIELD_TO_TRACKER)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A robot that is killed cannot shut its worker down."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

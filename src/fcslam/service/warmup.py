@@ -4,9 +4,7 @@ Compiling takes half a minute on a machine that has never done it, loading a sec
 that. Made-up robots cross a made-up room; nothing of it reaches any mission.
 """
 
-import multiprocessing
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -30,6 +28,7 @@ from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
+from fcslam.processes import obey_parent, start_method
 from fcslam.records import (
     CODE_BYTES,
     Channel,
@@ -141,7 +140,7 @@ def compiling(processes: int, needed: Sequence[Callable[[], None]]) -> Iterator[
     beside this one, which compiles the rest when it needs it.
     """
     here, *beside = WARM_UPS
-    context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    context = start_method()
     turns = context.BoundedSemaphore(max(1, processes - 1))
     workers = {
         run: context.Process(target=_compile, args=(run, turns), daemon=True)
@@ -162,7 +161,7 @@ def compiling(processes: int, needed: Sequence[Callable[[], None]]) -> Iterator[
 
 
 def _compile(run: Callable[[], None], turns: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+    obey_parent()
     sys.stderr = open(os.devnull, "w")  # noqa: SIM115  who needs the code compiles it and reports why it fails
     with turns:
         run()

@@ -1,0 +1,103 @@
+"""Cost of the real command beside that of another checkout: CPU, wall time of three robots on all cores, first run.
+
+    FCSLAM_DATA=/path/to/data python benchmarks/speed.py --against /path/to/checkout
+
+The two checkouts take turns, so that both see the same machine. A figure is the least of its repetitions, a ratio is
+ours to theirs. Both run with the interpreter that runs this script. CPU seconds are user and system, all threads and
+children, imports included, with compiled code in the cache. "Until the first scan": from the start of the process, with
+an empty cache, as after an installation without `fcslam warm-up`. Quick: three minutes with one repetition.
+"""
+
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import common
+
+FIRST_SCAN = """
+import sys, time
+began, path = float(sys.argv.pop(1)), sys.argv.pop(1)
+from fcslam.robot.frontend import RobotFrontend
+process = RobotFrontend.process
+def timed(robot, record):
+    packets = process(robot, record)
+    if robot.scan_poses:
+        RobotFrontend.process = process
+        with open(path, "w") as file:
+            file.write(str(time.time() - began))
+    return packets
+RobotFrontend.process = timed
+from fcslam.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+"""Runs the command line and writes down when the first scan was mapped."""
+PATIENCE_S = 600.0
+
+
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("--against", type=Path, help="the other checkout; without one there are no ratios")
+    parser.add_argument("--repetitions", type=int, default=3)
+    chosen = parser.parse_args()
+    folder = common.recordings(*common.slam_benchmark_files())
+    report = common.Report(__file__, __doc__, chosen)
+    checkouts = [common.REPOSITORY, *([chosen.against.resolve()] if chosen.against else [])]
+    logs = {name: common.log_path(folder, name) for name in common.SPLITS}
+    with tempfile.TemporaryDirectory() as place:
+
+        def repeated(measured: Callable[[Path, Path], float]) -> tuple[float, ...]:
+            """Ours, theirs and their ratio."""
+            turns = [[measured(checkout, Path(place)) for checkout in checkouts] for _ in range(chosen.repetitions)]
+            ours, theirs = (*map(min, zip(*turns, strict=True)), math.nan)[:2]
+            return ours, theirs, ours / theirs
+
+        first = repeated(lambda checkout, work: until_first_scan(checkout, logs["intel"], work))
+        for checkout in checkouts:  # fill the caches
+            for name, parts in common.SPLITS.items():
+                run(checkout, Path(place), logs[name], "--split", parts)
+        cpu = [
+            (name, *repeated(lambda checkout, work, log=log: run(checkout, work, log).cpu_s))
+            for name, log in logs.items()
+        ]
+        wall = repeated(lambda checkout, work: run(checkout, work, logs["intel"], "--split", 3).wall_s)
+    columns = {"": "", "ours, s": ".2f", "theirs, s": ".2f", "ratio": ".2f"}
+    report.table("CPU, one robot", columns, cpu)
+    report.table("Wall time, intel as three robots", columns, [(f"{os.cpu_count()} cores", *wall)])
+    report.table("Until the first scan is mapped, nothing compiled", columns, [("intel", *first)])
+    report.write()
+
+
+def run(checkout: Path, work: Path, log: Path, *options: object) -> common.Cost:
+    """`fcslam map` of a checkout."""
+    environment = {"PYTHONPATH": str(checkout / "src")}
+    return common.run_fcslam("map", log, *options, "--output", work / "run", "--force", environment=environment)
+
+
+def until_first_scan(checkout: Path, log: Path, work: Path) -> float:
+    """Seconds from the start of the process until the first scan is mapped, with an empty cache."""
+    noted = work / "seconds"
+    noted.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {**os.environ, "PYTHONPATH": str(checkout / "src"), "NUMBA_CACHE_DIR": cache}
+        arguments = ["map", log, "--output", work / "first", "--force"]
+        command = [sys.executable, "-c", FIRST_SCAN, time.time(), noted, *arguments]
+        process = subprocess.Popen(
+            list(map(str, command)), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        until = time.monotonic() + PATIENCE_S
+        while not (noted.exists() and noted.read_text(encoding="ascii")):
+            if process.poll() is not None or time.monotonic() > until:
+                sys.exit(f"{checkout}: no scan was mapped")
+            time.sleep(0.02)
+        process.terminate()
+        process.wait()
+    return float(noted.read_text(encoding="ascii"))
+
+
+if __name__ == "__main__":
+    main()
