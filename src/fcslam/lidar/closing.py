@@ -12,7 +12,7 @@ from itertools import combinations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
@@ -170,6 +170,8 @@ class LoopCloser:
         self._verification = verification
         self.submaps: list[AnchoredSubmap] = []
         """All submaps so far."""
+        self._travel = np.empty(0)
+        """Path length up to each of them, metres."""
         self._held: dict[int, Submap] = {}
         """The submaps that others are compared with, by index; the oldest of a well-known area are forgotten."""
         self._accepted: list[tuple[int, int]] = []
@@ -194,6 +196,7 @@ class LoopCloser:
         """
         later = len(self.submaps)
         self.submaps.append(anchored)
+        self._travel = np.append(self._travel, anchored.travel_m)
         self._held[later] = submap
         is_known = self._forget_surplus(anchors)
         paths = self._paths_from(later)
@@ -224,28 +227,25 @@ class LoopCloser:
 
     def _paths_from(self, later: int) -> FloatArray:
         """Shortest path through the pose graph from one submap to every other, metres, shape (S,)."""
-        n = len(self.submaps)
-        travel = np.array([submap.travel_m for submap in self.submaps])
-        rows = [*range(n - 1), *(earlier for earlier, _ in self._accepted)]
-        columns = [*range(1, n), *(later for _, later in self._accepted)]
-        lengths = [*(np.diff(travel) + _MINIMUM_PATH_M), *(CLOSURE_PATH_M for _ in self._accepted)]
-        links = coo_array((np.array(lengths), (np.array(rows), np.array(columns))), shape=(n, n))
+        n, closures = len(self.submaps), np.array(self._accepted, dtype=np.int64).reshape(-1, 2)
+        rows = np.concatenate((np.arange(n - 1), closures[:, 0]))
+        columns = np.concatenate((np.arange(1, n), closures[:, 1]))
+        lengths = np.concatenate((np.diff(self._travel) + _MINIMUM_PATH_M, np.full(len(closures), CLOSURE_PATH_M)))
+        links = coo_array((lengths, (rows, columns)), shape=(n, n))
         paths: FloatArray = dijkstra(links.tocsr(), directed=False, indices=[later])[0]
         return paths
 
-    def _drift_allowance(self, path_m: float) -> tuple[float, float]:
-        """Error of the estimate allowed for after a path through the graph: metres and radians."""
-        config = self._config
-        return (
-            min(config.widest_m, BASE_DRIFT_M + config.drift * path_m),
-            min(config.widest_rad, BASE_DRIFT_RAD + config.drift_rad_m * path_m),
-        )
+    def _drift_allowance(self, path_m: ArrayLike) -> FloatArray:
+        """Error of the estimate allowed for after paths (...) through the graph: metres and radians, (..., 2)."""
+        config, path = self._config, np.asarray(path_m)[..., None]
+        allowed = np.array((BASE_DRIFT_M, BASE_DRIFT_RAD)) + np.array((config.drift, config.drift_rad_m)) * path
+        return np.asarray(np.minimum((config.widest_m, config.widest_rad), allowed))
 
     def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
         """The nearest submap of each earlier visit to the neighbourhood, nearest visits first."""
-        travel = np.array([submap.travel_m for submap in self.submaps])
+        travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
-        drift = np.array([self._drift_allowance(path)[0] for path in paths])
+        drift = self._drift_allowance(paths)[:, 0]
         near = (travel[later] - travel > self._config.gap_m) & (distance < self._config.sight_m + drift)
         indices = np.flatnonzero(near & self._is_held())
         if not len(indices):
@@ -259,7 +259,7 @@ class LoopCloser:
         """Search where the drift allowance is wide, then verify; None if the submaps do not show the same place."""
         a, b = self._held[earlier], self._held[later]
         predicted = se2.between(anchors[earlier], anchors[later])
-        radius, angle = self._drift_allowance(path_m)
+        radius, angle = self._drift_allowance(path_m).tolist()
         guess = predicted
         if radius > NARROW_M:
             window = SearchWindow(radius, angle)
@@ -299,9 +299,9 @@ class LoopCloser:
     def _lookalikes(self, recognizer: PlaceRecognizer, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
         """The most similar places beyond the search's reach, ``sight_m`` of travel apart from each other."""
         config = self._config
-        travel = np.array([submap.travel_m for submap in self.submaps])
+        travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
-        drift = np.array([self._drift_allowance(path) for path in paths])
+        drift = self._drift_allowance(paths)
         capped = (drift >= (config.widest_m, config.widest_rad)).any(axis=1)
         unsure = capped | (distance > config.sight_m + drift[:, 0])
         possible = distance < config.sight_m + config.recognized_drift * paths
@@ -323,7 +323,7 @@ class LoopCloser:
         off_m = float(np.hypot(innovation[0], innovation[1]))
         if not (check.loose or check.support) or off_m > self._config.recognized_drift * path_m:
             return None
-        radius, angle = self._drift_allowance(path_m)
+        radius, angle = self._drift_allowance(path_m).tolist()
         beyond = off_m > radius or abs(innovation[2]) > angle
         return LocalClosure(earlier, later, check, innovation, radius, beyond)
 
