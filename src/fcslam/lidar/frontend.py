@@ -143,7 +143,7 @@ class LidarFrontend:
         tracking = self._tracker.localize(scan) if tracking is None else tracking
         self._tracker.commit(tracking)
         tracked = tracking.tracked
-        # 2. Keyscan: after enough motion the scan becomes a variable of the pose graph.
+        # 2. After enough motion the scan becomes a keyscan.
         laser = self._lasers.index(scan.laser)
         keyscan = self._add_keyscan(scan, tracked, laser) if self._is_keyscan(tracked, laser) else None
         return Step(self._scan_pose(scan.stamp, tracked), keyscan)
