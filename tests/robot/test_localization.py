@@ -42,14 +42,17 @@ def test_odom_is_where_the_cloud_thinks_it_is(driven):
     assert np.allclose(track.T_odom_base()[0], 0.0)
 
 
-def test_the_newest_pose_is_the_last_of_the_track(driven):
-    track = ScanTrack()
+def test_a_track_composes_motions_and_offsets(driven):
+    track, T_odom_keyscan, expected = ScanTrack(), [np.zeros(3)], []
     for pose in driven[1]:
-        while len(track) and pose.keyscan > track[-1].keyscan:
-            track.extend(np.array([0.25, 0.0, 0.1]))
-            track.add(replace(pose, keyscan=track[-1].keyscan + 1))
+        while pose.keyscan >= len(T_odom_keyscan):
+            motion = np.array([0.25, 0.0, 0.1])
+            track.extend(motion)
+            T_odom_keyscan.append(se2.compose(T_odom_keyscan[-1], motion))
         track.add(pose)
-        assert np.array_equal(track.newest(), track.T_odom_base()[-1])
+        expected.append(se2.compose(T_odom_keyscan[-1], pose.T_keyscan_base))
+    assert len(T_odom_keyscan) > 3
+    assert np.allclose(track.T_odom_base(), expected, atol=1e-12)
     assert np.array_equal(track.stamps, [pose.stamp for pose in track])
     assert np.array_equal(track.keyscans, [pose.keyscan for pose in track])
     assert np.array_equal(track.T_keyscan_base, [pose.T_keyscan_base for pose in track])

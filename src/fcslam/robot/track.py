@@ -58,8 +58,3 @@ class ScanTrack:
     def T_odom_base(self) -> FloatArray:
         """Pose of each scan in ``odom``, shape (N, 3), metres and radians."""
         return se2.compose(np.array(self._T_odom_keyscan).reshape(-1, 3)[self.keyscans], self.T_keyscan_base)
-
-    def newest(self) -> FloatArray:
-        """Pose of the newest scan in ``odom``, shape (3,), metres and radians."""
-        first = 3 * self._keyscans[-1]
-        return se2.compose(np.array(self._T_odom_keyscan[first : first + 3]), np.array(self._T_keyscan_base[-3:]))
