@@ -19,6 +19,7 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
+from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Constraint,
@@ -38,14 +39,25 @@ from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 class Fleet:
     """Applies packets; place recognition and decisions about closures have classes of their own."""
 
-    def __init__(self, config: FleetConfig, seed: int, read: Callable[[PacketNumber], Packet] | None = None) -> None:
-        """``read`` gives stored packets by their numbers, for ``restored``."""
+    def __init__(self, config: FleetConfig, seed: int, verify_pairs: VerifyPairs = verify_here,
+                 read: Callable[[PacketNumber], Packet] | None = None) -> None:  # fmt: skip
+        """Start without packets.
+
+        Args:
+            config: settings.
+            seed: of the random generator.
+            verify_pairs: verifies pairs of submaps, here or on a pool; the result is the same.
+            read: gives stored packets by their numbers, for ``restored``.
+        """
         self._config = config
+        self._verify_pairs = verify_pairs
         self._seed = seed
         self._sessions = SessionStore(read)
         self._graph = JointGraph()
         self._decisions = ClosureDecisions(config, self._sessions, self._graph)
-        self._recognition = PlaceRecognition(config, seed, self._sessions, self._graph, self._decisions.closures)
+        self._recognition = PlaceRecognition(
+            config, seed, self._sessions, self._graph, self._decisions.closures, verify_pairs
+        )
         self._quality = CorrectionQuality(self._graph, config.surprise_m, config.surprise_rad)
         self._needs_replay = False
         """Whether something besides the packets, such as a veto or an earlier result, changed the graph."""
@@ -88,12 +100,15 @@ class Fleet:
         }
 
     @classmethod
-    def restored(cls, config: FleetConfig, seed: int, state: State, read: Callable[[PacketNumber], Packet]) -> Self:
+    def restored(
+        cls, config: FleetConfig, seed: int, state: State, read: Callable[[PacketNumber], Packet],
+        verify_pairs: VerifyPairs = verify_here,
+    ) -> Self:  # fmt: skip
         """The fleet of a ``state`` under the same configuration and seed.
 
         ``read`` gives the packets that it applied; the fleet reads keyscans when it needs them.
         """
-        fleet = cls(config, seed, read)
+        fleet = cls(config, seed, verify_pairs, read)
         fleet._sessions.restore(state["sessions"])
         fleet._graph.restore(state["graph"])
         fleet._decisions.restore(state["decisions"])
@@ -134,7 +149,7 @@ class Fleet:
         """
         if log.is_canonical and not self._needs_replay:
             return self.conclude()
-        replay = Fleet(self._config, self._seed)
+        replay = Fleet(self._config, self._seed, self._verify_pairs)
         for veto in self._decisions.vetoes:
             replay.veto(veto)
         for number in log.canonical(arrived):

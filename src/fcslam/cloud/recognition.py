@@ -15,6 +15,7 @@ from fcslam.cloud.submaps import SubmapCache
 from fcslam.cloud.visits import NEWEST_PLACES, Visit, visits_near, worth_comparing
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
+from fcslam.lidar.pair_verification import VerifyPairs
 from fcslam.places.matcher import PlaceMatch, PlaceMatcher
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 from fcslam.storage.state_file import State
@@ -38,13 +39,15 @@ class PlaceRecognition:
     """One matcher for each channel and detector version."""
 
     def __init__(
-        self, config: FleetConfig, seed: int, sessions: SessionStore, graph: JointGraph, closures: ClosureLog
-    ) -> None:
+        self, config: FleetConfig, seed: int, sessions: SessionStore, graph: JointGraph, closures: ClosureLog,
+        verify_pairs: VerifyPairs,
+    ) -> None:  # fmt: skip
         self._config = config
         self._seed = seed
         self._sessions = sessions
         self._graph = graph
         self._closures = closures
+        self._verify_pairs = verify_pairs
         self._submaps = SubmapCache(sessions, graph, config.submaps_kept)
         self._matchers: dict[_VocabularyKey, PlaceMatcher] = {}
         self._places: dict[tuple[_VocabularyKey, str], list[KeyscanId]] = {}
@@ -97,7 +100,12 @@ class PlaceRecognition:
         if key not in self._matchers:
             rng = np.random.default_rng(self._seed)
             self._matchers[key] = PlaceMatcher(
-                self._config.matcher, self._submaps.of, rng, self._forget, self._submaps.noise_of
+                self._config.matcher,
+                self._submaps.of,
+                rng,
+                self._forget,
+                self._submaps.noise_of,
+                self._verify_pairs,
             )
         return self._matchers[key]
 

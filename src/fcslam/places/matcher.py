@@ -7,14 +7,16 @@ the overlap of the two submaps under this motion decides.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap
-from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig, verify
+from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.motions import Motion, MotionConfig, propose_motions
 from fcslam.places.persistence import index_state, restored_index
@@ -89,6 +91,17 @@ class PlaceMatch:
         return self.check.loose_reason if self.predicted else self.check.reason
 
 
+class _Comparison(NamedTuple):
+    """What is to be verified for one stored place."""
+
+    i: KeyscanId
+    guesses: Sequence[tuple[FloatArray, FloatArray]]
+    """T_i_j (3,) and its prior information (3, 3); none: there is no match."""
+    share: float
+    """Of matching descriptors, if it is known."""
+    predicted: bool
+
+
 class PlaceMatcher:
     """The places of one channel and detector version, with their dynamic vocabulary."""
 
@@ -99,6 +112,7 @@ class PlaceMatcher:
         rng: np.random.Generator,
         on_forget: Callable[[Place], None] = lambda _: None,
         noise_of: Callable[[Place], float] = lambda _: 0.0,
+        verify_pairs: VerifyPairs = verify_here,
     ) -> None:
         """Start without places.
 
@@ -108,11 +122,13 @@ class PlaceMatcher:
             rng: seeds the vocabulary.
             on_forget: called with each place that is forgotten.
             noise_of: how much the submap of a place contradicts itself.
+            verify_pairs: verifies pairs of submaps.
         """
         self._config = config
         self._submap_of = submap_of
         self._on_forget = on_forget
         self._noise_of = noise_of
+        self._verify_pairs = verify_pairs
         self._places: dict[KeyscanId, Place] = {}
         self._index: PlaceIndex[KeyscanId] = PlaceIndex(config.vocabulary, rng)
         self._backlog: list[Place] = []
@@ -146,14 +162,15 @@ class PlaceMatcher:
         comparable = bool(predicted) or any(is_unaligned(i) for i in self._places)
         result = self._query(place) if comparable else QueryResult[KeyscanId]()  # Algorithm 1, lines 11-13
         kept = {i: T_i_j for i, T_i_j in predicted.items() if i in self._places}
-        near = [self._near_match(i, place, T_i_j, result) for i, T_i_j in kept.items()]
+        near = [self._near(i, place, T_i_j) for i, T_i_j in kept.items()]
         lookalikes = self._lookalikes(place.id.robot, result, predicted, is_unaligned)
         others = (*self._candidates(result, is_unaligned), *lookalikes)
-        far = [self._far_match(i, place, result) for i in others]
+        far = [_far(i, propose_motions(self._places[i], place, self._config.motions)) for i in others]
+        matches = self._verified([*near, *far], place, result)
         self._places[place.id] = place
         self._backlog.append(place)
         self._forget_oldest()
-        return [match for match in (*near, *far) if match is not None]
+        return matches
 
     def state(self) -> State:
         """What ``restore`` needs."""
@@ -225,10 +242,8 @@ class PlaceMatcher:
 
         return [found.id for found in result.best(self._config.aligned_candidates, is_known)]
 
-    def _near_match(
-        self, i: KeyscanId, place: Place, T_i_j: FloatArray, result: QueryResult[KeyscanId]
-    ) -> PlaceMatch | None:
-        """Verify a predicted pair.
+    def _near(self, i: KeyscanId, place: Place, T_i_j: FloatArray) -> _Comparison:
+        """The comparison of a predicted pair.
 
         Submaps at nearby poses overlap, so LiDAR places need no further evidence. Images at nearby poses may show
         different things, so one of their motions must confirm the prediction. If none does, the pair is compared
@@ -236,14 +251,12 @@ class PlaceMatcher:
         """
         stored = self._places[i]
         if place.channel is Channel.LIDAR:
-            check = self._verify(stored, place, T_i_j)
-            return PlaceMatch(i, place.id, place.channel, result.similarity_of(i), check, predicted=True)
+            return _Comparison(i, [(T_i_j, NO_PRIOR)], 0.0, predicted=True)
         proposed = propose_motions(stored, place, self._config.motions)
         motion = next((motion for motion in proposed if self._confirms(motion, T_i_j)), None)
         if motion is None:
-            return self._best(stored, place, proposed, result)
-        check = self._verify(stored, place, motion.T_a_b, motion.information)
-        return PlaceMatch(i, place.id, place.channel, result.similarity_of(i, motion.share), check, predicted=True)
+            return _far(i, proposed)
+        return _Comparison(i, [(motion.T_a_b, motion.information)], motion.share, predicted=True)
 
     def _confirms(self, motion: Motion, T_i_j: FloatArray) -> bool:
         off = se2.between(T_i_j, motion.T_a_b)
@@ -252,23 +265,33 @@ class PlaceMatcher:
             and abs(off[2]) <= self._config.prediction_tolerance_rad
         )
 
-    def _far_match(self, i: KeyscanId, place: Place, result: QueryResult[KeyscanId]) -> PlaceMatch | None:
-        """Verify the motions from keypoints and return the best match, None without a motion."""
-        stored = self._places[i]
-        return self._best(stored, place, propose_motions(stored, place, self._config.motions), result)
+    def _verified(
+        self, comparisons: Sequence[_Comparison], place: Place, result: QueryResult[KeyscanId]
+    ) -> list[PlaceMatch]:
+        """Verify every guess of the comparisons; the best one of each counts."""
+        pairs = [
+            self._pair(self._places[comparison.i], place, *guess)
+            for comparison in comparisons
+            for guess in comparison.guesses
+        ]
+        checks = iter(self._verify_pairs(pairs, self._config.verification))
+        matches: list[PlaceMatch] = []
+        for comparison in comparisons:
+            found = [next(checks) for _ in comparison.guesses]
+            if found:
+                best = max(found, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
+                similarity = result.similarity_of(comparison.i, comparison.share)
+                matches.append(
+                    PlaceMatch(comparison.i, place.id, place.channel, similarity, best, comparison.predicted)
+                )
+        return matches
 
-    def _best(
-        self, stored: Place, place: Place, proposed: Sequence[Motion], result: QueryResult[KeyscanId]
-    ) -> PlaceMatch | None:
-        if not proposed:
-            return None
-        checks = [self._verify(stored, place, motion.T_a_b, motion.information) for motion in proposed]
-        best = max(checks, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
-        similarity = result.similarity_of(stored.id, proposed[0].share)
-        return PlaceMatch(stored.id, place.id, place.channel, similarity, best, predicted=False)
-
-    def _verify(self, stored: Place, place: Place, guess: FloatArray, prior: FloatArray = NO_PRIOR) -> Verification:
+    def _pair(self, stored: Place, place: Place, guess: FloatArray, prior: FloatArray) -> Pair:
         a, b = self._submap_of(stored), self._submap_of(place)
-        return verify(
-            a, b, guess, self._config.verification, prior, lambda: self._noise_of(stored) + self._noise_of(place)
-        )
+        return Pair(a, b, guess, prior, lambda: self._noise_of(stored) + self._noise_of(place))
+
+
+def _far(i: KeyscanId, proposed: Sequence[Motion]) -> _Comparison:
+    """The comparison of a pair that is not predicted, by its motions from keypoints."""
+    share = proposed[0].share if proposed else 0.0
+    return _Comparison(i, [(motion.T_a_b, motion.information) for motion in proposed], share, predicted=False)

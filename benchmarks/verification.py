@@ -1,0 +1,80 @@
+"""Verification of closures on a pool of processes: 10,000 pairs, one process against two.
+
+    python benchmarks/verification.py [--pairs 10000]
+
+The pairs are those that a mission of simulated robots in one building compares, again and again until they are enough,
+in batches of as many as one new place is compared with before robots share a map. One process is this one. The pool is
+started and has loaded its code before the clock runs; wall-clock time, so the machine must be quiet.
+"""
+
+import itertools
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import common
+
+AT_ONCE = 40
+COLUMNS = {"processes": "", "pairs": ",", "time, s": ".1f", "a pair, ms": ".2f", "against one": ".2f"}
+
+
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("--pairs", type=int, default=10_000, help="number of pairs")
+    parser.add_argument("--processes", nargs="+", type=int, default=[2], help="sizes of the pool")
+    chosen = parser.parse_args()
+    report = common.Report(__file__, __doc__, chosen)
+    batches = compared(chosen.pairs)
+    single_s, expected = timed(None, 1, batches)
+    rows = [(1, chosen.pairs, single_s, 1e3 * single_s / chosen.pairs, 1.0)]
+    for processes in chosen.processes:
+        with ProcessPoolExecutor(processes, get_context("spawn")) as executor:
+            timed(executor, processes, batches[:4])
+            pool_s, found = timed(executor, processes, batches)
+        if found != expected:
+            raise SystemExit("verification: the pool finds something else")
+        rows.append((processes, chosen.pairs, pool_s, 1e3 * pool_s / chosen.pairs, single_s / pool_s))
+    report.table("Verification", COLUMNS, rows)
+    report.write()
+
+
+def compared(count: int) -> list[list]:
+    """Batches of pairs, ``count`` in all."""
+    from fcslam.cloud.fleet import Fleet
+    from fcslam.lidar.pair_verification import verify_here
+    from fcslam.mission import MissionConfig
+    from fcslam.robot.frontend import RobotFrontend
+    from fcslam.simulation.noise import LidarSettings
+    from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+
+    asked: list = []
+
+    def keep(pairs, config):
+        # The noise needs the scans of its mission, and is asked for too rarely to count.
+        asked.extend(pair._replace(noise=lambda: 0.0) for pair in pairs)
+        return verify_here(pairs, config)
+
+    config = MissionConfig()
+    fleet = Fleet(config.fleet, config.seed, keep)
+    settings = SimulationSettings(robots=3, path_length_m=40.0, camera=None, lidar=LidarSettings(rate_hz=5.0))
+    robots = [(RobotFrontend(robot.name, config.robot), robot) for robot in simulate_fleet(settings, 1).robots]
+    sent = [[*itertools.chain(*map(front.process, robot.scans())), *front.finish()] for front, robot in robots]
+    for packet in sorted(itertools.chain(*sent), key=lambda packet: packet.order):
+        fleet.apply(packet)
+    repeated = itertools.islice(itertools.cycle(asked), count)
+    return [list(batch) for batch in iter(lambda: tuple(itertools.islice(repeated, AT_ONCE)), ())]
+
+
+def timed(executor, processes: int, batches: list[list]) -> tuple[float, list]:
+    """Seconds, and what was found."""
+    from fcslam.lidar.pair_verification import VerificationPool, verify_here
+    from fcslam.lidar.verification import VerificationConfig
+
+    run = verify_here if executor is None else VerificationPool(executor, processes)
+    config, began = VerificationConfig(), time.perf_counter()
+    found = [check for batch in batches for check in run(batch, config)]
+    return time.perf_counter() - began, [(check.T_a_b.tobytes(), check.strict, check.loose) for check in found]
+
+
+if __name__ == "__main__":
+    main()
