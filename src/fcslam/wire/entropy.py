@@ -90,7 +90,7 @@ def code_bit(coder: Coder, data: Bytes, probability: int, bit: int) -> tuple[Cod
 @njit(nogil=True)
 def code_learnt(coder: Coder, data: Bytes, model: Model, context: int, bit: int) -> tuple[Coder, int]:
     """One bit by the probability that its context has had so far."""
-    probability, seen = model[context]
+    probability, seen = model[context, 0], model[context, 1]
     coder, bit = code_bit(coder, data, min(max(probability, _LEAST), _ONE - _LEAST), bit)
     model[context, 0] += (2 * (bit * _ONE - probability)) // (2 * seen + 3)
     model[context, 1] = min(seen + 1, _MEMORY)
