@@ -58,6 +58,11 @@ def pairs():
     ]
 
 
+def pool(workers, submaps_kept=3):
+    """Executors whose processes soon drop a submap."""
+    return VerificationPool([LastFirst() for _ in range(workers)], submaps_kept)
+
+
 def written(checks):
     return [
         (check.T_a_b.tobytes(), check.information.tobytes(), check.strict, check.loose, check.partial, check.reason)
@@ -73,20 +78,22 @@ def test_a_pool_finds_what_is_found_here(pairs, workers):
     config = VerificationConfig(strict={"violation": 0.02, "explained": 0.2, "count": 10})
     expected = written(verify_here(noisy, config))
     assert 0 < len(asked) < len(pairs)
-    found = VerificationPool(LastFirst(), workers)(noisy, config)
-    assert written(found) == expected
+    verify = pool(workers)
+    for _ in range(2):
+        found = verify(noisy, config)
+        assert written(found) == expected
     assert len({check.strict for check in found}) == 2, "pairs of both kinds"
 
 
 def test_no_pairs_need_no_batch():
     executor = LastFirst()
-    assert VerificationPool(executor, 2)([], VerificationConfig()) == []
+    assert VerificationPool([executor], 2)([], VerificationConfig()) == []
     assert not executor.tasks
 
 
 def test_a_fleet_with_a_pool_is_the_same(packets):
     results = []
-    for options in ({}, {"verify_pairs": VerificationPool(LastFirst(), 3)}):
+    for options in ({}, {"verify_pairs": pool(3)}):
         fleet = Fleet(FleetConfig(), 0, **options)
         for packet in packets:
             fleet.apply(packet)
@@ -97,5 +104,7 @@ def test_a_fleet_with_a_pool_is_the_same(packets):
 @pytest.mark.slow
 def test_processes_find_what_is_found_here(pairs):
     config = VerificationConfig()
-    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
-        assert written(VerificationPool(executor, 2)(pairs, config)) == written(verify_here(pairs, config))
+    with ProcessPoolExecutor(1, get_context("spawn")) as one, ProcessPoolExecutor(1, get_context("spawn")) as two:
+        found = VerificationPool([one, two], 4)
+        for batch in (pairs, pairs[::-1], pairs[3:9]):
+            assert written(found(batch, config)) == written(verify_here(batch, config))

@@ -1,7 +1,8 @@
 """Verification of many pairs of submaps: here, or in batches on an executor. The results are the same."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from typing import NamedTuple
 
 from fcslam.lidar.submap import Submap
@@ -30,22 +31,63 @@ def verify_here(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verif
 
 
 class VerificationPool:
-    """Verifies pairs on an executor, such as a pool of processes. It has the signature ``VerifyPairs``."""
+    """Verifies pairs on executors of one process each. It has the signature ``VerifyPairs``.
 
-    def __init__(self, executor: Executor, workers: int) -> None:
-        """``workers``: into how many batches the pairs are divided. The caller shuts the executor down."""
-        self._executor, self._workers = executor, workers
+    A submap takes longer to send than to compare, so each process keeps those that it got.
+    """
+
+    def __init__(self, executors: Sequence[Executor], submaps_kept: int) -> None:
+        """Start with no submap sent.
+
+        Args:
+            executors: each runs its tasks in one process, in their order. The caller shuts them down.
+            submaps_kept: submaps in each process; the least recently used ones are dropped first.
+        """
+        self._processes = [_Process(executor, submaps_kept) for executor in executors]
 
     def __call__(self, pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
-        """Results in the order of the pairs, whichever batch is complete first."""
-        size = max(1, -(-len(pairs) // self._workers))
-        batches = [[pair[:4] for pair in pairs[begin : begin + size]] for begin in range(0, len(pairs), size)]
-        running = [self._executor.submit(_verify_batch, batch, config) for batch in batches]
+        """Results in the order of the pairs, whichever process is done first."""
+        size = max(1, -(-len(pairs) // len(self._processes)))
+        begins = range(0, len(pairs), size)
+        running = [
+            process.submit(pairs[begin : begin + size], config)
+            for process, begin in zip(self._processes, begins, strict=False)
+        ]
         checks = [check for batch in running for check in batch.result()]
         return [
             verify_here([pair], config)[0] if check is None else check
             for pair, check in zip(pairs, checks, strict=True)
         ]
+
+
+class _Process:
+    """Knows which submaps a process keeps."""
+
+    def __init__(self, executor: Executor, submaps_kept: int) -> None:
+        self._executor, self._submaps_kept = executor, submaps_kept
+        self._sent: dict[int, tuple[int, Submap]] = {}
+        """Name in the process, by identity; the reference keeps the identity from being used again. Newest last."""
+
+    def submit(self, pairs: Sequence[Pair], config: VerificationConfig) -> "Future[list[Verification | None]]":
+        new: dict[int, Submap] = {}
+        named = [(self._name(a, new), self._name(b, new), guess, prior) for a, b, guess, prior, _ in pairs]
+        surplus = list(self._sent)[: max(0, len(self._sent) - self._submaps_kept)]
+        dropped = [self._sent.pop(identity)[0] for identity in surplus]
+        return self._executor.submit(_verify_batch, new, named, dropped, config)
+
+    def _name(self, submap: Submap, new: dict[int, Submap]) -> int:
+        sent = self._sent.pop(id(submap), None)
+        if sent is None:
+            sent = next(_NAMES), submap
+            new[sent[0]] = submap
+        self._sent[id(submap)] = sent
+        return sent[0]
+
+
+_NAMES = itertools.count()
+"""Names of submaps in other processes; each is used once."""
+_kept: dict[int, Submap] = {}
+"""Submaps of a process of the pool, by name."""
 
 
 class _NoiseNeededError(Exception):
@@ -57,13 +99,19 @@ def _no_scans() -> float:
 
 
 def _verify_batch(
-    batch: Sequence[tuple[Submap, Submap, FloatArray, FloatArray]], config: VerificationConfig
+    new: Mapping[int, Submap],
+    batch: Sequence[tuple[int, int, FloatArray, FloatArray]],
+    dropped: Sequence[int],
+    config: VerificationConfig,
 ) -> list[Verification | None]:
     """The results of a batch in another process; None where the noise decides."""
+    _kept.update(new)
     results: list[Verification | None] = []
     for a, b, guess, prior in batch:
         try:
-            results.append(verify(a, b, guess, config, prior, _no_scans))
+            results.append(verify(_kept[a], _kept[b], guess, config, prior, _no_scans))
         except _NoiseNeededError:
             results.append(None)
+    for name in dropped:
+        del _kept[name]
     return results
