@@ -2,9 +2,10 @@
 
     python benchmarks/verification.py [--pairs 10000]
 
-The pairs are those that a mission of simulated robots in one building compares, again and again until they are enough,
-in batches of as many places as a new one is compared with while the fleet is small (`fleet.matcher.small_fleet`). One process is this one. The pool is
-started and has loaded its code before the clock runs; wall-clock time, so the machine must be quiet.
+The pairs are those that a mission of simulated robots in one building compares, again and again until they are enough.
+A batch has as many as there are places to compare while the fleet is small (`fleet.matcher.small_fleet`). One process
+is this one. The pool is started and has loaded its code before the clock runs. Wall-clock time: the machine must be
+quiet.
 """
 
 import itertools
