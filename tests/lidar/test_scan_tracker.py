@@ -117,6 +117,26 @@ def test_odometry_that_was_right_is_overruled_by_a_clear_scan(slip):
     assert np.rad2deg(turn.max()) < 1.0
 
 
+def posts(seed):
+    """Posts before a far wall."""
+    rng = np.random.default_rng(seed)
+    corners = zip(rng.uniform(-8, 12, 14), rng.uniform(-5, 6, 14), strict=True)
+    return np.vstack(
+        (path((-30, 12), (30, 12)), *(box(x, y, x + 0.3, y + 0.3) for x, y in corners if abs(y - 1.2) > 0.8))
+    )
+
+
+@pytest.mark.parametrize("slip", [(0.7, 0.0, 0.0), (-0.7, 0.0, np.deg2rad(2))])
+def test_a_slip_is_found_although_a_wrong_match_explains_what_is_known(slip):
+    """The far wall fits at the wrong pose too; that the scan is far less likely than usual tells the slip."""
+    laser = LaserModel(361, -0.5 * np.pi, np.pi / 360, 30.0)
+    truth = drive([(-4.0, 1.2), (4.0, 1.2)])
+    odometry = slipped(true_steps(truth, np.random.default_rng(5)), 50, slip)
+    shift, turn = pose_errors(track(recording(truth, odometry, posts(4), laser))[0], truth)
+    assert shift.max() < 0.10
+    assert np.rad2deg(turn.max()) < 1.0
+
+
 @pytest.mark.slow
 def test_without_returns_poses_follow_odometry(truth, odometry):
     scans = [replace(s, ranges_m=frozen(np.full(360, np.nan), np.float32)) for s in recording(truth, odometry, ring())]

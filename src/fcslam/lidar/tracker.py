@@ -1,7 +1,6 @@
 """Scan-to-submap tracking: every scan is matched; odometry only starts the match and steadies it."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from pydantic import Field
@@ -21,6 +20,11 @@ position to this many metres in every direction: odometry is judged by it."""
 SEARCH_GAIN = 3.0
 """The result of a search replaces a match near odometry only if its log-probability is higher by this: the best of many
 poses explains some points by chance."""
+SEARCH_SIGMA_M = 0.02
+"""If the match explains what is known, the points of the result must also fix the position to this many metres in every
+direction: along a bare wall the pattern of the beams favours poses that the points hardly tell apart."""
+USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
+"""The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
 _NO_INFORMATION = np.zeros((3, 3))
 
 
@@ -68,9 +72,17 @@ class TrackerConfig(Settings):
         description="a match farther than this from odometry, in learned standard deviations of odometry's error, "
         "starts a correlative search",
     )
+    unlikely: float = Field(
+        default=10.0,
+        gt=0,
+        description="a match whose log-probability is lower than usual by this starts a correlative search",
+    )
     odometry: OdometryConfig = Field(default=OdometryConfig(), description="error of the wheel odometry")
     matching: MatchingConfig = Field(default=MatchingConfig(), description="Gauss-Newton scan matching")
-    search: SearchConfig = Field(default=SearchConfig(), description="correlative search by branch and bound")
+    search: SearchConfig = Field(
+        default=SearchConfig(distance_penalty=0.0, angle_penalty=0.0),
+        description="correlative search by branch and bound; odometry weighs its result, so no penalty does",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +117,8 @@ class TrackingResult:
     """Mountings of the lasers whose scans were matched since the robot last moved."""
     trust: OdometryTrust
     """Trust in odometry, learned from all matches up to this one."""
+    usual: float
+    """Usual log-likelihood of a scan per point, learned from the latest matches; NaN before the first."""
 
 
 class ScanTracker:
@@ -123,6 +137,7 @@ class ScanTracker:
         self._turned_rad = 0.0
         self._matched_here: frozenset[tuple[float, float, float]] = frozenset()
         self._trust = OdometryTrust()
+        self._usual = np.nan
 
     def track(self, scan: LaserScan) -> TrackedScan:
         """Localize the next scan and continue from there."""
@@ -140,27 +155,27 @@ class ScanTracker:
         if self._fields and is_still and matched_here == self._matched_here:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, None)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
-            return TrackingResult(tracked, *unmatched, matched_here, self._trust)
+            return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 2. Scan to points.
         points = point_scan(scan.ranges_m, scan.laser)
         if not self._fields:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
-            return TrackingResult(tracked, *unmatched, matched_here, self._trust)
+            return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 3. Scan matching; a doubtful match starts a correlative search.
         error = odometry_error(moved_m, turned_rad, config.odometry)
-        match = self._match(points, T_local_guess, error)
+        match, likelihood = self._match(points, T_local_guess, error)
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < config.supported:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
             rejected = match.explained, match.known, scan.T_odom_base, moved_m, turned_rad
-            return TrackingResult(tracked, *rejected, self._matched_here, self._trust)
+            return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
         tracked = TrackedScan(match.T_field_base, match.information, points)
-        # 5. A good match shows how far odometry can be trusted.
+        # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
         innovation = se2.between(T_local_guess, match.T_field_base)
         trust = self._trust.learn(innovation, error) if _is_good(match) else self._trust
         accepted = match.explained, match.known, scan.T_odom_base, 0.0, 0.0
-        return TrackingResult(tracked, *accepted, matched_here, trust)
+        return TrackingResult(tracked, *accepted, matched_here, trust, _learn_usual(self._usual, likelihood))
 
     def commit(self, result: TrackingResult) -> None:
         """Continue from the pose that :meth:`localize` found."""
@@ -169,6 +184,7 @@ class ScanTracker:
         self._moved_m, self._turned_rad = result.moved_m, result.turned_rad
         self._matched_here = result.matched_here
         self._trust = result.trust
+        self._usual = result.usual
 
     def insert(self, points: PointScan, T_local_base: FloatArray, laser_count: int = 1) -> None:
         """Add a keyscan to the running buffer.
@@ -194,32 +210,51 @@ class ScanTracker:
         moved_m = self._moved_m + float(np.hypot(motion[0], motion[1]))
         return se2.compose(self._T_local_base, motion), moved_m, self._turned_rad + abs(float(motion[2]))
 
-    def _match(self, points: PointScan, T_local_guess: FloatArray, error: OdometryError) -> ScanMatch:
-        """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match."""
+    def _match(self, points: PointScan, T_local_guess: FloatArray, error: OdometryError) -> tuple[ScanMatch, float]:
+        """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match.
+
+        Returns:
+            The match, and the scan's log-likelihood per point there.
+        """
         config, field = self._config, self._fields[0][0]
         thinned = points.thinned(config.point_spacing_m, config.point_limit)
+        count = max(1, len(thinned))
         learned = self._trust.scale(error)
         match = match_scan(thinned, field, T_local_guess, error.information, config.matching)
-        surprise2 = learned.mahalanobis2(se2.between(T_local_guess, match.T_field_base))
-        if match.explained >= config.doubtful * match.known and surprise2 < config.surprise**2:
-            return match
-        log_posterior = partial(_log_posterior, thinned, field, T_local_guess, learned)
+        innovation = se2.between(T_local_guess, match.T_field_base)
+        log_likelihood = scan_log_likelihood(thinned, field, match.T_field_base)
+        log_posterior = log_likelihood + learned.log_likelihood(innovation)
+        is_doubtful = (
+            match.explained < config.doubtful * match.known or learned.mahalanobis2(innovation) >= config.surprise**2
+        )
+        is_unlikely = log_posterior < self._usual * count - config.unlikely  # False before the first match
+        if not is_doubtful and not is_unlikely:
+            return match, log_likelihood / count
         window = SearchWindow(config.search_radius_m, config.search_angle_rad)
         found = search(points, field, T_local_guess, window, config.search, visible_only=True)
         other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching)
-        return other if log_posterior(other) > log_posterior(match) + SEARCH_GAIN else match
+        other_log_likelihood = scan_log_likelihood(thinned, field, other.T_field_base)
+        odometry = learned.log_likelihood(se2.between(T_local_guess, other.T_field_base))
+        is_fixed = is_doubtful or _weakest_sigma_m(other) < SEARCH_SIGMA_M
+        if is_fixed and other_log_likelihood + odometry > log_posterior + SEARCH_GAIN:
+            return other, other_log_likelihood / count
+        return match, log_likelihood / count
 
 
-def _log_posterior(
-    scan: PointScan, field: SurfelField, T_local_guess: FloatArray, error: OdometryError, match: ScanMatch
-) -> float:
-    """Log-probability of a match, from its points and from odometry, relative to one that explains nothing."""
-    innovation = se2.between(T_local_guess, match.T_field_base)
-    return scan_log_likelihood(scan, field, match.T_field_base) + error.log_likelihood(innovation)
+def _learn_usual(usual: float, likelihood: float) -> float:
+    """The usual log-likelihood per point after one more match."""
+    if np.isnan(usual):
+        return likelihood
+    return usual + USUAL_WEIGHT * float(np.clip(likelihood - usual, -USUAL_STEP, USUAL_STEP))
 
 
 def _is_good(match: ScanMatch) -> bool:
     """Whether a match is clear enough to judge odometry by it."""
-    weakest = float(np.linalg.eigvalsh(match.information[:2, :2])[0])
     explains = match.explained >= GOOD_SHARE * match.known and match.known >= GOOD_KNOWN
-    return explains and weakest * GOOD_SIGMA_M**2 >= 1.0
+    return explains and _weakest_sigma_m(match) <= GOOD_SIGMA_M
+
+
+def _weakest_sigma_m(match: ScanMatch) -> float:
+    """Standard deviation of the position by the scan's points, in the direction that they fix least, metres."""
+    weakest = float(np.linalg.eigvalsh(match.information[:2, :2])[0])
+    return weakest**-0.5 if weakest > 0.0 else np.inf
