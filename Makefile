@@ -17,9 +17,9 @@ HAS_LEARNING := $(BIN)/python -c "import flwr, onnx, torch" 2>/dev/null
 # One worker per core. Workers share cores, so a library that starts its own threads gains nothing and slows the others.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
-BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py,$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system check bench docs proto
+.PHONY: help install gl learning demo test test-fast test-system check bench bench-quick docs proto
 .DEFAULT_GOAL := help
 
 help:
@@ -29,6 +29,7 @@ help:
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
+	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
 	@echo "make install      create .venv; EXTRAS=dev,train,federated,sim,foxglove adds packages"
 	@echo "make learning     install torch and Flower, for training the detector, if they are available"
 	@echo "make gl           install the GL library of the simulated cameras, if permitted"
@@ -82,6 +83,9 @@ check: $(INSTALLED)
 
 bench: $(INSTALLED)
 	@set -e; for script in $(BENCHMARKS); do echo "$$script"; $(BIN)/python "$$script"; done
+
+bench-quick: $(INSTALLED)
+	@$(BIN)/python benchmarks/quick.py
 
 docs: $(INSTALLED)
 	@$(BIN)/python tools/settings_reference.py
