@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import LaserScan, Odometry
-from fcslam.sources import Fault, ScanRange, open_source
+from fcslam.sources import Fault, FaultCount, ScanRange, open_source
+from fcslam.sources.logs import textlog
 from tests.sources.carmen_text import BEAMS, drive, flaser, odom, only_scans, pose_at, robotlaser, save, scans_of
 
 
@@ -204,8 +206,31 @@ def test_two_ranges_make_the_whole(tmp_path, cut):
     ]
 
 
+def test_a_short_log_is_parsed_once_and_a_long_one_in_each_pass_with_the_same_result(tmp_path, monkeypatch):
+    lines = drive(10)
+    path = save(tmp_path / "run.log", [*lines[:9], "FLASER damaged", *lines[9:]])
+    short, long = open_source(path), open_source(path)
+    survey = short.survey()
+    monkeypatch.setattr(textlog, "KEPT_BYTES", 500)
+    assert long.survey() == survey
+    path.rename(tmp_path / "away.log")
+    kept = list(short.records())
+    with pytest.raises(SourceError):
+        next(long.records())
+    (tmp_path / "away.log").rename(path)
+    again = list(long.records())
+    assert len(kept) == len(again) == len(lines)
+    for one, other in zip(kept, again, strict=True):
+        assert (type(one), one.stamp) == (type(other), other.stamp)
+        np.testing.assert_array_equal(one.T_odom_base, other.T_odom_base)
+    assert short.faults == long.faults
+    assert short.faults[Fault.BROKEN_LINE] == FaultCount(1, 10)
+
+
 @pytest.mark.slow
-def test_memory_does_not_depend_on_the_length(tmp_path):
+def test_memory_does_not_depend_on_the_length(tmp_path, monkeypatch):
+    monkeypatch.setattr(textlog, "KEPT_BYTES", 50_000)
+
     def peak_bytes(scans):
         source = open_source(save(tmp_path / f"{scans}.log", drive(scans, beams=90)))
         tracemalloc.start()

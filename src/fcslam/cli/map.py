@@ -95,8 +95,7 @@ def map_sources(
     surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
     print_notes(console, (note for survey in surveys for note in survey.notes))
     began = time.perf_counter()
-    gc.freeze()
-    gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
+    gc.freeze()  # code, settings and surveys stay to the end
     with compiled(console), ProgressDisplay(console) as display:
         faults: dict[str, Faults] = {}
         progress = _watch(display, sum(survey.scan_count for survey in surveys), faults)

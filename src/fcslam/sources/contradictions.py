@@ -8,13 +8,14 @@ The scans are kept, as one sensor alone does not say which of both is wrong.
 """
 
 from dataclasses import dataclass
-from math import hypot
+from math import hypot, remainder, tau
+from typing import NamedTuple
 
 import numpy as np
 
-from fcslam.records import LaserScan, Ranges
+from fcslam.records import LaserScan
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.pose import Pose, relative_pose
+from fcslam.sources.pose import Pose
 
 STILL_M, STILL_RAD = 0.005, 0.003
 """Odometry that moved less stands still."""
@@ -28,14 +29,21 @@ FEWEST_RETURNS = 20
 """Scans with fewer common returns are not compared."""
 
 
+class _Seen(NamedTuple):
+    """A scan and the odometry at it."""
+
+    scan: LaserScan
+    T_odom_base: Pose
+
+
 @dataclass(slots=True)
 class _Laser:
     """What is remembered of one laser."""
 
-    last: LaserScan
-    rest: LaserScan
+    last: _Seen
+    rest: _Seen
     """The first scan where the odometry now stands."""
-    turn: LaserScan
+    turn: _Seen
     """The scan from which the turn is counted."""
 
 
@@ -48,40 +56,44 @@ class OdometryWatch:
 
     def add(self, number: int, scan: LaserScan) -> None:
         """Count what is wrong with the next scan, which is on line (or in message) ``number``."""
+        x, y, theta = scan.T_odom_base.tolist()
+        seen = _Seen(scan, (x, y, theta))
         known = self._lasers.get(scan.laser.T_base_laser)
         if known is None:
-            self._lasers[scan.laser.T_base_laser] = _Laser(scan, scan, scan)
+            self._lasers[scan.laser.T_base_laser] = _Laser(seen, seen, seen)
             return
-        if _is_still(known.rest, scan):
-            if _changed_share(known.rest, scan) > CHANGED:
+        if _is_still(known.rest, seen):
+            if _changed_share(known.rest.scan, scan) > CHANGED:
                 self._audit.add(Fault.FROZEN_ODOMETRY, number)
         else:
-            known.rest = scan
-        moved_m, turned_rad = _motion(known.turn, scan)
-        turned_without_change = turned_rad > TURN_RAD and _changed_share(known.turn, scan) < UNCHANGED
-        repeated = not _is_still(known.last, scan) and _is_repeated(known.last.ranges_m, scan.ranges_m)
+            known.rest = seen
+        moved_m, turned_rad = _motion(known.turn, seen)
+        turned_without_change = turned_rad > TURN_RAD and _changed_share(known.turn.scan, scan) < UNCHANGED
+        repeated = _is_repeated(known.last.scan, scan) and not _is_still(known.last, seen)
         if turned_without_change or repeated:
             self._audit.add(Fault.FROZEN_SCAN, number)
         if turned_rad > TURN_RAD or moved_m > CHANGE_M:
-            known.turn = scan
-        known.last = scan
+            known.turn = seen
+        known.last = seen
 
 
-def _is_still(before: LaserScan, after: LaserScan) -> bool:
+def _is_still(before: _Seen, after: _Seen) -> bool:
     moved_m, turned_rad = _motion(before, after)
     return moved_m < STILL_M and turned_rad < STILL_RAD
 
 
-def _motion(before: LaserScan, after: LaserScan) -> tuple[float, float]:
+def _motion(before: _Seen, after: _Seen) -> tuple[float, float]:
     """Distance and turn by odometry."""
-    (x0, y0, theta0), (x1, y1, theta1) = before.T_odom_base.tolist(), after.T_odom_base.tolist()
-    x, y, theta = relative_pose((x0, y0, theta0), (x1, y1, theta1))
-    return hypot(x, y), abs(theta)
+    (x0, y0, theta0), (x1, y1, theta1) = before.T_odom_base, after.T_odom_base
+    return hypot(x1 - x0, y1 - y0), abs(remainder(theta1 - theta0, tau))
 
 
-def _is_repeated(before: Ranges, after: Ranges) -> bool:
-    returns = np.isfinite(after) & (after > 0.0)
-    return bool(np.count_nonzero(returns) >= FEWEST_RETURNS) and np.array_equal(before, after, equal_nan=True)
+def _is_repeated(before: LaserScan, after: LaserScan) -> bool:
+    """Whether the ranges are the same to the last bit, and enough of them are returns."""
+    ranges_m = after.ranges_m
+    if before.ranges_m.tobytes() != ranges_m.tobytes():
+        return False
+    return bool(np.count_nonzero(np.isfinite(ranges_m) & (ranges_m > 0.0)) >= FEWEST_RETURNS)
 
 
 def _changed_share(before: LaserScan, after: LaserScan) -> float:

@@ -18,7 +18,7 @@ from fcslam.errors import SourceError
 from fcslam.geometry.beams import misfit
 from fcslam.records import Beams
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.source import ScanRange
+from fcslam.sources.source import WHOLE, ScanRange
 
 MAX_STEP_BACK_S = 2.0
 """Largest tolerated step back in time."""
@@ -70,6 +70,9 @@ def scan_window(
 
     Afterwards, ``audit`` holds the faults of this range only.
     """
+    if scans == WHOLE:
+        yield from entries
+        return
     seen = 0
     for number, entry in entries:
         if is_scan(entry):

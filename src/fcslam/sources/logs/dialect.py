@@ -73,7 +73,8 @@ UNTIMED_STEP_S = 1.0
 def pose_of(tokens: list[bytes], metres_per_unit: float = 1.0) -> Pose:
     """Parse (x, y, theta); raises ValueError for an implausible pose."""
     x, y, theta = map(float, tokens)
-    if not (abs(x) < _MAX_COORDINATE and abs(y) < _MAX_COORDINATE and abs(theta) < _MAX_COORDINATE):
+    limit = _MAX_COORDINATE
+    if not (-limit < x < limit and -limit < y < limit and -limit < theta < limit):
         raise ValueError("no sane pose")
     return x * metres_per_unit, y * metres_per_unit, theta
 

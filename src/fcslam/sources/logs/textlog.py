@@ -28,7 +28,13 @@ from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import Pose, pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
+KEPT_BYTES = 1 << 25
+"""A log with more bytes is decompressed and parsed again in each pass, so that memory does not grow with its length."""
+
 _LONGEST_RANGE_M = 1e6
+
+_NumberedLine = tuple[int, Line | None]
+"""A line with its number, counted from 1; None if it is broken."""
 
 
 class _Scan(NamedTuple):
@@ -48,6 +54,8 @@ class TextLog:
         self._path = path
         self._dialect = dialect
         self._audit = Audit()
+        self._kept: list[_NumberedLine] = []
+        """All lines, once a short log was read to its end."""
 
     @property
     def faults(self) -> Faults:
@@ -114,15 +122,29 @@ class TextLog:
         return first_beams(scans, parameters)
 
     def _lines(self, audit: Audit) -> Iterator[tuple[int, Line]]:
+        for number, line in self._kept or self._parsed():
+            if line is None:
+                audit.add(Fault.BROKEN_LINE, number)
+            else:
+                yield number, line
+
+    def _parsed(self) -> Iterator[_NumberedLine]:
+        """Parse the log line by line; keeps the lines of a short log for the next pass."""
         parse = self._dialect.parser()
+        kept, size = list[_NumberedLine](), 0
         for number, text in numbered_lines(self._path):
             try:
                 line = parse(text)
+                if line is None:
+                    continue
             except ValueError:
-                audit.add(Fault.BROKEN_LINE, number)
-                continue
-            if line is not None:
-                yield number, line
+                line = None
+            size += len(text)
+            if size <= KEPT_BYTES:
+                kept.append((number, line))
+            yield number, line
+        if size <= KEPT_BYTES:
+            self._kept = kept
 
     def _entries(self, scans: ScanRange, audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
         """Scans and odometry of the range, with the poses to use; afterwards ``audit`` holds the range's faults."""
