@@ -1,6 +1,5 @@
 """The command line: one module for each command. Commands import what they need when they run, so help is quick."""
 
-import gc
 import os
 from collections.abc import Sequence
 from typing import Annotated
@@ -85,7 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     An error that the user can correct is one line on stderr, never a traceback.
     """
-    gc.set_threshold(100_000, 50, 100)  # imports and maps make few cycles: looking for some costs a tenth of the time
     if COMPLETION_VARIABLE in os.environ:
         _leave_paths_to_the_shell()
     try:

@@ -2,7 +2,8 @@
 
 import gc
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -65,15 +66,16 @@ def map_recordings(
     quiet: Quiet = False,
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
-    from fcslam.api import split_recordings
-    from fcslam.runs import prepare_output, read_vetoes
+    with _without_collection():
+        from fcslam.api import split_recordings
+        from fcslam.runs import prepare_output, read_vetoes
 
-    output = output or new_folder(RUNS)
-    prepare_output(output, force)
-    settings = mission_config(config, seed, no_fuse, fusion)
-    vetoes = read_vetoes(veto) if veto else ()
-    options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
-    sources = split_recordings(open_recordings(logs, options), split)
+        output = output or new_folder(RUNS)
+        prepare_output(output, force)
+        settings = mission_config(config, seed, no_fuse, fusion)
+        vetoes = read_vetoes(veto) if veto else ()
+        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
+        sources = split_recordings(open_recordings(logs, options), split)
     map_sources(sources, settings, output, notices(quiet), force, vetoes)
 
 
@@ -89,13 +91,15 @@ def map_sources(
 
     A run that appeared at ``output`` meanwhile is replaced only with ``force``.
     """
-    from fcslam import api
-    from fcslam.cli.progress import ProgressDisplay
+    with _without_collection():
+        from fcslam import api
+        from fcslam.cli.progress import ProgressDisplay
 
-    surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
+        surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
+        gc.freeze()
+    gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     print_notes(console, (note for survey in surveys for note in survey.notes))
     began = time.perf_counter()
-    gc.freeze()  # code, settings and surveys stay to the end
     with compiled(console), ProgressDisplay(console) as display:
         faults: dict[str, Faults] = {}
         progress = _watch(display, sum(survey.scan_count for survey in surveys), faults)
@@ -105,6 +109,16 @@ def map_sources(
     print_faults(console, faults)
     _report(answers(), run, time.perf_counter() - began, output, settings)
     return run
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Collect no garbage: imports and surveys make many objects, and all of them stay."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") -> "Callable[[Progress], None]":
