@@ -2,8 +2,8 @@
 
     python benchmarks/federated_deployed.py
 
-Needs fcslam[federated]; images are drawn. Five robots and a server, each a command of a user with Flower's daemons
-under it, train for a few steps on this machine. One robot is killed (SIGKILL) while it trains in the first round and
+Needs fcslam[federated]; images are drawn. Five robots and a server, each a command of a user, train for a few steps on
+this machine. One robot is killed (SIGKILL) while it trains in the first round and
 never comes back. The same run in one process, without that robot, must end in the same bytes.
 
 Then one process trains with the default settings, five robots of 5 images each, and the processor's time is split:
@@ -15,6 +15,7 @@ number follows.
 import csv
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -90,11 +91,16 @@ def wait_for(happened: Callable[[], bool], what: str, log: Path) -> None:
         time.sleep(0.05)
 
 
+def free_port() -> int:
+    """A port of this machine on which no process listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 def deploy(folder: Path, options: Sequence[object]) -> Path:
     """Server and robots in processes of their own; one robot is killed while it trains."""
     from contextlib import ExitStack
-
-    from fcslam.federated.launch import free_port
 
     where, output, log = f"127.0.0.1:{free_port()}", folder / "deployed", folder / "server.log"
     with ExitStack() as running:

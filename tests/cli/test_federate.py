@@ -18,6 +18,8 @@ TINY = {
     "local_steps": 2,
     "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "points": 32, "label_copies": 1},
 }
+JOIN_FILES = ("--ca", "{fleet}/tiny.yaml", "--robot-key", "{fleet}/tiny.yaml")
+SERVE_FILES = (*JOIN_FILES, "--certificate", "{fleet}/tiny.yaml", "--key", "{fleet}/tiny.yaml")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -112,7 +114,10 @@ def test_the_same_command_with_more_rounds_goes_on(fleet, tmp_path, capsys):
         (["federate", "join", "a:1", "{fleet}/nobody", "-o", "{out}", "--insecure"], "nobody: is no folder"),
         (["federate", "join", "a", "{fleet}/one", "-o", "{out}", "--insecure"], "a: is no HOST:PORT"),
         (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", "--ca", "{fleet}/tiny.yaml"], "give --ca"),
+        (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", *JOIN_FILES], "tiny.yaml: is no private key"),
+        (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", *JOIN_FILES, "--insecure"], "leave out one"),
         (["federate", "join", "a:1", "{fleet}/one", "-o", "{out}", "--insecure", "--name", ""], "give --name"),
+        (["federate", "serve", "a:1", "-o", "{out}", *SERVE_FILES], "tiny.yaml: is no public key"),
     ],
 )
 def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
@@ -134,6 +139,7 @@ def test_bad_input_is_one_line(arguments, words, fleet, tmp_path, capsys):
         ["join", "a:1"],
         ["join", "a:1", "{fleet}/one", "{fleet}/two", "-o", "{out}"],
         ["join", "a:1", "{fleet}/one", "-o", "{out}", "--rounds", "3"],
+        ["join", "a:1", "{fleet}/one", "-o", "{out}", "--certificate", "own.crt"],
         ["--local", "{fleet}/one"],
     ],
 )

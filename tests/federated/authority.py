@@ -1,6 +1,7 @@
 """Certificates and keys of a fleet, made as docs/federated.md says."""
 
 import shutil
+import socket
 import subprocess
 
 import pytest
@@ -39,3 +40,10 @@ def keys(folder, *robots):
             ["ssh-keygen", "-q", "-t", "ecdsa", "-b", "384", "-N", "", "-f", robot],
             cwd=folder, check=True, capture_output=True,
         )  # fmt: skip
+
+
+def free_port():
+    """A port of this machine on which no process listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

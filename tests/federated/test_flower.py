@@ -1,7 +1,5 @@
 """The internals of Flower that fcslam relies on. If an upgrade of Flower fails, it fails here, with the reason."""
 
-import subprocess
-import sys
 import tomllib
 from importlib.metadata import version
 from pathlib import Path
@@ -14,13 +12,12 @@ pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
 from fcslam.errors import TrainingError
 from fcslam.federated import flower
+from fcslam.federated.fleet_grid import FleetGrid
 from fcslam.federated.messages import ARRAYS_KEY, CONFIG_KEY
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.strategies import create_strategy
-from fcslam.federated.tls import Address, Certificates
 from tests.federated.fakes import START, Fake, run, settings
 
-ADDRESS = Address("server.lab", 8000)
 STRATEGIES = ("fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum")
 
 
@@ -47,9 +44,10 @@ def test_a_message_asks_the_task_identity_who_sends_it():
     assert message.metadata.dst_node_id == flower.FIRST_NODE
 
 
-def test_the_grid_in_this_process_implements_all_of_flowers_grid():
-    assert flower.Grid.__abstractmethods__ <= vars(flower.InProcessGrid).keys()
-    assert not flower.InProcessGrid.__abstractmethods__
+@pytest.mark.parametrize("grid", [flower.InProcessGrid, FleetGrid])
+def test_our_grids_implement_all_of_flowers_grid(grid):
+    assert flower.Grid.__abstractmethods__ <= vars(grid).keys() | vars(flower.RobotGrid).keys()
+    assert not grid.__abstractmethods__
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
@@ -74,32 +72,28 @@ def test_the_moments_of_fedadam_can_be_read_and_restored(tmp_path):
     assert flower.strategy_moments(create_strategy(FederatedSettings())) == {"m_t": {}, "v_t": {}}
 
 
-def options(program):
-    """What a program of Flower says of its options."""
-    command = [str(Path(sys.executable).with_name(program)), "--help"]
-    return subprocess.run(command, env=flower.QUIET, capture_output=True, text=True, check=True).stdout
+def test_a_message_arrives_as_it_was_sent():
+    flower.use_own_identity()
+    arrays = flower.ArrayRecord({"a": flower.Array(np.arange(3, dtype=np.float32))})
+    content = flower.RecordDict({ARRAYS_KEY: arrays, CONFIG_KEY: flower.ConfigRecord({"version": "v"})})
+    sent = flower.Message(content, flower.FIRST_NODE, flower.MessageType.TRAIN)
+    received = flower.request_from_bytes(flower.message_to_bytes(sent))
+    assert received.metadata.message_type == flower.MessageType.TRAIN
+    assert received.content[CONFIG_KEY]["version"] == "v"
+    assert received.content[ARRAYS_KEY]["a"].numpy().tolist() == [0.0, 1.0, 2.0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("secure", [False, True])
-def test_the_daemons_know_the_options_that_they_are_given(secure):
-    files = Certificates(Path("ca.crt"), Path("own.crt"), Path("own.key")) if secure else None
-    link = flower.superlink_command(ADDRESS, files)
-    node = flower.supernode_command(ADDRESS, {"robot": "a"}, files, Path("robot.key") if secure else None)
-    for program, *words in (link, [*node, "--port", "1"]):
-        known = options(program)
-        assert all(word in known for word in words if word.startswith("--")), program
+def test_a_reply_cannot_name_its_sender():
+    """Only the content is taken from the bytes of a robot."""
+    flower.use_own_identity()
+    first, second = (flower.Message(flower.RecordDict({}), node, flower.MessageType.TRAIN) for node in (2, 3))
+    forged = flower.message_to_bytes(flower.Message(flower.RecordDict({}), reply_to=second))
+    assert flower.reply_from_bytes(forged, first).metadata.src_node_id == 2
 
 
-def test_the_app_is_one_that_flower_accepts(tmp_path):
-    from flwr.cli.config_utils import load_and_validate
-
-    flower.write_app(
-        tmp_path / "app",
-        "fcslam.federated.deployed_apps:server_app",
-        "fcslam.federated.deployed_apps:robot_app",
-        {"task": '{"output": "a \\"name\\""}'},
-    )
-    config, warnings = load_and_validate(tmp_path / "app" / "pyproject.toml")
-    assert warnings == []
-    assert config["tool"]["flwr"]["app"]["config"] == {"task": '{"output": "a \\"name\\""}'}
+@pytest.mark.parametrize("data", [b"x" * 100, b"\xff" * 9, flower.MessageProto().SerializeToString()])
+def test_bytes_that_are_no_message_are_refused(data):
+    flower.use_own_identity()
+    request = flower.Message(flower.RecordDict({}), 2, flower.MessageType.TRAIN)
+    with pytest.raises(ValueError, match=r"cannot be read|None"):
+        flower.reply_from_bytes(data, request)

@@ -20,6 +20,7 @@ from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, trained_names
 from fcslam.learning.images import find_images
 from fcslam.learning.local_training import LocalTrainingPlan, local_training
+from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
 from fcslam.learning.trainer import TrainingProgress, validation_pairs
 from fcslam.learning.validation import validate
@@ -69,6 +70,8 @@ class RobotClient:
     """Called with the name and the number of steps done in a round."""
     images: TrainingImages | None = None
     """The images with their labels; None until they are read."""
+    images_settings: TrainingSettings | None = None
+    """Settings with which the images were read; None if they were given."""
 
     def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
         """Train from the weights. The result depends on the arguments, the cache, the images and the noise.
@@ -125,11 +128,13 @@ class RobotClient:
 
     def _labelled_images(self, weights: Weights, settings: FederatedSettings) -> TrainingImages:
         """The images, labelled by the first weights that the robot ever received; the labels stay."""
-        if self.images is None:
+        is_outdated = self.images_settings not in (None, settings.training)
+        if self.images is None or is_outdated:
             device = torch.device(self.device)
             labeller = keypoint_response(weights_to_network(weights, settings.training.encoder).to(device), device)
             files = find_images([self.folder])
             self.images = read_labelled_images(files, self.cache, settings.training, labeller, None, _ignore_progress)
+            self.images_settings = settings.training
         return self.images
 
 

@@ -25,7 +25,7 @@ from fcslam.federated.evaluation import (
     combined_score,
     valid_metrics,
 )
-from fcslam.federated.flower import Grid, Message, MessageType, NodeSelection, RecordDict
+from fcslam.federated.flower import Message, MessageType, NodeSelection, RecordDict, RobotGrid
 from fcslam.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
 from fcslam.federated.messages import ARRAYS_KEY, CONFIG_KEY, reply_metrics, reply_sender, request_config
 from fcslam.federated.privacy import epsilon
@@ -70,7 +70,7 @@ class Coordinator:
     """Federated training in a folder."""
 
     def __init__(
-        self, grid: Grid, settings: FederatedSettings, initial: Weights, folder: Path, hooks: CoordinatorHooks
+        self, grid: RobotGrid, settings: FederatedSettings, initial: Weights, folder: Path, hooks: CoordinatorHooks
     ) -> None:
         self._grid, self._settings, self._folder, self._hooks = grid, settings, folder, hooks
         self._initial = self._model(initial)

@@ -1,23 +1,23 @@
 """The adapter to Flower: the only module that imports it or knows what it does not document.
 
-It relies on internals: who sends a message, what an in-process ``Grid`` has to offer, the moments of FedAdam, the
-options and configuration files of the daemons. ``tests/federated/test_flower.py`` checks each of them. To support
-another version of Flower, change ``SUPPORTED_VERSIONS`` and the requirement in pyproject.toml, and make that test pass.
+It relies on internals: who sends a message, how a message is serialised, what a ``Grid`` has to offer, the moments of
+FedAdam. ``tests/federated/test_flower.py`` checks each of them. To support another version of Flower, change
+``SUPPORTED_VERSIONS`` and the requirement in pyproject.toml, and make that test pass.
+
+Flower's SuperLink and SuperNode are not used. They run whatever app a caller submits, and their Control API asks for no
+credentials; see docs/federated.md.
 """
 
-import json
 import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version as installed_version
-from pathlib import Path
 from typing import Any, Final
 
 from numpy.typing import NDArray
 
 from fcslam.errors import TrainingError
-from fcslam.federated.tls import Address, Certificates
 
 QUIET: Final = {
     "FLWR_TELEMETRY_ENABLED": "0",
@@ -57,7 +57,9 @@ from flwr.app import (  # noqa: E402
     RecordDict,
 )
 from flwr.clientapp import ClientApp  # noqa: E402
-from flwr.serverapp import Grid, ServerApp  # noqa: E402
+from flwr.common.serde import message_from_proto, message_to_proto  # noqa: E402
+from flwr.proto.message_pb2 import Message as MessageProto  # noqa: E402
+from flwr.serverapp import Grid  # noqa: E402
 from flwr.serverapp.strategy import (  # noqa: E402
     FedAdam,
     FedAvg,
@@ -71,6 +73,8 @@ from flwr.supercore.task_identity import TaskIdentity  # noqa: E402
 logging.getLogger("flwr").setLevel(logging.ERROR)
 
 __all__ = [
+    "FIRST_NODE",
+    "RUN_ID",
     "Array",
     "ArrayRecord",
     "ClientApp",
@@ -90,17 +94,15 @@ __all__ = [
     "MetricRecord",
     "NodeSelection",
     "RecordDict",
-    "ServerApp",
+    "RobotGrid",
     "check_version",
-    "daemon_environment",
-    "register_command",
+    "error_reply",
+    "message_to_bytes",
+    "reply_from_bytes",
+    "request_from_bytes",
     "restore_moments",
-    "run_command",
     "strategy_moments",
-    "superlink_command",
-    "supernode_command",
-    "write_app",
-    "write_connection",
+    "use_own_identity",
 ]
 
 RUN_ID: Final = 1
@@ -108,33 +110,22 @@ FIRST_NODE: Final = 2
 """Node number of the first robot; Flower reserves node 1 for the server."""
 APP_FAILED: Final = 1001
 """Error code of a reply from an app that raised; smaller codes are Flower's, and 1000 is the client's own."""
-LOOPBACK: Final = "127.0.0.1"
-CONNECTION: Final = "fleet"
-"""Name of the SuperLink in the configuration of Flower's commands."""
 
 
-class InProcessGrid(Grid):
-    """A ``Grid`` that calls the robots' apps in this process, one after another, without ports and daemons.
+def use_own_identity() -> None:
+    """Say who sends the messages of this process, which a message asks; Flower's daemons do so for their processes."""
+    TaskIdentity.task_id = TaskIdentity.run_id = TaskIdentity.node_id = RUN_ID
 
-    Every robot has the whole deadline for itself, as if all worked at the same time.
 
-    Args:
-        app: of the robots; ``partition-id`` in the context's node configuration is the number of the robot, from 0.
-        robots: number of robots.
-        clock: gives seconds since any fixed moment.
-    """
+class RobotGrid(Grid):
+    """The part of a ``Grid`` that is the same whatever carries the messages."""
 
-    def __init__(self, app: ClientApp, robots: int, clock: Callable[[], float] = time.monotonic) -> None:
-        # A message asks this class who sends it; Flower's daemons set it for their processes.
-        TaskIdentity.task_id = TaskIdentity.run_id = TaskIdentity.node_id = RUN_ID
-        self._app, self._clock = app, clock
-        self._replies: dict[str, Message] = {}
-        self._pushed = 0
-        # Contexts stay from round to round, as Flower's daemons keep them.
-        self._contexts = {
-            FIRST_NODE + index: Context(RUN_ID, FIRST_NODE + index, {"partition-id": index}, RecordDict(), {})
-            for index in range(robots)
-        }
+    def __init__(self) -> None:
+        use_own_identity()
+
+    def robot_names(self) -> dict[int, str]:
+        """Names by node number of the robots whose names are known. The others are asked."""
+        return {}
 
     def set_run(self, run: Any) -> None:
         """Do nothing: there is one run."""
@@ -149,6 +140,29 @@ class InProcessGrid(Grid):
     ) -> Message:
         """A message to a robot."""
         return Message(content, dst_node_id, message_type, group_id=group_id, ttl=ttl)
+
+
+class InProcessGrid(RobotGrid):
+    """A ``Grid`` that calls the robots' apps in this process, one after another, without ports and daemons.
+
+    Every robot has the whole deadline for itself, as if all worked at the same time.
+
+    Args:
+        app: of the robots; ``partition-id`` in the context's node configuration is the number of the robot, from 0.
+        robots: number of robots.
+        clock: gives seconds since any fixed moment.
+    """
+
+    def __init__(self, app: ClientApp, robots: int, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._app, self._clock = app, clock
+        self._replies: dict[str, Message] = {}
+        self._pushed = 0
+        # Contexts stay from round to round, as Flower's daemons keep them.
+        self._contexts = {
+            FIRST_NODE + index: Context(RUN_ID, FIRST_NODE + index, {"partition-id": index}, RecordDict(), {})
+            for index in range(robots)
+        }
 
     def get_node_ids(self) -> list[int]:
         """Node numbers of all robots; in one process they are always connected."""
@@ -181,7 +195,7 @@ class InProcessGrid(Grid):
         try:
             return self._app(message, self._contexts[message.metadata.dst_node_id])
         except Exception as error:  # as across a network, one robot's failure does not end the training of the others
-            return Message(Error(APP_FAILED, f"{type(error).__name__}: {error}"), reply_to=message)
+            return error_reply(f"{type(error).__name__}: {error}", message)
 
 
 class NodeSelection:
@@ -207,107 +221,33 @@ def restore_moments(strategy: FedAvg, moments: Mapping[str, Mapping[str, NDArray
             setattr(strategy, moment, dict(arrays))
 
 
-def superlink_command(address: Address, certificates: Certificates | None) -> list[str]:
-    """The SuperLink's command line; without certificates it neither encrypts nor authenticates."""
-    security = ["--insecure"] if certificates is None else [*_tls_options(certificates), "--enable-supernode-auth"]
-    return ["flower-superlink", *security, "--host", address.host, "--port", str(address.port)]
+def message_to_bytes(message: Message) -> bytes:
+    """Serialise a message for the network; ``request_from_bytes`` and ``reply_from_bytes`` read it."""
+    return bytes(message_to_proto(message).SerializeToString(deterministic=True))
 
 
-def supernode_command(
-    address: Address, node_config: Mapping[str, str], certificates: Certificates | None, private_key: Path | None
-) -> list[str]:
-    """A robot's SuperNode's command line, except for the port on which its own processes reach it."""
-    security = ["--insecure"]
-    if certificates is not None:
-        security = ["--root-certificates", str(certificates.ca.resolve()), *_tls_options(certificates)]
-    if private_key is not None:
-        security += ["--auth-supernode-private-key", str(private_key.resolve())]
-    config = " ".join(f"{name}={json.dumps(value)}" for name, value in node_config.items())
-    return [
-        "flower-supernode", *security, "--superlink", str(address), "--host", LOOPBACK, "--node-config", config,
-    ]  # fmt: skip
+def request_from_bytes(data: bytes) -> Message:
+    """Read the server's message on a robot.
 
-
-def register_command(public_key: Path) -> list[str]:
-    """The command that lets the robot with this key join."""
-    return ["flwr", "supernode", "register", str(public_key.resolve()), CONNECTION]
-
-
-def run_command(app: Path) -> list[str]:
-    """The command that starts the app in this folder on the SuperLink and follows it."""
-    return ["flwr", "run", str(app), CONNECTION, "--stream"]
-
-
-def daemon_environment(home: Path) -> dict[str, str]:
-    """The environment of Flower's commands, with their configuration in the folder ``home``."""
-    return {**QUIET, "FLWR_HOME": str(home)}
-
-
-def write_connection(home: Path, address: Address, certificates: Certificates | None) -> None:
-    """Write the configuration with which Flower's commands find the SuperLink."""
-    trust = (
-        "insecure = true"
-        if certificates is None
-        else f"root-certificates = {json.dumps(str(certificates.ca.resolve()))}"
-    )
-    home.mkdir(parents=True)
-    (home / "config.toml").write_text(
-        f'[superlink]\ndefault = "{CONNECTION}"\n[superlink.{CONNECTION}]\naddress = "{address}"\n{trust}\n',
-        encoding="utf-8",
-    )
-
-
-def write_app(folder: Path, server_app: str, client_app: str, config: Mapping[str, str]) -> None:
-    """Write an app for ``run_command``.
-
-    Args:
-        folder: is created.
-        server_app: the ``ServerApp``, as `module:name` of an installed package.
-        client_app: the ``ClientApp``, as `module:name`.
-        config: configuration of the run, which both apps can read.
+    Raises:
+        ValueError: these bytes are no message.
     """
-    package = folder / "fcslam_fleet"
-    package.mkdir(parents=True)
-    values = "\n".join(f"{name} = {json.dumps(value)}" for name, value in config.items())
-    (folder / "pyproject.toml").write_text(_APP_PROJECT + values + "\n", encoding="utf-8")
-    (folder / "LICENSE").write_text("Apache-2.0\n", encoding="utf-8")
-    (package / "__init__.py").write_text('"""Refers to the apps of fcslam, which is installed on every machine."""\n')
-    lines = []
-    # Flower searches the text of this file for assignments to the names of the two apps.
-    for name, target in (("server", server_app), ("robot", client_app)):
-        module, _, variable = target.partition(":")
-        lines.append(f"import {module}\n\n{name} = {module}.{variable}\n")
-    (package / "apps.py").write_text("\n".join(lines), encoding="utf-8")
+    try:
+        return message_from_proto(MessageProto.FromString(data))
+    except Exception as error:  # Flower's parsers fail in many ways on bytes that they did not write
+        raise ValueError(f"a message that cannot be read ({type(error).__name__})") from error
 
 
-_APP_PROJECT: Final = """[build-system]
-requires = ["hatchling"]
-build-backend = "hatchling.build"
+def reply_from_bytes(data: bytes, request: Message) -> Message:
+    """Read a robot's reply to a request. Only content or error are taken from the bytes, so nobody can forge a sender.
 
-[project]
-name = "fcslam-fleet"
-version = "0.1.0"
-description = "Federated training of fcslam's detector"
-license = { file = "LICENSE" }
-dependencies = ["flwr>=1.41.0,<2.0"]
-
-[tool.flwr.app]
-publisher = "fcslam"
-fab-format-version = 1
-flwr-version-target = "1.41.0"
-
-[tool.flwr.app.components]
-serverapp = "fcslam_fleet.apps:server"
-clientapp = "fcslam_fleet.apps:robot"
-
-[tool.flwr.app.config]
-"""
+    Raises:
+        ValueError: these bytes are no message.
+    """
+    reply = request_from_bytes(data)
+    return Message(reply.error if reply.has_error() else reply.content, reply_to=request)
 
 
-def _tls_options(certificates: Certificates) -> list[str]:
-    files = {
-        "--ssl-ca-certfile": certificates.ca,
-        "--ssl-certfile": certificates.certificate,
-        "--ssl-keyfile": certificates.key,
-    }
-    return [word for option, file in files.items() for word in (option, str(file.resolve()))]
+def error_reply(reason: str, request: Message) -> Message:
+    """The reply in place of one that cannot be used."""
+    return Message(Error(APP_FAILED, reason), reply_to=request)

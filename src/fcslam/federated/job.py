@@ -12,7 +12,7 @@ from fcslam.federated.artifacts import DETECTOR, write_federated_artifacts
 from fcslam.federated.client import NOISE_NEEDS_PUBLIC_IMAGES
 from fcslam.federated.codec import weights_to_network, weights_version
 from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
-from fcslam.federated.flower import Grid
+from fcslam.federated.flower import RobotGrid
 from fcslam.federated.history import RoundReport
 from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.public_images import calibration_images, public_evaluation, read_public_images
@@ -54,7 +54,7 @@ def run_job(
     job: FederatedJob,
     options: ExecutionOptions,
     callbacks: ProgressCallbacks,
-    grid: Grid,
+    grid: RobotGrid,
     wait: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Run a job, or continue it.

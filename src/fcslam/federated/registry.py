@@ -1,17 +1,17 @@
-"""Maps Flower's nodes to robots. Flower gives a robot a new node number whenever it joins; its name stays."""
+"""Maps Flower's nodes to robots."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from fcslam.federated.flower import Grid, Message, MessageType, RecordDict
+from fcslam.federated.flower import Message, MessageType, RecordDict, RobotGrid
 from fcslam.federated.messages import reply_sender
 
 
 class RobotRegistry:
-    """The robots that are connected, by name; each node is asked for its name once."""
+    """The robots that are connected, by name; a node whose name the grid does not know is asked for it once."""
 
-    def __init__(self, grid: Grid, deadline_s: float) -> None:
+    def __init__(self, grid: RobotGrid, deadline_s: float) -> None:
         self._grid, self._deadline_s = grid, deadline_s
         self._names: dict[int, str] = {}
         self.duplicates: tuple[str, ...] = ()
@@ -20,6 +20,7 @@ class RobotRegistry:
     def connected(self) -> dict[str, int]:
         """Node numbers of the connected robots by name, sorted by name; of two with one name, the lower number."""
         nodes = sorted(self._grid.get_node_ids())
+        self._names |= self._grid.robot_names()
         self._identify([node for node in nodes if node not in self._names])
         found: dict[str, int] = {}
         duplicates: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""Checks certificates before Flower starts: its processes retry without end and do not say what is wrong."""
+"""Certificates and addresses. Certificates are checked before anything starts, so that a mistake is one line."""
 
 import contextlib
 import socket
@@ -18,10 +18,10 @@ MAX_FLIGHTS: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class Certificates:
-    """PEM files of one machine."""
+    """PEM files of the server."""
 
     ca: Path
-    """Certificate of the authority that signed all machines' certificates."""
+    """Certificate of the authority that signed the server's."""
     certificate: Path
     key: Path
     """Private key of ``certificate``."""
@@ -54,7 +54,7 @@ def check_own_certificate(certificates: Certificates, host: str) -> None:
             f"{certificates.key}: is not the key of {certificates.certificate} ({_reason(error)}); give its key"
         ) from error
     there = server.wrap_bio(outgoing, incoming, server_side=True)
-    here = _client_context(certificates.ca).wrap_bio(incoming, outgoing, server_hostname=host)
+    here = client_context(certificates.ca).wrap_bio(incoming, outgoing, server_hostname=host)
     try:
         for side in [here, there] * MAX_FLIGHTS:
             with contextlib.suppress(ssl.SSLWantReadError):
@@ -72,7 +72,7 @@ def check_server_certificate(address: Address, ca: Path) -> None:
     Raises:
         TrainingError: the server has no certificate, or one that the authority did not sign for this name.
     """
-    context = _client_context(ca)
+    context = client_context(ca)
     try:
         with (
             socket.create_connection((address.host, address.port), timeout=TIMEOUT_S) as connection,
@@ -90,7 +90,12 @@ def check_server_certificate(address: Address, ca: Path) -> None:
         return  # the server may start later
 
 
-def _client_context(ca: Path) -> ssl.SSLContext:
+def client_context(ca: Path) -> ssl.SSLContext:
+    """A context that trusts this authority and no other.
+
+    Raises:
+        TrainingError: the file is no certificate.
+    """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
         context.load_verify_locations(ca)

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,7 +15,7 @@ from fcslam.cli.federate.options import (
     Strategy,
     federated_settings,
 )
-from fcslam.cli.federate.rounds import round_line
+from fcslam.cli.federate.rounds import show_rounds
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, print_line
 from fcslam.cli.training_options import (
@@ -26,15 +26,6 @@ from fcslam.cli.training_options import (
     compute_budget,
     require_training_libraries,
 )
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.federated.history import RoundReport
-    from fcslam.federated.job import ProgressCallbacks
-    from fcslam.federated.settings import FederatedSettings
-    from fcslam.learning.trainer import TrainingProgress
 
 
 def local(
@@ -69,24 +60,7 @@ def local(
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {job.output}") as display:
-        files = federate_locally(folders, job, compute_budget(device, quick), _watches(display, console, settings))
+        files = federate_locally(folders, job, compute_budget(device, quick), show_rounds(display, console, settings))
     for file in files:
         typer.echo(str(file))
     print_line(console, f"{time.perf_counter() - began:.0f} s")
-
-
-def _watches(display: "ProgressDisplay", console: "Console", settings: "FederatedSettings") -> "ProgressCallbacks":
-    """Show the stages before the rounds, the rounds and the local training in them; print a line for each round."""
-    from fcslam.federated.job import ProgressCallbacks
-
-    def stage(name: str, status: "TrainingProgress") -> None:
-        display.show(name, status.step, status.steps)
-
-    def steps(robot: str, done: int) -> None:
-        display.show("local training", done, settings.local_steps, robot)
-
-    def rounds(report: "RoundReport") -> None:
-        display.show("rounds", report.round_number, settings.rounds)
-        print_line(console, round_line(report.row(), settings.rounds))
-
-    return ProgressCallbacks(stage, steps, rounds)

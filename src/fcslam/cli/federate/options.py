@@ -16,6 +16,8 @@ QUICK_TRAINING = {"shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 
 _FROM_SETTINGS = "that of the settings"
 _TLS = "TLS"
 _NEEDED = "give --ca, --certificate, --key and --robot-key, or --insecure in a network that nobody else can reach"
+_ROBOT_NEEDS = "give --ca and --robot-key, or --insecure in a network that nobody else can reach"
+_TOO_MUCH = "--insecure, but certificates or keys are given; leave out one or the other"
 
 SettingsFile = Annotated[
     Path | None, typer.Option("--config", help="YAML file of federated settings; see docs/federated.md.")
@@ -49,7 +51,7 @@ LocalSteps = Annotated[
 ServerAddress = Annotated[str, typer.Argument(metavar="HOST:PORT", help="Address of the server.")]
 Ca = Annotated[
     Path | None,
-    typer.Option(help="Certificate of the authority that signed all certificates of the fleet.", rich_help_panel=_TLS),
+    typer.Option(help="Certificate of the authority that signed the server's.", rich_help_panel=_TLS),
 ]
 Certificate = Annotated[Path | None, typer.Option(help="Certificate of this machine.", rich_help_panel=_TLS)]
 Key = Annotated[Path | None, typer.Option(help="Private key of --certificate.", rich_help_panel=_TLS)]
@@ -82,7 +84,7 @@ def federated_settings(
 
 @dataclass(frozen=True, slots=True)
 class Security:
-    """The files and the flag that the command line gives for TLS and authentication."""
+    """The files and the flag that the command line gives the server for TLS and authentication."""
 
     ca: Path | None
     certificate: Path | None
@@ -105,11 +107,29 @@ class Security:
                 raise TrainingError(f"{file}: is no file; {_NEEDED}")
         if self.insecure:
             if files:
-                raise TrainingError("--insecure, but certificates or keys are given; leave out one or the other")
+                raise TrainingError(_TOO_MUCH)
             return None
         if self.ca is None or self.certificate is None or self.key is None or not self.robot_keys:
             raise TrainingError(_NEEDED)
         return Certificates(self.ca, self.certificate, self.key)
+
+
+def check_robot_security(ca: Path | None, robot_key: Path | None, insecure: bool) -> None:
+    """Check that a robot has an authority and a private key, or that the user wants neither.
+
+    Raises:
+        TrainingError: something is missing, is no file, or is too much.
+    """
+    from fcslam.errors import TrainingError
+
+    files = [file for file in (ca, robot_key) if file is not None]
+    for file in files:
+        if not file.is_file():
+            raise TrainingError(f"{file}: is no file; {_ROBOT_NEEDS}")
+    if insecure and files:
+        raise TrainingError(_TOO_MUCH)
+    if not insecure and len(files) < 2:
+        raise TrainingError(_ROBOT_NEEDS)
 
 
 def parse_address(text: str) -> "Address":

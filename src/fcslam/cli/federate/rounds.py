@@ -1,6 +1,18 @@
-"""A round of federated training in one line."""
+"""Shows the rounds of federated training while they run."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from fcslam.cli.output import print_line
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.federated.history import RoundReport
+    from fcslam.federated.job import ProgressCallbacks
+    from fcslam.federated.settings import FederatedSettings
+    from fcslam.learning.trainer import TrainingProgress
 
 
 def round_line(row: Mapping[str, str], rounds: int) -> str:
@@ -18,3 +30,20 @@ def round_line(row: Mapping[str, str], rounds: int) -> str:
         *([f"without {row['left_out']}"] if row["left_out"] else []),
     ]
     return "  ".join(parts)
+
+
+def show_rounds(display: "ProgressDisplay", console: "Console", settings: "FederatedSettings") -> "ProgressCallbacks":
+    """Show the stages before the rounds, the rounds and the local training in them; print a line for each round."""
+    from fcslam.federated.job import ProgressCallbacks
+
+    def stage(name: str, status: "TrainingProgress") -> None:
+        display.show(name, status.step, status.steps)
+
+    def steps(robot: str, done: int) -> None:
+        display.show("local training", done, settings.local_steps, robot)
+
+    def rounds(report: "RoundReport") -> None:
+        display.show("rounds", report.round_number, settings.rounds)
+        print_line(console, round_line(report.row(), settings.rounds))
+
+    return ProgressCallbacks(stage, steps, rounds)

@@ -1,7 +1,7 @@
 """`fcslam federate serve`: the server of a fleet on several machines."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -21,7 +21,7 @@ from fcslam.cli.federate.options import (
     federated_settings,
     parse_address,
 )
-from fcslam.cli.federate.rounds import round_line
+from fcslam.cli.federate.rounds import show_rounds
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, print_line
 from fcslam.cli.training_options import (
@@ -33,13 +33,8 @@ from fcslam.cli.training_options import (
     require_training_libraries,
 )
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rich.console import Console
-
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.federated.job import FederatedJob
+MAX_LINES = 1000
+"""Different notices that are printed, so that nobody on the network can fill a log."""
 
 
 def serve(
@@ -59,7 +54,10 @@ def serve(
     key: Key = None,
     robot_key: Annotated[
         list[Path] | None,
-        typer.Option(help="Public key of a robot that may join. Can be repeated.", rich_help_panel="TLS"),
+        typer.Option(
+            help="Public key of a robot that may join: robot1.pub is that of robot1. Can be repeated.",
+            rich_help_panel="TLS",
+        ),
     ] = None,
     insecure: Insecure = False,
     quick: Quick = False,
@@ -75,36 +73,23 @@ def serve(
     settings = federated_settings(config, quick, strategy, rounds, local_steps, seed)
     require_training_libraries("flwr", extra="federated")
     from fcslam.federated import launch
+    from fcslam.federated.identity import RobotAuthenticator, read_robot_keys
     from fcslam.federated.job import FederatedJob
 
     security = Security(ca, certificate, key, tuple(robot_key or ()), insecure)
-    certificates = security.certificates()
+    certificates, keys = security.certificates(), read_robot_keys(robot_key or ())
+    authenticator = RobotAuthenticator(None if certificates is None else keys)
     where = parse_address(address)
-    chosen = compute_budget(device).device
-    console = notices(quiet)
+    options = compute_budget(device, quick)
+    console, printed = notices(quiet), set[str]()
+
+    def print_once(line: str) -> None:
+        if line not in printed and len(printed) < MAX_LINES:
+            printed.add(line)
+            print_line(console, line)
+
     job = FederatedJob(output or new_folder(TRAINING), settings, start, tuple(public or ()))
     with ProgressDisplay(console, f"output: {job.output}") as display:
-        launch.serve(job, chosen, where, certificates, security.robot_keys, _watch(display, console, job))
+        progress = show_rounds(display, console, settings)
+        launch.serve(job, options, where, certificates, authenticator, progress, print_once)
     typer.echo(str(job.output / "detector.onnx"))
-
-
-def _watch(display: "ProgressDisplay", console: "Console", job: "FederatedJob") -> "Callable[[], None]":
-    """Read the run folder; show the rounds, and print a line for each round and each reason to wait."""
-    from fcslam.federated.deployed_apps import read_status
-    from fcslam.federated.history import ROUNDS_FILE, read_rows
-
-    printed: set[str] = set()
-
-    def watch() -> None:
-        state, reason = read_status(job.output)
-        rows = read_rows(job.output / ROUNDS_FILE, job.settings.rounds)
-        lines = [round_line(row, job.settings.rounds) for row in rows]
-        if state == "waiting":
-            lines.append(f"waiting: {reason}")
-        for line in lines:
-            if line not in printed:
-                printed.add(line)
-                print_line(console, line)
-        display.show("rounds", len(rows), job.settings.rounds, state)
-
-    return watch

@@ -1,0 +1,197 @@
+"""The server's port: robots fetch requests and bring replies, and nothing else can be asked there.
+
+    POST /fleet/next             204, or a request with its number in a header; waits some seconds for one
+    POST /fleet/alive            204; a robot at work shows that it is still there
+    POST /fleet/reply/NUMBER     204; the reply to a request
+
+Whoever does not sign as a robot of the fleet gets 401 before the body is read. There is no operation that starts a
+run, adds a key or names a program: the operator does this on the server's command line.
+"""
+
+import asyncio
+import contextlib
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Final
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route
+
+from fcslam.federated.fleet_grid import FleetGrid
+from fcslam.federated.identity import RefusedRequestError, RobotAuthenticator
+from fcslam.federated.replies import printable_line
+from fcslam.federated.tls import Certificates
+
+NEXT_PATH: Final = "/fleet/next"
+ALIVE_PATH: Final = "/fleet/alive"
+REPLY_PATH: Final = "/fleet/reply/"
+NUMBER_HEADER: Final = "x-fcslam-request"
+"""Number of the request in the body."""
+LONG_POLL_S: Final = 10.0
+"""Time for which the server holds a robot's question for a request."""
+POLL_S: Final = 0.1
+MAX_OPEN_REQUESTS: Final = 4
+"""Requests of one robot at the same time. A robot needs two: one at work, and the sign of life."""
+START_S: Final = 30.0
+STOP_S: Final = 5.0
+MAX_NOTICES: Final = 100
+"""Different refusals that are reported, so that nobody can flood the log."""
+MAX_UNWANTED_BYTES: Final = 64 * 2**20
+"""A robot may send so much too late before the server hangs up."""
+_UNWANTED: Final = "nobody waits for this reply"
+
+OnNotice = Callable[[str], None]
+
+
+class FleetApp:
+    """The operations of the port. Its methods are the handlers.
+
+    Args:
+        grid: holds requests and replies.
+        authenticator: decides which robot a request is by.
+        on_notice: called with one line for each kind of refused request; from the thread of the server.
+    """
+
+    def __init__(self, grid: FleetGrid, authenticator: RobotAuthenticator, on_notice: OnNotice) -> None:
+        self._grid, self._authenticator, self._on_notice = grid, authenticator, on_notice
+        self._open: Counter[str] = Counter()
+        self._notices: set[str] = set()
+
+    def asgi(self) -> Starlette:
+        """The application for an ASGI server."""
+        operations = {
+            NEXT_PATH: self._next,
+            ALIVE_PATH: self._alive,
+            f"{REPLY_PATH}{{number:int}}": self._reply,
+        }
+        routes = [Route(path, self._guarded(handler), methods=["POST"]) for path, handler in operations.items()]
+        return Starlette(routes=routes, exception_handlers={404: self._unknown, 405: self._unknown})
+
+    def _guarded(
+        self, handler: Callable[[Request, str], Awaitable[Response]]
+    ) -> Callable[[Request], Awaitable[Response]]:
+        """The handler, for robots of the fleet only, and not too many times at once."""
+
+        async def handle(request: Request) -> Response:
+            try:
+                robot = await run_in_threadpool(
+                    self._authenticator.robot, request.method, request.url.path, request.headers
+                )
+                if not self._grid.mark_online(robot):
+                    raise RefusedRequestError("the fleet is full")
+            except RefusedRequestError as error:
+                return self._refusal(request, 401, str(error))
+            if self._open[robot] >= MAX_OPEN_REQUESTS:
+                return self._refusal(request, 429, f"{robot} has too many requests open")
+            self._open[robot] += 1
+            try:
+                return await handler(request, robot)
+            except RefusedRequestError as error:
+                return self._refusal(request, 401, str(error))
+            except ClientDisconnect:
+                return Response(status_code=400)
+            finally:
+                self._open[robot] -= 1
+
+        return handle
+
+    async def _next(self, request: Request, robot: str) -> Response:
+        await self._body(request, 0)
+        end = time.monotonic() + LONG_POLL_S
+        while time.monotonic() < end:
+            found = self._grid.next_request(robot)
+            if found is not None:
+                return Response(found.data, headers={NUMBER_HEADER: str(found.number)})
+            await asyncio.sleep(POLL_S)
+        return Response(status_code=204)
+
+    async def _alive(self, request: Request, _robot: str) -> Response:
+        await self._body(request, 0)
+        return Response(status_code=204)
+
+    async def _reply(self, request: Request, robot: str) -> Response:
+        number = int(request.path_params["number"])
+        limit = self._grid.reply_limit(robot, number)
+        if limit == 0:
+            await self._drain(request)
+            return PlainTextResponse(_UNWANTED, 409)
+        body = await self._body(request, limit)
+        if body is None:
+            reason = f"a reply of more than {limit} bytes"
+            self._grid.refuse_reply(robot, number, reason)
+            return self._refusal(request, 413, f"{robot}: {reason}")
+        is_taken = await run_in_threadpool(self._grid.store_reply, robot, number, body)
+        return Response(status_code=204) if is_taken else PlainTextResponse(_UNWANTED, 409)
+
+    async def _body(self, request: Request, limit: int) -> bytes | None:
+        """The body, read no further than ``limit`` bytes; None if it is longer.
+
+        Raises:
+            RefusedRequestError: the body is not the one that was signed.
+        """
+        body = bytearray()
+        async for part in request.stream():
+            body += part
+            if len(body) > limit:
+                return None
+        await run_in_threadpool(self._authenticator.check_body, request.headers, bytes(body))
+        return bytes(body)
+
+    async def _drain(self, request: Request) -> None:
+        """Read a body that nobody wants: a robot that is still sending would not see the answer."""
+        size = 0
+        async for part in request.stream():
+            size += len(part)
+            if size > MAX_UNWANTED_BYTES:
+                return
+
+    async def _unknown(self, request: Request, _error: Exception) -> Response:
+        return self._refusal(request, 404, "this port starts no run and runs no app; robots fetch requests here")
+
+    def _refusal(self, request: Request, status: int, reason: str) -> Response:
+        host = "?" if request.client is None else request.client.host
+        line = printable_line(f"refused: {request.method} {request.url.path} from {host}: {reason}")
+        if line not in self._notices and len(self._notices) < MAX_NOTICES:
+            self._notices.add(line)
+            self._on_notice(line)
+        return PlainTextResponse(reason, status, headers={"connection": "close"})
+
+
+@contextlib.contextmanager
+def listening(app: Starlette, listener: socket.socket, certificates: Certificates | None) -> Iterator[None]:
+    """Serve the application in a thread while the block runs.
+
+    Args:
+        app: what to serve.
+        listener: bound socket.
+        certificates: of this machine; None for no encryption.
+    """
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            ssl_certfile=None if certificates is None else certificates.certificate,
+            ssl_keyfile=None if certificates is None else certificates.key,
+            log_level="critical",
+            lifespan="off",
+            ws="none",
+            server_header=False,
+            timeout_graceful_shutdown=1,
+        )
+    )
+    thread = threading.Thread(target=server.run, args=([listener],), name="fleet server", daemon=True)
+    thread.start()
+    end = time.monotonic() + START_S
+    while not server.started and thread.is_alive() and time.monotonic() < end:
+        time.sleep(0.02)
+    try:
+        yield
+    finally:
+        server.should_exit = True
+        thread.join(STOP_S)
