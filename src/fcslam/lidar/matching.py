@@ -64,6 +64,11 @@ class ScanMatch:
     """Share of the scan's points that lie on a surface."""
     known: float
     """Share of the scan's points that fall near any surface."""
+    log_likelihood: float
+    """Log-likelihood of the scan, relative to a scan without a point on a surface.
+
+    Each point lies on its nearest surface, with a normally distributed distance, or is an outlier.
+    """
 
 
 def match_scan(
@@ -83,14 +88,14 @@ def match_scan(
         config: loss and iterations.
 
     Returns:
-        The pose, the information of the points, and the share of points on known surfaces.
+        The pose, the information of the points, and how well they fit.
     """
-    pose, information, explained, known = _match(
+    pose, information, explained, known, log_likelihood = _match(
         _Points(scan.points, scan.normals, scan.solitary, scan.origin),
         np.array(T_field_guess), prior_information, field.arrays,  # a writable copy: code is compiled once
         config.iterations, config.wide_scale_m, config.narrow_scale_m, config.point_sigma_m, config.explained_m,
     )  # fmt: skip
-    return ScanMatch(pose, information, explained, known)
+    return ScanMatch(pose, information, explained, known, INDEPENDENT * log_likelihood)
 
 
 class _Points(NamedTuple):
@@ -125,8 +130,7 @@ def _match(scan, guess, prior, field, iterations, wide, narrow, sigma, explained
         scale = max(narrow, scale * (FAST_SHRINK if small else SHRINK))
     pose[2] = (pose[2] + np.pi) % (2.0 * np.pi) - np.pi
     H, g = _normal_equations(scan, pose, field, narrow)
-    explained, known = _explained(scan, pose, field, explained_m)
-    return pose, H / (sigma * sigma), explained, known
+    return (pose, H / (sigma * sigma), *_fit(scan, pose, field, explained_m))
 
 
 @njit
@@ -145,8 +149,7 @@ def _solve(A, b):  # type: ignore[no-untyped-def]
 @njit
 def _normal_equations(scan, pose, field, scale):  # type: ignore[no-untyped-def]
     """Point-to-line where a normal is known, point-to-point for solitary returns; Geman-McClure weights."""
-    H = np.zeros((3, 3))
-    g = np.zeros(3)
+    hxx = hxy = hxt = hyy = hyt = htt = gx = gy = gt = 0.0  # scalars, which stay in registers
     points, normals, surfels = scan.points, scan.normals, field.surfels
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     c2 = scale * scale
@@ -167,47 +170,47 @@ def _normal_equations(scan, pose, field, scale):  # type: ignore[no-untyped-def]
         d2 = dx * dx + dy * dy
         if nx == 0.0 and ny == 0.0:
             nx, ny = mx, my
-        if nx == 0.0 and ny == 0.0 and scan.solitary[i]:
+        if nx == 0.0 and ny == 0.0:
             w = NO_NORMAL_WEIGHT * (c2 / (c2 + d2)) ** 2
-            _add(H, g, w, 1.0, 0.0, -ry, dx)
-            _add(H, g, w, 0.0, 1.0, rx, dy)
-        elif nx == 0.0 and ny == 0.0:
-            # Far along a wall, returns in a row repeat the pattern of the beams: their range would bind the robot to
-            # its previous position with false certainty. Only their bearing counts.
-            w = NO_NORMAL_WEIGHT * (c2 / (c2 + d2)) ** 2
-            bx, by = points[i, 0] - scan.origin[0], points[i, 1] - scan.origin[1]
-            length = max(np.hypot(bx, by), 1e-9)
-            nx, ny = -(sin * bx + cos * by) / length, (cos * bx - sin * by) / length
-            _add(H, g, w, nx, ny, ny * rx - nx * ry, nx * dx + ny * dy)
+            if scan.solitary[i]:  # two lines through the surfel: along x here, along y below
+                hyy += w
+                hyt += w * rx
+                htt += w * rx * rx
+                gy += w * dy
+                gt += w * rx * dy
+                nx = 1.0
+            else:
+                # Far along a wall, returns in a row repeat the pattern of the beams: their range would bind the robot
+                # to its previous position with false certainty. Only their bearing counts.
+                bx, by = points[i, 0] - scan.origin[0], points[i, 1] - scan.origin[1]
+                length = max(np.hypot(bx, by), 1e-9)
+                nx, ny = -(sin * bx + cos * by) / length, (cos * bx - sin * by) / length
+            e = nx * dx + ny * dy
         else:
             e = nx * dx + ny * dy
             along2 = max(0.0, d2 - e * e)
             w = (c2 / (c2 + e * e + ALONG * along2)) ** 2
-            _add(H, g, w, nx, ny, ny * rx - nx * ry, e)
-    return H, g
+        t = ny * rx - nx * ry
+        hxx += w * nx * nx
+        hxy += w * nx * ny
+        hxt += w * nx * t
+        hyy += w * ny * ny
+        hyt += w * ny * t
+        htt += w * t * t
+        gx += w * nx * e
+        gy += w * ny * e
+        gt += w * t * e
+    H = np.array(((hxx, hxy, hxt), (hxy, hyy, hyt), (hxt, hyt, htt)))
+    return H, np.array((gx, gy, gt))
 
 
 @njit
-def _add(H, g, w, jx, jy, jt, e):  # type: ignore[no-untyped-def]
-    H[0, 0] += w * jx * jx
-    H[0, 1] += w * jx * jy
-    H[0, 2] += w * jx * jt
-    H[1, 1] += w * jy * jy
-    H[1, 2] += w * jy * jt
-    H[2, 2] += w * jt * jt
-    H[1, 0] = H[0, 1]
-    H[2, 0] = H[0, 2]
-    H[2, 1] = H[1, 2]
-    g[0] += w * jx * e
-    g[1] += w * jy * e
-    g[2] += w * jt * e
-
-
-@njit
-def _explained(scan, pose, field, limit):  # type: ignore[no-untyped-def]
+def _fit(scan, pose, field, limit):  # type: ignore[no-untyped-def]
+    """Share of the points on a surface, share near any, and the log-likelihood of the points."""
     points, normals, surfels = scan.points, scan.normals, field.surfels
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     explained = known = 0
+    total = 0.0
     for i in range(len(points)):
         x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
         y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
@@ -221,51 +224,16 @@ def _explained(scan, pose, field, limit):  # type: ignore[no-untyped-def]
         if s[2] * mx + s[3] * my < OPPOSED:
             continue
         dx, dy = x - s[0], y - s[1]
-        d = abs(s[2] * dx + s[3] * dy)
-        if s[2] == 0.0 and s[3] == 0.0:
-            d = np.hypot(dx, dy)
-        elif dx * dx + dy * dy > ALONG_LIMIT2 * limit * limit:
-            continue
-        if d < limit:
-            explained += 1
-    n = max(1, len(points))
-    return explained / n, known / n
-
-
-def scan_log_likelihood(scan: PointScan, field: SurfelField, T_field_base: FloatArray) -> float:
-    """Log-likelihood of a scan at a pose, relative to a scan without a point on a surface.
-
-    Each point lies on its nearest surface, with a normally distributed distance, or is an outlier.
-
-    Args:
-        scan: points in ``base``.
-        field: surfaces.
-        T_field_base: the pose, shape (3,), metres and radians.
-    """
-    points = _Points(scan.points, scan.normals, scan.solitary, scan.origin)
-    return INDEPENDENT * float(_log_likelihood(points, T_field_base, field.arrays))
-
-
-@njit
-def _log_likelihood(scan, pose, field):  # type: ignore[no-untyped-def]
-    points, normals, surfels = scan.points, scan.normals, field.surfels
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    total = 0.0
-    for i in range(len(points)):
-        x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
-        y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
-        label = label_at(x, y, field)
-        if label == EMPTY:
-            continue
-        s = surfels[label]
-        mx = cos * normals[i, 0] - sin * normals[i, 1]
-        my = sin * normals[i, 0] + cos * normals[i, 1]
-        if s[2] * mx + s[3] * my < OPPOSED:
-            continue
-        dx, dy = x - s[0], y - s[1]
         d2 = dx * dx + dy * dy
-        if s[2] != 0.0 or s[3] != 0.0:
+        if s[2] == 0.0 and s[3] == 0.0:
+            likely2 = d2
+            on_surface = d2 < limit * limit
+        else:
             e = s[2] * dx + s[3] * dy
-            d2 = e * e + ALONG * (d2 - e * e)
-        total += np.log1p(INLIER_RATIO * np.exp(-0.5 * d2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))
-    return total
+            likely2 = e * e + ALONG * (d2 - e * e)
+            on_surface = abs(e) < limit and d2 <= ALONG_LIMIT2 * limit * limit
+        if on_surface:
+            explained += 1
+        total += np.log1p(INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M)))
+    n = max(1, len(points))
+    return explained / n, known / n, total

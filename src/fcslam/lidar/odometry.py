@@ -4,6 +4,7 @@ A good match measures how far odometry was wrong. These innovations, relative to
 of the error. Slips are outliers: the error follows a Student t distribution, whose scale is learned robustly.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -56,12 +57,12 @@ class OdometryError(NamedTuple):
 
     def mahalanobis2(self, innovation: FloatArray) -> float:
         """Squared Mahalanobis length of an innovation (x, y, theta), shape (3,), metres and radians."""
-        x, y, theta = innovation
+        x, y, theta = innovation.tolist()
         return float((x * x + y * y) / self.position_m**2 + (theta / self.heading_rad) ** 2)
 
     def log_likelihood(self, innovation: FloatArray) -> float:
         """Log-likelihood of an innovation, shape (3,), relative to none: a Student t distribution with ``TAIL``."""
-        return -0.5 * (TAIL + 3.0) * float(np.log1p(self.mahalanobis2(innovation) / TAIL))
+        return -0.5 * (TAIL + 3.0) * math.log1p(self.mahalanobis2(innovation) / TAIL)
 
 
 def odometry_error(moved_m: float, turned_rad: float, config: OdometryConfig) -> OdometryError:
@@ -99,7 +100,7 @@ class OdometryTrust:
             error: error of that motion by the model.
         """
         rate = 1.0 / min(FIRST_MATCHES + self.matches, LATEST_MATCHES)
-        x, y, theta = innovation
+        x, y, theta = innovation.tolist()
         return OdometryTrust(
             _learned_scale(self.position, 0.5 * (x * x + y * y) / error.position_m**2, rate),
             _learned_scale(self.heading, theta * theta / error.heading_rad**2, rate),
@@ -110,4 +111,4 @@ class OdometryTrust:
 def _learned_scale(scale: float, squared: float, rate: float) -> float:
     """One step of the recursive estimate of a Student t distribution's scale: an outlier has little weight."""
     weight = (TAIL + 1.0) / (TAIL + squared / scale**2)
-    return float(max(LEAST_TRUST, np.sqrt(scale**2 + rate * (weight * squared - scale**2))))
+    return max(LEAST_TRUST, math.sqrt(scale**2 + rate * (weight * squared - scale**2)))

@@ -38,12 +38,14 @@ class PointScan:
     def __len__(self) -> int:
         return len(self.points)
 
-    def thinned(self, spacing_m: float, limit: int | None = None) -> "PointScan":
-        """Every return at least ``spacing_m`` from the one kept before, at most ``limit`` of them."""
-        keep = _thin(self.points, spacing_m)
-        if limit is not None and len(keep) > limit:
-            keep = keep[np.linspace(0, len(keep) - 1, limit).astype(np.int64)]
-        return self.only(keep)
+    def thinned(self, spacing_m: float, limit: int | None = None, radius_m: float = np.inf) -> "PointScan":
+        """Every return at least ``spacing_m`` from the one kept before, at most ``limit`` of them.
+
+        Returns farther than ``radius_m`` from the origin of ``base`` are left out.
+        """
+        most = len(self) if limit is None else limit
+        points, normals, solitary = _thin(self.points, self.normals, self.solitary, spacing_m, most, radius_m)
+        return PointScan(points, normals, solitary, self.origin)
 
     def only(self, kept: NDArray[Any]) -> "PointScan":
         """The returns with the indices ``kept``, shape (K,), or where the mask ``kept``, shape (N,), is true."""
@@ -139,8 +141,7 @@ def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # typ
         sxx += dx * dx
         sxy += dx * dy
         syy += dy * dy
-    half = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)  # direction of the line
-    nx, ny = -np.sin(half), np.cos(half)
+    nx, ny = _across(sxx - syy, 2.0 * sxy)
     across = (nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy) / m
     along = (sxx + syy) / m - across
     if across > LINE_TOLERANCE_M**2 or across > ROUNDEST * along:
@@ -149,6 +150,21 @@ def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # typ
         nx, ny = -nx, -ny
     normals[k, 0] = nx
     normals[k, 1] = ny
+
+
+@njit
+def _across(difference, mixed):  # type: ignore[no-untyped-def]
+    """Unit normal of the line along half the angle of (difference, mixed), without trigonometric functions."""
+    length = np.hypot(difference, mixed)
+    if length == 0.0:
+        return 0.0, 1.0
+    if difference >= 0.0:
+        cos = np.sqrt(0.5 + 0.5 * difference / length)
+        sin = 0.5 * mixed / (length * cos)
+    else:
+        sin = np.copysign(np.sqrt(0.5 - 0.5 * difference / length), mixed)
+        cos = 0.5 * mixed / (length * sin)
+    return -sin, cos
 
 
 @njit
@@ -163,10 +179,12 @@ def _connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def
 
 
 @njit
-def _thin(points, spacing):  # type: ignore[no-untyped-def]
+def _thin(points, normals, solitary, spacing, limit, radius):  # type: ignore[no-untyped-def]
     keep = np.empty(len(points), np.int64)
     n = 0
     for i in range(len(points)):
+        if points[i, 0] ** 2 + points[i, 1] ** 2 >= radius * radius:
+            continue
         if n > 0:
             dx = points[i, 0] - points[keep[n - 1], 0]
             dy = points[i, 1] - points[keep[n - 1], 1]
@@ -174,4 +192,11 @@ def _thin(points, spacing):  # type: ignore[no-untyped-def]
                 continue
         keep[n] = i
         n += 1
-    return keep[:n]
+    count = min(n, limit)
+    kept_points, kept_normals, kept_solitary = np.empty((count, 2)), np.empty((count, 2)), np.empty(count, np.bool_)
+    for k in range(count):  # evenly spread over those that are far enough apart
+        i = keep[k * (n - 1) // max(1, count - 1)]
+        kept_points[k] = points[i]
+        kept_normals[k] = normals[i]
+        kept_solitary[k] = solitary[i]
+    return kept_points, kept_normals, kept_solitary

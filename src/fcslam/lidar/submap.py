@@ -1,5 +1,6 @@
 """Submaps: surfaces and free space seen by the keyscans around one anchor keyscan, in the base of the anchor."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -74,9 +75,8 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
 
 def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
     """Returns a field cell apart, within the radius of the anchor (measured from the robot: the window is short)."""
-    limit = max(1.0, RADIUS_M - float(np.hypot(T_anchor_base[0], T_anchor_base[1])))
-    inside = scan.points[:, 0] ** 2 + scan.points[:, 1] ** 2 < limit * limit
-    return (scan if inside.all() else scan.only(inside)).thinned(CELL_M)
+    radius_m = max(1.0, RADIUS_M - math.hypot(T_anchor_base[0], T_anchor_base[1]))
+    return scan.thinned(CELL_M, radius_m=radius_m)
 
 
 def _beam_counts(

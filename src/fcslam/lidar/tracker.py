@@ -1,5 +1,6 @@
 """Scan-to-submap tracking: every scan is matched; odometry only starts the match and steadies it."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
 from fcslam.lidar.field import SurfelField
-from fcslam.lidar.matching import MatchingConfig, ScanMatch, match_scan, scan_log_likelihood
+from fcslam.lidar.matching import MatchingConfig, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryConfig, OdometryError, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan
@@ -164,7 +165,8 @@ class ScanTracker:
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 3. Scan matching; a doubtful match starts a correlative search.
         error = odometry_error(moved_m, turned_rad, config.odometry)
-        match, likelihood = self._match(points, T_local_guess, error)
+        thinned = points.thinned(config.point_spacing_m, config.point_limit)
+        match, innovation = self._match(points, thinned, T_local_guess, error)
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < config.supported:
             tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points)
@@ -172,10 +174,10 @@ class ScanTracker:
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
         tracked = TrackedScan(match.T_field_base, match.information, points)
         # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
-        innovation = se2.between(T_local_guess, match.T_field_base)
         trust = self._trust.learn(innovation, error) if _is_good(match) else self._trust
+        usual = _learn_usual(self._usual, match.log_likelihood / max(1, len(thinned)))
         accepted = match.explained, match.known, scan.T_odom_base, 0.0, 0.0
-        return TrackingResult(tracked, *accepted, matched_here, trust, _learn_usual(self._usual, likelihood))
+        return TrackingResult(tracked, *accepted, matched_here, trust, usual)
 
     def commit(self, result: TrackingResult) -> None:
         """Continue from the pose that :meth:`localize` found."""
@@ -207,45 +209,47 @@ class ScanTracker:
         """The last pose moved by odometry; travel and turn since the last accepted match."""
         last = scan.T_odom_base if self._T_odom_base is None else self._T_odom_base
         motion = se2.between(last, scan.T_odom_base)
-        moved_m = self._moved_m + float(np.hypot(motion[0], motion[1]))
+        moved_m = self._moved_m + math.hypot(motion[0], motion[1])
         return se2.compose(self._T_local_base, motion), moved_m, self._turned_rad + abs(float(motion[2]))
 
-    def _match(self, points: PointScan, T_local_guess: FloatArray, error: OdometryError) -> tuple[ScanMatch, float]:
+    def _match(
+        self, points: PointScan, thinned: PointScan, T_local_guess: FloatArray, error: OdometryError
+    ) -> tuple[ScanMatch, FloatArray]:
         """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match.
 
         Returns:
-            The match, and the scan's log-likelihood per point there.
+            The match, and its pose relative to the guess, shape (3,), metres and radians.
         """
         config, field = self._config, self._fields[0][0]
-        thinned = points.thinned(config.point_spacing_m, config.point_limit)
-        count = max(1, len(thinned))
         learned = self._trust.scale(error)
         match = match_scan(thinned, field, T_local_guess, error.information, config.matching)
         innovation = se2.between(T_local_guess, match.T_field_base)
-        log_likelihood = scan_log_likelihood(thinned, field, match.T_field_base)
-        log_posterior = log_likelihood + learned.log_likelihood(innovation)
+        log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
         is_doubtful = (
             match.explained < config.doubtful * match.known or learned.mahalanobis2(innovation) >= config.surprise**2
         )
-        is_unlikely = log_posterior < self._usual * count - config.unlikely  # False before the first match
+        is_unlikely = log_posterior < self._usual * len(thinned) - config.unlikely  # False before the first match
         if not is_doubtful and not is_unlikely:
-            return match, log_likelihood / count
+            return match, innovation
         window = SearchWindow(config.search_radius_m, config.search_angle_rad)
-        found = search(points, field, T_local_guess, window, config.search, visible_only=True)
+        found = search(
+            points, field, T_local_guess, window, config.search, visible_only=True, better_than=match.T_field_base
+        )
+        if np.array_equal(found.T_field_base, match.T_field_base):
+            return match, innovation
         other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching)
-        other_log_likelihood = scan_log_likelihood(thinned, field, other.T_field_base)
-        odometry = learned.log_likelihood(se2.between(T_local_guess, other.T_field_base))
+        other_innovation = se2.between(T_local_guess, other.T_field_base)
         is_fixed = is_doubtful or _weakest_sigma_m(other) < SEARCH_SIGMA_M
-        if is_fixed and other_log_likelihood + odometry > log_posterior + SEARCH_GAIN:
-            return other, other_log_likelihood / count
-        return match, log_likelihood / count
+        if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:
+            return other, other_innovation
+        return match, innovation
 
 
 def _learn_usual(usual: float, likelihood: float) -> float:
     """The usual log-likelihood per point after one more match."""
-    if np.isnan(usual):
+    if math.isnan(usual):
         return likelihood
-    return usual + USUAL_WEIGHT * float(np.clip(likelihood - usual, -USUAL_STEP, USUAL_STEP))
+    return usual + USUAL_WEIGHT * min(max(likelihood - usual, -USUAL_STEP), USUAL_STEP)
 
 
 def _is_good(match: ScanMatch) -> bool:
@@ -256,5 +260,6 @@ def _is_good(match: ScanMatch) -> bool:
 
 def _weakest_sigma_m(match: ScanMatch) -> float:
     """Standard deviation of the position by the scan's points, in the direction that they fix least, metres."""
-    weakest = float(np.linalg.eigvalsh(match.information[:2, :2])[0])
-    return weakest**-0.5 if weakest > 0.0 else np.inf
+    (xx, xy), (_, yy) = match.information[:2, :2].tolist()
+    weakest = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)  # the lesser eigenvalue
+    return weakest**-0.5 if weakest > 0.0 else math.inf

@@ -22,7 +22,7 @@ from fcslam.lidar import correlative, matching
 from fcslam.lidar import field as field_code
 from fcslam.lidar.correlative import SearchConfig, SearchWindow, search
 from fcslam.lidar.field import SurfelField, field_of
-from fcslam.lidar.matching import MatchingConfig, match_scan, scan_log_likelihood
+from fcslam.lidar.matching import MatchingConfig, match_scan
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import build_submap
@@ -75,7 +75,6 @@ def warm_up_scanning() -> None:
 def warm_up_matching() -> None:
     """Compile what the second scan needs. Arrays without content: nothing else is compiled for them."""
     match_scan(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), np.zeros((3, 3)), MatchingConfig())
-    scan_log_likelihood(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3))
 
 
 def warm_up_searching() -> None:
