@@ -11,7 +11,6 @@ from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.trajectory import Trajectory
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.lidar.uniqueness import align_map, best_elsewhere
 from fcslam.records import FloatArray
 
 REACH_M = 20.0
@@ -42,6 +41,9 @@ class MapComparison:
         Returns:
             The comparison; None if a session has no keyscan left around the places.
         """
+        # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
+        from fcslam.lidar.uniqueness import align_map, best_elsewhere
+
         map_a = self._map_around(sessions[0], a, members.i)
         map_b = self._map_around(sessions[1], b, members.j)
         if map_a is None or map_b is None:

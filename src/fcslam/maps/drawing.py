@@ -162,10 +162,11 @@ def _shrunk(cells: Cells, factor: int) -> Cells:
 def _canvas(view: _Viewport) -> Image:
     colors = np.zeros((len(Occupancy), 3), np.uint8)
     colors[Occupancy.UNKNOWN], colors[Occupancy.FREE], colors[Occupancy.OCCUPIED] = PAPER, FLOOR, WALL
-    rows = view.cells[::-1].repeat(view.cell_px, axis=0).repeat(view.cell_px, axis=1)
-    canvas = np.full((rows.shape[0] + 2 * MARGIN_PX, rows.shape[1] + 2 * view.offset_px, 3), PAPER, np.uint8)
-    canvas[MARGIN_PX : MARGIN_PX + rows.shape[0], view.offset_px : view.offset_px + rows.shape[1]] = colors[rows]
-    return canvas
+    drawn = cv2.resize(
+        colors[view.cells[::-1]], None, fx=view.cell_px, fy=view.cell_px, interpolation=cv2.INTER_NEAREST_EXACT
+    )
+    margins = MARGIN_PX, MARGIN_PX, view.offset_px, view.offset_px
+    return np.asarray(cv2.copyMakeBorder(drawn, *margins, cv2.BORDER_CONSTANT, value=PAPER))
 
 
 def _draw_trajectory(canvas: Image, pixels: FloatArray, color: Color) -> None:

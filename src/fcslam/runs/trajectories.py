@@ -8,13 +8,18 @@ import numpy as np
 from fcslam.errors import EvaluationError
 from fcslam.records import FloatArray, frozen
 
+_TUM_LINE = "%.9f %.9f %.9f 0 0 0 %.9f %.9f\n"
+
 
 def write_tum(path: Path | BinaryIO, stamps: FloatArray, T_map_base: FloatArray) -> None:
     """Write poses (N, 3) as TUM lines ``stamp x y 0 0 0 qz qw``, nine digits after the point."""
     half = T_map_base[:, 2] / 2.0
-    zeros = np.zeros(len(half))
-    columns = (stamps, T_map_base[:, 0], T_map_base[:, 1], zeros, zeros, zeros, np.sin(half), np.cos(half))
-    np.savetxt(path, np.column_stack(columns), fmt="%.9f %.9f %.9f %d %d %d %.9f %.9f")
+    rows = np.column_stack((stamps, T_map_base[:, :2], np.sin(half), np.cos(half)))
+    text = "".join(_TUM_LINE % tuple(row) for row in rows.tolist()).encode()
+    if isinstance(path, Path):
+        path.write_bytes(text)
+    else:
+        path.write(text)
 
 
 def read_tum(path: Path) -> tuple[FloatArray, FloatArray]:
