@@ -19,7 +19,7 @@ from fcslam.lidar.matching import MatchingConfig, match_scan
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Submap, agreement
 from fcslam.records import FloatArray
 
-Spectrum = NDArray[np.complex128]
+Spectrum = NDArray[np.complex64]
 
 CELL_M = 0.25
 """Side of a cell of the exhaustive search."""
@@ -153,24 +153,27 @@ def _coarse_peaks(a: Submap, b: Submap) -> Iterator[tuple[float, FloatArray]]:
             scores[np.ix_((row + near) % cells, (column + near) % cells)] = -np.inf
 
 
-def _smear(cells: int) -> FloatArray:
+def _smear(cells: int) -> NDArray[np.float32]:
     """Spectrum of a Gaussian that is 1 on a straight wall, shape (cells, cells // 2 + 1)."""
     y, x = np.meshgrid(fft.fftfreq(cells), fft.rfftfreq(cells), indexing="ij")
-    spectrum: FloatArray = np.exp(-2.0 * np.pi**2 * (x * x + y * y)) * np.sqrt(2.0 * np.pi)
-    return spectrum
+    spectrum: NDArray[np.float32] = np.exp(-2.0 * np.pi**2 * (x * x + y * y)).astype(np.float32)
+    return spectrum * np.float32(np.sqrt(2.0 * np.pi))
 
 
-def _spectra(drawing: _Drawing, heading: float, smear: FloatArray) -> tuple[Spectrum, Spectrum]:
-    """Spectra of a turned map: its surface, and what a surface point of another map is worth in each cell."""
+def _spectra(drawing: _Drawing, heading: float, smear: NDArray[np.float32]) -> tuple[Spectrum, Spectrum]:
+    """Spectra of a turned map: the cells with a surface, and what such a cell of another map is worth in each cell.
+
+    Single precision is enough for peaks that are refined later, and takes two thirds of the time.
+    """
     cells = len(smear)
     turn = np.array([0.0, 0.0, heading])
-    counts, occupied, inside = np.zeros((3, cells, cells))
+    surface, inside = np.zeros((2, cells, cells), np.float32)
     row, column = _cells_of(se2.transform(turn, drawing.surface), cells)
-    np.add.at(counts, (row, column), 1.0)
-    occupied[row, column] = 1.0
+    surface[row, column] = 1.0
     row, column = _cells_of(se2.transform(turn, drawing.inside), cells)
     inside[row, column] = VIOLATION_WEIGHT
-    return fft.rfft2(counts), fft.rfft2(occupied) * smear - fft.rfft2(inside)
+    occupied = fft.rfft2(surface)
+    return occupied, occupied * smear - fft.rfft2(inside)
 
 
 def _cells_of(points: FloatArray, cells: int) -> NDArray[np.int64]:
