@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import NamedTuple
 
+from fcslam.records import Ranges
 from fcslam.sources.pose import Pose
 
 _MAX_COORDINATE = 1e7
@@ -21,7 +22,7 @@ class StatedLaser(NamedTuple):
 
 
 class ScanLine(NamedTuple):
-    """One scan, its ranges still as text."""
+    """One scan, its ranges as text."""
 
     stamp: float
     T_odom_base: Pose
@@ -29,6 +30,8 @@ class ScanLine(NamedTuple):
     beam_count: int
     range_text: bytes
     stated: StatedLaser | None = None
+    ranges_m: Ranges | None = None
+    """The ranges, if they are parsed already, shape (beam_count,)."""
 
 
 class OdometryLine(NamedTuple):

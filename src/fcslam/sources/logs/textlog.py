@@ -7,16 +7,13 @@ Besides the rules of ``gate``:
   and is rejected. If only the odometry messages change, a scan takes the pose of the message before it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
-from math import nan
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from fcslam.errors import SourceError
-from fcslam.records import Beams, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.records import Beams, LaserScan, Odometry, SensorRecord
 from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, scan_window
@@ -24,17 +21,13 @@ from fcslam.sources.logs.archive import numbered_lines
 from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ParameterLine, ScanLine
 from fcslam.sources.logs.laser import Interleaving, LogBeams, first_beams
 from fcslam.sources.logs.overview import LogReading, Overview
+from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import Pose, pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 KEPT_BYTES = 1 << 25
 """A log with more bytes is decompressed and parsed again in each pass, so that memory does not grow with its length."""
-
-_LONGEST_RANGE_M = 1e6
-
-_NumberedLine = tuple[int, Line | None]
-"""A line with its number, counted from 1; None if it is broken."""
 
 
 class _Scan(NamedTuple):
@@ -54,7 +47,7 @@ class TextLog:
         self._path = path
         self._dialect = dialect
         self._audit = Audit()
-        self._kept: list[_NumberedLine] = []
+        self._kept: list[NumberedLine] = []
         """All lines, once a short log was read to its end."""
 
     @property
@@ -67,7 +60,7 @@ class TextLog:
         if scans == WHOLE:
             return self._reading.survey
         audit, track = Audit(), PathSummary()
-        for _, entry in self._entries(scans, audit):
+        for _, entry in self._entries(scans, self._all_lines(), audit):
             if isinstance(entry, _Scan):
                 track.add(entry.line.stamp, entry.T_odom_base)
         return Survey(track.count, track.duration_s, track.length_m, self._reading.survey.lasers, audit.faults())
@@ -77,13 +70,14 @@ class TextLog:
         audit = self._audit = Audit()
         watch = OdometryWatch(audit)
         (laser,) = self._reading.survey.lasers
-        for number, entry in self._entries(scans, audit):
+        unit = self._dialect.metres_per_range_unit
+        for number, entry in self._entries(scans, parse_ahead(self._all_lines(), unit), audit):
             T_odom_base = pose_array(entry.T_odom_base)
             if isinstance(entry, OdometryLine):
                 yield Odometry(entry.stamp, T_odom_base)
                 continue
             try:
-                ranges_m = _ranges(entry.line, self._dialect.metres_per_range_unit, number, audit)
+                ranges_m = parse_ranges(entry.line, unit, number, audit)
             except ValueError:
                 audit.add(Fault.BROKEN_LINE, number)
             else:
@@ -98,7 +92,7 @@ class TextLog:
         overview = Overview()
         declared, interleaving = self._first_look()
         gate, log_beams = ScanGate(declared, audit), LogBeams(declared, interleaving)
-        for number, line in self._lines(audit):
+        for number, line in _sound(self._all_lines(), audit):
             if isinstance(line, ScanLine):
                 if not gate.admits(number, line.stamp, log_beams.of(line)):
                     continue
@@ -109,7 +103,7 @@ class TextLog:
     def _first_look(self) -> tuple[Beams, Interleaving | None]:
         """The usual beams of the first scans, and whether they interleave."""
         audit, scans, parameters = Audit(), list[ScanLine](), dict[str, str]()
-        for _, line in self._lines(audit):
+        for _, line in _sound(self._all_lines(), audit):
             if isinstance(line, ParameterLine):
                 parameters[line.name] = line.value
             elif isinstance(line, ScanLine):
@@ -121,17 +115,13 @@ class TextLog:
             raise SourceError(f"{self._path}: no laser scan in this {self._dialect.name}{seen}; give a log with scans")
         return first_beams(scans, parameters)
 
-    def _lines(self, audit: Audit) -> Iterator[tuple[int, Line]]:
-        for number, line in self._kept or self._parsed():
-            if line is None:
-                audit.add(Fault.BROKEN_LINE, number)
-            else:
-                yield number, line
+    def _all_lines(self) -> Iterable[NumberedLine]:
+        return self._kept or self._parsed()
 
-    def _parsed(self) -> Iterator[_NumberedLine]:
+    def _parsed(self) -> Iterator[NumberedLine]:
         """Parse the log line by line; keeps the lines of a short log for the next pass."""
         parse = self._dialect.parser()
-        kept, size = list[_NumberedLine](), 0
+        kept, size = list[NumberedLine](), 0
         for number, text in numbered_lines(self._path):
             try:
                 line = parse(text)
@@ -146,19 +136,23 @@ class TextLog:
         if size <= KEPT_BYTES:
             self._kept = kept
 
-    def _entries(self, scans: ScanRange, audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
+    def _entries(
+        self, scans: ScanRange, lines: Iterable[NumberedLine], audit: Audit
+    ) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
         """Scans and odometry of the range, with the poses to use; afterwards ``audit`` holds the range's faults."""
-        for number, entry in scan_window(self._posed(audit), scans, lambda entry: isinstance(entry, _Scan), audit):
+        for number, entry in scan_window(
+            self._posed(lines, audit), scans, lambda entry: isinstance(entry, _Scan), audit
+        ):
             if isinstance(entry, _Scan):
                 self._note_clock(number, audit)
             yield number, entry
 
-    def _posed(self, audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
+    def _posed(self, lines: Iterable[NumberedLine], audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
         reading = self._reading
         declared = reading.survey.lasers[0].beams
         gate, log_beams = ScanGate(declared, audit), LogBeams(declared, reading.interleaving)
         latest = None
-        for number, line in self._lines(audit):
+        for number, line in _sound(lines, audit):
             if isinstance(line, OdometryLine):
                 latest = line
                 yield number, line
@@ -173,18 +167,10 @@ class TextLog:
             audit.add(Fault.NO_STAMP, number)
 
 
-def _ranges(scan: ScanLine, metres_per_unit: float, number: int, audit: Audit) -> Ranges:
-    """Ranges in metres, shape (beam_count,), invalid ones NaN; raises ValueError if one is not a number."""
-    values = np.array(scan.range_text.split(), dtype=np.float64) * metres_per_unit
-    if not (values.min() >= 0.0 and values.max() < _LONGEST_RANGE_M):
-        finite, negative = np.isfinite(values), values < 0.0
-        for kind, count in (
-            (Fault.NON_FINITE_RANGE, np.count_nonzero(~finite)),
-            (Fault.NEGATIVE_RANGE, np.count_nonzero(negative & finite)),
-        ):
-            if count:
-                audit.add(kind, number, int(count))
-        values = np.where(finite & ~negative, np.minimum(values, _LONGEST_RANGE_M), nan)
-    ranges: Ranges = values.astype(np.float32)
-    ranges.setflags(write=False)
-    return ranges
+def _sound(lines: Iterable[NumberedLine], audit: Audit) -> Iterator[tuple[int, Line]]:
+    """The lines that are not broken; counts the others."""
+    for number, line in lines:
+        if line is None:
+            audit.add(Fault.BROKEN_LINE, number)
+        else:
+            yield number, line
