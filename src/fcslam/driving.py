@@ -20,7 +20,7 @@ from fcslam.records import Keyscan, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
 from fcslam.sources import Source
-from fcslam.sources.faults import Faults
+from fcslam.sources.faults import Fault, Faults
 from fcslam.wire.packets import SizedPacket, measure
 
 SCANS_PER_LEG: Final = 50
@@ -101,7 +101,8 @@ def _legs(source: Source, config: RobotConfig) -> Iterator[Leg]:
             yield Leg(robot.robot, tuple(packets), tuple(stamps))
             packets, stamps = [], []
     packets += map(measure, robot.finish())
-    yield Leg(robot.robot, tuple(packets), tuple(stamps), tuple(map(_track, robot.tracks)), source.faults)
+    faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
+    yield Leg(robot.robot, tuple(packets), tuple(stamps), tuple(map(_track, robot.tracks)), faults)
 
 
 def _track(poses: ScanTrack) -> Track:

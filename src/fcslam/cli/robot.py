@@ -136,6 +136,7 @@ def robot(
     """Map a recording as one robot and send places and keyscans to the cloud, through outages and restarts."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.robot.agent import PlaybackPace
+    from fcslam.sources.faults import Fault
 
     pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
     settings = mission_config(config).robot
@@ -158,7 +159,7 @@ def robot(
                 f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume",
             )
             raise
-        print_faults(console, {recording.name: recording.faults})
+        print_faults(console, {recording.name: recording.faults.plus(Fault.ODOMETRY_JUMP, agent.odometry_jumps)})
         _report(agent, state, server)
 
 

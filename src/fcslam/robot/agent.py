@@ -73,7 +73,8 @@ class AgentProgress:
     catching_up: bool
     """Whether a resumed recording has not yet reached the point of interruption."""
     notices: tuple[str, ...]
-    """Messages about packets of another mission, refused packets, and the last detector update, if there were any."""
+    """Messages about packets of another mission, refused packets, the last detector update, a failed back end, and
+    jumps of the odometry, if there were any."""
 
     @property
     def localization(self) -> LocalizationState:
@@ -164,13 +165,20 @@ class Agent:
         sender = self._sender
         failure = self._frontend.backend_failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
-        notices = tuple(filter(None, (sender.notice, sender.refused_notice, self._detector_updates.notice, broken)))
+        jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
+        found = sender.notice, sender.refused_notice, self._detector_updates.notice, broken, jumps
+        notices = tuple(filter(None, found))
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(
             sum(map(len, self._frontend.tracks)), self._keyscans, self._outbox.waiting, sender.confirmed,
             sender.sent_bytes, left_out, sender.refusals, self.localizer.map_index, self.localizer.age_s,
             self.localizer.quality, len(self._frontend.tracks) - 1, sender.trouble, self._put < self._known, notices,
         )  # fmt: skip
+
+    @property
+    def odometry_jumps(self) -> int:
+        """Number of jumps of the odometry so far."""
+        return self._frontend.odometry.jumps
 
     @property
     def localizer(self) -> Localizer:

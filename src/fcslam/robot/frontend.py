@@ -31,6 +31,7 @@ from fcslam.robot.backend import (
     essential,
 )
 from fcslam.robot.beside import BackendRunner, Inline
+from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.quantisation import dequantise, quantise
@@ -40,6 +41,9 @@ class RobotConfig(SessionConfig):
     """Settings of one robot."""
 
     lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost and starts a new session")
+    odometry: OdometryLimits = Field(
+        default=OdometryLimits(), description="jumps of the wheel odometry, which scan matching bridges"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +74,8 @@ class RobotFrontend:
         """Poses of the scans, by session."""
         self.backend_failure: str | None = None
         """Why the back end ended early; from then on the robot sends neither closures nor places. None if it works."""
+        self.odometry = OdometryGate(config.odometry)
+        """Jumps of the odometry so far."""
         self._config = config
         self._backend = Inline(RobotBackend(robot, config)) if backend is None else backend
         self._waiting: deque[_Waiting] = deque()
@@ -102,11 +108,14 @@ class RobotFrontend:
         match record:
             case LaserScan():
                 # The robot maps with the quantised ranges, so robot and cloud see the same numbers.
-                self._process_scan(replace(record, ranges_m=dequantise(quantise(record.ranges_m))))
-            case CameraImage() if Channel.CAMERA in self._config.channels and self._deferred:
-                self._deferred.append(record)
+                scan = self.odometry.scan(record)
+                self._process_scan(replace(scan, ranges_m=dequantise(quantise(scan.ranges_m))))
             case CameraImage() if Channel.CAMERA in self._config.channels:
-                self._describe(record)
+                image = self.odometry.image(record)
+                if self._deferred:
+                    self._deferred.append(image)
+                else:
+                    self._describe(image)
         return self.ready()  # scans carry their odometry; images never leave the robot
 
     def ready(self, wait: bool = False) -> list[Packet]:

@@ -19,6 +19,7 @@ class Fault(StrEnum):
     HELD_ODOMETRY = "scans beyond the odometry's ends given its nearest pose"
     FROZEN_ODOMETRY = "scans that change while the odometry stands still kept"
     FROZEN_SCAN = "scans that stay the same while the odometry moves kept"
+    ODOMETRY_JUMP = "jumps of the odometry bridged by scan matching"
     ODOMETRY_GAP = "scans in gaps of the odometry of more than 1 s kept"
     MISPLACED_SCAN = "scans recorded far back in time skipped"
     TIME_REVERSAL = "steps back in time kept"
@@ -34,7 +35,7 @@ class FaultCount:
 
     count: int = 0
     first_line: int = 0
-    """Line (or message of its topic, or record of its file) of the first fault, counted from 1; 0 without faults."""
+    """Line (or message of its topic, or record of its file) of the first fault, counted from 1; 0 if unknown."""
     largest_s: float = 0.0
     """Largest step back in time, for kinds of faults that have one."""
 
@@ -53,13 +54,18 @@ class Faults:
     def __bool__(self) -> bool:
         return bool(self.counts)
 
+    def plus(self, kind: Fault, count: int) -> "Faults":
+        """These faults and ``count`` more, found by the robot and not by the reader."""
+        return Faults({**self.counts, kind: FaultCount(self[kind].count + count)}, self.unit) if count else self
+
     def __str__(self) -> str:
         return ", ".join(self._describe(kind) for kind in Fault if kind in self.counts) or "no faults"
 
     def _describe(self, kind: Fault) -> str:
         found = self.counts[kind]
         largest = f", largest {found.largest_s:.3g} s" if found.largest_s else ""
-        return f"{kind}: {found.count} (first: {self.unit} {found.first_line}{largest})"
+        first = f" (first: {self.unit} {found.first_line}{largest})" if found.first_line else ""
+        return f"{kind}: {found.count}{first}"
 
 
 class Audit:

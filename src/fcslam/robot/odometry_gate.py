@@ -1,0 +1,81 @@
+"""Odometry that no robot can have: a reading that jumps is bridged, so that scan matching goes on from where it was."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.geometry import se2
+from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
+
+LEAST_BRIDGE_M, LEAST_BRIDGE_RAD = 0.02, 0.02
+"""A bridge is at least such a motion: the tracker does not match the scans of a robot that stands still."""
+
+WITHOUT_CLOCK_S = 2.0
+"""Scans with equal stamps may be so far apart: some logs were recorded without a clock, a scan every two metres."""
+
+
+class OdometryLimits(Settings):
+    """The fastest motion that wheel odometry may report between two scans; a faster one is a jump."""
+
+    speed_m_s: float = Field(default=5.0, gt=0, description="largest speed [m/s]")
+    turn_rad_s: float = Field(default=6.0, gt=0, description="largest speed of a turn [rad/s]")
+    slack_m: float = Field(default=1.0, ge=0, description="length allowed to any step, as stamps may be wrong [m]")
+    slack_rad: float = Field(default=1.5, ge=0, description="turn allowed to any step [rad]")
+
+
+class OdometryGate:
+    """Moves the frame ``odom`` at every jump, so that odometry goes on as before the jump."""
+
+    def __init__(self, limits: OdometryLimits) -> None:
+        self.jumps = 0
+        """Number of jumps so far."""
+        self.largest_m = 0.0
+        """Length of the largest one, metres."""
+        self._limits = limits
+        self._last: tuple[float, FloatArray] | None = None
+        """Stamp and pose, as it was read, of the scan before."""
+        self._bridge: FloatArray | None = None
+        """The present frame ``odom`` in the first one, shape (3,); None before the first jump."""
+        self._motion = np.array((LEAST_BRIDGE_M, 0.0, 0.0))
+        """The last motion between two scans of a robot that moved."""
+
+    def scan(self, scan: LaserScan) -> LaserScan:
+        """The next scan, with its odometry free of jumps."""
+        read = scan.T_odom_base
+        if self._last is not None:
+            stamp, before = self._last
+            if not np.isfinite(read).all():
+                self.jumps += 1
+                read = se2.compose(before, self._motion)
+            motion = se2.between(before, read)
+            if self._is_jump(motion, scan.stamp - stamp):
+                self.jumps += 1
+                self.largest_m = max(self.largest_m, math.hypot(motion[0], motion[1]))
+                self._bridge = se2.compose(se2.compose(self.bridged(before), self._motion), se2.inverse(read))
+            elif math.hypot(motion[0], motion[1]) > LEAST_BRIDGE_M or abs(motion[2]) > LEAST_BRIDGE_RAD:
+                self._motion = motion
+        self._last = scan.stamp, read
+        if self._bridge is None and read is scan.T_odom_base:
+            return scan
+        return LaserScan(scan.stamp, scan.ranges_m, scan.laser, frozen(self.bridged(read)))
+
+    def image(self, image: CameraImage) -> CameraImage:
+        """An image taken since the last scan, with its odometry in the same frame."""
+        if self._bridge is None or image.T_odom_base is None:
+            return image
+        return replace(image, T_odom_base=frozen(self.bridged(image.T_odom_base)))
+
+    def bridged(self, T_odom_base: FloatArray) -> FloatArray:
+        """A pose that was read, shape (3,), in the first frame ``odom``."""
+        return T_odom_base if self._bridge is None else se2.compose(self._bridge, T_odom_base)
+
+    def _is_jump(self, motion: FloatArray, within_s: float) -> bool:
+        limits = self._limits
+        within_s = within_s if within_s > 0.0 else WITHOUT_CLOCK_S
+        return bool(
+            math.hypot(motion[0], motion[1]) > limits.slack_m + limits.speed_m_s * within_s
+            or abs(motion[2]) > limits.slack_rad + limits.turn_rad_s * within_s
+        )

@@ -1,0 +1,117 @@
+"""Odometry that no robot can have is bridged."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.records import CameraImage, CameraModel, Channel, LaserModel, LaserScan, Transform, frozen
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
+from tests import small_fleet
+
+LASER = LaserModel(3, -1.0, 1.0, 10.0)
+CAMERA = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+RANGES = frozen(np.ones(3), np.float32)
+
+
+def scans_of(poses, step_s=0.1):
+    return [LaserScan(step_s * k, RANGES, LASER, frozen(pose)) for k, pose in enumerate(poses)]
+
+
+def wandering(count, seed):
+    rng = np.random.default_rng(seed)
+    poses = [np.zeros(3)]
+    for motion in rng.uniform((-0.05, -0.05, -0.1), (0.2, 0.05, 0.1), (count - 1, 3)):
+        poses.append(se2.compose(poses[-1], motion))
+    return np.array(poses)
+
+
+def test_odometry_without_a_jump_is_not_touched():
+    scans, gate = scans_of(wandering(100, 0)), OdometryGate(OdometryLimits())
+    assert all(gate.scan(scan) is scan for scan in scans)
+    assert gate.jumps == 0
+
+
+@pytest.mark.parametrize("far", [(30.0, 0.0, 0.0), (3e3, -2e3, 1.0), (1e5, 1e5, -3.0), (0.0, 0.0, 3.1)])
+@pytest.mark.parametrize("lasting", [1, 4, 1000])
+def test_motions_that_do_not_jump_are_kept_whatever_jumps_lie_between(far, lasting):
+    """A spike jumps twice, a reset once."""
+    poses = wandering(60, 1)
+    read = poses.copy()
+    read[30 : 30 + lasting] = se2.compose(np.array(far), poses[30 : 30 + lasting])
+    gate = OdometryGate(OdometryLimits())
+    bridged = np.array([gate.scan(scan).T_odom_base for scan in scans_of(read)])
+    jumped = {29} | ({29 + lasting} if 30 + lasting < 60 else set())
+    assert gate.jumps == len(jumped)
+    kept = [k for k in range(59) if k not in jumped]
+    np.testing.assert_allclose(se2.relative(bridged)[kept], se2.relative(poses)[kept], atol=1e-6)
+    assert np.hypot(*se2.relative(bridged)[:, :2].T).max() < 0.25
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_a_reading_that_is_no_number_is_bridged(broken):
+    poses = wandering(20, 2)
+    poses[10] = broken
+    gate = OdometryGate(OdometryLimits())
+    bridged = np.array([gate.scan(scan).T_odom_base for scan in scans_of(poses)])
+    assert np.isfinite(bridged).all()
+    assert gate.jumps == 1
+
+
+def test_a_bridge_is_never_taken_for_standing_still():
+    """The tracker does not match the scans of a robot that stands."""
+    poses = np.zeros((10, 3))
+    poses[5:, 0] = 1e3
+    gate = OdometryGate(OdometryLimits())
+    bridged = np.array([gate.scan(scan).T_odom_base for scan in scans_of(poses)])
+    assert np.hypot(*(bridged[5] - bridged[4])[:2]) == pytest.approx(0.02)
+
+
+def test_scans_without_a_clock_may_be_metres_apart():
+    poses = np.zeros((5, 3))
+    poses[:, 0] = 4.0 * np.arange(5)
+    gate = OdometryGate(OdometryLimits())
+    for scan in scans_of(poses, step_s=0.0):
+        gate.scan(scan)
+    assert gate.jumps == 0
+
+
+def test_images_move_with_the_scans():
+    poses = wandering(40, 3)
+    read = poses.copy()
+    read[20:] = se2.compose(np.array((500.0, 0.0, 2.0)), poses[20:])
+    gate = OdometryGate(OdometryLimits())
+    for scan in scans_of(read):
+        seen = gate.scan(scan)
+        offset = np.array((0.1, 0.02, 0.03))
+        image = CameraImage(scan.stamp, b"", CAMERA, frozen(se2.compose(scan.T_odom_base, offset)))
+        np.testing.assert_allclose(se2.between(seen.T_odom_base, gate.image(image).T_odom_base), offset, atol=1e-6)
+        without = replace(image, T_odom_base=None)
+        assert gate.image(without) is without
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("far_m", [3.0, 30.0, 3e3, 2e4, 1.5e5])
+def test_a_robot_maps_on_through_spikes(far_m):
+    robot = small_fleet.draw(1, path_length_m=12.0).robots[0]
+    scans = list(robot.scans())
+    read = list(scans)
+    for k in (len(scans) // 4, len(scans) // 2, 3 * len(scans) // 4):
+        away = se2.compose(scans[k].T_odom_base, np.array((far_m, 0.3 * far_m, 0.5)))
+        read[k] = replace(scans[k], T_odom_base=frozen(away))
+
+    def mapped(records):
+        frontend = RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,)))
+        for record in records:
+            frontend.process(record)
+        frontend.finish()
+        assert len(frontend.tracks) == 1
+        return frontend, frontend.scan_poses.T_odom_base()
+
+    frontend, poses = mapped(read)
+    assert frontend.odometry.jumps == 6
+    error = se2.between(mapped(scans)[1], poses)
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.03
+    assert np.abs(error[:, 2]).max() < 0.01
