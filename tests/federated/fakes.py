@@ -68,7 +68,7 @@ def settings(**given):
     )
 
 
-LENIENT = {"largest_change": None, "longest": None, "least_agreement": None}
+LENIENT = {"largest_change": None, "longest": None, "least_agreement": None, "statistics_distance": None}
 
 
 def run(robots, folder, chosen=None, grid=None, start=START, **given):

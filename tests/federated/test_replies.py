@@ -78,6 +78,9 @@ ODD = {
     "large": with_data(bytes(100_000)),
     "odd names": with_figures({"x\ny": 1.0}),
     "long names": with_figures({"x" * 1000: 1.0}),
+    "NaN": with_figures({"detector": float("nan")}),
+    "infinity": with_figures({"detector": float("-inf")}),
+    "beyond measure": with_figures({"detector": 1e300}),
     "many": with_figures({f"x{number}": 1.0 for number in range(1000)}),
 }
 
@@ -107,7 +110,7 @@ def test_an_odd_answer_leaves_the_others_their_round(odd, tmp_path):
     assert len(read_rows(tmp_path / ROUNDS_FILE, 9)) == 2
 
 
-@pytest.mark.parametrize("odd", ["no metrics", "odd names", "long names", "many"])
+@pytest.mark.parametrize("odd", ["no metrics", "odd names", "long names", "many", "NaN", "infinity", "beyond measure"])
 def test_who_judges_oddly_does_not_judge(odd, tmp_path):
     robots = [Fake("bad"), Fake("good", 0.25)]
     state, _ = run(robots, tmp_path, grid=twisted_grid(robots, MessageType.EVALUATE, ODD[odd]), evaluate_fn=None)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.federated.screening import agreement, screen
+from fcslam.federated.screening import agreements, screen, statistics_distances
 from fcslam.federated.settings import ScreeningSettings
 from fcslam.federated.weights import apply_update, trained_names, update_vector, weights_error
 
@@ -93,7 +93,7 @@ def test_two_that_disagree_are_not_judged():
 
 
 def test_bounds_that_are_off_let_everything_finite_pass():
-    off = ScreeningSettings(largest_change=None, longest=None, least_agreement=None)
+    off = ScreeningSettings(largest_change=None, longest=None, least_agreement=None, statistics_distance=None)
     answers = {kind: poisoned(kind) for kind in ("flipped", "scaled", "random", "huge")}
     assert screen(answers, BEFORE, off) == {}
 
@@ -112,9 +112,68 @@ def test_an_update_taken_apart_and_added_again_is_the_same(seed, frozen):
     assert ("norm.running_var" in names) is not frozen
 
 
-def test_agreement_is_a_cosine():
-    x = np.array([3.0, 4.0])
-    assert agreement(x, [x, 2 * x, 100 * x]) == pytest.approx(1.0)
-    assert agreement(x, [-x]) == pytest.approx(-1.0)
-    assert agreement(x, [np.array([-4.0, 3.0])]) == pytest.approx(0.0)
-    assert agreement(x, [np.zeros(2)]) == 0.0
+def test_agreement_is_a_cosine_with_the_mean_direction_of_the_others():
+    x, across = np.array([3.0, 4.0]), np.array([-4.0, 3.0])
+    assert agreements([x, 2 * x, 100 * x]) == pytest.approx([1.0, 1.0, 1.0])
+    assert agreements([x, -5 * x]) == pytest.approx([-1.0, -1.0])
+    assert agreements([across, x, 100 * x]) == pytest.approx([0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    assert agreements([np.zeros(2), x, x]) == pytest.approx([0.0, 1.0, 1.0])
+
+
+def test_the_distance_of_statistics_counts_standard_deviations():
+    def network(mean, variance):
+        return {"n.running_mean": np.full(3, mean, np.float32), "n.running_var": np.full(3, variance, np.float32)}
+
+    same, shifted, wider = statistics_distances([network(1.0, 4.0), network(3.0, 4.0), network(1.0, 4.0 * np.e**2)])
+    assert same == pytest.approx(np.zeros(3))
+    assert shifted == pytest.approx(np.ones(3), rel=1e-4)
+    assert wider == pytest.approx(np.ones(3), rel=1e-4)
+    assert statistics_distances([{"a.weight": np.ones(2, np.float32)}])[0].shape == (0,)
+
+
+def seen(seed, **changed):
+    """An honest robot in light of its own."""
+    rng = np.random.default_rng(seed)
+    means, variances = rng.normal(0.0, 0.1, 200), np.exp(rng.normal(0.0, 0.2, 200))
+    statistics = {"norm.running_mean": means, "norm.running_var": variances} | changed
+    return honest(seed) | {name: array.astype(np.float32) for name, array in statistics.items()}
+
+
+LIT = BEFORE | {"norm.running_mean": np.zeros(200, np.float32), "norm.running_var": np.ones(200, np.float32)}
+
+
+@pytest.mark.parametrize("robots", [2, 3, 7])
+@pytest.mark.parametrize(
+    "falsify",
+    [
+        lambda array: 3.0 * array,
+        lambda array: array / 3.0,
+        np.zeros_like,
+        lambda array: np.where(np.arange(len(array)) == 5, 1e4 * array, array),
+        lambda array: np.where(np.arange(len(array)) < 100, 6.0 * array, array),
+    ],
+)
+def test_false_variances_are_refused(falsify, robots):
+    """By their length or by their distance from those of the others."""
+    answers = {f"robot{seed}": seen(seed) for seed in range(robots)}
+    assert screen(answers, LIT, ScreeningSettings()) == {}
+    true = seen(99)["norm.running_var"]
+    refused = screen(answers | {"bad": seen(99, **{"norm.running_var": falsify(true)})}, LIT, ScreeningSettings())
+    assert set(refused) == {"bad"}
+
+
+def test_a_flipped_update_takes_no_honest_robot_with_it():
+    """With four robots, the flipped update is a third of what an honest one is compared with."""
+    for seed in range(0, 40, 4):
+        answers = {f"robot{number}": honest(seed + number, share=0.35) for number in range(3)}
+        update = honest(seed + 3, share=0.35)["convolution.weight"] - BEFORE["convolution.weight"]
+        flipped = BEFORE | {"convolution.weight": BEFORE["convolution.weight"] - update}
+        assert set(screen(answers | {"bad": flipped}, BEFORE, ScreeningSettings())) == {"bad"}
+
+
+def test_two_flipped_updates_of_six_are_refused_and_no_other():
+    answers = {f"robot{seed}": honest(seed) for seed in range(4)}
+    for name, seed in (("bad", 98), ("worse", 99)):
+        update = honest(seed)["convolution.weight"] - BEFORE["convolution.weight"]
+        answers[name] = BEFORE | {"convolution.weight": BEFORE["convolution.weight"] - update}
+    assert set(screen(answers, BEFORE, ScreeningSettings())) == {"bad", "worse"}

@@ -63,6 +63,11 @@ class FleetApp:
         self._grid, self._authenticator, self._on_notice = grid, authenticator, on_notice
         self._open: Counter[str] = Counter()
         self._notices: set[str] = set()
+        self._is_closing = False
+
+    def close(self) -> None:
+        """Let no robot wait for a request any longer."""
+        self._is_closing = True
 
     def asgi(self) -> Starlette:
         """The application for an ASGI server."""
@@ -105,7 +110,7 @@ class FleetApp:
     async def _next(self, request: Request, robot: str) -> Response:
         await self._body(request, 0)
         end = time.monotonic() + LONG_POLL_S
-        while time.monotonic() < end:
+        while time.monotonic() < end and not self._is_closing:
             found = self._grid.next_request(robot)
             if found is not None:
                 return Response(found.data, headers={NUMBER_HEADER: str(found.number)})
@@ -165,24 +170,26 @@ class FleetApp:
 
 
 @contextlib.contextmanager
-def listening(app: Starlette, listener: socket.socket, certificates: Certificates | None) -> Iterator[None]:
-    """Serve the application in a thread while the block runs.
+def listening(app: FleetApp, listener: socket.socket, certificates: Certificates | None) -> Iterator[None]:
+    """Serve the port in a thread while the block runs.
 
     Args:
-        app: what to serve.
+        app: the operations to serve.
         listener: bound socket.
         certificates: of this machine; None for no encryption.
     """
     server = uvicorn.Server(
         uvicorn.Config(
-            app,
+            app.asgi(),
+            loop="asyncio",
+            http="h11",
             ssl_certfile=None if certificates is None else certificates.certificate,
             ssl_keyfile=None if certificates is None else certificates.key,
             log_level="critical",
             lifespan="off",
             ws="none",
             server_header=False,
-            timeout_graceful_shutdown=1,
+            timeout_graceful_shutdown=2,
         )
     )
     thread = threading.Thread(target=server.run, args=([listener],), name="fleet server", daemon=True)
@@ -193,5 +200,6 @@ def listening(app: Starlette, listener: socket.socket, certificates: Certificate
     try:
         yield
     finally:
+        app.close()
         server.should_exit = True
         thread.join(STOP_S)

@@ -66,7 +66,7 @@ def serve(
         on_notice(f"waiting: {reason}")
         time.sleep(WAIT_S)
 
-    app = FleetApp(grid, authenticator, on_notice).asgi()
+    app = FleetApp(grid, authenticator, on_notice)
     with _bound(address) as listener, listening(app, listener, certificates):
         return run_job(job, options, callbacks, grid, wait)
 

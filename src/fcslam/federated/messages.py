@@ -17,6 +17,8 @@ EXAMPLES_KEY: Final = "num-examples"
 MAX_NAME_LENGTH: Final = 64
 MAX_METRICS: Final = 32
 """A reply with more metrics than this is refused: fcslam's clients send fewer than ten."""
+LARGEST_METRIC: Final = 1e6
+"""Losses and metrics are of the order of 1. A larger one, or one that is no number, would spoil a mean."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +95,8 @@ def reply_metrics(content: RecordDict) -> dict[str, float]:
     """The metrics in a reply.
 
     Raises:
-        ValueError: the reply has no metrics, too many of them, or some whose names are no identifiers.
+        ValueError: the reply has no metrics, too many of them, some whose names are no identifiers, or some that are no
+            plausible numbers.
     """
     record = content[METRICS_KEY]
     if not isinstance(record, MetricRecord):
@@ -101,4 +104,7 @@ def reply_metrics(content: RecordDict) -> dict[str, float]:
     metrics = {str(name): float(value) for name, value in record.items() if isinstance(value, int | float)}
     if len(metrics) > MAX_METRICS or not all(name.isidentifier() and len(name) <= MAX_NAME_LENGTH for name in metrics):
         raise ValueError("figures that nobody asked for")
+    odd = next((name for name, value in metrics.items() if not abs(value) <= LARGEST_METRIC), None)
+    if odd is not None:
+        raise ValueError(f"{odd} is {metrics[odd]:g}")
     return metrics

@@ -25,10 +25,16 @@ class ScreeningSettings(Settings):
         description="largest norm of an update, as a multiple of the median norm in the round; null for no limit",
     )
     least_agreement: float | None = Field(
-        default=-0.03,
+        default=-0.02,
         ge=-1.0,
         le=1.0,
-        description="least cosine between an update and the median of the other updates; null for no limit",
+        description="least cosine between an update and the mean direction of the others; null for no limit",
+    )
+    statistics_distance: float | None = Field(
+        default=0.4,
+        gt=0.0,
+        description="largest distance of batch statistics from the median of three robots or more, in standard "
+        "deviations, root mean square over the channels; null for no limit",
     )
     quorum: int = Field(
         default=4, ge=3, description="fewest updates in a round for which they are compared with one another"

@@ -9,7 +9,8 @@ Weights = Mapping[str, NDArray[np.float32]]
 """Arrays by their names in the network, in the network's order; integer counters are left out."""
 FloatVector = NDArray[np.float64]
 
-STATISTICS = ("running_mean", "running_var")
+MEAN, VARIANCE = "running_mean", "running_var"
+STATISTICS = (MEAN, VARIANCE)
 """Suffixes of the names of batch normalisation's statistics."""
 
 
@@ -54,6 +55,6 @@ def weights_error(new: Weights, old: Weights) -> str | None:
             return f"{name} is {new[name].dtype}, not float32"
         if not np.isfinite(new[name]).all():
             return f"{name} holds numbers that are not finite"
-        if name.endswith("running_var") and (new[name] < 0.0).any():
+        if name.endswith(VARIANCE) and (new[name] < 0.0).any():
             return f"{name} holds negative variances"
     return None
