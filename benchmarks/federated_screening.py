@@ -2,9 +2,9 @@
 
     python benchmarks/federated_screening.py
 
-Needs fcslam[federated] and the image sets. Six robots with ten images each, of three places and in six lights (two as they are taken, one
-of photographs, dark, hazy, noisy), train for some rounds from the bundled detector. Each round's updates are kept. Then
-every group of four, five and six of them is screened: as it is, and with one or two updates whose sign is flipped.
+Needs fcslam[federated] and the image sets. Six robots with ten images each, of three places and in different light
+(dark, hazy, noisy, or as they were taken), train for some rounds from the bundled detector. Then every group of four,
+five and six of the updates of a round is screened: as it is, and with one or two updates whose sign is flipped.
 """
 
 import itertools
