@@ -66,3 +66,15 @@ def test_the_lines_before_a_damage_are_read():
     assert next(read)[1].ranges_m.tolist() == [1.0, 2.0]
     with pytest.raises(SourceError):
         next(read)
+
+
+def test_long_lines_are_parsed_a_few_at_a_time():
+    taken = 0
+
+    def lines():
+        nonlocal taken
+        for taken in range(1, 100):
+            yield taken, scan(b"1 " * 50_000 + b"1", 50_001)
+
+    next(parse_ahead(lines(), 1.0))
+    assert taken < 5

@@ -17,8 +17,8 @@ NumberedLine = tuple[int, Line | None]
 _Indices = NDArray[np.int64]
 
 _LONGEST_RANGE_M = 1e6
-_BATCH = 256
-"""Lines that are parsed together."""
+_BATCH_LINES, _BATCH_BYTES = 256, 1 << 18
+"""Lines that are parsed together; fewer if the text of their ranges is longer."""
 _MAX_LETTERS = 16
 """Of a number that float64 holds exactly without its point."""
 _POINT, _SPACE, _ZERO = b". 0"
@@ -101,12 +101,14 @@ def _ranges_of(scans: list[ScanLine], metres_per_unit: float) -> Ranges | None:
 
 def _batches(lines: Iterable[NumberedLine]) -> Iterator[list[NumberedLine]]:
     batch: list[NumberedLine] = []
+    size = 0
     try:
-        for line in lines:
-            batch.append(line)
-            if len(batch) == _BATCH:
+        for number, line in lines:
+            batch.append((number, line))
+            size += len(line.range_text) if isinstance(line, ScanLine) else 0
+            if len(batch) == _BATCH_LINES or size >= _BATCH_BYTES:
                 yield batch
-                batch = []
+                batch, size = [], 0
     except SourceError:
         yield batch  # the lines before the damage
         raise
