@@ -37,6 +37,7 @@ RUN_S = 90.0
 FOREIGN_APP = """import os, pathlib
 if "FOREIGN_APP_OWNER" not in os.environ:  # not in the stranger's own processes
     pathlib.Path({marker!r}).write_text("a stranger's program ran here")
+    os._exit(0)
 from flwr.{side} import {kind}
 app = {kind}()
 """
@@ -203,6 +204,26 @@ def test_a_robot_cannot_start_a_run_or_send_to_robots(operation, fleet):
     assert any(
         line.startswith(f"refused: POST {path} from 127.0.0.1: this port starts no run") for line in fleet.notices
     )
+
+
+def test_a_robot_cannot_hold_many_requests_open(fleet):
+    """Four wait for work, the rest are refused at once."""
+    refused = []
+
+    def fetch():
+        with fleet.link(HOSTILE) as link:
+            try:
+                link.fetch()
+            except ConnectionError as error:
+                refused.append(str(error))
+
+    with fleet.server():
+        threads = [threading.Thread(target=fetch) for _ in range(12)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert refused == ["the server answers with status 429"] * 8
 
 
 # ---- a stranger who has nothing but the certificate of the authority ----
