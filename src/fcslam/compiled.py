@@ -27,11 +27,15 @@ def is_compiled(function: Any) -> bool:
     return isinstance(cache, _Cache) and cache.has_code()
 
 
-def njit(function: Any = None, *, nogil: bool = False) -> Any:
-    """As ``numba.njit`` with a cache, if there can be one."""
+def njit(function: Any = None, *, nogil: bool = False, allocates: bool = True) -> Any:
+    """As ``numba.njit`` with a cache, if there can be one.
+
+    A function that makes no array may say so with ``allocates=False``: it then counts no references to the arrays it
+    is given, which costs a short function more than its work.
+    """
     if function is None:
-        return lambda function: njit(function, nogil=nogil)
-    dispatcher = numba.njit(nogil=nogil)(function)
+        return lambda function: njit(function, nogil=nogil, allocates=allocates)
+    dispatcher = numba.njit(nogil=nogil, _nrt=allocates)(function)
     try:
         dispatcher._cache = _Cache(function)
     except RuntimeError:  # no locator available: no folder can be written

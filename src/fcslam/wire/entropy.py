@@ -66,7 +66,7 @@ def fresh_model(contexts: int) -> Model:
     return model
 
 
-@njit(nogil=True)
+@njit(nogil=True, allocates=False)
 def code_bit(coder: Coder, data: Bytes, probability: int, bit: int) -> tuple[Coder, int]:
     """One bit that is 1 with ``probability`` in 1/65536, between 1 and 65535."""
     reads, low, high, number, position = coder
@@ -87,7 +87,7 @@ def code_bit(coder: Coder, data: Bytes, probability: int, bit: int) -> tuple[Cod
     return Coder(reads, low, high, number, position), bit
 
 
-@njit(nogil=True)
+@njit(nogil=True, allocates=False)
 def code_learnt(coder: Coder, data: Bytes, model: Model, context: int, bit: int) -> tuple[Coder, int]:
     """One bit by the probability that its context has had so far."""
     probability, seen = model[context, 0], model[context, 1]
@@ -97,7 +97,7 @@ def code_learnt(coder: Coder, data: Bytes, model: Model, context: int, bit: int)
     return coder, bit
 
 
-@njit(nogil=True)
+@njit(nogil=True, allocates=False)
 def code_number(coder: Coder, data: Bytes, model: Model, context: int, value: int) -> tuple[Coder, int]:
     """A number in [0, 2^20), in ``CONTEXTS_OF_NUMBER`` contexts: Elias' gamma code, whose first bits are learnt."""
     value += 1
@@ -116,14 +116,14 @@ def code_number(coder: Coder, data: Bytes, model: Model, context: int, value: in
     return coder, result - 1
 
 
-@njit(nogil=True)
+@njit(nogil=True, allocates=False)
 def code_signed(coder: Coder, data: Bytes, model: Model, context: int, value: int) -> tuple[Coder, int]:
     """A number in (-2^19, 2^19): 0, -1, 1, -2, 2 ... as 0, 1, 2, 3, 4 ..."""
     coder, number = code_number(coder, data, model, context, (value << 1) ^ (value >> 63))
     return coder, int((number >> 1) ^ -(number & 1))
 
 
-@njit(nogil=True)
+@njit(nogil=True, allocates=False)
 def written(coder: Coder, data: Bytes) -> int:
     """End the stream: how many bytes it has, or -1 if it has more than there was room for."""
     size = coder.number
@@ -132,7 +132,7 @@ def written(coder: Coder, data: Bytes) -> int:
     return int(size) if size <= len(data) else -1
 
 
-@njit(nogil=True)
+@njit(nogil=True, allocates=False)
 def is_at_end(coder: Coder, data: Bytes) -> bool:
     """Whether the stream that was read has this end and no other."""
     ending = coder.high >> 24 << 24 if coder.low > 0 else 0
@@ -140,13 +140,13 @@ def is_at_end(coder: Coder, data: Bytes) -> bool:
     return bool(shortest and coder.number == ending and coder.position - 4 >= len(data) - 1)
 
 
-@njit(nogil=True)
+@njit(nogil=True, allocates=False)
 def _byte_at(data: Bytes, position: int) -> int:
     """A byte of a stream, which zeros follow."""
     return int(data[position]) if position < len(data) else 0
 
 
-@njit(nogil=True)
+@njit(nogil=True, allocates=False)
 def _put_byte(data: Bytes, position: int, byte: int, size: int) -> int:
     """Write a byte if there is room; returns the length without zeros at the end, which was ``size`` before."""
     if position < len(data):

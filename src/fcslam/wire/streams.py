@@ -27,7 +27,7 @@ from fcslam.wire.entropy import (
     written,
 )
 from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_RANGE
-from fcslam.wire.prediction import PROBABILITIES, code_descriptors, predictor_of
+from fcslam.wire.prediction import PROBABILITIES, code_descriptors, sums_of
 
 RangeCodes = NDArray[np.uint16]
 KeypointCodes = NDArray[np.int16]
@@ -111,7 +111,7 @@ def unpack_descriptors(data: bytes, keypoints: KeypointCodes, channel: Channel) 
 
 
 def _expectation(keypoints: KeypointCodes, channel: Channel) -> tuple[NDArray[Any], ...]:
-    return (keypoints.astype(np.int64), *predictor_of(channel), PROBABILITIES)
+    return (keypoints.astype(np.int64), *sums_of(channel), PROBABILITIES)
 
 
 def _pack(plain: bytes, code: Callable[..., Coder], *content: NDArray[Any]) -> bytes:
