@@ -7,6 +7,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 from collections.abc import Callable, Iterable
 from typing import Self
 
+from fcslam.cloud.claims import check_constraint, check_submap
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
 from fcslam.cloud.fusion_strategy import FusionStrategy
@@ -52,7 +53,7 @@ class Fleet:
         self._config = config
         self._verify_pairs = verify_pairs
         self._seed = seed
-        self._sessions = SessionStore(read)
+        self._sessions = SessionStore(config.claims, read)
         self._graph = JointGraph()
         self._decisions = ClosureDecisions(config, self._sessions, self._graph)
         self._recognition = PlaceRecognition(
@@ -81,8 +82,10 @@ class Fleet:
                 self._graph.extend(motion)
             case Constraint() as closure:
                 self._sessions.require(KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j))
+                check_constraint(closure, self._config.claims.closure_m, self._config.claims)
                 self._decisions.add_local(closure)
             case Place() as place:
+                self._check_submap(place)
                 self._sessions.add_place(place)
                 self._add_place(place)  # place recognition and map fusion
             case Correction() | Acknowledgement() | DetectorUpdate():
@@ -183,6 +186,11 @@ class Fleet:
         if keyscan.id.number == 0:
             self._graph.start(keyscan.id.robot)
             self._decisions.start_map(keyscan.id.robot)
+
+    def _check_submap(self, place: Place) -> None:
+        robot = place.id.robot
+        self._sessions.require(place.id, KeyscanId(robot, place.last))
+        check_submap(place, self._graph.chain(robot, place.first, place.last), self._config.claims)
 
     def _add_place(self, place: Place) -> None:
         """Match a place (Algorithm 1), decide about its closures, join maps, optimise."""

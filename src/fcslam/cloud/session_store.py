@@ -1,11 +1,11 @@
 """What the cloud keeps of each session, and the checks of a packet against the earlier ones of its session."""
 
-import math
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 import numpy as np
 
+from fcslam.cloud.claims import ClaimLimits, check_constraint, check_distance
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.sessions import in_session
 from fcslam.errors import PacketError
@@ -13,14 +13,9 @@ from fcslam.geometry import se2
 from fcslam.geometry.beams import misfit
 from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, Place, frozen
 from fcslam.storage.state_file import State
-from fcslam.wire.limits import MAXIMUM_COORDINATE_M
 from fcslam.wire.messages import Hello, Packet
 
 _Body = TypeVar("_Body", Hello, Keyscan)
-
-FARTHEST_M = MAXIMUM_COORDINATE_M / 4.0
-"""Largest distance of a robot from its start, in metres. Joining and optimising maps moves poses further away; a
-quarter of the packet format's limit leaves room for that."""
 
 
 class SessionStore:
@@ -29,8 +24,9 @@ class SessionStore:
     Packets of a session come in the order of their numbers. A refused packet changes nothing.
     """
 
-    def __init__(self, read: Callable[[PacketNumber], Packet] | None = None) -> None:
+    def __init__(self, limits: ClaimLimits, read: Callable[[PacketNumber], Packet] | None = None) -> None:
         """``read`` gives the packets of keyscans that ``restore`` names; None: nothing is restored."""
+        self._limits = limits
         self._read = read
         self._hellos: dict[str, Hello] = {}
         self._hello_sequences: dict[str, int] = {}
@@ -98,15 +94,15 @@ class SessionStore:
         """Connect the newest keyscan to the one before.
 
         Raises:
-            PacketError: it does not, the keyscan has one already, or it leads out of all bounds.
+            PacketError: it does not, the keyscan has one already, or no robot moves or measures like this.
         """
         robot, connected = motion.robot, self._connected.get(motion.robot, 0)
         if connected == len(self._stamps.get(robot, ())) or (motion.i, motion.j) != (connected - 1, connected):
             raise PacketError(f"{robot}: motion {motion.i} to {motion.j} does not lead to a new keyscan")
+        check_constraint(motion, self._limits.motion_m, self._limits)
         before = self._T_odom_base.get(robot)
         T_odom_base = motion.T_i_j if before is None else se2.compose(before, motion.T_i_j)
-        if not math.hypot(T_odom_base[0], T_odom_base[1]) <= FARTHEST_M:
-            raise PacketError(f"{robot}: motion {motion.i} to {motion.j} leads over {FARTHEST_M:g} m from the start")
+        check_distance(T_odom_base, robot, self._limits)
         self._T_odom_base[robot] = T_odom_base
         self._connected[robot] = connected + 1
 

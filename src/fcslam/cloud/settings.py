@@ -2,6 +2,7 @@
 
 from pydantic import Field
 
+from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.config import Settings
 from fcslam.graph.consistency import ConsistencySettings
@@ -46,6 +47,7 @@ class FleetConfig(Settings):
     submaps_kept: int = Field(
         default=300, gt=1, description="number of submaps in the cache; others are rebuilt from their keyscans"
     )
+    claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
     consistency: ConsistencySettings = Field(
         default=ConsistencySettings(), description="pairwise consistency of closures, and the rule for joining maps"

@@ -1,0 +1,82 @@
+"""What a robot may claim: bounds that no robot with a 2D LiDAR exceeds, so that none can exhaust or bend a mission."""
+
+import math
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.errors import PacketError
+from fcslam.geometry import se2
+from fcslam.records import Constraint, FloatArray, Place
+
+_ROUNDING = 1.01
+"""Information is sent in single precision, and standard deviations are compared by its diagonal."""
+
+
+class ClaimLimits(Settings):
+    """Bounds on the packets of a robot; a packet beyond one is refused with the reason."""
+
+    motion_m: float = Field(default=20.0, gt=0, description="largest motion between two consecutive keyscans [m]")
+    closure_m: float = Field(
+        default=50.0, gt=0, description="largest distance between two keyscans that a robot's own closure connects [m]"
+    )
+    distance_m: float = Field(
+        default=20_000.0, gt=0, description="largest distance of a robot from its start, by its motions [m]"
+    )
+    submap_m: float = Field(
+        default=100.0, gt=0, description="largest distance of a keyscan from the anchor of its submap [m]"
+    )
+    submap_keyscans: int = Field(default=2000, gt=0, description="largest number of keyscans in a submap")
+    sigma_m: float = Field(
+        default=0.001, gt=0, description="least standard deviation of a position that a robot measures [m]"
+    )
+    sigma_rad: float = Field(
+        default=0.0002, gt=0, description="least standard deviation of a heading that a robot measures [rad]"
+    )
+
+
+def check_constraint(constraint: Constraint, largest_m: float, limits: ClaimLimits) -> None:
+    """Check a constraint, whose length is at most ``largest_m``.
+
+    Raises:
+        PacketError: it is longer, or more precise than a robot can measure.
+    """
+    name = f"{constraint.robot}: constraint {constraint.i} to {constraint.j}"
+    length_m = math.hypot(constraint.T_i_j[0], constraint.T_i_j[1])
+    if not length_m <= largest_m:
+        raise PacketError(f"{name} is {length_m:.4g} m long, at most {largest_m:g} m (fleet.claims)")
+    x, y, theta = (constraint.information.diagonal() / _ROUNDING).tolist()
+    if max(x, y) > limits.sigma_m**-2 or theta > limits.sigma_rad**-2:
+        raise PacketError(
+            f"{name} claims a standard deviation of {max(x, y) ** -0.5:.3g} m and {theta**-0.5:.3g} rad, at least "
+            f"{limits.sigma_m:g} m and {limits.sigma_rad:g} rad (fleet.claims)"
+        )
+
+
+def check_distance(T_odom_base: FloatArray, robot: str, limits: ClaimLimits) -> None:
+    """Check the pose (3,) of a keyscan by the robot's motions alone.
+
+    Raises:
+        PacketError: it is too far from the start.
+    """
+    distance_m = math.hypot(T_odom_base[0], T_odom_base[1])
+    if not distance_m <= limits.distance_m:
+        raise PacketError(
+            f"{robot}: is {distance_m:.4g} m off its start, at most {limits.distance_m:g} m (fleet.claims)"
+        )
+
+
+def check_submap(place: Place, poses: FloatArray, limits: ClaimLimits) -> None:
+    """Check the submap of a place, whose keyscans have these poses (N, 3) by the robot's motions alone.
+
+    Raises:
+        PacketError: it has too many keyscans, or one is too far from the anchor.
+    """
+    name = f"{place.id.robot}: {place.channel} place {place.id.number}"
+    if len(poses) > limits.submap_keyscans:
+        raise PacketError(f"{name} has {len(poses)} keyscans, at most {limits.submap_keyscans} (fleet.claims)")
+    anchor = poses[place.id.number - place.first]
+    reach_m = float(np.hypot(*se2.between(anchor, poses)[:, :2].T).max())
+    if not reach_m <= limits.submap_m:
+        raise PacketError(f"{name} has a keyscan {reach_m:.4g} m away, at most {limits.submap_m:g} m (fleet.claims)")

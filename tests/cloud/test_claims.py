@@ -1,0 +1,95 @@
+"""Bounds on what a robot may claim."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.cloud.claims import ClaimLimits
+from fcslam.cloud.cloud import Cloud
+from fcslam.cloud.settings import FleetConfig
+from fcslam.errors import PacketError
+from fcslam.records import Channel, ConstraintKind, LaserModel, frozen
+from fcslam.wire.messages import Hello, Packet
+from fcslam.wire.packets import encode
+from tests.scripted import keyscan, motion, place
+
+FAR_LASER = LaserModel(8, -np.pi, np.pi / 4, 10.0)
+
+
+def sent(bodies):
+    return [Packet("a", 0, number, 1e3, body) for number, body in enumerate(bodies)]
+
+
+def drive(steps):
+    """Hello, and keyscans with these motions (N, 3) between them."""
+    bodies = [Hello("a", 0, (FAR_LASER,), {Channel.LIDAR: "test-1"}), keyscan("a", 0, 0.0)]
+    for k, step in enumerate(steps):
+        bodies += [keyscan("a", k + 1, 1.0 + k), motion("a", k, k + 1, np.array(step))]
+    return bodies
+
+
+def refusals(bodies, **claims):
+    """Why the cloud refuses the packets, by their numbers."""
+    cloud, found = Cloud(FleetConfig(claims=ClaimLimits(**claims)), 0), {}
+    for packet in sent(bodies):
+        try:
+            cloud.receive(encode(packet))
+        except PacketError as error:
+            found[packet.sequence] = str(error)
+    cloud.finalize()  # whatever came, there is a result
+    return found
+
+
+AHEAD = (1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("length_m", [21.0, 1.8e3, 1.7e5])
+def test_a_motion_that_no_robot_makes_is_refused(length_m):
+    bodies = drive([AHEAD, (length_m, 0.0, 0.0), AHEAD])
+    reasons = refusals(bodies)
+    assert f"constraint 1 to 2 is {length_m:.4g} m long, at most 20 m" in reasons[5]
+    assert "does not lead to a new keyscan" in reasons[7] or "before the motion" in reasons[6]
+    assert refusals(drive([AHEAD] * 3)) == {}
+
+
+def test_a_submap_wider_than_any_is_refused():
+    """Each motion is allowed, their sum is not."""
+    bodies = [*drive([(15.0, 0.0, 0.0)] * 12), place("a", 4, first=0, last=12), place("a", 8, first=4, last=12)]
+    (number,), (reason,) = zip(*refusals(bodies).items(), strict=True)
+    assert number == len(bodies) - 2
+    assert "keyscan 120 m away, at most 100 m" in reason
+
+
+def test_a_submap_of_too_many_keyscans_is_refused():
+    bodies = [*drive([AHEAD] * 12), place("a", 4, first=0, last=12), place("a", 8, first=4, last=12)]
+    (reason,) = refusals(bodies, submap_keyscans=9).values()
+    assert "has 13 keyscans, at most 9" in reason
+
+
+def test_a_robot_does_not_leave_the_building():
+    (first, *_) = refusals(drive([(15.0, 0.0, 0.0)] * 10), distance_m=100.0).values()
+    assert "105 m off its start, at most 100 m" in first
+
+
+def test_an_own_closure_over_a_distance_is_refused():
+    closure = motion("a", 0, 3, np.array((60.0, 0.0, 0.0)), ConstraintKind.CLOSURE)
+    (reason,) = refusals([*drive([AHEAD] * 3), closure]).values()
+    assert "60 m long, at most 50 m" in reason
+
+
+@pytest.mark.parametrize(
+    ("information", "refused"),
+    [((1e6, 1e6, 2.5e7), False), ((1e12, 1e4, 1e4), True), ((1e4, 1e4, 1e9), True), ((1e4, 2e6, 1e4), True)],
+)
+@pytest.mark.parametrize("kind", ConstraintKind)
+def test_a_precision_that_no_lidar_has_is_refused(information, refused, kind):
+    bodies = drive([AHEAD] * 3)
+    claim = replace(
+        motion("a", *((2, 3) if kind is ConstraintKind.ODOMETRY else (0, 3)), np.array(AHEAD), kind),
+        information=frozen(np.diag(information)),
+    )
+    bodies[-1:] = [claim] if kind is ConstraintKind.ODOMETRY else [bodies[-1], claim]
+    reasons = list(refusals(bodies).values())
+    assert bool(reasons) is refused
+    assert not refused or "claims a standard deviation of" in reasons[0]
