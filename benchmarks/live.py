@@ -5,11 +5,14 @@
 A simulated fleet (LiDAR, 360 beams at 10 Hz) is run through the robots' front ends beforehand. Then each robot's
 packets go to `fcslam serve` at the moments at which the robot had them, over a connection of its own, from one process
 that does nothing else. The simulated LiDARs all turn in step, real ones do not: each robot begins at a moment of its
-own within the first second, or, with `--in-step`, all at once.
+own within the first second, or, with `--in-step`, all at once. A building has at most 25 robots; more robots are in
+more buildings.
 
 "Taken in": from sending a request to the answer that says that its packets are on disk. "In effect": from that answer
 until the process in which the fleet lives has matched, verified and solved what they bring, and a correction lies
-ready; seen by looking into the mission's file 20 times a second, which keeps nobody waiting. Memory: the most that the
+ready; seen by looking into the mission's file 20 times a second, which keeps nobody waiting. "Correction at the robot":
+from sending a place until the answer to the first request that the robot sends after the place has had effect. A robot
+that has nothing left to send asks once a second. Memory: the most that the
 service and its worker held (VmHWM, added up). Server, worker and sender share the machine.
 CPU: user and system of each, all threads; the sender's is that of the robots' side, which a fleet has elsewhere.
 """
@@ -22,6 +25,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,13 +35,16 @@ import numpy as np
 from faults import cloud, finalize
 
 from fcslam.mission import MissionConfig
+from fcslam.records import Correction
 from fcslam.robot.frontend import RobotFrontend
+from fcslam.robot.sender import SEND_INTERVAL_S
 from fcslam.service.missions import FIRST
 from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
-from fcslam.wire.batches import MEDIA_TYPE, write_batch
-from fcslam.wire.packets import encode
+from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch, write_batch
+from fcslam.wire.packets import decode, encode
 
 ROBOTS, PATH_M = 20, 30.0
+ROBOTS_PER_BUILDING = 25
 LOOK_EVERY_S = 0.05
 EFFECTLESS_S = 600.0
 """If packets have had no effect for so long they will have none."""
@@ -56,8 +63,10 @@ class Due(NamedTuple):
 class Sent(NamedTuple):
     """A request that was answered."""
 
+    robot: str
     asked_s: float
     answered_s: float
+    packets: int
     has_place: bool
 
 
@@ -77,22 +86,22 @@ def main() -> None:
     parser.add_argument("--in-step", action="store_true", help="all robots begin in the same millisecond")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
-    settings = SimulationSettings(robots=chosen.robots, path_length_m=chosen.path, camera=None)
     begins_s = np.random.default_rng(chosen.seed).uniform(0.0, 0.0 if chosen.in_step else 1.0, chosen.robots)
-    robots = simulate_fleet(settings, chosen.seed).robots
+    robots = _simulated(chosen.robots, chosen.path, chosen.seed)
     agendas = {robot.name: _agenda(robot, begin_s) for robot, begin_s in zip(robots, begins_s, strict=True)}
     gc.collect()
     gc.freeze()  # the sender's own pauses are not the service's
     with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (server, port):
         began_s = time.process_time()
         mission = Path(place) / "cloud" / "missions" / FIRST / "mission.sqlite"
-        sent, looks = asyncio.run(_play(agendas, f"http://127.0.0.1:{port}", mission))
+        answers, looks = asyncio.run(_play(agendas, f"http://127.0.0.1:{port}", mission))
         sender_s = time.process_time() - began_s
         worker = _children(server.process.pid)
         memory_mb = sum(_peak_mb(pid) for pid in (server.process.pid, *worker))
         cpu_s = _cpu_s(server.process.pid), sum(_cpu_s(pid) for pid in worker), sender_s
         run = finalize(port)
         closures, maps = common.metrics(run)["inter_robot_closures_accepted"], common.metrics(run)["maps"]
+    sent = [each for each in answers if each.packets]
     places = [each for each in sent if each.has_place]
     report.table(
         "Milliseconds",
@@ -101,6 +110,7 @@ def main() -> None:
             ("taken in", len(sent), *_spread([each.answered_s - each.asked_s for each in sent])),
             ("in effect, all", len(sent), *_spread(_effect(sent, looks))),
             ("in effect, places", len(places), *_spread(_effect(places, looks))),
+            ("correction at the robot", len(places), *_spread(_corrected(places, answers, looks))),
         ],
     )
     packets = sum(len(due.packets) for agenda in agendas.values() for due in agenda)
@@ -113,6 +123,18 @@ def main() -> None:
         f"{closures:.0f} accepted closures between robots, {maps:.0f} map(s) in the end."
     )
     report.write()
+
+
+def _simulated(count: int, path_m: float, seed: int) -> list[SimulatedRobot]:
+    """Robots, spread evenly over as few buildings as hold them."""
+    buildings = -(-count // ROBOTS_PER_BUILDING)
+    robots: list[SimulatedRobot] = []
+    for building in range(buildings):
+        size = count // buildings + (building < count % buildings)
+        settings = SimulationSettings(robots=size, path_length_m=path_m, camera=None)
+        fleet = simulate_fleet(settings, seed + building).robots
+        robots += [replace(robot, name=f"building_{building + 1}_{robot.name}") for robot in fleet]
+    return robots
 
 
 def _agenda(robot: SimulatedRobot, begin_s: float) -> list[Due]:
@@ -137,30 +159,51 @@ async def _play(agendas: dict[str, list[Due]], url: str, mission: Path) -> tuple
     sent: list[Sent] = []
     looks: list[Look] = []
     began = time.perf_counter()
-    watching = asyncio.create_task(_watch(mission, looks))
+    all_sent, done = asyncio.Barrier(len(agendas) + 1), asyncio.Event()
     async with asyncio.TaskGroup() as group:
+        watching = group.create_task(_watch(mission, looks))
         for name, agenda in agendas.items():
-            group.create_task(_robot(name, agenda, url, began, sent))
-    all_sent = time.perf_counter()
-    while not (looks and looks[-1].at_s > all_sent and looks[-1].applied >= looks[-1].stored):
-        if watching.done():
-            watching.result()
-        if time.perf_counter() - all_sent > EFFECTLESS_S:
-            raise SystemExit("live: the service has not caught up")
-        await asyncio.sleep(LOOK_EVERY_S)
-    watching.cancel()
+            group.create_task(_robot(name, agenda, url, began, sent, all_sent, done))
+        await all_sent.wait()
+        end = time.perf_counter()
+        while not (looks and looks[-1].at_s > end and looks[-1].applied >= looks[-1].stored):
+            if time.perf_counter() - end > EFFECTLESS_S:
+                raise SystemExit("live: the service has not caught up")
+            await asyncio.sleep(LOOK_EVERY_S)
+        watching.cancel()
+        done.set()
     return sorted(sent, key=lambda each: each.answered_s), looks
 
 
-async def _robot(name: str, agenda: list[Due], url: str, began: float, sent: list[Sent]) -> None:
-    headers = {"Content-Type": MEDIA_TYPE, "Fcslam-Agent": f"{len(sent):032x}"}
+async def _robot(
+    name: str, agenda: list[Due], url: str, began: float, sent: list[Sent], all_sent: asyncio.Barrier,
+    done: asyncio.Event,
+) -> None:  # fmt: skip
+    headers = {"Content-Type": MEDIA_TYPE, AGENT_HEADER: name.encode().hex()[:32]}
+    version = -1
     async with httpx.AsyncClient(base_url=url, headers=headers, timeout=60.0, trust_env=False) as client:
+
+        async def send(due: Due) -> None:
+            nonlocal version
+            asked, known = time.perf_counter(), {CORRECTION_HEADER: str(version)}
+            path, content = f"/api/v1/robots/{name}/packets", write_batch(due.packets)
+            answer = await client.post(path, content=content, headers=known)
+            answer.raise_for_status()
+            sent.append(Sent(name, asked, time.perf_counter(), len(due.packets), due.has_place))
+            news = [decode(data).body for data in read_batch(answer.content)]
+            version = max([version, *(body.version for body in news if isinstance(body, Correction))])
+
         for due in agenda:
             await asyncio.sleep(max(0.0, began + due.at_s - time.perf_counter()))
-            asked = time.perf_counter()
-            answer = await client.post(f"/api/v1/robots/{name}/packets", content=write_batch(due.packets))
-            answer.raise_for_status()
-            sent.append(Sent(asked, time.perf_counter(), due.has_place))
+            await send(due)
+        waiting = asyncio.create_task(all_sent.wait())
+        is_last = False
+        while not is_last:
+            is_last = done.is_set()
+            await send(Due(agenda[-1].at_s, (), False))
+            if not is_last:
+                await asyncio.wait([asyncio.create_task(done.wait())], timeout=SEND_INTERVAL_S)
+        await waiting
 
 
 async def _watch(mission: Path, looks: list[Look]) -> None:
@@ -170,6 +213,19 @@ async def _watch(mission: Path, looks: list[Look]) -> None:
             (applied,) = database.execute("SELECT ifnull(max(value), 0) FROM facts WHERE name = 'applied'").fetchone()
             looks.append(Look(time.perf_counter(), stored, int(applied)))
             await asyncio.sleep(LOOK_EVERY_S)
+
+
+def _corrected(chosen: Sequence[Sent], answers: Sequence[Sent], looks: Sequence[Look]) -> list[float]:
+    """For each request the time until the robot had the first answer that it asked for after the effect."""
+    by_robot: dict[str, list[Sent]] = {}
+    for each in answers:
+        by_robot.setdefault(each.robot, []).append(each)
+    latencies = []
+    for each, effect_s in zip(chosen, _effect(chosen, looks), strict=True):
+        in_effect = each.answered_s + effect_s
+        following = next(answer for answer in by_robot[each.robot] if answer.asked_s >= in_effect)
+        latencies.append(following.answered_s - each.asked_s)
+    return latencies
 
 
 def _effect(chosen: Sequence[Sent], looks: Sequence[Look]) -> list[float]:

@@ -24,6 +24,7 @@ from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, read_label
 from tests.scripted import closures, rectangle, stream
+from tests.service.inline import InlineTask
 from tests.small_fleet import in_order
 
 POSES = rectangle(29)
@@ -54,7 +55,7 @@ class Cloud:
         self.restart()
 
     def restart(self):
-        self.worker = Worker(self.folder, self.store, self.clock, lambda *told: self.told.append(told))
+        self.worker = Worker(self.folder, self.store, self.clock, lambda *told: self.told.append(told), InlineTask)
 
     def clock(self):
         self.now += 1.0
@@ -452,7 +453,7 @@ def test_a_result_or_live_map_that_fails_stops_nothing(cloud, monkeypatch, caplo
         number = cloud.store.ask_to_finalize()
         cloud.work()
     assert cloud.store.finalization(number).failure == "a pose is not finite"
-    assert "the live map stays as it was: ValueError" in caplog.text
+    assert "the live map cannot be written: ValueError" in caplog.text
     cloud.now += 1000.0
     assert len(cloud.finalize().trajectories) == 2
     assert cloud.folder.live.exists()

@@ -14,6 +14,7 @@ import fcntl
 import gc
 import json
 import logging
+import math
 import os
 import select
 import signal
@@ -23,8 +24,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import cache
 from hashlib import blake2b
+from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple, Protocol
+
+import cv2
 
 import fcslam
 from fcslam.cloud.fleet import Fleet
@@ -36,12 +41,14 @@ from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError
+from fcslam.processes import obey_parent
 from fcslam.runs import Metric, Run
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.service.supervisor import READY
 from fcslam.service.warmup import warm_up_fleet
 from fcslam.storage.state_file import read_state, write_state
+from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode
 
@@ -50,7 +57,13 @@ AT_ONCE_S = 0.25
 """Packets, and about the time, between two looks at what else there is to do. Corrections leave in between, so a robot
 does not wait for its own while there is a queue."""
 LIVE_SHARE = 0.1
-"""Of the worker's time, for the live run folder."""
+"""Of the time, for writing the live run folder beside the worker."""
+LIVE_LOOK_S = 0.05
+"""Between two looks whether the live run folder is written."""
+LIVE_NICENESS = 10
+"""Increment of the niceness of the process that writes the live run folder: packets and corrections go first."""
+REPORT_EVERY_S = 0.1
+"""Corrections are not stored more often than this: packets that come in wait until they are on the disk."""
 PAUSE_S = 30.0
 """After the live run folder could not be written."""
 SNAPSHOT_SHARE = 0.05
@@ -66,13 +79,27 @@ Tell = Callable[[str, int], None]
 """Is told of an event and its number."""
 
 
+class Background(Protocol):
+    """A task that runs beside the worker."""
+
+    @property
+    def exitcode(self) -> int | None:
+        """None while it runs, 0 if it succeeded."""
+
+
+Start = Callable[[Callable[[], None]], Background]
+"""Starts a task beside the worker."""
+
+
 class Worker:
     """One mission's fleet; ``step`` by ``step`` it follows what the store holds."""
 
-    def __init__(self, folder: MissionFolder, store: MissionStore, clock: Callable[[], float], tell: Tell) -> None:
+    def __init__(
+        self, folder: MissionFolder, store: MissionStore, clock: Callable[[], float], tell: Tell, start: Start
+    ) -> None:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
-        self._folder, self._store, self._clock, self._tell = folder, store, clock, tell
+        self._folder, self._store, self._clock, self._tell, self._start = folder, store, clock, tell, start
         self._ready: deque[StoredPacket] = deque()
         """Packets that may take effect and did not yet."""
         self._fleet = Fleet(self._config.fleet, self._config.seed)
@@ -87,18 +114,31 @@ class Worker:
         """Newest time of each session."""
         self._published = -1
         self._publish_at = clock()
+        self._publishing: _Publishing | None = None
         self._resume()
+        self._reported, self._report_at = self._resumed_at, -math.inf
         self._written, self._write_at = self._applied, clock() + SNAPSHOT_EVERY_S
 
     def step(self) -> bool:
         """Do one piece of work; False: there is none."""
         return (
-            self._take_vetoes() or self._take_packets() or self._write_snapshot() or self._finalize() or self._publish()
+            self._take_vetoes()
+            or self._take_packets()
+            or self._report()
+            or self._write_snapshot()
+            or self._finalize()
+            or self._publish()
         )
 
     def wait_s(self) -> float:
         """How long there is nothing to do unless something comes in."""
-        return max(self._publish_at - self._clock(), 0.0) if self._published < self._applied else LIVE_EVERY_S
+        if self._publishing is not None:
+            due_s = LIVE_LOOK_S
+        else:
+            due_s = self._publish_at - self._clock() if self._published < self._applied else LIVE_EVERY_S
+        if self._reported < self._applied:
+            due_s = min(due_s, self._report_at - self._clock())
+        return max(due_s, 0.0)
 
     def _take_vetoes(self) -> bool:
         vetoes = self._store.vetoes()[self._vetoes :]
@@ -124,9 +164,17 @@ class Worker:
             self._apply(self._ready.popleft())
             if self._clock() > began + AT_ONCE_S:
                 break
-        if self._applied > max(applied, self._resumed_at):
-            self._store.progress(self._applied, self._corrections())
+        self._report()
         return self._arrivals > arrivals or self._applied > applied
+
+    def _report(self) -> bool:
+        """Store how many packets took effect, and new corrections, if the last time is long enough ago."""
+        now = self._clock()
+        if self._reported >= self._applied or now < self._report_at:
+            return False
+        self._store.progress(self._applied, self._corrections())
+        self._reported, self._report_at = self._applied, now + REPORT_EVERY_S
+        return True
 
     def _read_arrivals(self) -> None:
         """Read what arrived, and queue the packets that may take effect now."""
@@ -227,7 +275,7 @@ class Worker:
     def _answer(self, asked: Finalization) -> None:
         name = str(asked.number)
         try:
-            self._run(self._result()).save(self._folder.run(name), force=True)
+            self._run(self._result(), self._store.traffic()).save(self._folder.run(name), force=True)
         except (
             Exception
         ) as error:  # asked for again by the next worker, it would fail there too, and nothing else go on
@@ -252,29 +300,61 @@ class Worker:
         return decode(self._store.packet(*robot_and_epoch(number.session), number.sequence).data)
 
     def _publish(self) -> bool:
-        """Write the live run folder, if something is new and the last time is long enough ago."""
+        """Write the live run folder beside the worker, if something is new and the last time is long enough ago."""
         now = self._clock()
+        if self._publishing is not None:
+            return self._end_publishing(self._publishing, now)
         if self._published == self._applied or self._applied < self._resumed_at or now < self._publish_at:
             return False
         try:
-            self._folder.publish(self._run(self._fleet.estimate(), with_local_maps=False))
-        except Exception as error:  # packets matter more, and the disk may be freed
-            _log.error("the live map stays as it was: %s: %s", type(error).__name__, error)
-            self._publish_at = now + PAUSE_S
-            return False
+            result, traffic = self._fleet.estimate(), self._store.traffic()
+            # Everything that it needs is in memory: the copy of this process must not use the store.
+            task = self._start(lambda: self._write_live(result, traffic))
+        except Exception as error:  # packets matter more, and there may be memory later
+            return self._postpone(f"{type(error).__name__}: {error}")
+        self._publishing = _Publishing(task, self._applied, now)
         self._published = self._applied
-        self._publish_at = self._clock() + max((self._clock() - now) / LIVE_SHARE, LIVE_EVERY_S)
-        self._tell("live", self._applied)
         return True
 
-    def _run(self, result: FleetResult, with_local_maps: bool = True) -> Run:
+    def _write_live(self, result: FleetResult, traffic: Ledger) -> None:
+        try:
+            self._folder.publish(self._run(result, traffic, with_local_maps=False))
+        except Exception as error:
+            _log.error("the live map cannot be written: %s: %s", type(error).__name__, error)
+            sys.exit(1)
+
+    def _end_publishing(self, publishing: "_Publishing", now: float) -> bool:
+        if publishing.task.exitcode is None:
+            return False
+        self._publishing = None
+        if publishing.task.exitcode:  # packets matter more, and the disk may be freed
+            return self._postpone(f"its writer ended with code {publishing.task.exitcode}")
+        self._publish_at = now + max((now - publishing.began_s) / LIVE_SHARE, LIVE_EVERY_S)
+        self._tell("live", publishing.applied)
+        return True
+
+    def _postpone(self, reason: str) -> bool:
+        _log.error("the live map stays as it was: %s", reason)
+        self._published, self._publish_at = -1, self._clock() + PAUSE_S
+        return False
+
+    def _run(self, result: FleetResult, traffic: Ledger, with_local_maps: bool = True) -> Run:
         words = [
             Metric(f"words_{state.channel}_{state.detector_version}", state.words, "1")
             for state in self._fleet.vocabularies()
         ]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-        metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(self._store.traffic(), tracks)]
+        metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(traffic, tracks)]
         return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)
+
+
+class _Publishing(NamedTuple):
+    """The live run folder that is being written."""
+
+    task: Background
+    applied: int
+    """How many packets it shows."""
+    began_s: float
 
 
 def _chained(before: bytes, data: bytes) -> bytes:
@@ -297,13 +377,14 @@ def main(arguments: Sequence[str]) -> int:
     # Who stops the service stops it first; its end ends stdin. It sends a signal as well, for nobody has to wait for a
     # compiler.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)  # a copy of this process would wait for threads that it does not have
     warm_up_fleet()
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     folder = MissionFolder(Path(arguments[0]))
     alone = _alone(folder)
-    worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print)
+    worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print, _start)
     _print(READY, 0)
     while True:
         wait_s = 0.0 if worker.step() else worker.wait_s()
@@ -320,6 +401,20 @@ def _alone(folder: MissionFolder) -> IO[str]:
     file = folder.worker_lock.open("w")
     fcntl.flock(file, fcntl.LOCK_EX)
     return file
+
+
+def _start(task: Callable[[], None]) -> Background:
+    """Run a task in a copy of this process, which ends with it."""
+    process: BaseProcess = get_context("fork").Process(target=_in_copy, args=(task,), daemon=True)
+    process.start()
+    return process
+
+
+def _in_copy(task: Callable[[], None]) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    obey_parent()
+    os.nice(LIVE_NICENESS)
+    task()
 
 
 def _print(event: str, number: int) -> None:

@@ -24,6 +24,7 @@ from fcslam.service.worker import Worker
 from fcslam.wire.batches import MEDIA_TYPE, read_batch, write_batch
 from fcslam.wire.packets import decode, encode
 from tests.scripted import closures, rectangle, stream
+from tests.service.inline import InlineTask
 
 POSES = rectangle(29)
 SCRIPT = closures(("a", POSES), ("b", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)])
@@ -52,12 +53,12 @@ class InlineWorker:
     def __init__(self, folder: MissionFolder) -> None:
         self._now = 0.0
         self._store = MissionStore(folder.store)
-        self._worker = Worker(folder, self._store, lambda: self._now, lambda *_: None)
+        self._worker = Worker(folder, self._store, lambda: self._now, lambda *_: None, InlineTask)
 
     def ring(self) -> None:
         self._now += 1000.0
         while self._worker.step():
-            pass
+            self._now += 1.0
 
     def stop(self) -> None:
         self._store.close()

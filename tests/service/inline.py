@@ -1,0 +1,14 @@
+"""The worker's background tasks, run at once."""
+
+from collections.abc import Callable
+
+
+class InlineTask:
+    """A task that is done when it is started."""
+
+    def __init__(self, task: Callable[[], None]) -> None:
+        self.exitcode = 0
+        try:
+            task()
+        except SystemExit as end:
+            self.exitcode = end.code
