@@ -5,7 +5,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 """
 
 from collections.abc import Callable, Iterable
-from typing import Self
+from typing import NamedTuple, Self
 
 from fcslam.cloud.claims import check_constraint, check_submap
 from fcslam.cloud.correction_quality import CorrectionQuality
@@ -37,6 +37,13 @@ from fcslam.storage.state_file import State
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 
 
+class _Replayed(NamedTuple):
+    """Packets that were applied in canonical order, and the state of a fleet after them."""
+
+    order: list[PacketNumber]
+    state: State
+
+
 class Fleet:
     """Applies packets; place recognition and decisions about closures have classes of their own."""
 
@@ -61,7 +68,9 @@ class Fleet:
         )
         self._quality = CorrectionQuality(self._graph, config.surprise_m, config.surprise_rad)
         self._needs_replay = False
-        """Whether something besides the packets, such as a veto or an earlier result, changed the graph."""
+        """Whether something besides the packets changed the graph: a veto."""
+        self._replayed: _Replayed | None = None
+        """The replay of the last result, which the next one goes on from."""
 
     def apply(self, packet: Packet) -> None:
         """Let one packet take effect: figure 1 of the paper, cloud side.
@@ -123,6 +132,7 @@ class Fleet:
     def veto(self, veto: Veto) -> None:
         """Exclude closures from now on; maps that only they joined are separated."""
         self._needs_replay |= self._decisions.veto(veto)
+        self._replayed = None
 
     def estimate(self) -> FleetResult:
         """The current estimate, without a new decision: quick, for live maps."""
@@ -130,20 +140,25 @@ class Fleet:
         poses: dict[str, FloatArray] = {session: frozen(self._graph.trajectory(session)) for session in sessions}
         own: dict[str, FloatArray] = {session: frozen(self._graph.chain(session)) for session in sessions}
         closures = tuple(entry.closure for entry in self._decisions.closures)
-        return self._result(Fusion(self._decisions.maps, poses, own, closures))
+        fusion = Fusion(self._decisions.maps, poses, own, closures)
+        return conclude(self._sessions, self._graph, self._decisions.closures, fusion, self._decisions.version)
 
     def conclude(self) -> FleetResult:
-        """Decide every closure from all evidence and collect the result."""
-        self._needs_replay = True
-        fusion = self._decisions.reevaluate()
+        """Decide every closure from all evidence and collect the result; the fleet stays as it is."""
+        graph = JointGraph()
+        graph.restore(self._graph.state())
+        decisions = ClosureDecisions(self._config, self._sessions, graph)
+        decisions.restore(self._decisions.state())
+        fusion = decisions.reevaluate()
         if self._config.fusion is not FusionStrategy.JOINT:
-            fusion = fuse_rigidly(self._decisions.closures, fusion.T_local_base, self._config.fusion)
-        return self._result(fusion)
+            fusion = fuse_rigidly(decisions.closures, fusion.T_local_base, self._config.fusion)
+        return conclude(self._sessions, graph, decisions.closures, fusion, decisions.version)
 
     def finalize(
         self, log: PacketLog, arrived: Iterable[tuple[float, PacketNumber]], read: Callable[[PacketNumber], Packet]
     ) -> FleetResult:
-        """The result of all packets, which a new fleet applies in canonical order unless they came in that order.
+        """The result of all packets in canonical order. Unless they came in it, another fleet applies them: all,
+        or those after an earlier result, if all of these come later in the order.
 
         Args:
             log: the order in which this fleet applied its packets.
@@ -152,11 +167,18 @@ class Fleet:
         """
         if log.is_canonical and not self._needs_replay:
             return self.conclude()
-        replay = Fleet(self._config, self._seed, self._verify_pairs)
-        for veto in self._decisions.vetoes:
-            replay.veto(veto)
-        for number in log.canonical(arrived):
+        order, done = list(log.canonical(arrived)), 0
+        replayed, self._replayed = self._replayed, None
+        if replayed is not None and order[: len(replayed.order)] == replayed.order:
+            done = len(replayed.order)
+            replay = Fleet.restored(self._config, self._seed, replayed.state, read, self._verify_pairs)
+        else:
+            replay = Fleet(self._config, self._seed, self._verify_pairs)
+            for veto in self._decisions.vetoes:
+                replay.veto(veto)
+        for number in order[done:]:
             replay.apply(read(number))
+        self._replayed = _Replayed(order, replay.state())
         return replay.conclude()
 
     def correction(self, session: str) -> Correction | None:
@@ -202,6 +224,3 @@ class Fleet:
             self._recognition.thin(place, decisions.map_of(session))
         decisions.optimize_if_due()
         self._quality.update(matches, decisions.map_of(session))
-
-    def _result(self, fusion: Fusion) -> FleetResult:
-        return conclude(self._sessions, self._graph, self._decisions.closures, fusion, self._decisions.version)

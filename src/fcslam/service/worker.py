@@ -123,9 +123,9 @@ class Worker:
         """Do one piece of work; False: there is none."""
         return (
             self._take_vetoes()
+            or self._write_snapshot()
             or self._take_packets()
             or self._report()
-            or self._write_snapshot()
             or self._finalize()
             or self._publish()
         )
