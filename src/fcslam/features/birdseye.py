@@ -133,7 +133,7 @@ def _likelihood_discs(sigma_cells: float) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=8)
 def _comparison_pattern(radius_cells: float) -> FloatArray:
-    """Pairs of points in the patch, shape (256, 4): x, y, x', y' in cells.
+    """Pairs of points in the patch, shape (4, 256): x, y, x', y' in cells.
 
     They follow the R-sequence of the generalised golden ratio in four dimensions (a low-discrepancy sequence), which
     covers the patch evenly and needs no random generator. Pairs that leave the patch are skipped.
@@ -147,7 +147,7 @@ def _comparison_pattern(radius_cells: float) -> FloatArray:
     start = np.sqrt(u[:, 0]) * np.exp(2j * np.pi * u[:, 1])
     end = start + (shortest + (longest - shortest) * u[:, 2]) * np.exp(2j * np.pi * u[:, 3])
     pairs = np.stack((start.real, start.imag, end.real, end.imag), axis=1)[np.abs(end) < 1.0]
-    return frozen(radius_cells * pairs[:CODE_BITS])
+    return frozen(np.ascontiguousarray(radius_cells * pairs[:CODE_BITS].T))
 
 
 @njit
@@ -192,22 +192,26 @@ def _directions(picture: Picture, pixels: NDArray[np.int64], radius: int) -> Flo
 def _compare(
     picture: Picture, pixels: NDArray[np.int64], directions: FloatArray, pattern: FloatArray
 ) -> NDArray[np.bool_]:
-    """Whether the first point of each rotated pair is darker, shape (K, 256)."""
-    darker = np.empty((pixels.shape[0], pattern.shape[0]), np.bool_)
+    """Whether the first point of each rotated pair of ``pattern`` (4, 256) is darker, shape (K, 256).
+
+    All cells of a keypoint are found before the first is read: that loop has no branch and so works on vectors.
+    """
+    rows, columns = picture.shape
+    outside = rows * columns
+    levels = np.zeros(outside + 1, np.uint8)  # the last one is that of the points outside
+    levels[:outside] = picture.ravel()
+    cells = np.empty((2, pattern.shape[1]), np.int32)
+    darker = np.empty((pixels.shape[0], pattern.shape[1]), np.bool_)
     for index in range(pixels.shape[0]):
         column, row = pixels[index, 0] + 0.5, pixels[index, 1] + 0.5
         cos, sin = np.cos(directions[index]), np.sin(directions[index])
-        for bit in range(pattern.shape[0]):
-            x, y, other_x, other_y = pattern[bit]
-            first = _level(picture, column + cos * x - sin * y, row + sin * x + cos * y)
-            other = _level(picture, column + cos * other_x - sin * other_y, row + sin * other_x + cos * other_y)
-            darker[index, bit] = first < other
+        for end in range(2):
+            for bit in range(pattern.shape[1]):
+                x, y = pattern[2 * end, bit], pattern[2 * end + 1, bit]
+                u = np.int32(np.floor(column + cos * x - sin * y))
+                v = np.int32(np.floor(row + sin * x + cos * y))
+                inside = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+                cells[end, bit] = np.int32(v * columns + u) if inside else np.int32(outside)
+        for bit in range(pattern.shape[1]):
+            darker[index, bit] = levels[np.uint32(cells[0, bit])] < levels[np.uint32(cells[1, bit])]
     return darker
-
-
-@njit
-def _level(picture: Picture, column: float, row: float) -> int:
-    """Grey level of the cell that contains a point (whole numbers are corners of cells); 0 outside the picture."""
-    if 0.0 <= row < picture.shape[0] and 0.0 <= column < picture.shape[1]:
-        return int(picture[int(row), int(column)])
-    return 0
