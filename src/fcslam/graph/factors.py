@@ -44,6 +44,18 @@ class FactorCache:
         """Factors of the closures, by loss."""
         self._built = 0
 
+    def restricted(self, graph: PoseGraph, kept: NDArray[np.bool_]) -> "FactorCache":
+        """Factors of a ``graph`` that has the same variables, all trusted edges, and the closures that are kept, (K,).
+
+        It shares what is built.
+        """
+        self._update()
+        part = FactorCache(graph)
+        part._trusted = gtsam.NonlinearFactorGraph(self._trusted)
+        part._closures = [closure for closure, keep in zip(self._closures, kept.tolist(), strict=True) if keep]
+        part._built = len(graph.edges)
+        return part
+
     def squared(self, weights: FloatArray, poses: FloatArray) -> Any:
         """Factor graph with the information of the closures scaled by weights; closures of weight 0 are left out.
 

@@ -22,6 +22,7 @@ from fcslam.graph.cluster import (
 )
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
 from fcslam.graph.evidence import Uniqueness, shortfall
+from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import Edge, PoseGraph
@@ -115,7 +116,8 @@ def solve_jointly(
         Poses (N, 3), weights (E,), and the maps.
     """
     # 1. Optimise each robot's own graph.
-    own = [_solve_own_graph(evidence, robot, consistency, gnc) for robot in evidence.robots]
+    factors = FactorCache(evidence.graph)
+    own = [_solve_own_graph(evidence, robot, consistency, gnc, factors) for robot in evidence.robots]
     paths = [path for path, _ in own]
     # 2. Find the dominant cluster of closures between every two robots (PCM).
     links = _find_links(evidence, paths, consistency, examine)
@@ -126,13 +128,13 @@ def solve_jointly(
         within_maps = _edges_within_maps(evidence, maps)
         # 4. Solve with the supported closures, then decide all closures within maps by that solution.
         supported = within_maps & _supported_edges(evidence, [weights for _, weights in own], joining)
-        solution = _solve_supported(evidence, supported, paths, frames, bool(joining), gnc)
-        solution = _refine_inliers(evidence.graph, within_maps, solution, gnc)
+        solution = _solve_supported(evidence, supported, paths, frames, bool(joining), gnc, factors)
+        solution = _refine_inliers(factors, within_maps, solution, gnc)
         # 5. Withdraw isolated closures and decide once more.
         isolated = _isolated_closures(evidence, paths, solution, consistency)
         if isolated.any():
             trusted = replace(solution, weights=solution.weights * ~isolated)
-            solution = _refine_inliers(evidence.graph, within_maps, trusted, gnc)
+            solution = _refine_inliers(factors, within_maps, trusted, gnc)
         # 6. Repeat without the links that the joint solution contradicts.
         confirmed = [
             link for link in joining if _is_confirmed(link, paths, solution, evidence.informative, consistency)
@@ -144,7 +146,11 @@ def solve_jointly(
 
 
 def _solve_own_graph(
-    evidence: JointEvidence, robot: NDArray[np.int64], consistency: ConsistencySettings, gnc: GncSettings | None
+    evidence: JointEvidence,
+    robot: NDArray[np.int64],
+    consistency: ConsistencySettings,
+    gnc: GncSettings | None,
+    factors: FactorCache,
 ) -> tuple[Trajectory, FloatArray]:
     """Trajectory of one robot from its own measurements, and the weights (E,) of its edges; other edges have 0."""
     graph = evidence.graph
@@ -161,7 +167,9 @@ def _solve_own_graph(
             for e in (graph.edges[k] for k in mine.tolist())
         ],
     )
-    solution = solve_single_robot(own_graph, consistency, gnc)
+    same = np.array_equal(robot, np.arange(len(graph)))  # then its factors are those of the joint graph
+    own_factors = factors.restricted(own_graph, ~evidence.excluded[edges.robust]) if same else None
+    solution = solve_single_robot(own_graph, consistency, gnc, own_factors)
     weights = np.zeros(len(edges.i))
     weights[mine] = solution.weights
     return robot_trajectory(own_graph, solution.poses, consistency), weights
@@ -249,6 +257,7 @@ def _solve_supported(
     frames: Sequence[FloatArray],
     joined: bool,
     gnc: GncSettings | None,
+    factors: FactorCache,
 ) -> Solution:
     """Graduated non-convexity with supported closures only, so that false ones cannot distort its start.
 
@@ -261,18 +270,21 @@ def _solve_supported(
     for robot, path, frame in zip(evidence.robots, own, frames, strict=True):
         start[robot] = se2.compose(frame, path.poses)
     subgraph = _subgraph(graph, start, supported)
+    kept = factors.restricted(subgraph, supported[graph.arrays().robust])
     starts = (start, initialize(subgraph)) if joined else (start,)
-    solutions = [optimize_gnc(subgraph, poses, settings=gnc) for poses in starts]
+    solutions = [optimize_gnc(subgraph, poses, settings=gnc, factors=kept) for poses in starts]
     best = min(solutions, key=lambda solution: solution.stats.final_cost)
     return _expand_weights(best, supported)
 
 
 def _refine_inliers(
-    graph: PoseGraph, within_maps: NDArray[np.bool_], trusted: Solution, gnc: GncSettings | None
+    factors: FactorCache, within_maps: NDArray[np.bool_], trusted: Solution, gnc: GncSettings | None
 ) -> Solution:
     """Decide every edge within a map, starting from the inliers of a trusted solution."""
+    graph = factors.graph
     subgraph = _subgraph(graph, trusted.poses, within_maps)
-    refined = refine_inliers(subgraph, None, trusted.weights[within_maps], settings=gnc)
+    kept = factors.restricted(subgraph, within_maps[graph.arrays().robust])
+    refined = refine_inliers(subgraph, None, trusted.weights[within_maps], settings=gnc, factors=kept)
     return _expand_weights(refined, within_maps)
 
 

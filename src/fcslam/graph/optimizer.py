@@ -198,11 +198,16 @@ class _Steps:
     def __init__(self, cache: FactorCache, values: Any) -> None:
         self.cache, self.values, self.iterations = cache, values, 0
         self._robust = cache.graph.arrays().robust
+        self._optimal_for: FloatArray | None = None
+        """The weights for which the values are optimal."""
 
     def solve(self, weights: FloatArray, iterations: int) -> None:
+        if self._optimal_for is not None and np.array_equal(weights, self._optimal_for):
+            return
         problem = self.cache.squared(weights, from_values(self.values))
         self.values, used = _levenberg_marquardt(problem, self.values, iterations)
         self.iterations += used
+        self._optimal_for = weights if used < iterations else None
 
     def chi2(self) -> FloatArray:
         """Squared Mahalanobis lengths of the closures' residuals, shape (K,)."""

@@ -3,6 +3,7 @@
 import numpy as np
 
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
+from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import PoseGraph
@@ -13,7 +14,12 @@ _UNMEASURED_VARIANCE = 1e6
 """Variance of a step that no odometry measured, m^2 and rad^2."""
 
 
-def solve_single_robot(graph: PoseGraph, consistency: ConsistencySettings, gnc: GncSettings | None = None) -> Solution:
+def solve_single_robot(
+    graph: PoseGraph,
+    consistency: ConsistencySettings,
+    gnc: GncSettings | None = None,
+    factors: FactorCache | None = None,
+) -> Solution:
     """Optimise the graph of one robot robustly; its variables are in the order of its path.
 
     Returns the cheapest of three solutions; the value of the truncated loss, which has many minima, ranks them:
@@ -28,13 +34,14 @@ def solve_single_robot(graph: PoseGraph, consistency: ConsistencySettings, gnc: 
         graph: N variables and E edges of one robot.
         consistency: when closures support each other.
         gnc: settings of graduated non-convexity.
+        factors: those of ``graph``, where they are built already.
 
     Returns:
         Poses (N, 3) in the frame of the first variable, and weights (E,).
     """
-    robust = graph.arrays().robust
+    robust, factors = graph.arrays().robust, factors or FactorCache(graph)
     odometry = initialize(graph, (~robust).astype(float))
-    by_odometry = refine_inliers(graph, odometry, ~robust, settings=gnc)
+    by_odometry = refine_inliers(graph, odometry, ~robust, settings=gnc, factors=factors)
     if not robust.any():
         return by_odometry
     supported = ~robust
@@ -45,13 +52,18 @@ def solve_single_robot(graph: PoseGraph, consistency: ConsistencySettings, gnc: 
     supported_graph = PoseGraph(
         graph.poses(), [edge for edge, kept in zip(graph.edges, supported, strict=True) if kept]
     )
-    first = optimize_gnc(supported_graph, initialize_robust(supported_graph), settings=gnc)
+    first = optimize_gnc(
+        supported_graph,
+        initialize_robust(supported_graph),
+        settings=gnc,
+        factors=factors.restricted(supported_graph, supported[robust]),
+    )
     weights = np.zeros(len(robust))
     weights[supported] = first.weights
     solutions = (
         by_odometry,
-        refine_inliers(graph, first.poses, weights, settings=gnc),
-        optimize_gnc(graph, odometry, settings=gnc),
+        refine_inliers(graph, first.poses, weights, settings=gnc, factors=factors),
+        optimize_gnc(graph, odometry, settings=gnc, factors=factors),
     )
     return min(solutions, key=lambda solution: solution.stats.final_cost)
 
