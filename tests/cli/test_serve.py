@@ -173,6 +173,7 @@ def test_killed_at_any_moment_a_service_loses_nothing_and_finds_the_same(tmp_pat
             runs.append(open_run(Path(client.post(f"{API}/finalize").json()["run"])))
         service.stop()
     assert runs[0].pose_graph_g2o == runs[1].pose_graph_g2o
+    assert all(path.stat().st_mode & 0o077 == 0 for path in tmp_path.glob("data*/**/*"))
     assert runs[0].map_files == runs[1].map_files
     assert [str(c) for c in runs[0].closures] == [str(c) for c in runs[1].closures]
 

@@ -167,6 +167,12 @@ def test_an_epoch_that_the_cloud_knows_from_before_is_not_taken_again(outbox):
     assert decode(stored[4, 0]).body.epoch == 4
 
 
+def test_epochs_do_not_run_out_silently(outbox):
+    """Whoever has the robot's token may have used the last one."""
+    with pytest.raises(StateError, match="something else sends under its name"):
+        outbox.synchronize({2**31 - 1: 3})
+
+
 @pytest.mark.parametrize(
     ("starts", "known", "epochs"), [(3, {}, [0, 1, 2]), (3, {0: 1}, [1, 2, 3]), (2, {5: 1}, [6, 7])]
 )

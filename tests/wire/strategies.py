@@ -22,6 +22,7 @@ from fcslam.wire.streams import ascending
 
 NAMES = st.text("AZaz09._+-", min_size=0, max_size=63).map(lambda rest: "a" + rest)
 SEQUENCES = st.integers(0, 2**63 - 1)
+EPOCHS = st.integers(0, 2**31 - 1)
 NUMBERS = st.integers(0, 2**31 - 1)
 STAMPS = st.floats(allow_nan=False, allow_infinity=False)
 COORDINATES = st.floats(-1e6, 1e6)
@@ -115,12 +116,12 @@ def bodies(robot, epoch, time):
         constraints(robot),
         places(robot),
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),
-        st.builds(Acknowledgement, st.just(robot), SEQUENCES, SEQUENCES),
+        st.builds(Acknowledgement, st.just(robot), EPOCHS, SEQUENCES),
         st.builds(DetectorUpdate, st.just(robot), detector_files()),
     )
 
 
 @st.composite
 def packets(draw):
-    robot, epoch, sequence, time = draw(NAMES), draw(SEQUENCES), draw(SEQUENCES), draw(STAMPS)
+    robot, epoch, sequence, time = draw(NAMES), draw(EPOCHS), draw(SEQUENCES), draw(STAMPS)
     return Packet(robot, epoch, sequence, time, draw(bodies(robot, epoch, time)))

@@ -137,7 +137,9 @@ def robot(
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.robot.agent import PlaybackPace
     from fcslam.sources.faults import Fault
+    from fcslam.storage.files import keep_private
 
+    keep_private()
     pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
     settings = mission_config(config).robot
     argument = source if name is None else f"{name}={source}"

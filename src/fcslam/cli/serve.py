@@ -60,10 +60,12 @@ def serve(
     from fcslam.errors import ServiceError
     from fcslam.service.http.app import create_app
     from fcslam.service.warmup import warm_up_decoding
+    from fcslam.storage.files import keep_private
 
     if tokens is None and client_ca is None and not insecure and not _is_loopback(host):
         raise ServiceError(f"everybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
     _check_tls(tls_certificate, tls_key, client_ca)
+    keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with _listen(host, port) as listening:
         state = _state(data, _authenticator(tokens, client_ca), _cloud_config(config))

@@ -18,6 +18,7 @@ from fcslam.errors import StateError, StoreError
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.storage.database import Database
 from fcslam.wire.batches import LENGTH
+from fcslam.wire.limits import MAXIMUM_EPOCH
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, readdress
 
@@ -213,7 +214,7 @@ class Outbox:
             whose first packets it had confirmed and does not have any more.
 
         Raises:
-            StateError: the cloud does not have the first packets of the present epoch any more.
+            StateError: the cloud does not have the first packets of the present epoch any more, or no epoch is left.
         """
         with self._transaction() as connection:
             newest = max(expected, default=-1)
@@ -221,6 +222,11 @@ class Outbox:
             for (epoch,) in connection.execute("SELECT epoch FROM sessions WHERE met = 0 ORDER BY epoch"):
                 newest = max(epoch, newest + 1)
                 moves.append((epoch, newest))
+            if newest > MAXIMUM_EPOCH:
+                raise StateError(
+                    f"{self._path}: the cloud has packets of epoch {max(expected)} of this robot, and epochs end at "
+                    f"{MAXIMUM_EPOCH}: something else sends under its name; replace its token and start a new mission"
+                )
             for move in reversed(moves):
                 self._move(connection, *move)
             connection.execute("UPDATE sessions SET met = 1")

@@ -25,6 +25,11 @@ def write_file(path: Path, content: bytes | memoryview | str, *, private: bool =
             file.write(data)
 
 
+def keep_private() -> None:
+    """Let only the owner read what this process and its children write from now on: files 0600, folders 0700."""
+    os.umask(0o077)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a path beside ``path`` for a file to be written; it replaces ``path`` when the block succeeds.

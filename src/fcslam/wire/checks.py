@@ -15,6 +15,7 @@ from fcslam.wire.limits import (
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
     MAXIMUM_COORDINATE_M,
+    MAXIMUM_EPOCH,
     MAXIMUM_INFORMATION,
     MAXIMUM_KEYPOINTS,
     MAXIMUM_LASER_RANGE_M,
@@ -36,7 +37,7 @@ def check(packet: Packet) -> None:
         PacketError: the packet is not valid; the message says why.
     """
     check_name(packet.robot, "robot")
-    _check_count(packet.epoch, "epoch", MAXIMUM_SEQUENCE)
+    _check_count(packet.epoch, "epoch", MAXIMUM_EPOCH)
     _check_count(packet.sequence, "sequence", MAXIMUM_SEQUENCE)
     _require(math.isfinite(packet.time), "time is not finite")
     robot = _robot_of(packet.body)
@@ -148,7 +149,7 @@ def _check_correction(correction: Correction, _: Packet) -> None:
 
 
 def _check_acknowledgement(acknowledgement: Acknowledgement, _: Packet) -> None:
-    _check_count(acknowledgement.epoch, "acknowledgement: epoch", MAXIMUM_SEQUENCE)
+    _check_count(acknowledgement.epoch, "acknowledgement: epoch", MAXIMUM_EPOCH)
     _check_count(acknowledgement.sequence, "acknowledgement: sequence", MAXIMUM_SEQUENCE)
 
 

@@ -8,7 +8,9 @@ MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
 
 MAXIMUM_SEQUENCE = 2**63 - 1
-"""Epochs and sequence numbers fit a signed 64-bit column."""
+"""Sequence numbers fit a signed 64-bit column."""
+MAXIMUM_EPOCH = 2**31 - 1
+"""A robot that starts every second needs 68 years."""
 MAXIMUM_NUMBER = 2**31 - 1
 """Numbers of keyscans, versions and maps."""
 

@@ -15,6 +15,7 @@ from fcslam.wire.limits import (
     BYTES_PER_RANGE,
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
+    MAXIMUM_EPOCH,
     MAXIMUM_KEYPOINTS,
     MAXIMUM_PACKET_BYTES,
     MAXIMUM_SEQUENCE,
@@ -139,7 +140,8 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
         check_name(message.robot, "robot")
     except (DecodeError, PacketError):
         return None
-    known = message.version == PROTOCOL_VERSION and max(message.epoch, message.sequence) <= MAXIMUM_SEQUENCE
+    numbered = message.epoch <= MAXIMUM_EPOCH and message.sequence <= MAXIMUM_SEQUENCE
+    known = message.version == PROTOCOL_VERSION and numbered
     return (message.robot, message.epoch, message.sequence) if known else None
 
 
