@@ -5,7 +5,7 @@
 The pairs are those that a mission of simulated robots in one building compares, again and again until they are enough.
 A batch has as many as there are places to compare while the fleet is small (`fleet.matcher.small_fleet`). One process
 is this one. The pool is started and has loaded its code before the clock runs. Wall-clock time: the machine must be
-quiet.
+quiet. The last column needs no quiet machine: CPU of one process, against that of this one and the busiest of the pool.
 """
 
 import itertools
@@ -18,7 +18,7 @@ import common
 
 AT_ONCE = 150
 SUBMAPS_KEPT = 300
-COLUMNS = {"processes": "", "pairs": ",", "time, s": ".1f", "a pair, ms": ".2f", "against one": ".2f"}
+COLUMNS = {"processes": "", "pairs": ",", "time, s": ".1f", "a pair, ms": ".2f", "against one": ".2f", "by CPU": ".2f"}
 
 
 def main() -> None:
@@ -28,17 +28,18 @@ def main() -> None:
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
     batches = compared(chosen.pairs)
-    single_s, expected = timed([], batches)
-    rows = [(1, chosen.pairs, single_s, 1e3 * single_s / chosen.pairs, 1.0)]
+    single_s, single_cpu_s, expected = timed([], batches)
+    rows = [(1, chosen.pairs, single_s, 1e3 * single_s / chosen.pairs, 1.0, 1.0)]
     for processes in chosen.processes:
         with ExitStack() as stack:
             pools = [ProcessPoolExecutor(1, get_context("spawn")) for _ in range(processes)]
             executors = [stack.enter_context(pool) for pool in pools]
             timed(executors, batches[:4])
-            pool_s, found = timed(executors, batches)
+            pool_s, cpu_s, found = timed(executors, batches)
         if found != expected:
             raise SystemExit("verification: the pool finds something else")
-        rows.append((processes, chosen.pairs, pool_s, 1e3 * pool_s / chosen.pairs, single_s / pool_s))
+        a_pair_ms = 1e3 * pool_s / chosen.pairs
+        rows.append((processes, chosen.pairs, pool_s, a_pair_ms, single_s / pool_s, single_cpu_s / cpu_s))
     report.table("Verification", COLUMNS, rows)
     report.write()
 
@@ -70,15 +71,24 @@ def compared(count: int) -> list[list]:
     return [list(batch) for batch in iter(lambda: tuple(itertools.islice(repeated, AT_ONCE)), ())]
 
 
-def timed(executors: list, batches: list[list]) -> tuple[float, list]:
-    """Seconds, and what was found."""
+def timed(executors: list, batches: list[list]) -> tuple[float, float, list]:
+    """Seconds, seconds of CPU of this process and the busiest executor, and what was found."""
     from fcslam.lidar.pair_verification import VerificationPool, verify_here
     from fcslam.lidar.verification import VerificationConfig
 
     run = VerificationPool(executors, SUBMAPS_KEPT) if executors else verify_here
-    config, began = VerificationConfig(), time.perf_counter()
+    config, began, before_s = VerificationConfig(), time.perf_counter(), used(executors)
     found = [check for batch in batches for check in run(batch, config)]
-    return time.perf_counter() - began, [(check.T_a_b.tobytes(), check.strict, check.loose) for check in found]
+    took_s = time.perf_counter() - began
+    here_s, *there_s = (after - before for after, before in zip(used(executors), before_s, strict=True))
+    cpu_s = here_s + max(there_s, default=0.0)
+    return took_s, cpu_s, [(check.T_a_b.tobytes(), check.strict, check.loose) for check in found]
+
+
+def used(executors: list) -> list[float]:
+    """Seconds of CPU of this process and of each executor so far."""
+    there = [executor.submit(time.process_time).result() for executor in executors]
+    return [time.process_time(), *there]
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def written(checks):
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 20])
 def test_a_pool_finds_what_is_found_here(pairs, workers):
-    """The limits are such that the noise of the submaps, which the pool does not know, decides some pairs."""
+    """The limits are such that the noise of the submaps, which its processes do not know, decides some pairs."""
     asked = []
     noisy = [pair._replace(noise=lambda: asked.append(1) or 0.5) for pair in pairs]
     config = VerificationConfig(strict={"violation": 0.02, "explained": 0.2, "count": 10})

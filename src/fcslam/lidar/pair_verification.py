@@ -6,7 +6,16 @@ from concurrent.futures import Executor, Future
 from typing import NamedTuple
 
 from fcslam.lidar.submap import Submap
-from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig, no_noise, verify
+from fcslam.lidar.verification import (
+    NO_PRIOR,
+    Aligned,
+    Verification,
+    VerificationConfig,
+    align,
+    judge,
+    no_noise,
+    verify,
+)
 from fcslam.records import FloatArray
 
 
@@ -18,7 +27,7 @@ class Pair(NamedTuple):
     T_a_b_guess: FloatArray
     prior: FloatArray = NO_PRIOR
     noise: Callable[[], float] = no_noise
-    """Stays in this process: it is asked for rarely, and needs the scans."""
+    """Stays in this process: it needs the scans."""
 
 
 VerifyPairs = Callable[[Sequence[Pair], VerificationConfig], list[Verification]]
@@ -31,7 +40,7 @@ def verify_here(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verif
 
 
 class VerificationPool:
-    """Verifies pairs on executors of one process each. It has the signature ``VerifyPairs``.
+    """Aligns pairs on executors of one process each, and judges them here. It has the signature ``VerifyPairs``.
 
     A submap takes longer to send than to compare, so each process keeps those that it got.
     """
@@ -53,11 +62,8 @@ class VerificationPool:
             process.submit(pairs[begin : begin + size], config)
             for process, begin in zip(self._processes, begins, strict=False)
         ]
-        checks = [check for batch in running for check in batch.result()]
-        return [
-            verify_here([pair], config)[0] if check is None else check
-            for pair, check in zip(pairs, checks, strict=True)
-        ]
+        aligned = [each for batch in running for each in batch.result()]
+        return [judge(each, config, pair.noise) for pair, each in zip(pairs, aligned, strict=True)]
 
 
 class _Process:
@@ -68,12 +74,12 @@ class _Process:
         self._sent: dict[int, tuple[int, Submap]] = {}
         """Name in the process, by identity; the reference keeps the identity from being used again. Newest last."""
 
-    def submit(self, pairs: Sequence[Pair], config: VerificationConfig) -> "Future[list[Verification | None]]":
+    def submit(self, pairs: Sequence[Pair], config: VerificationConfig) -> "Future[list[Aligned]]":
         new: dict[int, Submap] = {}
         named = [(self._name(a, new), self._name(b, new), guess, prior) for a, b, guess, prior, _ in pairs]
         surplus = list(self._sent)[: max(0, len(self._sent) - self._submaps_kept)]
         dropped = [self._sent.pop(identity)[0] for identity in surplus]
-        return self._executor.submit(_verify_batch, new, named, dropped, config)
+        return self._executor.submit(_align_batch, new, named, dropped, config)
 
     def _name(self, submap: Submap, new: dict[int, Submap]) -> int:
         sent = self._sent.pop(id(submap), None)
@@ -90,28 +96,15 @@ _kept: dict[int, Submap] = {}
 """Submaps of a process of the pool, by name."""
 
 
-class _NoiseNeededError(Exception):
-    """The noise of the submaps decides."""
-
-
-def _no_scans() -> float:
-    raise _NoiseNeededError
-
-
-def _verify_batch(
+def _align_batch(
     new: Mapping[int, Submap],
     batch: Sequence[tuple[int, int, FloatArray, FloatArray]],
     dropped: Sequence[int],
     config: VerificationConfig,
-) -> list[Verification | None]:
-    """The results of a batch in another process; None where the noise decides."""
+) -> list[Aligned]:
+    """The alignments of a batch in another process."""
     _kept.update(new)
-    results: list[Verification | None] = []
-    for a, b, guess, prior in batch:
-        try:
-            results.append(verify(_kept[a], _kept[b], guess, config, prior, _no_scans))
-        except _NoiseNeededError:
-            results.append(None)
+    results = [align(_kept[a], _kept[b], guess, config, prior) for a, b, guess, prior in batch]
     for name in dropped:
         del _kept[name]
     return results

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -140,6 +141,18 @@ class Verification:
         return 1.0 if self.strict else 0.5 * self.partial
 
 
+class Aligned(NamedTuple):
+    """Two submaps aligned in both directions; the fields are those of ``Verification``."""
+
+    T_a_b: FloatArray
+    information: FloatArray
+    worse: Agreement
+    weakest: float
+    """Smallest eigenvalue of the normal tensor of ``worse``."""
+    gap: FloatArray
+    """Motion between both alignments, shape (3,), metres and radians."""
+
+
 def no_noise() -> float:
     """Submaps that do not contradict themselves."""
     return 0.0
@@ -169,6 +182,13 @@ def verify(
     Returns:
         The alignment halfway between both directions, and the gates that it passes.
     """
+    return judge(align(a, b, T_a_b_guess, config, prior), config, noise)
+
+
+def align(
+    a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig, prior: FloatArray = NO_PRIOR
+) -> Aligned:
+    """What takes the time of ``verify``: the alignment, which does not depend on the noise of the submaps."""
     forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, prior, _ALIGNMENT)
     # The prior must not count twice: backward it acts at the guess, as it does forward.
     start = T_a_b_guess if prior.any() else forward.T_field_base
@@ -187,14 +207,20 @@ def verify(
         max(side.overlap for side in sides),
         worse.normal_tensor,
     )
-    asymmetric = _asymmetry(gap, config)
+    return Aligned(T_a_b, _information(forward.information + prior, T_a_b, config), worse, worse.weakest, gap)
+
+
+def judge(aligned: Aligned, config: VerificationConfig, noise: Callable[[], float] = no_noise) -> Verification:
+    """Which gates an alignment passes; arguments as for ``verify``."""
+    worse, weakest = aligned.worse, aligned.weakest
+    asymmetric = _asymmetry(aligned.gap, config)
     symmetric = asymmetric is None
-    informative = worse.weakest >= config.informative
-    one_direction = Reason(ReasonCode.ONE_DIRECTION, worse.weakest, config.informative, "informative")
+    informative = weakest >= config.informative
+    one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, config.informative, "informative")
     strict, loose = _shortfall(worse, config.strict, "strict", noise), _shortfall(worse, config.loose, "loose", noise)
     return Verification(
-        T_a_b=T_a_b,
-        information=_information(forward.information + prior, T_a_b, config),
+        T_a_b=aligned.T_a_b,
+        information=aligned.information,
         worse=worse,
         strict=symmetric and not strict,
         loose=symmetric and not loose,
