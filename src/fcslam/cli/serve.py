@@ -85,12 +85,13 @@ def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_c
 
     import uvicorn
 
-    from fcslam.service.http.tls import CertifiedProtocol
+    from fcslam.service.http.protocol import GuardedProtocol, allow_many_connections
 
+    allow_many_connections()
     return uvicorn.Server(
         uvicorn.Config(
             app,
-            http=CertifiedProtocol,
+            http=GuardedProtocol,
             ssl_certfile=certificate,
             ssl_keyfile=key,
             ssl_ca_certs=None if client_ca is None else str(client_ca),
@@ -100,7 +101,6 @@ def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_c
             server_header=False,
             timeout_graceful_shutdown=10,
             h11_max_incomplete_event_size=64 * 1024,
-            limit_concurrency=512,
         )
     )
 

@@ -8,7 +8,7 @@ import pytest
 from fcslam.errors import CloudError, UnavailableError
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http.authentication import Authenticator, Identity, Role, read_tokens
-from fcslam.service.http.tls import CertifiedProtocol
+from fcslam.service.http.protocol import GuardedProtocol
 from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode
@@ -35,7 +35,7 @@ def connect(tmp_path, scripted, authority):
     transports = []
     certificate, key = pair(authority, "cloud")
     tls = {
-        "http": CertifiedProtocol, "ssl_certfile": certificate, "ssl_keyfile": key,
+        "http": GuardedProtocol, "ssl_certfile": certificate, "ssl_keyfile": key,
         "ssl_ca_certs": str(authority / "ca.pem"), "ssl_cert_reqs": ssl.CERT_OPTIONAL,
     }  # fmt: skip
     with Desk(tmp_path / "data", read_tokens(authority / "tokens.yaml"), **tls) as desk:

@@ -1,0 +1,104 @@
+"""The connections of the service: how many there may be, how long they may be idle, and whose certificate they show."""
+
+import asyncio
+import resource
+import ssl
+from collections import Counter
+from typing import Any
+
+from cryptography import x509
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+MOST_CONNECTIONS = 512
+"""Connections without a request in progress; of more, one of the address that has most is closed."""
+IDLE_S = 10.0
+"""Time for the header of a request, from the connection or the response before."""
+BODY_S = 60.0
+"""Time for a request with its body."""
+_LOOK_EVERY_S = 2.0
+_FILES = 16_384
+"""Files that may be open at a time, if the system allows it: connections whose TLS handshake is not done count, too."""
+
+
+def allow_many_connections() -> None:
+    """Raise this process's limit of open files."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+
+
+class GuardedProtocol(H11Protocol):
+    """uvicorn's protocol, with limits for connections that ask nothing, and with the client's certificate.
+
+    uvicorn has a timeout only between two requests, and where it limits connections it refuses new ones. So whoever
+    holds idle connections would lock everybody else out.
+    """
+
+    _idle_since = _asked_since = 0.0
+    """Times of the loop: when the present request began, or when the connection was seen without one first."""
+    _look: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """After the handshake: a client certificate, if there is one, was signed by the trusted authority."""
+        super().connection_made(transport)
+        self._idle_since = self._asked_since = self.loop.time()
+        self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
+        if len(self.connections) > MOST_CONNECTIONS:
+            self._make_room()
+        self._pass_certificate(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The client or a limit closed the connection."""
+        if self._look is not None:
+            self._look.cancel()
+        super().connection_lost(exc)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no request is in progress."""
+        return self.cycle is None or self.cycle.response_complete
+
+    def _enforce_timeouts(self) -> None:
+        """Close the connection if it has been idle, or its request has been coming in, for too long."""
+        now = self.loop.time()
+        if self.is_idle:
+            self._asked_since = now
+            is_late = now - self._idle_since > IDLE_S
+        else:
+            self._idle_since = now
+            is_late = self.cycle.more_body and now - self._asked_since > BODY_S
+        if is_late:
+            self.transport.abort()
+        else:
+            self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
+
+    def _make_room(self) -> None:
+        """Close the longest idle connection of the address that has most of them."""
+        idle = [each for each in self.connections if isinstance(each, GuardedProtocol) and each.is_idle]
+        held = Counter(_address(each) for each in idle if each is not self)
+        if held:
+            ((address, _),) = held.most_common(1)
+            oldest = min((e for e in idle if e is not self and _address(e) == address), key=lambda e: e._idle_since)
+            oldest.transport.abort()
+
+    def _pass_certificate(self, transport: asyncio.Transport) -> None:
+        """Pass the certificate to the application by ASGI's TLS extension; of its entries only ``client_cert_name``.
+
+        https://asgi.readthedocs.io/en/latest/specs/tls.html
+        """
+        tls: ssl.SSLObject | None = transport.get_extra_info("ssl_object")
+        shown = None if tls is None else tls.getpeercert(binary_form=True)
+        if shown is None:
+            return
+        name, app = x509.load_der_x509_certificate(shown).subject.rfc4514_string(), self.app
+
+        async def with_certificate(scope: Any, receive: Any, send: Any) -> None:
+            scope["extensions"] = {**scope.get("extensions", {}), "tls": {"client_cert_name": name}}
+            await app(scope, receive, send)
+
+        self.app = with_certificate
+
+
+def _address(protocol: H11Protocol) -> str:
+    return protocol.client[0] if protocol.client else ""

@@ -1,0 +1,65 @@
+"""Whoever holds connections without a request locks nobody out."""
+
+import contextlib
+import socket
+import time
+
+import httpx
+import pytest
+
+from fcslam.service.http import protocol
+from tests.cli.test_serve import API, Service
+
+pytestmark = [pytest.mark.system, pytest.mark.attack]
+
+
+@contextlib.contextmanager
+def held(url, count, beginning=b""):
+    """Open connections that send no more than the beginning of a request."""
+    address = httpx.URL(url)
+    with contextlib.ExitStack() as stack:
+        connections = []
+        for _ in range(count):
+            connection = socket.create_connection((address.host, address.port), timeout=10.0)
+            stack.callback(connection.close)
+            with contextlib.suppress(ConnectionError):
+                connection.sendall(beginning)
+            connections.append(connection)
+        yield connections
+
+
+@pytest.fixture
+def service(tmp_path):
+    service = Service(tmp_path / "data")
+    yield service
+    service.kill()
+
+
+@pytest.mark.parametrize("beginning", [b"", b"POST /api/v1/robots/a/packets HTTP/1.1\r\nHost: x\r\nX: "])
+def test_two_thousand_idle_connections_lock_nobody_out(service, beginning):
+    protocol.allow_many_connections()
+    with held(service.url, 2000, beginning):
+        for _ in range(50):
+            response = httpx.get(f"{service.url}{API}/robots/a/state", headers={"Fcslam-Agent": "x"}, timeout=5.0)
+            assert response.status_code == 200
+
+
+def test_a_connection_without_a_request_is_closed(service):
+    with held(service.url, 2, b"GET / HT") as connections:
+        began = time.monotonic()
+        for connection in connections:
+            connection.settimeout(5 * protocol.IDLE_S)
+            with contextlib.suppress(ConnectionResetError):
+                assert connection.recv(1) == b""
+        assert time.monotonic() - began > 0.5 * protocol.IDLE_S
+
+
+def trickle(connection, count):
+    for _ in range(count):
+        connection.sendall(b"X")
+        time.sleep(1.0)
+
+
+def test_a_header_that_trickles_in_is_closed(service):
+    with held(service.url, 1, b"GET / HTTP/1.1\r\n") as (connection,), pytest.raises(ConnectionError):
+        trickle(connection, int(5 * protocol.IDLE_S))
