@@ -224,6 +224,27 @@ def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, monkeypatc
     assert len(applied) >= len(packets)
 
 
+def test_packets_come_before_the_keyscans_that_the_live_map_needs_after_a_restart(cloud, monkeypatch):
+    packets = two_robots()
+    cloud.put(packets[:-1])
+    cloud.work()
+    cloud.now += 60.0
+    cloud.work()
+    cloud.restart()
+    read = []
+    decode = worker_module.decode
+    monkeypatch.setattr(worker_module, "decode", lambda data: read.append(data) or decode(data))
+    monkeypatch.setattr(worker_module, "AT_ONCE", 20)
+    cloud.worker.step()
+    assert len(read) == 20
+    cloud.put(packets[-1:])
+    cloud.worker.step()
+    assert cloud.store.applied() == len(packets)
+    assert len(read) == 20 + 1
+    cloud.work()
+    assert len(read) == len(set(read)) == 2 * len(POSES) + 1, "no keyscan twice"
+
+
 def test_a_worker_that_is_killed_while_it_catches_up_does_not_begin_again(cloud, monkeypatch):
     cloud.put(two_robots())
     for _ in range(AT_ONCE + 1):

@@ -134,6 +134,10 @@ class Fleet:
         self._needs_replay |= self._decisions.veto(veto)
         self._replayed = None
 
+    def read_ahead(self, most: int) -> bool:
+        """After ``restored``: read at most so many keyscans, so that ``estimate`` need not; False: all are read."""
+        return self._sessions.read_ahead(most)
+
     def estimate(self) -> FleetResult:
         """The current estimate, without a new decision: quick, for live maps."""
         sessions = self._sessions.robots

@@ -35,6 +35,8 @@ class SessionStore:
         """Of every keyscan, in seconds."""
         self._keyscans: dict[str, list[Keyscan | int | None]] = {}
         """None where it was released, the number of its packet where that was not read yet."""
+        self._unread: list[KeyscanId] = []
+        """Keyscans that ``restore`` named; some may have been read since."""
         self._sequences: dict[str, list[int]] = {}
         """Number of every keyscan's packet."""
         self._holders: dict[str, list[int]] = {}
@@ -154,11 +156,16 @@ class SessionStore:
     def keyscans(self, robot: str, first: int = 0, last: int | None = None) -> tuple[Keyscan, ...]:
         """Connected keyscans first to last (inclusive) of a robot, without released ones."""
         end = self._connected[robot] if last is None else last + 1
-        keyscans = self._keyscans[robot]
         for number in range(first, end):
-            if isinstance(sequence := keyscans[number], int):
-                keyscans[number] = self._stored(PacketNumber(robot, sequence), Keyscan)
-        return tuple(keyscan for keyscan in keyscans[first:end] if isinstance(keyscan, Keyscan))
+            self._read_keyscan(robot, number)
+        return tuple(keyscan for keyscan in self._keyscans[robot][first:end] if isinstance(keyscan, Keyscan))
+
+    def read_ahead(self, most: int) -> bool:
+        """Read at most so many of the keyscans that ``restore`` named; False: all are read."""
+        chosen, self._unread = self._unread[-most:], self._unread[:-most]
+        for robot, number in chosen:
+            self._read_keyscan(robot, number)
+        return bool(chosen)
 
     def stamp(self, keyscan: KeyscanId) -> float:
         """When the keyscan was taken."""
@@ -209,8 +216,13 @@ class SessionStore:
             self._sequences[robot] = kept["sequences"].tolist()
             held = zip(self._sequences[robot], kept["held"].tolist(), strict=True)
             self._keyscans[robot] = [sequence if is_held else None for sequence, is_held in held]
+            self._unread += [KeyscanId(robot, number) for number in np.flatnonzero(kept["held"]).tolist()]
         self._connected = dict(zip(state["robots"], state["connected"], strict=True))
         self._T_odom_base = {robot: frozen(pose) for robot, pose in state["T_odom_base"].items()}
+
+    def _read_keyscan(self, robot: str, number: int) -> None:
+        if isinstance(sequence := self._keyscans[robot][number], int):
+            self._keyscans[robot][number] = self._stored(PacketNumber(robot, sequence), Keyscan)
 
     def _stored(self, number: PacketNumber, kind: type[_Body]) -> _Body:
         """The content of a stored packet."""

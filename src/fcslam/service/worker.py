@@ -307,6 +307,8 @@ class Worker:
         if self._published == self._applied or self._applied < self._resumed_at or now < self._publish_at:
             return False
         try:
+            if self._fleet.read_ahead(AT_ONCE):  # after a restart, with a look at what else there is to do in between
+                return True
             result, traffic = self._fleet.estimate(), self._store.traffic()
             # Everything that it needs is in memory: the copy of this process must not use the store.
             task = self._start(lambda: self._write_live(result, traffic))
