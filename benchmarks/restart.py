@@ -24,8 +24,8 @@ import common
 
 COLUMNS = {"packets": ",", "start": "", "first worker, s": ".0f", "snapshot, MB": ".1f", "ready again, s": ".1f"}
 LOOK_S = 0.02
-SETTLED_S = 8.0
-"""After the last packet, so that a snapshot of all is written."""
+SETTLED_S = 120.0
+"""A worker that has written no snapshot so long after the last packet will write none."""
 
 
 def main() -> None:
@@ -108,13 +108,13 @@ def restarted(place: Path, rounds: list[tuple[list, Any]], size: int) -> Iterato
     store = MissionStore(folder.store)
     packets = stored(rounds)
     store.put([next(packets) for _ in range(size - 2)], 0.0)
-    first_s = worked(folder, store, SETTLED_S)
+    first_s = worked(folder, store, settles=True)
     snapshot_mb = folder.snapshot.stat().st_size / 1e6
     for start in ("snapshot", "no snapshot"):
         if start == "no snapshot":
             folder.snapshot.unlink()
         store.put([next(packets)], 0.0)
-        yield size, start, first_s, snapshot_mb, worked(folder, store, 0.0)
+        yield size, start, first_s, snapshot_mb, worked(folder, store)
     store.close()
 
 
@@ -129,20 +129,30 @@ def stored(rounds: list[tuple[list, Any]]) -> Iterator[Any]:
         yield StoredPacket(packet.robot, packet.epoch, packet.sequence, packet.time, label.kind, label.channel, data)
 
 
-def worked(folder: Any, store: Any, settle_s: float) -> float:
-    """Seconds until a new worker has let every packet take effect; it is killed ``settle_s`` later."""
+def worked(folder: Any, store: Any, settles: bool = False) -> float:
+    """Seconds until a new worker has let every packet take effect; it is killed then, or after its next snapshot."""
     size = len(store.envelopes())
     began = time.perf_counter()
     command = [sys.executable, "-m", "fcslam.service.worker", str(folder.path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        written_ns = written(folder)
         while store.applied() < size:
             if process.poll() is not None:
                 raise SystemExit(f"restart: the worker ended with code {process.returncode}")
+            written_ns = written(folder)
             time.sleep(LOOK_S)
         took_s = time.perf_counter() - began
-        time.sleep(settle_s)
+        while settles and written(folder) == written_ns:
+            if time.perf_counter() > began + took_s + SETTLED_S:
+                raise SystemExit("restart: the worker wrote no snapshot")
+            time.sleep(LOOK_S)
         process.kill()
     return took_s
+
+
+def written(folder: Any) -> int:
+    """When the snapshot was written, in nanoseconds; 0: never."""
+    return int(folder.snapshot.stat().st_mtime_ns) if folder.snapshot.exists() else 0
 
 
 if __name__ == "__main__":
