@@ -211,7 +211,7 @@ def _pyramid(base, count):  # type: ignore[no-untyped-def]
     return levels
 
 
-@njit
+@njit(allocates=False)
 def _bound(cells, level, width, sx, sy):  # type: ignore[no-untyped-def]
     """Sum of the points' largest likelihoods over shifts from (sx, sy) on, ``width`` cells; off the grid they are 0."""
     total = 0
@@ -236,14 +236,14 @@ def _cells_of(points, pose, corner, cell, turn):  # type: ignore[no-untyped-def]
     return cells
 
 
-@njit
+@njit(allocates=False)
 def _penalty(near, shifts, turn, turns, distance_penalty, angle_penalty):  # type: ignore[no-untyped-def]
     """Least penalty factor of a square of shifts whose nearest squared distance is ``near``."""
     away = distance_penalty * min(1.0, near / max(1, shifts * shifts))
     return (1.0 - away) * (1.0 - angle_penalty * (turn / max(1, turns)) ** 2)
 
 
-@njit
+@njit(allocates=False)
 def _nearest(low, high):  # type: ignore[no-untyped-def]
     if low > 0:
         return low

@@ -114,7 +114,7 @@ class SurfelField:
             self.arrays = self.arrays._replace(surfels=np.concatenate([surfels, np.zeros_like(surfels)]))
 
 
-@njit
+@njit(allocates=False)
 def label_at(x, y, field):  # type: ignore[no-untyped-def]
     """Surfel nearest to the cell of (x, y), or EMPTY."""
     cx = int(np.floor((x - field.corner[0]) / CELL_M))
@@ -136,7 +136,7 @@ def _labels_at(points, field):  # type: ignore[no-untyped-def]
     return result
 
 
-@njit
+@njit(allocates=False)
 def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-untyped-def]
     """Insert returns from index ``start`` on, until all are inserted or storage must grow; returns the next index."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
@@ -164,7 +164,7 @@ def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-unty
     return len(points)
 
 
-@njit
+@njit(allocates=False)
 def _within(x, y, field):  # type: ignore[no-untyped-def]
     """Whether the table holds every cell within reach of (x, y)."""
     side = field.table.shape[0] * TILE * CELL_M
@@ -173,7 +173,7 @@ def _within(x, y, field):  # type: ignore[no-untyped-def]
     return cx > margin and cy > margin and cx < side - margin and cy < side - margin
 
 
-@njit
+@njit(allocates=False)
 def _merge(x, y, nx, ny, solitary, label, field):  # type: ignore[no-untyped-def]
     """Merge a return into a surfel that is near and does not face away; returns whether it did.
 
@@ -209,7 +209,7 @@ def _merge(x, y, nx, ny, solitary, label, field):  # type: ignore[no-untyped-def
     return True
 
 
-@njit
+@njit(allocates=False)
 def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
     """Label every cell within reach that has no nearer surfel, row by row of the disc and tile by tile."""
     corner, labels, surfels = field.corner, field.labels, field.surfels
@@ -235,7 +235,7 @@ def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
                     labels[tile, row, gx - tx * TILE] = label
 
 
-@njit
+@njit(allocates=False)
 def _tile_at(tx, ty, field):  # type: ignore[no-untyped-def]
     """Storage number of a tile; allocates it if it had none."""
     tile = field.table[ty, tx]

@@ -133,7 +133,7 @@ def _match(scan, guess, prior, field, iterations, wide, narrow, sigma, explained
     return (pose, H / (sigma * sigma), *_fit(scan, pose, field, explained_m))
 
 
-@njit
+@njit(allocates=False)
 def _solve(A, b):  # type: ignore[no-untyped-def]
     """Solution of A x = b for a positive definite A (3, 3), by its LDL decomposition; compiles faster than LAPACK."""
     l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
@@ -148,6 +148,12 @@ def _solve(A, b):  # type: ignore[no-untyped-def]
 
 @njit
 def _normal_equations(scan, pose, field, scale):  # type: ignore[no-untyped-def]
+    hxx, hxy, hxt, hyy, hyt, htt, gx, gy, gt = _sums(scan, pose, field, scale)
+    return np.array(((hxx, hxy, hxt), (hxy, hyy, hyt), (hxt, hyt, htt))), np.array((gx, gy, gt))
+
+
+@njit(allocates=False)
+def _sums(scan, pose, field, scale):  # type: ignore[no-untyped-def]
     """Point-to-line where a normal is known, point-to-point for solitary returns; Geman-McClure weights."""
     hxx = hxy = hxt = hyy = hyt = htt = gx = gy = gt = 0.0  # scalars, which stay in registers
     points, normals, surfels = scan.points, scan.normals, field.surfels
@@ -200,11 +206,10 @@ def _normal_equations(scan, pose, field, scale):  # type: ignore[no-untyped-def]
         gx += w * nx * e
         gy += w * ny * e
         gt += w * t * e
-    H = np.array(((hxx, hxy, hxt), (hxy, hyy, hyt), (hxt, hyt, htt)))
-    return H, np.array((gx, gy, gt))
+    return hxx, hxy, hxt, hyy, hyt, htt, gx, gy, gt
 
 
-@njit
+@njit(allocates=False)
 def _fit(scan, pose, field, limit):  # type: ignore[no-untyped-def]
     """Share of the points on a surface, share near any, and the log-likelihood of the points."""
     points, normals, surfels = scan.points, scan.normals, field.surfels

@@ -164,7 +164,7 @@ def _bounds(beams, usable):  # type: ignore[no-untyped-def]
     return low, high
 
 
-@njit
+@njit(allocates=False)
 def _cast(beams, layout, usable, hits, passes):  # type: ignore[no-untyped-def]
     for k in range(len(beams.ranges_m)):
         pose = beams.T_map_laser[k]
@@ -181,7 +181,7 @@ def _cast(beams, layout, usable, hits, passes):  # type: ignore[no-untyped-def]
                 hits[int(np.floor(y1)), int(np.floor(x1))] += np.uint32(1)
 
 
-@njit
+@njit(allocates=False)
 def _traverse(x0, y0, x1, y1, passes):  # type: ignore[no-untyped-def]
     """Count a pass for each cell of a beam, including the first and the last; returns whether the last is in the grid.
 

@@ -105,7 +105,7 @@ def _project(ranges, beams, spacing, max_range, T_base_laser):  # type: ignore[n
     return points, normals, solitary
 
 
-@njit
+@njit(allocates=False)
 def _in_row(points, k):  # type: ignore[no-untyped-def]
     """Whether return k and two neighbours lie in a row, as the far returns from a wall seen at a grazing angle do."""
     for first in range(max(0, k - 2), min(k, len(points) - 3) + 1):
@@ -118,7 +118,7 @@ def _in_row(points, k):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit
+@njit(allocates=False)
 def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # type: ignore[no-untyped-def]
     """Total least squares through the neighbours of return k on the same surface; facing the laser."""
     first = last = k
@@ -152,7 +152,7 @@ def _fit_normal(points, kept, ranges, spacing, k, T_base_laser, normals):  # typ
     normals[k, 1] = ny
 
 
-@njit
+@njit(allocates=False)
 def _across(difference, mixed):  # type: ignore[no-untyped-def]
     """Unit normal of the line along half the angle of (difference, mixed), without trigonometric functions."""
     length = np.hypot(difference, mixed)
@@ -167,7 +167,7 @@ def _across(difference, mixed):  # type: ignore[no-untyped-def]
     return -sin, cos
 
 
-@njit
+@njit(allocates=False)
 def _connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def]
     """Whether returns i and i + 1 lie on one surface."""
     if kept[i + 1] - kept[i] > 2:

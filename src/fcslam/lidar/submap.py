@@ -94,7 +94,7 @@ def _beam_counts(
     return passes, hits, corner
 
 
-@njit
+@njit(allocates=False)
 def _count_beams(points, origin, T, corner, number, latest, passes, hits):  # type: ignore[no-untyped-def]
     """Count a scan once in each cell between the laser and a return, short of the return, and in the return's."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
