@@ -19,7 +19,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system check bench bench-quick docs proto
+.PHONY: help install gl learning demo test test-fast test-system test-attack check bench bench-quick docs proto
 .DEFAULT_GOAL := help
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo "make test         all tests that need no recordings"
 	@echo "make test-fast    the same without the slow tests"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
+	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
@@ -75,6 +76,9 @@ test-fast: $(INSTALLED)
 
 test-system: $(INSTALLED)
 	@$(PYTEST) -m system -rs
+
+test-attack: $(INSTALLED)
+	@$(PYTEST) -m attack -rs
 
 check: $(INSTALLED)
 	@$(BIN)/ruff check .

@@ -8,6 +8,7 @@ import ssl
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import httpx
@@ -200,3 +201,29 @@ def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, crede
     with httpx.Client(base_url=service.url, timeout=60.0) as client, pytest.raises(httpx.ConnectError):
         client.get("/healthz")
     service.stop()
+
+
+@pytest.mark.system
+def test_tokens_are_read_again_at_sighup(credentials, tmp_path):
+    tokens = tmp_path / "tokens.yaml"
+    tokens.write_text((credentials / "tokens.yaml").read_text())
+    service = Service(tmp_path / "data", "--tokens", str(tokens))
+    as_boss = {"Authorization": f"Bearer {token(credentials, 'boss')}"}
+
+    def hang_up(text):
+        tokens.write_text(text)
+        service.process.send_signal(signal.SIGHUP)
+        time.sleep(1.0)
+        return httpx.get(f"{service.url}{API}/robots", headers=as_boss, timeout=30.0).status_code
+
+    entries = yaml.safe_load(tokens.read_text())["tokens"]
+    others = [entry for entry in entries if entry["name"] != "boss"]
+    ended = [*others, {**entries[-1], "expires": "2020-01-01T00:00:00Z"}]
+    try:
+        assert hang_up(yaml.safe_dump({"tokens": entries})) == 200
+        assert hang_up("tokens: [") == 200, "those of before stay"
+        assert hang_up(yaml.safe_dump({"tokens": ended})) == 401
+        assert hang_up(yaml.safe_dump({"tokens": entries})) == 200
+        assert hang_up(yaml.safe_dump({"tokens": others})) == 401
+    finally:
+        service.kill()

@@ -68,7 +68,9 @@ def serve(
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with _listen(host, port) as listening:
-        state = _state(data, _authenticator(tokens, client_ca), _cloud_config(config))
+        authenticator = _authenticator(tokens, client_ca)
+        _reload_on_hangup(authenticator, tokens)
+        state = _state(data, authenticator, _cloud_config(config))
         tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
@@ -111,6 +113,29 @@ def _authenticator(tokens: Path | None, client_ca: Path | None) -> "Authenticato
     if tokens is None:
         return Authenticator(None if client_ca is None else ())
     return Authenticator(read_tokens(tokens))
+
+
+def _reload_on_hangup(authenticator: "Authenticator", tokens: Path | None) -> None:
+    """Read the tokens again at SIGHUP; those of before stay if the file is bad."""
+    import logging
+    import signal
+
+    from fcslam.errors import FcslamError
+    from fcslam.service.http.authentication import read_tokens
+
+    log = logging.getLogger("fcslam.service")
+
+    def reload(*_: object) -> None:
+        if tokens is None:
+            return
+        try:
+            authenticator.replace(read_tokens(tokens))
+        except FcslamError as error:
+            log.error("%s; the tokens of before stay valid", error)
+        else:
+            log.warning("read the tokens of %s again", tokens)
+
+    signal.signal(signal.SIGHUP, reload)
 
 
 def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig") -> "ServiceState":

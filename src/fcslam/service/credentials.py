@@ -121,7 +121,7 @@ def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
             token = secrets.token_urlsafe(TOKEN_BYTES)
             write_file(folder / "tokens" / name, f"{token}\n".encode(), private=True)
             entries.append(TokenEntry(name=name, role=role, sha256=hashlib.sha256(token.encode()).hexdigest()))
-    content = TokensFile(tokens=tuple(entries)).model_dump(mode="json")
+    content = TokensFile(tokens=tuple(entries)).model_dump(mode="json", exclude_none=True)
     write_file(path, yaml.safe_dump(content, sort_keys=False).encode())
 
 

@@ -2,14 +2,15 @@
 
 import hashlib
 import hmac
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
 
 from cryptography import x509
 from cryptography.x509.oid import NameOID
-from pydantic import Field
+from pydantic import AwareDatetime, Field
 
 from fcslam.cloud.sessions import check_robot
 from fcslam.config import Settings, load
@@ -42,6 +43,9 @@ class TokenEntry(Settings):
     name: str = Field(pattern=f"^{NAME.pattern}$", description="of the robot or person that holds the token")
     role: Role = Field(description="robot, viewer or admin")
     sha256: str = Field(pattern="^[0-9a-f]{64}$", description="of the token, in hexadecimal")
+    expires: AwareDatetime | None = Field(
+        default=None, description="when the token ends, with a time zone, as 2027-01-31T00:00:00Z; never without it"
+    )
 
 
 class TokensFile(Settings):
@@ -53,8 +57,15 @@ class TokensFile(Settings):
 class Authenticator:
     """Tells who has a token."""
 
-    def __init__(self, tokens: Sequence[TokenEntry] | None) -> None:
+    def __init__(
+        self, tokens: Sequence[TokenEntry] | None, clock: Callable[[], datetime] = lambda: datetime.now(UTC)
+    ) -> None:
         """None: no authentication; every client may do everything."""
+        self._tokens = tokens
+        self._clock = clock
+
+    def replace(self, tokens: Sequence[TokenEntry]) -> None:
+        """Use these tokens from the next request on."""
         self._tokens = tokens
 
     @property
@@ -76,7 +87,8 @@ class Authenticator:
         found = None
         for entry in self._tokens or ():
             if hmac.compare_digest(entry.sha256, digest) and scheme.lower() == "bearer":
-                found = Identity(entry.name, entry.role)
+                is_valid = entry.expires is None or self._clock() < entry.expires
+                found = Identity(entry.name, entry.role) if is_valid else None
         return found
 
 
