@@ -4,7 +4,7 @@ A plain object without a network. Robots stay in maps of their own until the evi
 evidence may revoke a join. ``finalize`` depends on the set of packets only, not on their order.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple, Self
 
 from fcslam.cloud.claims import check_constraint, check_submap
@@ -187,16 +187,12 @@ class Fleet:
 
     def correction(self, session: str) -> Correction | None:
         """Where the session's odometry lies in its map by the current estimate; None before its first keyscan."""
-        if not self._graph.keyscan_count(session):
-            return None
-        quality = self._quality.of(session, self._decisions.map_of(session), self._decisions.closures)
-        map_index = map_indices(self._decisions.maps)[session]
-        T_map_odom: FloatArray = frozen(self._graph.T_map_odom(session))
-        return Correction(session, self._decisions.version, map_index, T_map_odom, quality)
+        return self._correction(session, map_indices(self._decisions.maps))
 
     def corrections(self) -> tuple[Correction, ...]:
         """The corrections of all sessions."""
-        corrections = (self.correction(session) for session in self._sessions.robots)
+        indices = map_indices(self._decisions.maps)
+        corrections = (self._correction(session, indices) for session in self._sessions.robots)
         return tuple(correction for correction in corrections if correction is not None)
 
     def vocabularies(self) -> tuple[VocabularyState, ...]:
@@ -206,6 +202,13 @@ class Fleet:
     def closure_counts(self) -> dict[str, int]:
         """Accepted closures so far, by kind."""
         return self._decisions.counts()
+
+    def _correction(self, session: str, indices: Mapping[str, int]) -> Correction | None:
+        if not self._graph.keyscan_count(session):
+            return None
+        quality = self._quality.of(session, self._decisions.map_of(session), self._decisions.closures)
+        T_map_odom: FloatArray = frozen(self._graph.T_map_odom(session))
+        return Correction(session, self._decisions.version, indices[session], T_map_odom, quality)
 
     def _add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:
         self._sessions.add_keyscan(keyscan, sequence)

@@ -45,7 +45,9 @@ class FleetConfig(Settings):
         description="number of new closures after which the joint graph is solved; 5 % of all closures if that is more",
     )
     submaps_kept: int = Field(
-        default=300, gt=1, description="number of submaps in the cache; others are rebuilt from their keyscans"
+        default=1000,
+        gt=1,
+        description="number of submaps in the cache, 0.2 MB each; others are rebuilt from their keyscans",
     )
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
