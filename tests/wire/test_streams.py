@@ -137,7 +137,7 @@ def test_probabilities_are_the_same_on_every_machine():
 
 @given(hnp.arrays(np.int64, st.tuples(st.integers(2, 20), st.just(3)), elements=POSITIONS))
 def test_the_nearest_keypoint_before(points):
-    last = len(points) - 1
+    points, last = points[ascending(points)], len(points) - 1
     distances = ((points[:last] - points[last]) ** 2).sum(axis=1)
     assert nearest_before(points, last) == int(np.argmin(distances))
 

@@ -199,7 +199,9 @@ def _checked(values: ArrayLike, shape: tuple[int, ...], what: str) -> FloatArray
 
 def _positive_definite(information: ArrayLike, where: str) -> FloatArray:
     matrix = _checked(information, (3, 3), f"{where}: information")
-    if np.abs(matrix - matrix.T).max() > _ASYMMETRY * np.abs(matrix).max():
+    (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = matrix.tolist()  # without arrays: thousands of edges come one by one
+    largest = max(map(abs, (xx, xy, xt, yx, yy, yt, tx, ty, tt)))
+    if max(abs(xy - yx), abs(xt - tx), abs(yt - ty)) > _ASYMMETRY * largest:
         raise ValueError(f"{where}: information is not symmetric: {matrix.tolist()}")
     symmetric = 0.5 * (matrix + matrix.T)
     try:

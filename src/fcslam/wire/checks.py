@@ -27,7 +27,7 @@ from fcslam.wire.limits import (
     MINIMUM_INFORMATION,
 )
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
-from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise, unpack_information
+from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
 
 
 def check(packet: Packet) -> None:
@@ -111,17 +111,26 @@ def _check_constraint(constraint: Constraint, _: Packet) -> None:
 def _check_information(information: FloatArray) -> None:
     """Refuse a matrix that is not symmetric or, as rounded and with a unit diagonal, not clearly positive definite."""
     _check_shape(information, (3, 3), "constraint: information")
-    sent = unpack_information(pack_information(information))
-    _require(bool(np.isfinite(sent).all()), "constraint: information is not finite")
-    diagonal = sent.diagonal()
-    bounded = bool(((diagonal >= MINIMUM_INFORMATION) & (diagonal <= MAXIMUM_INFORMATION)).all())
+    xx, xy, xt, yy, yt, tt = sent = pack_information(information)
+    _require(all(map(math.isfinite, sent)), "constraint: information is not finite")
+    bounded = all(MINIMUM_INFORMATION <= diagonal <= MAXIMUM_INFORMATION for diagonal in (xx, yy, tt))
     _require(bounded, "constraint: a diagonal element of information is not in [2^-20, 2^40]")
-    deviation = 1.0 / np.sqrt(diagonal)
-    scale = deviation * deviation[:, np.newaxis]
-    symmetric = bool((np.abs(information - sent) * scale <= 1e-6).all())
+    x, y, t = 1.0 / math.sqrt(xx), 1.0 / math.sqrt(yy), 1.0 / math.sqrt(tt)
+    scale = (x * x, x * y, x * t, y * x, y * y, y * t, t * x, t * y, t * t)
+    given = zip(information.ravel().tolist(), (xx, xy, xt, xy, yy, yt, xt, yt, tt), scale, strict=True)
+    symmetric = all(abs(number - rounded) * factor <= 1e-6 for number, rounded, factor in given)
     _require(symmetric, "constraint: information is not symmetric")
-    smallest = float(np.linalg.eigvalsh(sent * scale)[0])
-    _require(smallest >= MINIMUM_CORRELATION_EIGENVALUE, "constraint: information is not clearly positive definite")
+    definite = _exceeds(MINIMUM_CORRELATION_EIGENVALUE, xy * x * y, xt * x * t, yt * y * t)
+    _require(definite, "constraint: information is not clearly positive definite")
+
+
+def _exceeds(limit: float, xy: float, xt: float, yt: float) -> bool:
+    """Whether a matrix (3, 3) with these correlations has no eigenvalue below ``limit`` < 1: without the limit on its
+    diagonal, all pivots of its elimination are positive. Without arrays it takes a tenth of the time."""
+    first = 1.0 - limit
+    second = first - xy * xy / first
+    rest = yt - xy * xt / first
+    return second > 0.0 and first - xt * xt / first - rest * rest / second > 0.0
 
 
 def _check_place(place: Place, _: Packet) -> None:

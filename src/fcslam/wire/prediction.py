@@ -107,14 +107,18 @@ def code_descriptors(
 
 @njit(nogil=True, allocates=False)
 def nearest_before(keypoints: NDArray[np.int64], i: int) -> int:
-    """Index of the nearest of the ``keypoints`` (N, axes) before keypoint i > 0; of several the first."""
+    """Index of the nearest of the ``keypoints`` (N, axes), in ascending order, before keypoint i > 0; of several the
+    first."""
     nearest, least = 0, np.int64(1) << 62
-    for k in range(i):
+    for k in range(i - 1, -1, -1):
+        ahead = keypoints[i, 0] - keypoints[k, 0]
+        if ahead * ahead > least:
+            break
         distance = np.int64(0)
         for axis in range(keypoints.shape[1]):
             difference = keypoints[k, axis] - keypoints[i, axis]
             distance += difference * difference
-        if distance < least:
+        if distance <= least:
             nearest, least = k, distance
     return nearest
 
