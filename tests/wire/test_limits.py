@@ -5,10 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from fcslam.errors import PacketError
 from fcslam.records import Beams, Channel, KeyscanId
 from fcslam.wire import fcslam_pb2 as pb
+from fcslam.wire.limits import MINIMUM_CORRELATION_EIGENVALUE, MINIMUM_INFORMATION
 from fcslam.wire.packets import decode, encode
 from fcslam.wire.streams import pack_ranges
 from tests.wire.examples import (
@@ -139,6 +143,21 @@ REFUSED_BODIES = [
     (detector_update(size=2**26 + 1), "67108865 bytes"),
     (detector_update(sha256=bytes(31)), "31 bytes"),
 ]
+
+
+@given(hnp.arrays(np.float64, (3, 3), elements=st.floats(-1.0, 1.0)), st.floats(1e-9, 1e-3))
+def test_information_is_written_if_its_correlations_have_no_small_eigenvalue(root, ridge):
+    covariance = root @ root.T + ridge * np.eye(3)
+    sent = covariance.astype(np.float32).astype(np.float64)
+    deviation = np.sqrt(sent.diagonal())
+    smallest = np.linalg.eigvalsh(sent / np.outer(deviation, deviation))[0]
+    assume(sent.diagonal().min() >= MINIMUM_INFORMATION and abs(smallest - MINIMUM_CORRELATION_EIGENVALUE) > 1e-12)
+    closure = packet(replace(CLOSURE, information=covariance))
+    if smallest > MINIMUM_CORRELATION_EIGENVALUE:
+        encode(closure)
+    else:
+        with pytest.raises(PacketError, match="clearly positive definite"):
+            encode(closure)
 
 
 @pytest.mark.parametrize(("body", "reason"), REFUSED_BODIES)
