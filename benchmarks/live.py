@@ -187,7 +187,10 @@ async def _robot(
             nonlocal version
             asked, known = time.perf_counter(), {CORRECTION_HEADER: str(version)}
             path, content = f"/api/v1/robots/{name}/packets", write_batch(due.packets)
-            answer = await client.post(path, content=content, headers=known)
+            try:
+                answer = await client.post(path, content=content, headers=known)
+            except httpx.ReadError:  # the service closed an idle connection; a robot sends again as well
+                answer = await client.post(path, content=content, headers=known)
             answer.raise_for_status()
             sent.append(Sent(name, asked, time.perf_counter(), len(due.packets), due.has_place))
             news = [decode(data).body for data in read_batch(answer.content)]
