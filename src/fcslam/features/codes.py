@@ -86,7 +86,7 @@ def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches
     return Matches(np.stack((rows, column_of[rows]), axis=1), distances[rows])
 
 
-@njit
+@njit(allocates=False)
 def hamming(a: CodeWords, b: CodeWords) -> Any:
     """Hamming distance between two codes, shape (4,) each, in bits; for use in compiled code."""
     return popcount(a[0] ^ b[0]) + popcount(a[1] ^ b[1]) + popcount(a[2] ^ b[2]) + popcount(a[3] ^ b[3])
