@@ -106,14 +106,14 @@ class Watches:
     @contextmanager
     def on(self) -> Iterator["Watches"]:
         """Count what runs inside."""
-        from fcslam.cloud import fleet
+        from fcslam.cloud import decisions
         from fcslam.cloud.joint_graph import JointGraph
         from fcslam.lidar import backend
 
         with ExitStack() as stack:
             for owner, name, watch in (
                 (JointGraph, "optimize", self.quick),
-                (fleet, "reevaluate", self.robust),
+                (decisions, "reevaluate", self.robust),
                 (backend, "optimize", self.robot_solve),
             ):
                 stack.enter_context(patch.object(owner, name, watch.watch(getattr(owner, name))))
