@@ -12,8 +12,9 @@ import platform
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -162,6 +163,28 @@ class Report:
         content = {"benchmark": self._name, **self._setting, "tables": self._tables}
         (self._folder / f"{self._name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         print(text)
+
+
+class Kept:
+    """Rows of a long benchmark in a file, so that an interrupted run goes on; rows of another commit do not count."""
+
+    def __init__(self, path: Path | None) -> None:
+        """``path``: a file of JSON lines; None keeps nothing."""
+        self._path = path
+        self._lock = threading.Lock()
+        lines = path.read_text(encoding="utf-8").splitlines() if path is not None and path.exists() else []
+        found = [json.loads(line) for line in lines]
+        self._rows = {tuple(entry["key"]): entry["rows"] for entry in found if entry["commit"] == _commit()}
+
+    def rows(self, key: tuple, compute: Callable[[], Iterable[tuple]]) -> list[tuple]:
+        """The rows of ``key``: kept, or computed and kept now."""
+        if key not in self._rows:
+            self._rows[key] = list(compute())
+            if self._path is not None:
+                entry = {"commit": _commit(), "key": key, "rows": self._rows[key]}
+                with self._lock, self._path.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(entry) + "\n")
+        return [tuple(row) for row in self._rows[key]]
 
 
 def machine() -> dict[str, str]:

@@ -51,11 +51,14 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="kinds of fleet")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of the fleets")
     parser.add_argument("--jobs", type=int, default=1, help="fleets at the same time; more spoil the times")
+    parser.add_argument("--keep", type=Path, help="file that keeps finished fleets; the same one resumes")
     chosen = parser.parse_args()
+    kept = common.Kept(chosen.keep)
     report = common.Report(__file__, __doc__, chosen)
     fleets = [(case, seed) for case in chosen.cases for seed in chosen.seeds]
     with ThreadPoolExecutor(chosen.jobs) as pool:
-        rows = [row for some in pool.map(lambda fleet: list(fleet_rows(*fleet)), fleets) for row in some]
+        done = pool.map(lambda fleet: kept.rows(fleet, lambda: fleet_rows(*fleet)), fleets)
+        rows = [row for some in done for row in some]
     report.table("Summary", SUMMARY, summary(rows, chosen.cases))
     report.table("Fleets", COLUMNS, rows)
     report.write()
