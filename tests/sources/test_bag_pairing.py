@@ -18,7 +18,7 @@ def scan(stamp):
 
 
 def reading(stamp, pose=None):
-    return OdometryReading(stamp, pose or (2.0 * stamp, -stamp, 0.05 * stamp), "base")
+    return OdometryReading(stamp, pose or (2.0 * stamp, -stamp, 0.05 * stamp), "base", "odom")
 
 
 def run(items):

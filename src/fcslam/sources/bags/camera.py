@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fcslam.records import CameraModel, Transform
+from fcslam.sources.bags.codec import COMPRESSED_IMAGE
 from fcslam.sources.bags.messages import header_of
 from fcslam.sources.images import MAX_SIDE_PX, check_camera, image_suffix
 
@@ -38,7 +39,12 @@ class Calibration(NamedTuple):
         return CameraModel(self.width, self.height, self.fx, self.fy, self.cx, self.cy, T_base_camera)
 
 
-def compressed_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
+def image_of(content: Any, kind: str, bag_time_ns: int) -> ImageMessage:
+    """Convert a message of type ``kind``, COMPRESSED_IMAGE or IMAGE; raises ValueError if the image is not read."""
+    return (_compressed_image_of if kind == COMPRESSED_IMAGE else _raw_image_of)(content, bag_time_ns)
+
+
+def _compressed_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
     """A JPEG or PNG image as it was sent; raises ValueError for other formats."""
     encoded = np.asarray(content.data, dtype=np.uint8).tobytes()
     image_suffix(encoded)
@@ -46,7 +52,7 @@ def compressed_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
     return ImageMessage(stamp, encoded)
 
 
-def raw_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
+def _raw_image_of(content: Any, bag_time_ns: int) -> ImageMessage:
     """An image of encoding rgb8, bgr8 or mono8 as lossless PNG; raises ValueError for other encodings."""
     import cv2
 

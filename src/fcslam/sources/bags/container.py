@@ -8,23 +8,17 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from urllib.parse import quote
 
 from fcslam.errors import SourceError
+from fcslam.sources.bags.codec import OLD_TRANSFORMS, TRANSFORMS, MessageCodec
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
-    from rosbags.typesys.store import Typestore
 
-SCAN, ODOMETRY, TRANSFORMS = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "tf2_msgs/TFMessage"
-COMPRESSED_IMAGE, IMAGE = "sensor_msgs/CompressedImage", "sensor_msgs/Image"
-CAMERA_INFO = "sensor_msgs/CameraInfo"
-"""Message types that are read."""
-
-_OLD_TRANSFORMS = "tf/tfMessage"
 _ROS1, _MCAP, _SQLITE = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
 _METADATA = "metadata.yaml"
 _LONGEST_REASON = 200
@@ -118,15 +112,11 @@ class BagFile:
         Raises:
             ValueError: the bytes are not a message of its type.
         """
-        kind = TRANSFORMS if message.topic.type == _OLD_TRANSFORMS else message.topic.type
-        name = kind.replace("/", "/msg/")
-        store = typestore(self._is_ros1)
-        try:
-            if self._is_ros1:
-                return store.deserialize_ros1(message.payload, name)
-            return store.deserialize_cdr(message.payload, name)
-        except Exception as error:  # generated code raises any exception on invalid bytes
-            raise ValueError("the bytes are no message of this type") from error
+        return self._codec.decode(message.payload, message.topic.type)
+
+    @cached_property
+    def _codec(self) -> MessageCodec:
+        return MessageCodec(self._is_ros1)
 
     @cached_property
     def _magic(self) -> bytes:
@@ -165,7 +155,7 @@ class BagFile:
 
 def is_transforms(topic: Topic) -> bool:
     """Whether the topic carries tf."""
-    return topic.type in (TRANSFORMS, _OLD_TRANSFORMS)
+    return topic.type in (TRANSFORMS, OLD_TRANSFORMS)
 
 
 def _reader(path: Path, magic: bytes) -> _Reader:
@@ -215,15 +205,3 @@ def _type_of(connection: "Connection") -> str:
     kind = connection.msgtype.replace("/msg/", "/")
     encoding = getattr(connection.ext, "serialization_format", "cdr")
     return kind if encoding == "cdr" else f"{kind} as {encoding}"
-
-
-@cache
-def typestore(ros1: bool) -> "Typestore":
-    """Message types that are read and written, of ROS 1 or ROS 2."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    if not ros1:
-        return get_typestore(Stores.ROS2_JAZZY)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    return store

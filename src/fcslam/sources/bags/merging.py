@@ -10,25 +10,36 @@ _LONGEST_QUEUE = 20
 """Most scans of one laser that wait for scans of the others; beyond, another laser has paused."""
 
 
+class ScanMerger:
+    """Puts the scans of several lasers in the order of their stamps, as they come."""
+
+    def __init__(self, laser_count: int) -> None:
+        self._queues: list[deque[tuple[int, ScanMessage]]] = [deque() for _ in range(laser_count)]
+
+    def add(self, number: int, item: Message) -> Iterator[tuple[int, Message]]:
+        """Add the next item; yields those that wait no longer. Only scans wait."""
+        if len(self._queues) == 1 or not isinstance(item, ScanMessage):
+            yield number, item
+            return
+        self._queues[item.laser].append((number, item))
+        while all(self._queues) or len(self._queues[item.laser]) > _LONGEST_QUEUE:
+            yield self._earliest()
+
+    def flush(self) -> Iterator[tuple[int, Message]]:
+        """Yield all scans that wait."""
+        while any(self._queues):
+            yield self._earliest()
+
+    def _earliest(self) -> tuple[int, ScanMessage]:
+        return min((queue for queue in self._queues if queue), key=lambda queue: queue[0][1].stamp).popleft()
+
+
 def merge_scans(items: Iterable[tuple[int, Message]], laser_count: int) -> Iterator[tuple[int, Message]]:
     """Yield the items in their order, but the scans of ``laser_count`` lasers by their stamps.
 
     The scans of each laser keep their order. The messages between scans do not wait.
     """
-    if laser_count == 1:
-        yield from items
-        return
-    queues: list[deque[tuple[int, ScanMessage]]] = [deque() for _ in range(laser_count)]
+    merger = ScanMerger(laser_count)
     for number, item in items:
-        if not isinstance(item, ScanMessage):
-            yield number, item
-            continue
-        queues[item.laser].append((number, item))
-        while all(queues) or len(queues[item.laser]) > _LONGEST_QUEUE:
-            yield _earliest(queues)
-    while any(queues):
-        yield _earliest(queues)
-
-
-def _earliest(queues: list[deque[tuple[int, ScanMessage]]]) -> tuple[int, ScanMessage]:
-    return min((queue for queue in queues if queue), key=lambda queue: queue[0][1].stamp).popleft()
+        yield from merger.add(number, item)
+    yield from merger.flush()

@@ -43,6 +43,7 @@ class OdometryReading(NamedTuple):
     stamp: float
     T_odom_base: Pose
     base_frame: str
+    odom_frame: str
 
 
 class StampedTransform(NamedTuple):
@@ -108,10 +109,10 @@ def measured_ranges(scan: ScanMessage) -> Ranges:
 
 def odometry_of(content: Any, bag_time_ns: int) -> OdometryReading:
     """Convert an odometry message; the base is its child frame."""
-    stamp, _ = header_of(content.header, bag_time_ns)
+    stamp, odom_frame = header_of(content.header, bag_time_ns)
     pose = content.pose.pose
     transform = _transform(pose.position, pose.orientation)
-    return OdometryReading(stamp, planar(transform), _frame(content.child_frame_id))
+    return OdometryReading(stamp, planar(transform), _frame(content.child_frame_id), odom_frame)
 
 
 def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
@@ -120,6 +121,16 @@ def transforms_of(content: Any, bag_time_ns: int) -> Iterator[StampedTransform]:
         stamp, parent = header_of(entry.header, bag_time_ns)
         transform = _transform(entry.transform.translation, entry.transform.rotation)
         yield StampedTransform(stamp, parent, _frame(entry.child_frame_id), transform)
+
+
+def is_odometry(transform: StampedTransform) -> bool:
+    """Whether a transform of tf is the odometry: its parent frame has "odom" in its name."""
+    return "odom" in transform.parent.rsplit("/", 1)[-1]
+
+
+def odometry_in(transform: StampedTransform) -> OdometryReading:
+    """The reading that a transform from odom to base is."""
+    return OdometryReading(transform.stamp, planar(transform.T_parent_child), transform.child, transform.parent)
 
 
 def _angle_rad(single: float) -> float:

@@ -61,13 +61,21 @@ class _QueuedItem:
     match: _PoseMatch | None
 
 
-def pair_with_odometry(
-    items: Iterable[tuple[int, Message]],
-) -> Iterator[tuple[int, Entry]]:
-    """Yield the items in their order, each with its number; scans and images with their poses."""
-    readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
-    queue: deque[_QueuedItem] = deque()
-    for number, item in items:
+class OdometryPairing:
+    """Pairs items as they come; each waits until the odometry at its stamp is known."""
+
+    def __init__(self) -> None:
+        self._readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
+        self._queue: deque[_QueuedItem] = deque()
+
+    @property
+    def waiting(self) -> int:
+        """Number of items that wait for odometry, or behind one that does."""
+        return len(self._queue)
+
+    def add(self, number: int, item: Message) -> Iterator[tuple[int, Entry]]:
+        """Add the next item; yields those that wait no longer, in their order."""
+        readings, queue = self._readings, self._queue
         if isinstance(item, OdometryReading):
             _assign_poses(queue, readings[-1] if readings else None, item)
             readings.append(item)
@@ -76,8 +84,21 @@ def pair_with_odometry(
             queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
         while queue and (queue[0].match or len(queue) > _LONGEST_QUEUE):
             yield _with_pose(queue.popleft(), readings)
-    for waiting in queue:
-        yield _with_pose(waiting, readings)
+
+    def flush(self) -> Iterator[tuple[int, Entry]]:
+        """Yield all that wait, as no odometry comes any more."""
+        while self._queue:
+            yield _with_pose(self._queue.popleft(), self._readings)
+
+
+def pair_with_odometry(
+    items: Iterable[tuple[int, Message]],
+) -> Iterator[tuple[int, Entry]]:
+    """Yield the items in their order, each with its number; scans and images with their poses."""
+    pairing = OdometryPairing()
+    for number, item in items:
+        yield from pairing.add(number, item)
+    yield from pairing.flush()
 
 
 def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[int, Entry]:

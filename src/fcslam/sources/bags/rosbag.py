@@ -7,40 +7,40 @@ shows that there is odometry.
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from math import degrees, radians
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from fcslam.errors import SourceError
-from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Odometry, Ranges, SensorRecord
+from fcslam.records import CameraModel, Odometry, SensorRecord
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import OdometryReading, measured_ranges
+from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.pairing import Entry, PosedImage, PosedScan
-from fcslam.sources.bags.stream import BagStream, RecordedLaser
+from fcslam.sources.bags.pairing import Entry, PosedScan
+from fcslam.sources.bags.rig import (
+    USUAL_BASES,
+    Rig,
+    TiltedLaserError,
+    level_mounting,
+    mounted_camera,
+    rig_of,
+    tilt_note,
+)
+from fcslam.sources.bags.stream import BagStream
 from fcslam.sources.bags.topics import agree_on_topics
-from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
+from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree
 from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
-from fcslam.sources.images import check_image
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import pose_array
 from fcslam.sources.source import WHOLE, ScanRange, Survey
-
-_LEVEL_RAD = radians(2.0)
-_STEEPEST_RAD = radians(10.0)
-_USUAL_BASES = ("base_footprint", "base_link")
 
 
 class _Reading(NamedTuple):
     """Summary of a bag, and how to read it."""
 
     survey: Survey
-    upside_down: tuple[bool, ...]
-    """Of each laser."""
+    rig: Rig
 
 
 class RosBag:
@@ -77,25 +77,19 @@ class RosBag:
         """As in Source."""
         audit = self._audit = _audit()
         watch = OdometryWatch(audit)
-        reading = self._reading
-        lasers, camera = reading.survey.lasers, reading.survey.camera
-        for number, entry in self._entries(scans, audit, with_images=camera is not None):
+        rig = self._reading.rig
+        for number, entry in self._entries(scans, audit, with_images=rig.camera is not None):
             if isinstance(entry, PosedScan):
-                scan, upside_down = entry.scan, reading.upside_down[entry.scan.laser]
-                ranges_m = _turned(measured_ranges(scan), upside_down)
-                laser = lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
-                record = LaserScan(scan.stamp, ranges_m, laser, pose_array(entry.T_odom_base))
+                record = rig.scan(entry)
                 watch.add(number, record)
                 yield record
             elif isinstance(entry, OdometryReading):
                 yield Odometry(entry.stamp, pose_array(entry.T_odom_base))
-            elif camera is not None:
+            else:
                 try:
-                    check_image(entry.image.encoded, camera)
+                    yield rig.image(entry)
                 except ValueError:
                     audit.add(Fault.BROKEN_IMAGE, number)
-                else:
-                    yield _image(entry, camera)
 
     def _entries(self, scans: ScanRange, audit: Audit, with_images: bool = False) -> Iterator[tuple[int, Entry]]:
         entries = self.stream.entries(audit, with_images=with_images)
@@ -114,16 +108,16 @@ class RosBag:
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry)
-        base_frame = base_frame or next((frame for frame in _USUAL_BASES if frame in tree), _USUAL_BASES[-1])
+        base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = self._mountings(tree, base_frame)
         camera, camera_notes = self._camera(tree, base_frame)
         tilts = (
             self._tilt_note(laser.topic, mounted) for laser, mounted in zip(self.stream.lasers, mountings, strict=True)
         )
         notes = (*self._notes, *self.stream.topics.notes, *filter(None, tilts), *camera_notes)
-        lasers = tuple(map(_laser_model, self.stream.lasers, mountings))
-        survey = Survey(scans.count, scans.duration_s, scans.length_m, lasers, audit.faults(), notes, camera)
-        return _Reading(survey, tuple(mounted.upside_down for mounted in mountings))
+        rig = rig_of([laser.first for laser in self.stream.lasers], mountings, camera)
+        survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
+        return _Reading(survey, rig)
 
     def _check_options(self, path: Path) -> None:
         topics, poses = self._options.scan_topics, self._options.laser_poses
@@ -164,40 +158,30 @@ class RosBag:
 
     def _mounting(self, topic: str, laser_frame: str, tree: TransformTree, base_frame: str) -> Mounting:
         try:
-            mounted = mounting(tree.fixed(base_frame, laser_frame))
+            return level_mounting(tree, base_frame, laser_frame)
         except NoTransformError as error:
             raise SourceError(
                 f"{self.stream.path}: tf has {error}, so it does not say where the laser of {topic} sits; say it by "
                 f"--laser-pose X,Y,THETA (metres, radians){' for each laser' * (len(self.stream.lasers) > 1)}"
             ) from error
-        if mounted.tilt_rad > _STEEPEST_RAD:
+        except TiltedLaserError as error:
             raise SourceError(
-                f"{self.stream.path}: the laser of {topic} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and "
-                "does not look along the floor; choose a level one by --scan-topic, or say its pose by --laser-pose"
-            )
-        return mounted
+                f"{self.stream.path}: the laser of {topic} is {error} and does not look along the floor; choose a "
+                "level one by --scan-topic, or say its pose by --laser-pose"
+            ) from error
 
     def _camera(self, tree: TransformTree, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
         """The camera with its calibration and mounting; without them it is ignored, with a note."""
-        path, topic, calibration = self.stream.path, self.stream.topics.camera, self.stream.calibration
+        path, topic = self.stream.path, self.stream.topics.camera
         if topic is None:
             return None, ()
-        if calibration is None:
-            return None, (f"{path}: the camera of {topic.name} was never calibrated, it is left out",)
-        try:
-            camera = calibration.camera(tree.fixed(base_frame, calibration.frame))
-        except NoTransformError as error:
-            return None, (f"{path}: tf has {error}, so the camera of {topic.name} is left out",)
-        if calibration.is_distorted:
-            return camera, (f"{path}: the images of {topic.name} are distorted, read as if they were not",)
-        return camera, ()
+        camera, note = mounted_camera(self.stream.calibration, tree, base_frame)
+        return camera, (f"{path}: the camera of {topic.name} {note}",) * bool(note)
 
     def _tilt_note(self, topic: Topic, mounted: Mounting) -> str:
-        if mounted.tilt_rad <= _LEVEL_RAD:
-            return ""
-        tilt = f"tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level"
+        tilt = tilt_note(mounted)
         which = f" of {topic.name}" * (len(self.stream.lasers) > 1)
-        return f"{self.stream.path}: the laser{which} is {tilt}"
+        return f"{self.stream.path}: the laser{which} is {tilt}" * bool(tilt)
 
 
 def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]:
@@ -212,26 +196,3 @@ def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]
 
 def _audit() -> Audit:
     return Audit("message")
-
-
-def _laser_model(laser: RecordedLaser, mounted: Mounting) -> LaserModel:
-    beams = _turned_beams(laser.first.beams, mounted.upside_down)
-    return LaserModel(*beams, laser.first.range_max_m, mounted.T_base_laser)
-
-
-def _turned_beams(beams: Beams, upside_down: bool) -> Beams:
-    """The beams of a laser that is mounted upside down, as seen from above."""
-    return beams._replace(angle_min_rad=-(beams.angle_min_rad + beams.span_rad)) if upside_down else beams
-
-
-def _image(posed: PosedImage, camera: CameraModel) -> CameraImage:
-    T_odom_base = None if posed.T_odom_base is None else pose_array(posed.T_odom_base)
-    return CameraImage(posed.image.stamp, posed.image.encoded, camera, T_odom_base)
-
-
-def _turned(ranges_m: Ranges, upside_down: bool) -> Ranges:
-    """Reverse the ranges (beam_count,) of a laser that is mounted upside down."""
-    if upside_down:
-        ranges_m = np.ascontiguousarray(ranges_m[::-1])
-    ranges_m.setflags(write=False)
-    return ranges_m

@@ -11,16 +11,17 @@ from fcslam.sources.bags.camera import (
     Calibration,
     ImageMessage,
     calibration_of,
-    compressed_image_of,
-    raw_image_of,
+    image_of,
 )
-from fcslam.sources.bags.container import COMPRESSED_IMAGE, ODOMETRY, BagFile, RawMessage, Topic
+from fcslam.sources.bags.codec import ODOMETRY
+from fcslam.sources.bags.container import BagFile, RawMessage, Topic
 from fcslam.sources.bags.merging import merge_scans
 from fcslam.sources.bags.messages import (
     BeamsError,
-    OdometryReading,
     ScanMessage,
     StampedTransform,
+    is_odometry,
+    odometry_in,
     odometry_of,
     scan_of,
     transforms_of,
@@ -28,7 +29,7 @@ from fcslam.sources.bags.messages import (
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.pairing import Entry, Message, PosedScan, pair_with_odometry
 from fcslam.sources.bags.topics import Candidates, Topics, choose_topics, find_candidates
-from fcslam.sources.bags.transforms import TransformTree, planar
+from fcslam.sources.bags.transforms import TransformTree
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, usual_beams
 
@@ -149,7 +150,7 @@ class BagStream:
         if message.topic not in self.topics.odometry:
             return []
         return [
-            OdometryReading(transform.stamp, planar(transform.T_parent_child), transform.child)
+            odometry_in(transform)
             for transform in transforms
             if (transform.parent, transform.child) == self._odometry_edge
         ]
@@ -164,7 +165,7 @@ class BagStream:
             except ValueError:
                 continue
             for transform in transforms:
-                if "odom" in transform.parent.rsplit("/", 1)[-1]:
+                if is_odometry(transform):
                     return transform.parent, transform.child
                 seen.add(f"{transform.parent} -> {transform.child}")
         known = ", ".join(sorted(seen)[:_EDGES_NAMED]) or "nothing that can be read"
@@ -196,8 +197,7 @@ class BagStream:
         return ""
 
     def _image_in(self, message: RawMessage) -> ImageMessage:
-        image_of = compressed_image_of if message.topic.type == COMPRESSED_IMAGE else raw_image_of
-        return image_of(self._bag.decode(message), message.bag_time_ns)
+        return image_of(self._bag.decode(message), message.topic.type, message.bag_time_ns)
 
     def _has_images(self, topic: Topic) -> bool:
         """Whether one of the first messages is a readable image; depth images are not."""

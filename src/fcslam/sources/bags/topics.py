@@ -7,16 +7,8 @@ from itertools import chain
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
-from fcslam.sources.bags.container import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    ODOMETRY,
-    SCAN,
-    BagFile,
-    Topic,
-    is_transforms,
-)
+from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN
+from fcslam.sources.bags.container import BagFile, Topic, is_transforms
 from fcslam.sources.bags.options import BagOptions
 
 _NAMED_AT_MOST = 15

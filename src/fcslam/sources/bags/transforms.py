@@ -1,11 +1,11 @@
 """The tree of transforms (tf) of a bag, and the mounting of the laser in it."""
 
 from collections.abc import Iterator
-from math import acos, atan2, isfinite, pi, sqrt
+from math import acos, atan2, cos, isfinite, pi, sin, sqrt
 from typing import NamedTuple
 
 from fcslam.errors import FcslamError
-from fcslam.records import Transform
+from fcslam.records import FloatArray, Transform
 from fcslam.sources.pose import Pose
 
 Vector = tuple[float, float, float]
@@ -50,6 +50,12 @@ def planar(transform: Transform) -> Pose:
     x, y, z, w = transform.rotation
     heading_rad = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return transform.translation_m[0], transform.translation_m[1], round(heading_rad, 9)
+
+
+def in_space(pose: FloatArray) -> Transform:
+    """A pose on the floor, shape (3,), in three dimensions."""
+    x, y, heading_rad = pose.tolist()
+    return Transform((x, y, 0.0), (0.0, 0.0, sin(0.5 * heading_rad), cos(0.5 * heading_rad)))
 
 
 def mounting(T_base_laser: Transform) -> Mounting:

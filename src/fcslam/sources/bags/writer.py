@@ -3,7 +3,6 @@
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from math import cos, sin
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,8 @@ from fcslam.records import (
     RecordedItem,
     Transform,
 )
-from fcslam.sources.bags.container import CAMERA_INFO, COMPRESSED_IMAGE, ODOMETRY, SCAN, TRANSFORMS, typestore
+from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, ODOMETRY, SCAN, TRANSFORMS, MessageCodec, full_name
+from fcslam.sources.bags.transforms import in_space
 from fcslam.sources.images import image_suffix
 
 if TYPE_CHECKING:
@@ -99,8 +99,7 @@ class _Bag:
 
     def __init__(self, writer: "Writer1 | Writer2", ros1: bool) -> None:
         self._writer: Any = writer
-        self._store = typestore(ros1)
-        self._ros1 = ros1
+        self._codec = MessageCodec(ros1)
         self._connections = {topic: self._connect(topic, kind) for topic, kind in _TOPICS.items()}
         self._bag_time_ns = -1
         self._mounted: set[str] = set()
@@ -113,7 +112,7 @@ class _Bag:
         stamp_ns = _nanoseconds(item.stamp)
         self._bag_time_ns = max(self._bag_time_ns + 1, stamp_ns)
         if isinstance(item, GroundTruth):
-            header = self._header(stamp_ns, _BUILDING)
+            header = self._codec.header(stamp_ns, _BUILDING)
             self._put(_GROUND_TRUTH_TOPIC, self._odometry(header, item.T_building_base))
             return
         if item.T_odom_base is not None:
@@ -126,9 +125,9 @@ class _Bag:
     def _put_odometry(self, stamp_ns: int, T_odom_base: FloatArray) -> None:
         reading = (stamp_ns, *T_odom_base.tolist())
         if reading != self._latest_reading:
-            odom = self._header(stamp_ns, _ODOM)
+            odom = self._codec.header(stamp_ns, _ODOM)
             self._put("/odom", self._odometry(odom, T_odom_base))
-            self._put("/tf", self._transforms(odom, _BASE, _in_space(T_odom_base)))
+            self._put("/tf", self._codec.transforms(odom, _BASE, in_space(T_odom_base)))
             self._latest_reading = reading
 
     def _put_scan(self, stamp_ns: int, scan: LaserScan) -> None:
@@ -138,78 +137,51 @@ class _Bag:
             self._mountings.append(T_base_laser)
         number = self._mountings.index(T_base_laser) + 1
         suffix = f"_{number}" * (number > 1)
-        self._mount(stamp_ns, _LASER + suffix, _in_space(np.array(T_base_laser)))
-        self._put(_SCAN_TOPIC + suffix, self._scan(self._header(stamp_ns, _LASER + suffix), scan), SCAN)
+        self._mount(stamp_ns, _LASER + suffix, in_space(np.array(T_base_laser)))
+        self._put(_SCAN_TOPIC + suffix, self._scan(self._codec.header(stamp_ns, _LASER + suffix), scan), SCAN)
 
     def _put_image(self, stamp_ns: int, image: CameraImage) -> None:
         try:
             encoding = _IMAGE_FORMATS[image_suffix(image.encoded)]
         except ValueError as error:
             raise OutputError(f"an image at {image.stamp} s cannot be written ({error})") from error
-        header = self._header(stamp_ns, _CAMERA)
+        header = self._codec.header(stamp_ns, _CAMERA)
         self._mount(stamp_ns, _CAMERA, image.camera.T_base_camera)
         self._put(_CAMERA_INFO_TOPIC, self._camera_info(header, image.camera))
         data = np.frombuffer(image.encoded, dtype=np.uint8)
-        self._put(_IMAGE_TOPIC, self._make(COMPRESSED_IMAGE, header=header, format=encoding, data=data))
+        self._put(_IMAGE_TOPIC, self._codec.make(COMPRESSED_IMAGE, header=header, format=encoding, data=data))
 
     def _mount(self, stamp_ns: int, frame: str, T_base_frame: Transform) -> None:
         """Write the mounting of a sensor once."""
         if frame not in self._mounted:
-            self._put("/tf_static", self._transforms(self._header(stamp_ns, _BASE), frame, T_base_frame))
+            self._put("/tf_static", self._codec.transforms(self._codec.header(stamp_ns, _BASE), frame, T_base_frame))
             self._mounted.add(frame)
 
     def _connect(self, topic: str, kind: str) -> Any:
-        return self._writer.add_connection(topic, _full(kind), typestore=self._store)
+        return self._writer.add_connection(topic, full_name(kind), typestore=self._codec.store)
 
     def _put(self, topic: str, message: Any, kind: str = "") -> None:
         kind = kind or _TOPICS.get(topic) or _TOPICS_OF_SOME[topic]
         if topic not in self._connections:
             self._connections[topic] = self._connect(topic, kind)
-        serialize = self._store.serialize_ros1 if self._ros1 else self._store.serialize_cdr
-        payload = serialize(message, _full(kind))
-        self._writer.write(self._connections[topic], self._bag_time_ns, payload)
-
-    def _make(self, kind: str, **fields: Any) -> Any:
-        return self._store.types[_full(kind)](**fields)
-
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
-        stamp = self._make("builtin_interfaces/Time", sec=seconds, nanosec=nanoseconds)
-        count = {"seq": 0} if self._ros1 else {}
-        return self._make("std_msgs/Header", stamp=stamp, frame_id=frame, **count)
-
-    def _rotation(self, transform: Transform) -> Any:
-        x, y, z, w = transform.rotation
-        return self._make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
-
-    def _vector(self, kind: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
-        return self._make(f"geometry_msgs/{kind}", x=x, y=y, z=z)
+        self._writer.write(self._connections[topic], self._bag_time_ns, self._codec.encode(message, kind))
 
     def _odometry(self, header: Any, T_parent_base: FloatArray) -> Any:
         unknown = np.zeros(36)
-        transform = _in_space(T_parent_base)
-        position = self._vector("Point", *transform.translation_m)
-        pose = self._make("geometry_msgs/Pose", position=position, orientation=self._rotation(transform))
-        twist = self._make("geometry_msgs/Twist", linear=self._vector("Vector3"), angular=self._vector("Vector3"))
-        return self._make(
+        make, vector = self._codec.make, self._codec.vector
+        pose = self._codec.pose(in_space(T_parent_base))
+        twist = make("geometry_msgs/Twist", linear=vector("Vector3"), angular=vector("Vector3"))
+        return make(
             ODOMETRY,
             header=header,
             child_frame_id=_BASE,
-            pose=self._make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=unknown),
-            twist=self._make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
+            pose=make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=unknown),
+            twist=make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
         )
-
-    def _transforms(self, header: Any, child: str, T_parent_child: Transform) -> Any:
-        translation = self._vector("Vector3", *T_parent_child.translation_m)
-        transform = self._make(
-            "geometry_msgs/Transform", translation=translation, rotation=self._rotation(T_parent_child)
-        )
-        stamped = self._make("geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=transform)
-        return self._make(TRANSFORMS, transforms=[stamped])
 
     def _scan(self, header: Any, scan: LaserScan) -> Any:
         laser: LaserModel = scan.laser
-        return self._make(
+        return self._codec.make(
             SCAN,
             header=header,
             angle_min=laser.angle_min_rad,
@@ -228,8 +200,9 @@ class _Bag:
         K = np.array([camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0])
         P = np.insert(K, (3, 6, 9), 0.0)
         matrices = {"D": np.zeros(5), "K": K, "R": np.eye(3).ravel(), "P": P}
-        region = self._make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        return self._make(
+        make = self._codec.make
+        region = make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        return make(
             CAMERA_INFO,
             header=header,
             height=camera.height,
@@ -238,14 +211,8 @@ class _Bag:
             binning_x=0,
             binning_y=0,
             roi=region,
-            **{name if self._ros1 else name.lower(): matrix for name, matrix in matrices.items()},
+            **{name if self._codec.ros1 else name.lower(): matrix for name, matrix in matrices.items()},
         )
-
-
-def _in_space(pose: FloatArray) -> Transform:
-    """A pose on the floor in three dimensions."""
-    x, y, heading_rad = pose.tolist()
-    return Transform((x, y, 0.0), (0.0, 0.0, sin(0.5 * heading_rad), cos(0.5 * heading_rad)))
 
 
 def _nanoseconds(stamp: float) -> int:
@@ -253,7 +220,3 @@ def _nanoseconds(stamp: float) -> int:
         raise OutputError(f"a bag has no stamp {stamp:.6f} s; ROS counts from 0 s to {_END_OF_TIME_S} s")
     seconds = int(stamp)
     return seconds * _NANOSECONDS + round((stamp - seconds) * _NANOSECONDS)
-
-
-def _full(kind: str) -> str:
-    return kind.replace("/", "/msg/")

@@ -1,0 +1,106 @@
+"""The mounted sensors of a robot: they turn its messages into records."""
+
+from math import degrees, radians
+from typing import NamedTuple
+
+import numpy as np
+
+from fcslam.errors import FcslamError
+from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, Ranges
+from fcslam.sources.bags.camera import Calibration
+from fcslam.sources.bags.messages import ScanMessage, measured_ranges
+from fcslam.sources.bags.pairing import PosedImage, PosedScan
+from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
+from fcslam.sources.images import check_image
+from fcslam.sources.pose import pose_array
+
+_LEVEL_RAD = radians(2.0)
+_STEEPEST_RAD = radians(10.0)
+USUAL_BASES = ("base_footprint", "base_link")
+"""Frames of the robot's body, where no message names it."""
+
+
+class TiltedLaserError(FcslamError):
+    """A laser does not look along the floor; the message says by how much."""
+
+
+class Rig(NamedTuple):
+    """Lasers and camera of a robot."""
+
+    lasers: tuple[LaserModel, ...]
+    """In the order of their topics."""
+    upside_down: tuple[bool, ...]
+    """Of each laser."""
+    camera: CameraModel | None
+
+    def scan(self, posed: PosedScan) -> LaserScan:
+        """The record of a scan."""
+        scan, upside_down = posed.scan, self.upside_down[posed.scan.laser]
+        ranges_m = _turned(measured_ranges(scan), upside_down)
+        laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
+        return LaserScan(scan.stamp, ranges_m, laser, pose_array(posed.T_odom_base))
+
+    def image(self, posed: PosedImage) -> CameraImage:
+        """The record of an image; raises ValueError if it is damaged, or of another camera, or there is none."""
+        if self.camera is None:
+            raise ValueError("no camera")
+        check_image(posed.image.encoded, self.camera)
+        T_odom_base = None if posed.T_odom_base is None else pose_array(posed.T_odom_base)
+        return CameraImage(posed.image.stamp, posed.image.encoded, self.camera, T_odom_base)
+
+
+def rig_of(first_scans: list[ScanMessage], mountings: list[Mounting], camera: CameraModel | None) -> Rig:
+    """The rig whose lasers have these scans and mountings."""
+    lasers = tuple(map(_laser_model, first_scans, mountings))
+    return Rig(lasers, tuple(mounted.upside_down for mounted in mountings), camera)
+
+
+def level_mounting(tree: TransformTree, base_frame: str, laser_frame: str) -> Mounting:
+    """Where tf says that a laser sits.
+
+    Raises:
+        NoTransformError: tf does not say it.
+        TiltedLaserError: the laser does not look along the floor.
+    """
+    mounted = mounting(tree.fixed(base_frame, laser_frame))
+    if mounted.tilt_rad > _STEEPEST_RAD:
+        raise TiltedLaserError(f"tilted by {degrees(mounted.tilt_rad):.0f} degrees")
+    return mounted
+
+
+def tilt_note(mounted: Mounting) -> str:
+    """How much a laser is tilted; empty for a level one."""
+    if mounted.tilt_rad <= _LEVEL_RAD:
+        return ""
+    return f"tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level"
+
+
+def mounted_camera(
+    calibration: Calibration | None, tree: TransformTree, base_frame: str
+) -> tuple[CameraModel | None, str]:
+    """The camera with its calibration and mounting, and a note about it; without them it is left out."""
+    if calibration is None:
+        return None, "was never calibrated, it is left out"
+    try:
+        camera = calibration.camera(tree.fixed(base_frame, calibration.frame))
+    except NoTransformError as error:
+        return None, f"is left out, as tf has {error}"
+    return camera, "has distorted images, read as if they were not" if calibration.is_distorted else ""
+
+
+def _laser_model(first: ScanMessage, mounted: Mounting) -> LaserModel:
+    beams = _turned_beams(first.beams, mounted.upside_down)
+    return LaserModel(*beams, first.range_max_m, mounted.T_base_laser)
+
+
+def _turned_beams(beams: Beams, upside_down: bool) -> Beams:
+    """The beams of a laser that is mounted upside down, as seen from above."""
+    return beams._replace(angle_min_rad=-(beams.angle_min_rad + beams.span_rad)) if upside_down else beams
+
+
+def _turned(ranges_m: Ranges, upside_down: bool) -> Ranges:
+    """Reverse the ranges (beam_count,) of a laser that is mounted upside down."""
+    if upside_down:
+        ranges_m = np.ascontiguousarray(ranges_m[::-1])
+    ranges_m.setflags(write=False)
+    return ranges_m
