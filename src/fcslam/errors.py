@@ -11,6 +11,7 @@ FcslamError
 │   ├── EvaluationError   a reference file or a run folder cannot be evaluated
 │   ├── ServiceError      the service cannot run: tokens, certificates, address, folder or mission are unusable
 │   ├── StoreError        a mission cannot be stored or read: the disk is full, or the file is damaged
+│   ├── EditError         an edit of a mission cannot be undone or read
 │   ├── StateError        a robot's state folder cannot be used
 │   └── CloudError        the cloud rejects a robot: its token, its name or its packets
 │       └── OversizeError     a request is too large
@@ -54,6 +55,10 @@ class TrainingError(InputError):
 
 class EvaluationError(InputError):
     """A reference file or a run folder cannot be evaluated."""
+
+
+class EditError(InputError):
+    """An edit of a mission cannot be undone, or cannot be read; the message says why."""
 
 
 class StateError(InputError):

@@ -74,8 +74,7 @@ def run_mission(
     _check_robots(sources)
     _check_vetoes(vetoes, [source.name for source in sources])
     cloud = Cloud(config.fleet, config.seed)
-    for veto in vetoes:
-        cloud.fleet.veto(veto)
+    cloud.fleet.edit(vetoes)
     traffic = Counter()
     meter = _Meter(watch, cloud.fleet, [source.name for source in sources])
     with drive(sources, config.robot) as robots:

@@ -365,6 +365,43 @@ class Veto:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Removal:
+    """A user's statement that the packets of a robot, or of one of its sessions, have no effect."""
+
+    robot: str
+    epoch: int | None = None
+    """Of the session; None: all sessions of the robot, later ones as well."""
+
+    def covers(self, robot: str, epoch: int) -> bool:
+        """Whether it removes this session."""
+        return self.robot == robot and self.epoch in (None, epoch)
+
+
+@dataclass(frozen=True, slots=True)
+class Undo:
+    """A user's statement that an earlier edit is not in force any more."""
+
+    number: int
+    """Of the edit."""
+
+
+Change = Veto | Removal
+"""What an edit changes about a mission."""
+
+
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """One line of the log of what users changed about a mission by hand."""
+
+    number: int
+    """Counts the edits of a mission from 1."""
+    author: str
+    time_s: float
+    """Seconds since 1970."""
+    content: Change | Undo
+
+
 def _same_stamps(a: tuple[float, float], b: tuple[float, float]) -> bool:
     return abs(a[0] - b[0]) <= SAME_STAMP_S and abs(a[1] - b[1]) <= SAME_STAMP_S
 

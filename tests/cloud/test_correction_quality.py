@@ -53,5 +53,5 @@ def test_a_place_that_shows_something_else_than_the_map_bears_out_nothing(script
 
 def test_what_is_vetoed_bears_out_nothing(scripted):
     cloud = feed(scripted(closures(A, B, PAIRS[:5])), two_robots())
-    cloud.fleet.veto(Veto("a", "b"))
+    cloud.fleet.edit([Veto("a", "b")])
     assert qualities(cloud) == {"a": 0.0, "b": 0.0}

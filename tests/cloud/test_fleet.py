@@ -156,13 +156,13 @@ def test_a_veto_parts_what_only_liars_joined(scripted):
     alias = closures(A, B, TRUE, shift=ALIAS)
     cloud = feed(scripted(alias), two_robots())
     assert cloud.fleet.closure_counts()["between robots"] == 6
-    cloud.fleet.veto(Veto("b", "a"))
+    cloud.fleet.edit([Veto("b", "a")])
     assert cloud.fleet.closure_counts()["between robots"] == 0
     result = cloud.finalize()
     assert map_of(result) == {"a": 0, "b": 1}
     assert {(c.status, c.reason) for c in between(result)} == {(ClosureStatus.REVOKED, Reason(ReasonCode.VETOED))}
     before = scripted(alias)
-    before.fleet.veto(Veto("a", "b"))
+    before.fleet.edit([Veto("a", "b")])
     assert fingerprint(feed(before, two_robots()).finalize()) == fingerprint(result)
 
 
@@ -173,12 +173,10 @@ def test_a_veto_clears_the_way_for_the_truth_whenever_it_comes(scripted):
     vetoes = [Veto("a", "b", (float(i), LATER + j)) for i, j in OTHERS[:4]]
     late = feed(scripted(alias, closures(A, B, TRUE)), two_robots())
     assert late.fleet.closure_counts()["between robots"] == 0
-    for veto in vetoes:
-        late.fleet.veto(veto)
+    late.fleet.edit(vetoes)
     assert late.fleet.closure_counts()["between robots"] == len(TRUE)
     early = scripted(alias, closures(A, B, TRUE))
-    for veto in vetoes:
-        early.fleet.veto(veto)
+    early.fleet.edit(vetoes)
     result = late.finalize()
     assert map_of(result) == {"a": 0, "b": 0}
     assert fingerprint(result) == fingerprint(feed(early, two_robots()).finalize())
@@ -195,7 +193,7 @@ def test_a_turn_on_the_spot_drifts_as_its_odometry_says(scripted):
 
 def test_a_veto_of_one_closure_leaves_the_others(scripted):
     cloud = feed(scripted(closures(A, B, TRUE)), two_robots())
-    cloud.fleet.veto(Veto("b", "a", (LATER + 8, 8.0)))
+    cloud.fleet.edit([Veto("b", "a", (LATER + 8, 8.0))])
     result = cloud.finalize()
     (vetoed,) = between(result, ClosureStatus.REVOKED)
     assert (vetoed.i.number, vetoed.j.number) == (8, 8)
@@ -207,7 +205,7 @@ def test_a_veto_of_one_closure_leaves_the_others(scripted):
 def test_a_robots_own_closure_can_be_vetoed(scripted):
     loop = motion("a", 2, 58, se2.between(POSES[2], POSES[58]), ConstraintKind.CLOSURE)
     cloud = scripted()
-    cloud.fleet.veto(Veto("a", "a", (58.0, 2.0)))
+    cloud.fleet.edit([Veto("a", "a", (58.0, 2.0))])
     (closure,) = feed(cloud, stream(*A, start_s=0.0, local=[loop])).finalize().closures
     assert (closure.status, closure.reason) == (ClosureStatus.REVOKED, Reason(ReasonCode.VETOED))
 
@@ -217,8 +215,7 @@ def test_one_surviving_closure_holds_no_maps_together(scripted):
     follower = closures(A, B, [(20, 20)], shift=ALIAS)
     cloud = feed(scripted(closures(A, B, [(0, 0), (8, 8), (16, 16)], shift=ALIAS), follower), two_robots())
     assert cloud.fleet.closure_counts()["between robots"] == 4
-    for number in (0, 8):
-        cloud.fleet.veto(Veto("a", "b", (number, LATER + number)))
+    cloud.fleet.edit([Veto("a", "b", (number, LATER + number)) for number in (0, 8)])
     result = cloud.finalize()
     assert map_of(result) == {"a": 0, "b": 1}
     assert not between(result, ClosureStatus.ACCEPTED)

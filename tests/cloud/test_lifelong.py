@@ -157,8 +157,7 @@ def test_a_session_of_which_everything_was_forgotten_still_has_its_trajectory_an
     cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
     empty = next(robot.robot for robot in cloud.fleet.estimate().robots if not robot.keyscans)
     others = [robot.robot for robot in cloud.fleet.estimate().robots if robot.robot != empty]
-    for other in others:
-        cloud.fleet.veto(Veto(empty, other))
+    cloud.fleet.edit([Veto(empty, other) for other in others])
     result = cloud.fleet.estimate()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     run_of(result, tracks, [], "", OccupancyConfig()).save(tmp_path / "run")

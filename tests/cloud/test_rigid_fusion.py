@@ -159,7 +159,7 @@ def test_two_matches_join_what_the_joint_graph_leaves_apart(scripted, strategy):
 @rigid
 def test_a_veto_takes_a_match_away(scripted, strategy):
     cloud = scripted(closures(A, B, MEETINGS[:2]), fusion=strategy)
-    cloud.fleet.veto(Veto("a", "b", (8.0, LATER + 8.0)))
+    cloud.fleet.edit([Veto("a", "b", (8.0, LATER + 8.0))])
     result = feed(cloud, two_robots()).finalize()
     assert map_of(result) == {"a": 0, "b": 1}
     (revoked,) = between(result, ClosureStatus.REVOKED)

@@ -76,7 +76,7 @@ def test_restarts_anywhere_change_nothing(packets, uninterrupted, tmp_path, seed
 
 def test_a_veto_and_decisions_survive(packets, tmp_path):
     fleet = go_on(Fleet(CONFIG, 0), packets)
-    fleet.veto(Veto(packets[0].robot, next(p.robot for p in packets if p.robot != packets[0].robot)))
+    fleet.edit([Veto(packets[0].robot, next(p.robot for p in packets if p.robot != packets[0].robot))])
     same(restarted(fleet, packets, tmp_path / "state"), fleet)
 
 

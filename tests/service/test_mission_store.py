@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fcslam.cloud.replies import NEWS_M, NEWS_RAD, SessionCorrection
-from fcslam.errors import PacketConflictError, StoreError
-from fcslam.records import Channel, Correction, Veto, frozen
+from fcslam.errors import EditError, PacketConflictError, StoreError
+from fcslam.records import Channel, Correction, Edit, Removal, Undo, Veto, frozen
 from fcslam.service.mission_store import MissionStore, StoredPacket, check_mission
 from fcslam.wire.messages import PacketKind
 
@@ -159,17 +159,29 @@ def test_another_map_is_news_wherever_it_lies(store):
         assert store.correction("a", 0).correction.map_index == map_index
 
 
-def test_vetoes_and_requests_are_kept_in_their_order(store):
-    vetoes = [Veto("a", "b"), Veto("a", "a", (1.5, 2.5))]
-    for veto in vetoes:
-        store.veto(veto)
+def test_edits_and_requests_are_kept_in_their_order(store):
+    contents = [Veto("a", "b"), Veto("a", "a", (1.5, 2.5)), Removal("b"), Removal("a", 3), Undo(3)]
+    edits = [store.edit(content, "boss", float(k)) for k, content in enumerate(contents)]
+    assert edits == [Edit(k + 1, "boss", float(k), content) for k, content in enumerate(contents)]
     store.put([packet()], 0.0)
     number = store.ask_to_finalize()
     asked = store.finalization(number)
-    assert (asked.arrivals, asked.vetoes, asked.run) == (1, 2, None)
+    assert (asked.arrivals, asked.edits, asked.run) == (1, 5, None)
     store.answer(number, "1")
     assert store.finalization(number).run == "1"
-    assert store.vetoes() == vetoes
+    assert store.edits() == edits
+    assert store.edits(3) == edits[3:]
+
+
+@pytest.mark.parametrize(
+    ("number", "told"), [(1, "before, by edit 2"), (2, "again"), (4, "there are 3")], ids=["twice", "an undo", "none"]
+)
+def test_what_cannot_be_undone_changes_nothing(store, number, told):
+    for content in (Veto("a", "b"), Undo(1), Removal("a")):
+        store.edit(content, "boss", 0.0)
+    with pytest.raises(EditError, match=told):
+        store.edit(Undo(number), "boss", 0.0)
+    assert len(store.edits()) == 3
 
 
 def test_an_export_is_the_mission_and_nothing_else_is(store, tmp_path):
@@ -202,7 +214,9 @@ def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypa
     copy.close()
 
 
-@pytest.mark.parametrize("harm", ["text", "trigger", "view", "version", "torn", "kind", "channel", "none", "config"])
+@pytest.mark.parametrize(
+    "harm", ["text", "trigger", "view", "version", "torn", "kind", "channel", "none", "config", "edit", "undo"]
+)
 def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
     path = tmp_path / "out.sqlite"
     store.put([packet(sequence=k, data=bytes(4000)) for k in range(20)], 0.0)
@@ -215,12 +229,14 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
     else:
         connection = sqlite3.connect(path)
         connection.execute({
-            "trigger": "CREATE TRIGGER t AFTER INSERT ON vetoes BEGIN DELETE FROM packets; END",
+            "trigger": "CREATE TRIGGER t AFTER INSERT ON edits BEGIN DELETE FROM packets; END",
             "view": "CREATE VIEW v AS SELECT 1",
             "version": "PRAGMA user_version=99",
             "kind": "UPDATE packets SET kind = 'rumour' WHERE sequence = 3",
             "channel": "UPDATE packets SET channel = 'smell' WHERE sequence = 3",
             "none": "UPDATE packets SET kind = NULL WHERE sequence = 3",
+            "edit": "INSERT INTO edits VALUES (1, 'boss', 0.0, 'removal', '{\"robot\": 1}')",
+            "undo": "INSERT INTO edits VALUES (1, 'boss', 0.0, 'undo', '{\"number\": 1}')",
             "config": "INSERT INTO facts VALUES ('config', '{\"seed\": \"x\"}')",
         }[harm])  # fmt: skip
         connection.commit()

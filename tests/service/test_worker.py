@@ -13,7 +13,7 @@ import pytest
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.mission import MissionConfig, run_mission
-from fcslam.records import ClosureStatus, Veto
+from fcslam.records import ClosureStatus, Removal, Undo, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service import worker as worker_module
@@ -357,12 +357,61 @@ def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cl
 def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
     cloud.put(two_robots())
     assert {t.map_index for t in cloud.finalize().trajectories.values()} == {0}
-    cloud.store.veto(Veto("a", "b"))
+    cloud.store.edit(Veto("a", "b"), "boss", 0.0)
     for _ in range(2):
         run = cloud.finalize()
         assert {t.map_index for t in run.trajectories.values()} == {0, 1}
         assert {c.status for c in run.closures} == {ClosureStatus.REVOKED}
         cloud.restart()
+
+
+def content(run):
+    """What a run says of robots and maps, without its traffic."""
+    poses = {name: (robot.map_index, robot.T_map_base.tobytes()) for name, robot in run.trajectories.items()}
+    local = {name: (own.T_local_base.tobytes(), own.pgm) for name, own in run.local_maps.items()}
+    return poses, local, run.map_files, run.pose_graph_g2o, [str(closure) for closure in run.closures]
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+@pytest.mark.parametrize("change", [Removal("b"), Removal("b", 0), Veto("a", "b")], ids=str)
+def test_an_edit_and_its_undo_leave_what_would_have_been_without_them(cloud, tmp_path, change, restarts):
+    packets, others = two_robots(), [packet for packet in two_robots() if packet.robot == "a"]
+    if isinstance(change, Veto):
+        others = None
+    expected = {}
+    for name, sent_ in (("with", packets), ("without", others)):
+        if sent_ is not None:
+            reference = Cloud(tmp_path / name)
+            reference.put(sent_)
+            expected[name] = content(reference.finalize())
+            reference.store.close()
+    cloud.put(packets[:60])
+    cloud.finalize()
+    edit = cloud.store.edit(change, "boss", 0.0)
+    cloud.work()
+    if restarts:
+        cloud.now += 60.0
+        cloud.work()
+        cloud.restart()
+    cloud.put(packets[60:])
+    run = cloud.finalize()
+    cloud.now += 1000.0
+    cloud.work()
+    if isinstance(change, Removal):
+        assert set(open_run(cloud.folder.live).trajectories) == {"a"}
+        assert content(run) == expected["without"]
+    else:
+        assert {t.map_index for t in run.trajectories.values()} == {0, 1}
+    cloud.store.edit(Undo(edit.number), "boss", 0.0)
+    if restarts:
+        cloud.restart()
+    assert content(cloud.finalize()) == expected["with"]
+    cloud.now += 1000.0
+    cloud.work()
+    live = open_run(cloud.folder.live)
+    assert {name: t.map_index for name, t in live.trajectories.items()} == {"a": 0, "b": 0}
+    assert cloud.store.correction("b", 0) is not None
+    assert cloud.store.applied() == len(packets)
 
 
 def test_a_result_waits_for_the_packets_that_were_there_when_it_was_asked_for(cloud):

@@ -1,11 +1,11 @@
 """Decisions about closures: which are accepted, which maps they join, and what is revoked when evidence turns."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple
 
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
+from fcslam.cloud.edits import edit_json, is_removed, kind_of, read_edit
 from fcslam.cloud.joining import CONSISTENCY, decide_join, first_estimate
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.map_comparison import MapComparison
@@ -18,7 +18,7 @@ from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.trajectory import Trajectory
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import ClosureStatus, Constraint, KeyscanId, Reason, ReasonCode, Veto
+from fcslam.records import Change, ClosureStatus, Constraint, KeyscanId, Reason, ReasonCode, Removal, Veto
 from fcslam.storage.state_file import State
 
 EXAMINED_GROWTH = 2.0
@@ -30,7 +30,7 @@ the same evidence would be weighed again at every place."""
 
 
 class ClosureDecisions:
-    """Accepts closures, joins maps, applies vetoes and re-evaluates all of it when evidence turns."""
+    """Accepts closures, joins maps, applies edits and re-evaluates all of it when evidence turns."""
 
     def __init__(self, config: FleetConfig, sessions: SessionStore, graph: JointGraph) -> None:
         self._config = config
@@ -44,16 +44,16 @@ class ClosureDecisions:
         """Sessions by map; maps, and the sessions in them, in the order in which they started."""
         self.version = 0
         """How often the joint graph was solved."""
-        self._vetoes: list[Veto] = []
+        self._changes: tuple[Change, ...] = ()
         self._contested = False
         """Whether evidence has turned against a join."""
         self._postponed_until = 0
         """Number of closures below which a contested join is not re-evaluated."""
 
     @property
-    def vetoes(self) -> tuple[Veto, ...]:
-        """All vetoes, in their order."""
-        return tuple(self._vetoes)
+    def changes(self) -> tuple[Change, ...]:
+        """The changes by hand that are in force."""
+        return self._changes
 
     def map_of(self, session: str) -> list[str]:
         """The sessions that share a map with this one, itself included."""
@@ -73,14 +73,15 @@ class ClosureDecisions:
         i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)
         edge = self._graph.close(i, j, closure.T_i_j, closure.information)
         entry = self.closures.add_local(closure, edge)
-        self._apply_vetoes([entry])
+        entry.vetoed = self._is_vetoed(entry)
         if entry.vetoed:
             self._graph.count(edge, holds=False)
 
     def add_matches(self, matches: Iterable[PlaceMatch], session: str) -> None:
         """Accept the matches of a session's new place that fit the joint map; join maps on a dominant cluster."""
         entries = [self.closures.add(match) for match in matches if not self.closures.confirms(match)]
-        self._apply_vetoes(entries)
+        for entry in entries:
+            entry.vetoed = self._is_vetoed(entry)
         undecided = [entry for entry in entries if not entry.vetoed and not self._accept_if_consistent(entry)]
         for other in dict.fromkeys(entry.closure.i.robot for entry in undecided):
             between = [entry for entry in undecided if entry.closure.i.robot == other]
@@ -96,17 +97,19 @@ class ClosureDecisions:
         if self._contested and len(self.closures) >= self._postponed_until:
             self.reevaluate()
 
-    def veto(self, veto: Veto) -> bool:
-        """Exclude closures from now on; maps that only they joined are separated.
+    def edit(self, changes: Sequence[Change]) -> bool:
+        """Replace the changes by hand that are in force: they exclude closures, and no others are excluded.
 
-        Returns whether the veto changed a decision.
+        Returns whether a decision changed.
         """
-        self._vetoes.append(veto)
-        vetoed = self._apply_vetoes([entry for entry in self.closures if not entry.vetoed])
-        changes = any(entry.closure.status is not ClosureStatus.CANDIDATE for entry in vetoed)
-        if changes:
+        self._changes = tuple(changes)
+        turned = [entry for entry in self.closures if entry.vetoed != self._is_vetoed(entry)]
+        for entry in turned:
+            entry.vetoed = not entry.vetoed
+        decided = any(entry.closure.status is not ClosureStatus.CANDIDATE for entry in turned)
+        if decided:
             self.reevaluate()
-        return changes
+        return decided
 
     def reevaluate(self) -> Fusion:
         """Decide every closure again from all evidence: revoke outvoted ones, separate maps that only they joined."""
@@ -123,7 +126,7 @@ class ClosureDecisions:
             "examined": [(sorted(pair), size) for pair, size in self._examined.items()],
             "maps": self.maps,
             "version": self.version,
-            "vetoes": [astuple(veto) for veto in self._vetoes],
+            "changes": [(kind_of(change), edit_json(change)) for change in self._changes],
             "contested": self._contested,
             "postponed_until": self._postponed_until,
         }
@@ -133,20 +136,18 @@ class ClosureDecisions:
         self.closures.restore(state["closures"])
         self._examined = {frozenset(pair): size for pair, size in state["examined"]}
         self.maps, self.version = state["maps"], state["version"]
-        self._vetoes = [Veto(i, j, stamps and tuple(stamps)) for i, j, stamps in state["vetoes"]]
+        changes = (read_edit(*change) for change in state["changes"])
+        self._changes = tuple(change for change in changes if isinstance(change, Veto | Removal))
         self._contested, self._postponed_until = state["contested"], state["postponed_until"]
 
-    def _apply_vetoes(self, entries: Sequence[ClosureEntry]) -> list[ClosureEntry]:
-        """Mark the entries that a veto excludes, and return them."""
-        vetoed = [entry for entry in entries if self._is_vetoed(entry)]
-        for entry in vetoed:
-            entry.vetoed = True
-        return vetoed
-
     def _is_vetoed(self, entry: ClosureEntry) -> bool:
+        """Whether a veto excludes the closure, or one of its sessions is removed."""
         i, j = entry.closure.i, entry.closure.j
         stamps = self._sessions.stamp(i), self._sessions.stamp(j)
-        return any(veto.forbids(i.robot, stamps[0], j.robot, stamps[1]) for veto in self._vetoes)
+        vetoes = (change for change in self._changes if isinstance(change, Veto))
+        return any(veto.forbids(i.robot, stamps[0], j.robot, stamps[1]) for veto in vetoes) or any(
+            is_removed(end.robot, self._changes) for end in (i, j)
+        )
 
     def _accept_if_consistent(self, entry: ClosureEntry) -> bool:
         """Accept a verified closure that fits the joint map; False if only a cluster may accept it."""

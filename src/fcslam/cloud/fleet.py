@@ -4,12 +4,13 @@ A plain object without a network. Robots stay in maps of their own until the evi
 evidence may revoke a join. ``finalize`` depends on the set of packets only, not on their order.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Self
 
 from fcslam.cloud.claims import check_constraint, check_submap
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
+from fcslam.cloud.edits import is_removed
 from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
@@ -23,6 +24,7 @@ from fcslam.errors import PacketError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
+    Change,
     Constraint,
     ConstraintKind,
     Correction,
@@ -30,7 +32,7 @@ from fcslam.records import (
     Keyscan,
     KeyscanId,
     Place,
-    Veto,
+    Removal,
     frozen,
 )
 from fcslam.storage.state_file import State
@@ -68,19 +70,22 @@ class Fleet:
         )
         self._quality = CorrectionQuality(self._graph, config.surprise_m, config.surprise_rad)
         self._needs_replay = False
-        """Whether something besides the packets changed the graph: a veto."""
+        """Whether something besides the packets changed the graph: an edit."""
         self._replayed: _Replayed | None = None
         """The replay of the last result, which the next one goes on from."""
 
     def apply(self, packet: Packet) -> None:
         """Let one packet take effect: figure 1 of the paper, cloud side.
 
-        The packets of a session come in the order of their numbers, which ``PacketLog`` takes care of.
+        The packets of a session come in the order of their numbers, which ``PacketLog`` takes care of. Those of a
+        removed session have no effect.
 
         Raises:
             PacketError: it does not fit what its robot sent before; nothing has changed.
         """
         packet = in_session(packet)
+        if is_removed(packet.robot, self._decisions.changes):
+            return
         match packet.body:
             case Hello() as hello:
                 self._sessions.add_hello(hello, packet.sequence)
@@ -129,9 +134,20 @@ class Fleet:
         fleet._needs_replay = state["needs_replay"]
         return fleet
 
-    def veto(self, veto: Veto) -> None:
-        """Exclude closures from now on; maps that only they joined are separated."""
-        self._needs_replay |= self._decisions.veto(veto)
+    def edit(self, changes: Sequence[Change]) -> None:
+        """Replace the changes by hand that are in force; maps that only excluded closures joined are separated.
+
+        A removed session leaves the estimate and is compared with nothing, but stays in memory.
+
+        Raises:
+            ValueError: a removal is not in force any more; only a new fleet can apply its packets.
+        """
+        removals = {change for change in self._decisions.changes if isinstance(change, Removal)}
+        if not removals <= set(changes):
+            raise ValueError("a removed session cannot come back")
+        removed = [session for session in self._sessions.robots if is_removed(session, changes)]
+        self._needs_replay |= self._decisions.edit(changes) or bool(removed)
+        self._recognition.forget(removed)
         self._replayed = None
 
     def read_ahead(self, most: int) -> bool:
@@ -140,12 +156,12 @@ class Fleet:
 
     def estimate(self) -> FleetResult:
         """The current estimate, without a new decision: quick, for live maps."""
-        sessions = self._sessions.robots
+        sessions = self._present()
         poses: dict[str, FloatArray] = {session: frozen(self._graph.trajectory(session)) for session in sessions}
         own: dict[str, FloatArray] = {session: frozen(self._graph.chain(session)) for session in sessions}
-        closures = tuple(entry.closure for entry in self._decisions.closures)
-        fusion = Fusion(self._decisions.maps, poses, own, closures)
-        return conclude(self._sessions, self._graph, self._decisions.closures, fusion, self._decisions.version)
+        entries = [e for e in self._decisions.closures if e.closure.i.robot in poses and e.closure.j.robot in poses]
+        fusion = Fusion(self._present_maps(), poses, own, tuple(entry.closure for entry in entries))
+        return conclude(self._sessions, self._graph, entries, fusion, self._decisions.version)
 
     def conclude(self) -> FleetResult:
         """Decide every closure from all evidence and collect the result; the fleet stays as it is."""
@@ -161,8 +177,10 @@ class Fleet:
     def finalize(
         self, log: PacketLog, arrived: Iterable[tuple[float, PacketNumber]], read: Callable[[PacketNumber], Packet]
     ) -> FleetResult:
-        """The result of all packets in canonical order. Unless they came in it, another fleet applies them: all,
-        or those after an earlier result, if all of these come later in the order.
+        """The result of all packets in canonical order, without those of removed sessions.
+
+        Unless they came in this order, another fleet applies them: all, or those after an earlier result, if all of
+        these come later in the order.
 
         Args:
             log: the order in which this fleet applied its packets.
@@ -171,28 +189,28 @@ class Fleet:
         """
         if log.is_canonical and not self._needs_replay:
             return self.conclude()
-        order, done = list(log.canonical(arrived)), 0
+        changes, done = self._decisions.changes, 0
+        order = [number for number in log.canonical(arrived) if not is_removed(number.session, changes)]
         replayed, self._replayed = self._replayed, None
         if replayed is not None and order[: len(replayed.order)] == replayed.order:
             done = len(replayed.order)
             replay = Fleet.restored(self._config, self._seed, replayed.state, read, self._verify_pairs)
         else:
             replay = Fleet(self._config, self._seed, self._verify_pairs)
-            for veto in self._decisions.vetoes:
-                replay.veto(veto)
+            replay.edit(changes)
         for number in order[done:]:
             replay.apply(read(number))
         self._replayed = _Replayed(order, replay.state())
         return replay.conclude()
 
     def correction(self, session: str) -> Correction | None:
-        """Where the session's odometry lies in its map by the current estimate; None before its first keyscan."""
-        return self._correction(session, map_indices(self._decisions.maps))
+        """Where the session's odometry lies in its map by now; None if removed or without a keyscan."""
+        return self._correction(session, map_indices(self._present_maps()))
 
     def corrections(self) -> tuple[Correction, ...]:
-        """The corrections of all sessions."""
-        indices = map_indices(self._decisions.maps)
-        corrections = (self._correction(session, indices) for session in self._sessions.robots)
+        """The corrections of all sessions that are not removed."""
+        indices = map_indices(self._present_maps())
+        corrections = (self._correction(session, indices) for session in self._present())
         return tuple(correction for correction in corrections if correction is not None)
 
     def vocabularies(self) -> tuple[VocabularyState, ...]:
@@ -203,8 +221,16 @@ class Fleet:
         """Accepted closures so far, by kind."""
         return self._decisions.counts()
 
+    def _present(self) -> list[str]:
+        """Sessions with a keyscan that are not removed, in the order of their first."""
+        return [session for session in self._sessions.robots if not is_removed(session, self._decisions.changes)]
+
+    def _present_maps(self) -> list[list[str]]:
+        """The maps of these; a removed session is in a map of its own."""
+        return [map_ for map_ in self._decisions.maps if not is_removed(map_[0], self._decisions.changes)]
+
     def _correction(self, session: str, indices: Mapping[str, int]) -> Correction | None:
-        if not self._graph.keyscan_count(session):
+        if session not in indices:
             return None
         quality = self._quality.of(session, self._decisions.map_of(session), self._decisions.closures)
         T_map_odom: FloatArray = frozen(self._graph.T_map_odom(session))

@@ -1,6 +1,7 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
 from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +35,6 @@ class JointGraph:
     def variable(self, keyscan: KeyscanId) -> int:
         """Number of the keyscan's variable."""
         return self._variables[keyscan.robot][keyscan.number]
-
-    def keyscan_count(self, robot: str) -> int:
-        """Number of the robot's keyscans in the graph."""
-        return len(self._variables.get(robot, ()))
 
     def pose(self, keyscan: KeyscanId) -> FloatArray:
         """T_map_base (3,) of the keyscan in its robot's current map."""
@@ -128,11 +125,19 @@ class JointGraph:
         self._unsolved = 0
 
     def held(self, T_map_base: Mapping[str, FloatArray], left_out: Container[int | None]) -> PoseGraph:
-        """All robots at poses (N, 3), with the constraints that are not left out: the graph of a finished run."""
-        poses = np.zeros((len(self.graph), 3))
-        for robot, variables in self._variables.items():
-            poses[variables] = T_map_base[robot]
-        return PoseGraph(poses, [edge for number, edge in enumerate(self.graph.edges) if number not in left_out])
+        """These robots at poses (N, 3), with the constraints that are not left out: the graph of a finished run.
+
+        No constraint that connects one of them with another robot is kept.
+        """
+        kept, poses = np.zeros(len(self.graph), bool), np.zeros((len(self.graph), 3))
+        for robot, T_robot in T_map_base.items():
+            poses[self._variables[robot]], kept[self._variables[robot]] = T_robot, True
+        edges = [edge for number, edge in enumerate(self.graph.edges) if number not in left_out]
+        if not kept.all():
+            numbers = np.cumsum(kept) - 1
+            inside = (edge for edge in edges if kept[edge.i] and kept[edge.j])
+            edges = [replace(edge, i=int(numbers[edge.i]), j=int(numbers[edge.j])) for edge in inside]
+        return PoseGraph(poses[kept], edges)
 
     def robots(self) -> dict[str, NDArray[np.int64]]:
         """Variables of every robot in the order of its path; robots in the order in which they started."""

@@ -75,6 +75,12 @@ class PlaceRecognition:
         for row in surplus_places(positions, settings.nearby_m, settings.most_nearby):
             matcher.forget(ids[row])
 
+    def forget(self, sessions: Collection[str]) -> None:
+        """Forget all places of the sessions."""
+        for matcher in self._matchers.values():
+            for place in [place for place in matcher if place.robot in sessions]:
+                matcher.forget(place)
+
     def vocabularies(self) -> tuple[VocabularyState, ...]:
         """The state of every vocabulary."""
         return tuple(

@@ -1,12 +1,12 @@
 """The result of a fleet: all closures decided, all robots placed in maps."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.cloud.closure_log import ClosureLog
+from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.graph.pose_graph import PoseGraph
@@ -70,10 +70,11 @@ def map_indices(maps: Sequence[Sequence[str]]) -> dict[str, int]:
 
 
 def conclude(
-    sessions: SessionStore, graph: JointGraph, closures: ClosureLog, fusion: Fusion, version: int
+    sessions: SessionStore, graph: JointGraph, closures: Iterable[ClosureEntry], fusion: Fusion, version: int
 ) -> FleetResult:
-    """Collect the result."""
+    """Collect the result of the robots of ``fusion``, whose closures are those of the entries."""
     index = map_indices(fusion.maps)
+    names = [robot for robot in sessions.robots if robot in index]
     robots = tuple(
         MappedRobot(
             robot,
@@ -84,11 +85,11 @@ def conclude(
             fusion.T_local_base[robot],
             sessions.lasers(robot),
         )
-        for robot in sessions.robots
+        for robot in names
     )
     corrections = tuple(
         Correction(robot, version, index[robot], frozen(graph.T_map_odom(robot, fusion.T_map_base[robot][-1])))
-        for robot in sessions.robots
+        for robot in names
     )
     left_out = {
         entry.edge

@@ -1,6 +1,6 @@
 """One mission on disk: packets as received are the truth, and everything else can be computed from them again.
 
-The service writes packets, vetoes and requests; the worker writes results. A packet is stored once and never changes.
+The service writes packets, edits and requests; the worker writes results. A packet is stored once and never changes.
 Packets are numbered by **arrival**. The order in which they take effect follows from it: ``cloud.packet_log``.
 """
 
@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fcslam.cloud.edits import check_undo, edit_json, kind_of, read_edit
 from fcslam.cloud.replies import SessionCorrection, is_news
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import PacketConflictError, StoreError
-from fcslam.records import Channel, Correction, Veto, frozen
+from fcslam.errors import EditError, PacketConflictError, StoreError
+from fcslam.records import Change, Channel, Correction, Edit, Undo, frozen
 from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
@@ -25,7 +26,7 @@ APPLIED = "applied"
 CONFIG = "config"
 """A fact: the mission's configuration."""
 
-_VERSION = 4
+_VERSION = 5
 """Version of the schema and of the packets."""
 _AT_ONCE = 10_000
 """Packets that are read at once."""
@@ -46,11 +47,11 @@ CREATE TABLE corrections (
     map_index INTEGER NOT NULL, x REAL NOT NULL, y REAL NOT NULL, theta REAL NOT NULL, quality REAL NOT NULL,
     PRIMARY KEY (robot, epoch)
 ) STRICT;
-CREATE TABLE vetoes (
-    number INTEGER PRIMARY KEY, robot_i TEXT NOT NULL, robot_j TEXT NOT NULL, stamp_i REAL, stamp_j REAL
+CREATE TABLE edits (
+    number INTEGER PRIMARY KEY, author TEXT NOT NULL, time REAL NOT NULL, kind TEXT NOT NULL, content TEXT NOT NULL
 ) STRICT;
 CREATE TABLE finalizations (
-    number INTEGER PRIMARY KEY, arrivals INTEGER NOT NULL, vetoes INTEGER NOT NULL, run TEXT, failure TEXT
+    number INTEGER PRIMARY KEY, arrivals INTEGER NOT NULL, edits INTEGER NOT NULL, run TEXT, failure TEXT
 ) STRICT;
 CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT
 """
@@ -85,11 +86,11 @@ class Envelope(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Finalization:
-    """A request for the result of the first ``arrivals`` packets and ``vetoes`` vetoes."""
+    """A request for the result of the first ``arrivals`` packets and ``edits`` edits."""
 
     number: int
     arrivals: int
-    vetoes: int
+    edits: int
     run: str | None
     """Name of the run folder; None until it is written."""
     failure: str | None
@@ -206,29 +207,36 @@ class MissionStore:
         """The newest correction of a session."""
         return _read_correction(self._database.rows, robot, epoch)
 
-    def veto(self, veto: Veto) -> None:
-        """Store a veto."""
-        row = (veto.robot_i, veto.robot_j, *(veto.stamps or (None, None)))
-        with self._database.transaction() as database:
-            database.execute("INSERT INTO vetoes (robot_i, robot_j, stamp_i, stamp_j) VALUES (?, ?, ?, ?)", row)
+    def edit(self, content: Change | Undo, author: str, time_s: float) -> Edit:
+        """Append an edit to the log.
 
-    def vetoes(self) -> list[Veto]:
-        """All vetoes, in their order."""
-        rows = self._database.rows("SELECT robot_i, robot_j, stamp_i, stamp_j FROM vetoes ORDER BY number")
-        return [Veto(i, j, None if stamp_i is None else (stamp_i, stamp_j)) for i, j, stamp_i, stamp_j in rows]
+        Raises:
+            EditError: it undoes what cannot be undone.
+        """
+        with self._database.transaction() as database:
+            if isinstance(content, Undo):
+                check_undo(_edits(database.execute, 0), content.number)
+            columns, row = "author, time, kind, content", (author, time_s, kind_of(content), edit_json(content))
+            number = database.execute(f"INSERT INTO edits ({columns}) VALUES (?, ?, ?, ?)", row).lastrowid
+        assert number is not None
+        return Edit(number, author, time_s, content)
+
+    def edits(self, after: int = 0) -> list[Edit]:
+        """The edits after number ``after``, in their order."""
+        return _edits(self._database.rows, after)
 
     def ask_to_finalize(self) -> int:
         """Request the result of all packets that arrived; returns the number of the request."""
         with self._database.transaction() as database:
             database.execute(
-                "INSERT INTO finalizations (arrivals, vetoes)"
-                " SELECT (SELECT ifnull(max(arrival), 0) FROM packets), (SELECT count(*) FROM vetoes)"
+                "INSERT INTO finalizations (arrivals, edits)"
+                " SELECT (SELECT ifnull(max(arrival), 0) FROM packets), (SELECT count(*) FROM edits)"
             )
             return int(database.execute("SELECT last_insert_rowid()").fetchone()[0])
 
     def finalizations(self) -> list[Finalization]:
         """All requests, the oldest first."""
-        columns = "number, arrivals, vetoes, run, failure"
+        columns = "number, arrivals, edits, run, failure"
         return [
             Finalization(*row) for row in self._database.rows(f"SELECT {columns} FROM finalizations ORDER BY number")
         ]
@@ -305,14 +313,37 @@ def check_mission(path: Path) -> None:
     ):
         labels = found.execute("SELECT DISTINCT kind, channel, refusal IS NULL FROM packets").fetchall()
         facts = dict(found.execute("SELECT name, value FROM facts").fetchall())
+        edits = found.execute("SELECT number, author, time, kind, content FROM edits ORDER BY number").fetchall()
     try:
+        _check_edits(edits)
         for kind, channel, counts in labels:
             if counts or kind is not None:
                 Label("", PacketKind(kind), None if channel is None else Channel(channel))
         CloudConfig.model_validate_json(facts.get(CONFIG, "{}"))
         int(facts.get(APPLIED, "0"))
-    except ValueError as error:
+    except (ValueError, EditError) as error:
         raise StoreError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+def _edits(query: Callable[[str, tuple[int]], Iterable[Any]], after: int) -> list[Edit]:
+    rows = query("SELECT number, author, time, kind, content FROM edits WHERE number > ? ORDER BY number", (after,))
+    return [Edit(number, author, time_s, read_edit(*content)) for number, author, time_s, *content in rows]
+
+
+def _check_edits(rows: Sequence[tuple[int, str, float, str, str]]) -> None:
+    """Check a log of edits.
+
+    Raises:
+        EditError: an edit cannot be read, is missing, or undoes what cannot be undone.
+    """
+    edits: list[Edit] = []
+    for number, author, time_s, kind, content in rows:
+        edit = Edit(number, author, time_s, read_edit(kind, content))
+        if number != len(edits) + 1:
+            raise EditError(f"edit {len(edits) + 1} is missing")
+        if isinstance(edit.content, Undo):
+            check_undo(edits, edit.content.number)
+        edits.append(edit)
 
 
 def _remember(database: sqlite3.Connection, name: str, value: str) -> None:

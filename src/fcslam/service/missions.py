@@ -8,6 +8,7 @@ from typing import IO
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import ServiceError
+from fcslam.records import Change, Edit, Undo
 from fcslam.service.detectors import STAGING, DetectorStore
 from fcslam.service.intake import Intake
 from fcslam.service.mission_folder import MissionFolder
@@ -39,6 +40,18 @@ class OpenMission:
             self.store.remember(CONFIG, config.model_dump_json())
         self.intake = Intake(self.store, clock, wall_clock, detectors.announced)
         self.worker = launch(folder)
+        self._wall_clock = wall_clock
+
+    def edit(self, content: Change | Undo, author: str) -> Edit:
+        """Append an edit to the mission's log; the worker follows it.
+
+        Raises:
+            EditError: it undoes what cannot be undone.
+            StoreError: it cannot be written.
+        """
+        edit = self.store.edit(content, author, self._wall_clock())
+        self.worker.ring()
+        return edit
 
     def close(self) -> None:
         """Stop the worker, then close the store."""

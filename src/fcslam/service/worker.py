@@ -32,6 +32,7 @@ from typing import IO, NamedTuple, Protocol
 import cv2
 
 import fcslam
+from fcslam.cloud.edits import in_force
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import SessionCorrection
@@ -42,6 +43,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError
 from fcslam.processes import obey_parent
+from fcslam.records import Edit, Removal
 from fcslam.runs import Metric, Run
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
@@ -104,8 +106,10 @@ class Worker:
         """Packets that may take effect and did not yet."""
         self._fleet = Fleet(self._config.fleet, self._config.seed)
         self._log = PacketLog()
-        self._arrivals = self._vetoes = 0
-        """How many packets and vetoes were read."""
+        self._arrivals = 0
+        """How many packets were read."""
+        self._edits: list[Edit] = []
+        """The edits that were read."""
         self._read_hash = b""
         """Of all packets that were read, in their order."""
         self._resumed_at = store.applied()
@@ -122,7 +126,7 @@ class Worker:
     def step(self) -> bool:
         """Do one piece of work; False: there is none."""
         return (
-            self._take_vetoes()
+            self._take_edits()
             or self._write_snapshot()
             or self._take_packets()
             or self._report()
@@ -140,14 +144,26 @@ class Worker:
             due_s = min(due_s, self._report_at - self._clock())
         return max(due_s, 0.0)
 
-    def _take_vetoes(self) -> bool:
-        vetoes = self._store.vetoes()[self._vetoes :]
-        for veto in vetoes:
-            self._fleet.veto(veto)
-        self._vetoes += len(vetoes)
-        if vetoes:
-            self._published = -1
-        return bool(vetoes)
+    def _take_edits(self) -> bool:
+        edits = self._store.edits(len(self._edits))
+        if not edits:
+            return False
+        before, now = in_force(self._edits), in_force([*self._edits, *edits])
+        self._edits += edits
+        if {change for change in before if isinstance(change, Removal)} - set(now):
+            self._start_over()
+        self._fleet.edit(now)
+        self._published, self._reported = -1, min(self._reported, max(self._applied, self._resumed_at) - 1)
+        return True
+
+    def _start_over(self) -> None:
+        """Apply all packets again, as a worker without a snapshot does: a removed session comes back."""
+        self._resumed_at = max(self._resumed_at, self._applied)
+        self._written = 0
+        self._ready.clear()
+        self._fleet, self._log = Fleet(self._config.fleet, self._config.seed), PacketLog()
+        self._arrivals, self._read_hash = 0, b""
+        self._times.clear()
 
     @property
     def _applied(self) -> int:
@@ -201,7 +217,7 @@ class Worker:
             "fleet": self._fleet.state(),
             "log": self._log.state(),
             "arrivals": self._arrivals,
-            "vetoes": self._vetoes,
+            "edits": len(self._edits),
             "hash": self._read_hash.hex(),
             "times": [(*session, time_s) for session, time_s in self._times.items()],
         }
@@ -222,7 +238,8 @@ class Worker:
             read_hash = b""
             for data in self._store.contents(state["arrivals"]):
                 read_hash = _chained(read_hash, data)
-            if read_hash.hex() != state["hash"] or state["vetoes"] > len(self._store.vetoes()):
+            edits = self._store.edits()
+            if read_hash.hex() != state["hash"] or state["edits"] > len(edits):
                 raise InputError(f"{self._folder.snapshot}: is of other packets")
             fleet = Fleet.restored(self._config.fleet, self._config.seed, state["fleet"], self._read)
             log = PacketLog.restored(state["log"])
@@ -230,7 +247,7 @@ class Worker:
             _log.warning("%s; the worker applies all packets again", str(error) or type(error).__name__)
             return
         self._fleet, self._log = fleet, log
-        self._arrivals, self._vetoes, self._read_hash = state["arrivals"], state["vetoes"], read_hash
+        self._arrivals, self._edits, self._read_hash = state["arrivals"], edits[: state["edits"]], read_hash
         self._times = {(robot, epoch): time_s for robot, epoch, time_s in state["times"]}
 
     def _fits(self) -> str:
@@ -264,9 +281,9 @@ class Worker:
         ]
 
     def _finalize(self) -> bool:
-        """Answer the oldest request whose packets and vetoes have all taken effect."""
+        """Answer the oldest request whose packets and edits have all taken effect."""
         for asked in self._store.finalizations():
-            if asked.run or asked.failure or asked.arrivals > self._arrivals or asked.vetoes > self._vetoes:
+            if asked.run or asked.failure or asked.arrivals > self._arrivals or asked.edits > len(self._edits):
                 continue
             self._answer(asked)
             return True

@@ -216,6 +216,25 @@ def test_a_veto_parts_what_only_it_held_together(mapped):
     assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+1"}).status_code == 201
 
 
+def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
+    removed = mapped.ask("POST", f"{API}/removals", "boss", json={"robot": "b"}).json()
+    assert (removed["number"], removed["kind"], removed["author"]) == (1, "removal", "boss")
+    assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a"]}]
+    assert get(mapped, "closures").json() == []
+    undone = mapped.ask("POST", f"{API}/edits/1/undo", "boss").json()
+    assert (undone["kind"], undone["content"]) == ("undo", {"number": 1})
+    assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a", "b"]}]
+    edits = mapped.ask("GET", f"{API}/edits", "boss").json()
+    assert [(edit["number"], edit["undone_by"]) for edit in edits] == [(1, 2), (2, None)]
+    for path, wrong, status in (
+        ("removals", {"robot": "x"}, 404), ("removals", {"robot": "b+1"}, 400), ("removals", {}, 400),
+        ("removals", {"robot": "b", "epoch": -1}, 400), ("edits/1/undo", None, 409), ("edits/9/undo", None, 409),
+        ("edits/x/undo", None, 400),
+    ):  # fmt: skip
+        assert mapped.ask("POST", f"{API}/{path}", "boss", json=wrong).status_code == status
+    assert mapped.ask("POST", f"{API}/removals", "eye", json={"robot": "b"}).status_code == 403
+
+
 def test_missions_are_begun_opened_and_rest_as_they_were(mapped):
     assert mapped.ask("POST", f"{API}/missions", "boss", json={"name": "next"}).json() == {
         "open": "next",

@@ -1,24 +1,29 @@
 """Decisions about the open mission: results, vetoes, detectors."""
 
 import asyncio
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Request
+from fastapi import APIRouter, HTTPException, Path, Request
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from fcslam.cloud.sessions import robot_of
+from fcslam.cloud.edits import kind_of, undone
+from fcslam.cloud.sessions import check_robot, robot_of
 from fcslam.config import Settings
-from fcslam.records import NAME, Veto
+from fcslam.records import NAME, Change, Edit, Removal, Undo, Veto
 from fcslam.service.detectors import LONGEST_FILE_BYTES
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_body, read_json
-from fcslam.service.http.responses import DetectorVersion, Finalized, VetoCount, content, refusals
+from fcslam.service.http.responses import DetectorVersion, EditSummary, Finalized, content, refusals
 from fcslam.service.http.robots import NETWORK
 from fcslam.service.http.state import ServiceState
+from fcslam.wire.limits import MAXIMUM_EPOCH
 
 LOOK_EVERY_S = 0.1
 
+EditNumber = Annotated[int, Path(ge=1, le=2**31 - 1)]
 SessionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
 
@@ -33,8 +38,17 @@ class NewVeto(Settings):
     )
 
 
+class NewRemoval(Settings):
+    """A removal: the packets of a robot, or of one of its sessions, have no effect."""
+
+    robot: SessionName
+    epoch: int | None = Field(
+        None, ge=0, le=MAXIMUM_EPOCH, description="of the session; without it, all sessions, later ones as well"
+    )
+
+
 def decision_router(state: ServiceState) -> APIRouter:
-    """Results and vetoes."""
+    """Results, edits and detectors."""
     router = APIRouter(
         tags=["decisions"], dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503, 507)
     )
@@ -55,9 +69,30 @@ def decision_router(state: ServiceState) -> APIRouter:
         raise HTTPException(503, "the mission was closed; the result will be there when it is open again")
 
     @router.post("/vetoes", status_code=201, openapi_extra=json_body(NewVeto), responses=refusals(400, 404, 413))
-    async def veto(request: Request) -> VetoCount:
+    async def veto(request: Request) -> EditSummary:
         """Exclude closures from now on."""
-        return await run_in_threadpool(_veto, state, await read_json(request, NewVeto))
+        new = await read_json(request, NewVeto)
+        veto = Veto(new.robot_i, new.robot_j, new.stamps)
+        return await run_in_threadpool(_edit, state, request.state.author, veto, (new.robot_i, new.robot_j))
+
+    @router.post("/removals", status_code=201, openapi_extra=json_body(NewRemoval), responses=refusals(400, 404, 413))
+    async def remove(request: Request) -> EditSummary:
+        """Remove a robot or one of its sessions from all maps from now on; its packets are stored all the same."""
+        new = await read_json(request, NewRemoval)
+        check_robot(new.robot)
+        removal = Removal(new.robot, new.epoch)
+        return await run_in_threadpool(_edit, state, request.state.author, removal, (new.robot,))
+
+    @router.get("/edits")
+    def get_edits() -> list[EditSummary]:
+        """All edits: vetoes, removals and what undid them."""
+        edits = state.mission.store.edits()
+        return [_summary(edit, undone(edits)) for edit in edits]
+
+    @router.post("/edits/{number}/undo", status_code=201, responses=refusals(400, 404, 409))
+    async def undo(request: Request, number: EditNumber) -> EditSummary:
+        """Undo a veto or a removal. A removed session comes back when the worker has applied all packets again."""
+        return await run_in_threadpool(_edit, state, request.state.author, Undo(number), ())
 
     @router.post(
         "/detectors",
@@ -74,12 +109,19 @@ def decision_router(state: ServiceState) -> APIRouter:
     return router
 
 
-def _veto(state: ServiceState, veto: NewVeto) -> VetoCount:
+def _edit(state: ServiceState, author: str, content: Change | Undo, sessions: Sequence[str]) -> EditSummary:
+    """Store an edit that names these sessions."""
     mission = state.mission
     known = {robot.robot for robot in mission.intake.sessions()}
-    unknown = [name for name in (veto.robot_i, veto.robot_j) if robot_of(name) not in known]
+    unknown = [name for name in sessions if robot_of(name) not in known]
     if unknown:
         raise HTTPException(404, f"there is no robot '{unknown[0]}'; there are {', '.join(sorted(known))}")
-    mission.store.veto(Veto(veto.robot_i, veto.robot_j, veto.stamps))
-    mission.worker.ring()
-    return VetoCount(vetoes=len(mission.store.vetoes()))
+    return _summary(mission.edit(content, author), {})
+
+
+def _summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:
+    kind, content = kind_of(edit.content), asdict(edit.content)
+    return EditSummary(
+        number=edit.number, kind=kind, content=content, author=edit.author, time_s=edit.time_s,
+        undone_by=gone.get(edit.number),
+    )  # fmt: skip

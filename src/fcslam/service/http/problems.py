@@ -9,7 +9,15 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 from starlette.routing import Match
 
-from fcslam.errors import FcslamError, FeatureError, PacketConflictError, PacketError, ServiceError, StoreError
+from fcslam.errors import (
+    EditError,
+    FcslamError,
+    FeatureError,
+    PacketConflictError,
+    PacketError,
+    ServiceError,
+    StoreError,
+)
 from fcslam.service.intake import RETRY_AFTER_S, BusyError, LeaseError, RefusedPacketError
 
 STATUS: dict[type[FcslamError], int] = {
@@ -20,6 +28,7 @@ STATUS: dict[type[FcslamError], int] = {
     PacketError: 400,
     StoreError: 507,
     ServiceError: 409,
+    EditError: 409,
     FeatureError: 400,
 }
 """HTTP status by exception class; the most derived class counts."""

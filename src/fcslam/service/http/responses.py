@@ -137,10 +137,15 @@ class Finalized(Settings):
     run: str = Field(description="run folder, on the service's machine")
 
 
-class VetoCount(Settings):
-    """How many vetoes there are now."""
+class EditSummary(Settings):
+    """An edit: what somebody changed about the mission by hand."""
 
-    vetoes: int
+    number: int
+    kind: str = Field(description="veto, removal or undo")
+    content: dict[str, Any] = Field(description="what it names")
+    author: str
+    time_s: float = Field(description="seconds since 1970")
+    undone_by: int | None = Field(description="number of the edit that undid it; null: it is in force")
 
 
 _SECONDS = {"schema": {"type": "integer", "minimum": 0}, "required": True, "description": "seconds"}

@@ -14,6 +14,8 @@ from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission
 
+ANYBODY = "anybody"
+"""The author of what is done without authentication."""
 _BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
 
 
@@ -51,6 +53,7 @@ class ServiceState:
             if self.closing:
                 raise HTTPException(503, "the service is stopping; try again")
             if self.authenticator.is_open:
+                request.state.author = ANYBODY
                 return
             tls = request.scope.get("extensions", {}).get("tls", {})
             who = self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
@@ -62,6 +65,7 @@ class ServiceState:
             if who.role not in roles:
                 needed = " or ".join(roles)
                 raise HTTPException(403, f"'{who.name}' is a {who.role}; this is for a {needed}")
+            request.state.author = who.name
             robot = request.path_params.get("robot")
             if who.role is Role.ROBOT and robot not in (None, who.name):
                 raise HTTPException(403, f"robot '{who.name}' does not speak for robot '{robot}'")
