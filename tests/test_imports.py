@@ -40,6 +40,7 @@ ROOMS = [
     "driving",
     "mission",
     "api",
+    "live",
     "evaluation",
     "page",
     "bridges",

@@ -34,8 +34,10 @@ from fcslam.errors import (
 
 if TYPE_CHECKING:
     from fcslam.api import map_recordings
+    from fcslam.live.records import EventKind, RobotEvent, RobotPose
+    from fcslam.live.robot import Robot
     from fcslam.mission import MissionConfig, Progress
-    from fcslam.records import Channel, ClosureStatus, Veto
+    from fcslam.records import Channel, ClosureStatus, LaserModel, Veto
     from fcslam.runs import ClosureRow, LocalMap, Metric, Occupancy, OccupancyMap, RobotTrajectory, Run, open_run
     from fcslam.sources import BagOptions
 
@@ -49,9 +51,11 @@ __all__ = [
     "CloudError",
     "ConfigError",
     "EvaluationError",
+    "EventKind",
     "FcslamError",
     "FeatureError",
     "InputError",
+    "LaserModel",
     "LocalMap",
     "Metric",
     "MissionConfig",
@@ -62,6 +66,9 @@ __all__ = [
     "PacketConflictError",
     "PacketError",
     "Progress",
+    "Robot",
+    "RobotEvent",
+    "RobotPose",
     "RobotTrajectory",
     "Run",
     "ServiceError",
@@ -82,12 +89,17 @@ _LAZY: Final = {
     "Channel": "fcslam.records",
     "ClosureRow": "fcslam.runs",
     "ClosureStatus": "fcslam.records",
+    "EventKind": "fcslam.live.records",
+    "LaserModel": "fcslam.records",
     "LocalMap": "fcslam.runs",
     "Metric": "fcslam.runs",
     "MissionConfig": "fcslam.mission",
     "Occupancy": "fcslam.runs",
     "OccupancyMap": "fcslam.runs",
     "Progress": "fcslam.mission",
+    "Robot": "fcslam.live.robot",
+    "RobotEvent": "fcslam.live.records",
+    "RobotPose": "fcslam.live.records",
     "RobotTrajectory": "fcslam.runs",
     "Run": "fcslam.runs",
     "Veto": "fcslam.records",

@@ -62,7 +62,7 @@ def map_recordings(
     """
     if output is not None:
         prepare_output(Path(output), force)
-    settings = _settings(config, seed, join_maps)
+    settings = settings_of(config, seed, join_maps)
     robots = split_recordings(_opened(recordings, bag_options), split)
     run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes), side_by_side(processes))
     if output is not None:
@@ -111,9 +111,14 @@ def _checked(source: Source) -> Source:
     return source
 
 
-def _settings(
-    config: MissionConfig | Mapping[str, Any] | StrPath | None, seed: int | None, join_maps: bool | None
+def settings_of(
+    config: MissionConfig | Mapping[str, Any] | StrPath | None, seed: int | None = None, join_maps: bool | None = None
 ) -> MissionConfig:
+    """A complete configuration from what a user gives; ``seed`` and ``join_maps`` replace its own.
+
+    Raises:
+        ConfigError: a key is unknown, a value is wrong, or the file cannot be read.
+    """
     if isinstance(config, str | os.PathLike):
         config = load(MissionConfig, Path(config))
     elif not isinstance(config, MissionConfig):
