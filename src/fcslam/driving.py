@@ -102,11 +102,10 @@ def _legs(source: Source, config: RobotConfig) -> Iterator[Leg]:
             packets, stamps = [], []
     packets += map(measure, robot.finish())
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
-    yield Leg(robot.robot, tuple(packets), tuple(stamps), tuple(map(track_of, robot.tracks)), faults)
+    yield Leg(robot.robot, tuple(packets), tuple(stamps), tuple(map(_track, robot.tracks)), faults)
 
 
-def track_of(poses: ScanTrack) -> Track:
-    """A robot's scans of one session, as a run needs them."""
+def _track(poses: ScanTrack) -> Track:
     return Track(poses.stamps, poses.keyscans, poses.T_keyscan_base)
 
 
