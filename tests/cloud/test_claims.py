@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.cloud.claims import ClaimLimits
+from fcslam.cloud.claims import ClaimLimits, with_least_noise
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
+from fcslam.lidar.frontend import motion_information
+from fcslam.lidar.odometry import OdometryConfig
+from fcslam.lidar.tracker import TrackedScan
+from fcslam.lidar.verification import VerificationConfig
 from fcslam.records import Channel, ConstraintKind, LaserModel, frozen
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
@@ -93,3 +97,36 @@ def test_a_precision_that_no_lidar_has_is_refused(information, refused, kind):
     reasons = list(refusals(bodies).values())
     assert bool(reasons) is refused
     assert not refused or "claims a standard deviation of" in reasons[0]
+
+
+LEAST = {ConstraintKind.ODOMETRY: (0.013, 0.013, 0.003), ConstraintKind.CLOSURE: (0.03, 0.03, 0.006)}
+"""Standard deviations of scan matching at its best, over a metre with 0.2 rad."""
+
+
+@pytest.mark.parametrize("kind", ConstraintKind)
+def test_no_claim_is_more_precise_than_scan_matching(kind):
+    """In every direction: what is claimed beyond the least noise counts as the least noise, the rest stays."""
+    rng, unit = np.random.default_rng(0), np.outer(LEAST[kind], LEAST[kind])
+    changed = 0
+    for _ in range(200):
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        claimed = 10.0 ** rng.uniform(-3, 3, size=3)
+        information = (axes * claimed) @ axes.T / unit
+        claim = replace(motion("a", 0, 1, np.array((1.0, 0.0, 0.2)), kind), information=frozen(information))
+        found = with_least_noise(claim, VerificationConfig())
+        assert (found is claim) == (claimed.max() <= 1.01)
+        np.testing.assert_allclose(
+            np.diag(axes.T @ (found.information * unit) @ axes), np.minimum(claimed, 1.01), rtol=0.02
+        )
+        changed += found is not claim
+    assert 50 < changed < 200
+
+
+def test_what_robots_state_is_within_the_least_noise():
+    """However many points a scan has."""
+    for information in (np.zeros((3, 3)), np.diag((1e4, 1e4, 1e5)), 1e12 * np.eye(3)):
+        for step in ((0.25, 0.0, 0.0), (0.0, 0.0, 0.25), (1.0, 0.3, -1.2)):
+            tracked = TrackedScan(np.array((1.0, 2.0, 0.7)), information, None)
+            stated = motion_information(np.array(step), tracked, OdometryConfig())
+            claim = replace(motion("a", 0, 1, np.array(step)), information=frozen(stated))
+            assert with_least_noise(claim, VerificationConfig()) is claim

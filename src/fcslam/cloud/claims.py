@@ -1,6 +1,7 @@
 """What a robot may claim: bounds that no robot with a 2D LiDAR exceeds, so that none can exhaust or bend a mission."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
@@ -8,7 +9,9 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
-from fcslam.records import Constraint, FloatArray, Place
+from fcslam.lidar.frontend import least_sigmas
+from fcslam.lidar.verification import VerificationConfig
+from fcslam.records import Constraint, ConstraintKind, FloatArray, Place, frozen
 
 _ROUNDING = 1.01
 """Information is sent in single precision, and standard deviations are compared by its diagonal."""
@@ -52,6 +55,32 @@ def check_constraint(constraint: Constraint, largest_m: float, limits: ClaimLimi
             f"{name} claims a standard deviation of {max(x, y) ** -0.5:.3g} m and {theta**-0.5:.3g} rad, at least "
             f"{limits.sigma_m:g} m and {limits.sigma_rad:g} rad (fleet.claims)"
         )
+
+
+def with_least_noise(constraint: Constraint, closing: VerificationConfig) -> Constraint:
+    """The constraint with the precision that scan matching has at best.
+
+    Robots state no more: more points do not reduce the errors of matching that neighbouring points share, nor those of
+    the scanner's calibration (``least_sigmas``, ``closing.closure_sigma_m``). So this changes only claims that are
+    false.
+    """
+    if constraint.kind is ConstraintKind.ODOMETRY:
+        x, y, theta = constraint.T_i_j.tolist()
+        sigma_m, sigma_rad = least_sigmas(math.hypot(x, y), abs(theta))
+    else:
+        sigma_m, sigma_rad = closing.closure_sigma_m, closing.closure_sigma_rad
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = constraint.information.tolist()
+    # Without arrays: whether no eigenvalue of the information is above _ROUNDING, in units of the least noise.
+    x, y, t = (_ROUNDING - scaled for scaled in (xx * sigma_m**2, yy * sigma_m**2, tt * sigma_rad**2))
+    xy, xt, yt = xy * sigma_m**2, xt * sigma_m * sigma_rad, yt * sigma_m * sigma_rad
+    if x > 0.0:
+        second, rest = y - xy * xy / x, yt + xy * xt / x
+        if second > 0.0 and t - xt * xt / x - rest * rest / second > 0.0:
+            return constraint
+    unit = np.array((sigma_m, sigma_m, sigma_rad))
+    eigenvalues, axes = np.linalg.eigh(constraint.information * np.outer(unit, unit))
+    information = (axes * np.minimum(eigenvalues, 1.0)) @ axes.T / np.outer(unit, unit)
+    return replace(constraint, information=frozen(0.5 * (information + information.T)))
 
 
 def check_distance(T_odom_base: FloatArray, robot: str, limits: ClaimLimits) -> None:

@@ -7,7 +7,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Self
 
-from fcslam.cloud.claims import check_constraint, check_submap
+from fcslam.cloud.claims import check_constraint, check_submap, with_least_noise
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
 from fcslam.cloud.edits import is_removed
@@ -93,11 +93,11 @@ class Fleet:
                 self._add_keyscan(keyscan, packet.sequence)
             case Constraint(kind=ConstraintKind.ODOMETRY) as motion:
                 self._sessions.add_motion(motion)
-                self._graph.extend(motion)
+                self._graph.extend(with_least_noise(motion, self._config.matcher.verification))
             case Constraint() as closure:
                 self._sessions.require(KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j))
                 check_constraint(closure, self._config.claims.closure_m, self._config.claims)
-                self._decisions.add_local(closure)
+                self._decisions.add_local(with_least_noise(closure, self._config.matcher.verification))
             case Place() as place:
                 self._check_submap(place)
                 self._sessions.add_place(place)

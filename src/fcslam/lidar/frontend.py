@@ -237,11 +237,15 @@ def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: Odome
     if not tracked.information.any():  # odometry alone, and the wheels may have slipped
         prior = odometry_error(moved, turned, odometry).information
     covariance = np.linalg.inv(POINT_INFORMATION_SHARE * turn.T @ tracked.information @ turn + prior)
-    floor_m = FLOOR_SIGMA_M + FLOOR_SIGMA_PER_TRAVEL * moved
-    floor_rad = FLOOR_SIGMA_RAD + FLOOR_SIGMA_PER_TURN * turned
+    floor_m, floor_rad = least_sigmas(moved, turned)
     floor = np.diag((floor_m**2, floor_m**2, floor_rad**2))
     information = np.linalg.inv(covariance + floor)
     return np.asarray(0.5 * (information + information.T))
+
+
+def least_sigmas(moved_m: float, turned_rad: float) -> tuple[float, float]:
+    """Least standard deviations of the position (m) and heading (rad) between two consecutive keyscans."""
+    return FLOOR_SIGMA_M + FLOOR_SIGMA_PER_TRAVEL * moved_m, FLOOR_SIGMA_RAD + FLOOR_SIGMA_PER_TURN * turned_rad
 
 
 def _valid_ranges(ranges_m: Ranges, max_range_m: float) -> Ranges:
