@@ -33,20 +33,12 @@ from fcslam.errors import (
 )
 
 if TYPE_CHECKING:
-    from fcslam.api import localize, map_recordings
+    from fcslam.api import map_recordings
+    from fcslam.live.records import EventKind, RobotEvent, RobotPose
+    from fcslam.live.robot import Robot
     from fcslam.mission import MissionConfig, Progress
-    from fcslam.records import Channel, ClosureStatus, Veto
-    from fcslam.runs import (
-        ClosureRow,
-        LocalizedPoses,
-        LocalMap,
-        Metric,
-        Occupancy,
-        OccupancyMap,
-        RobotTrajectory,
-        Run,
-        open_run,
-    )
+    from fcslam.records import Channel, ClosureStatus, LaserModel, Veto
+    from fcslam.runs import ClosureRow, LocalMap, Metric, Occupancy, OccupancyMap, RobotTrajectory, Run, open_run
     from fcslam.sources import BagOptions
 
 __version__ = "0.1.0"
@@ -59,11 +51,12 @@ __all__ = [
     "CloudError",
     "ConfigError",
     "EvaluationError",
+    "EventKind",
     "FcslamError",
     "FeatureError",
     "InputError",
+    "LaserModel",
     "LocalMap",
-    "LocalizedPoses",
     "Metric",
     "MissionConfig",
     "Occupancy",
@@ -73,6 +66,9 @@ __all__ = [
     "PacketConflictError",
     "PacketError",
     "Progress",
+    "Robot",
+    "RobotEvent",
+    "RobotPose",
     "RobotTrajectory",
     "Run",
     "ServiceError",
@@ -84,7 +80,6 @@ __all__ = [
     "UnavailableError",
     "Veto",
     "__version__",
-    "localize",
     "map_recordings",
     "open_run",
 ]
@@ -94,17 +89,20 @@ _LAZY: Final = {
     "Channel": "fcslam.records",
     "ClosureRow": "fcslam.runs",
     "ClosureStatus": "fcslam.records",
+    "EventKind": "fcslam.live.records",
+    "LaserModel": "fcslam.records",
     "LocalMap": "fcslam.runs",
-    "LocalizedPoses": "fcslam.runs",
     "Metric": "fcslam.runs",
     "MissionConfig": "fcslam.mission",
     "Occupancy": "fcslam.runs",
     "OccupancyMap": "fcslam.runs",
     "Progress": "fcslam.mission",
+    "Robot": "fcslam.live.robot",
+    "RobotEvent": "fcslam.live.records",
+    "RobotPose": "fcslam.live.records",
     "RobotTrajectory": "fcslam.runs",
     "Run": "fcslam.runs",
     "Veto": "fcslam.records",
-    "localize": "fcslam.api",
     "map_recordings": "fcslam.api",
     "open_run": "fcslam.runs",
 }

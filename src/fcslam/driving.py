@@ -102,10 +102,11 @@ def _legs(source: Source, config: RobotConfig) -> Iterator[Leg]:
             packets, stamps = [], []
     packets += map(measure, robot.finish())
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
-    yield Leg(robot.robot, tuple(packets), tuple(stamps), tuple(map(_track, robot.tracks)), faults)
+    yield Leg(robot.robot, tuple(packets), tuple(stamps), tuple(map(track_of, robot.tracks)), faults)
 
 
-def _track(poses: ScanTrack) -> Track:
+def track_of(poses: ScanTrack) -> Track:
+    """A robot's scans of one session, as a run needs them."""
     return Track(poses.stamps, poses.keyscans, poses.T_keyscan_base)
 
 

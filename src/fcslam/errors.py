@@ -13,6 +13,7 @@ FcslamError
 │   ├── StoreError        a mission cannot be stored or read: the disk is full, or the file is damaged
 │   ├── EditError         an edit of a mission cannot be undone or read
 │   ├── StateError        a robot's state folder cannot be used
+│   ├── NetworkError      a ROS network cannot be used: its middleware, its topics or its transforms are missing
 │   └── CloudError        the cloud rejects a robot: its token, its name or its packets
 │       └── OversizeError     a request is too large
 ├── PacketError           received bytes are not a valid packet
@@ -63,6 +64,10 @@ class EditError(InputError):
 
 class StateError(InputError):
     """A robot's state folder belongs to another robot or recording, is in use, or is damaged."""
+
+
+class NetworkError(InputError):
+    """A ROS network cannot be used: its middleware, its topics or its transforms are missing."""
 
 
 class CloudError(InputError):

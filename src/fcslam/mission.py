@@ -26,6 +26,7 @@ from fcslam.sources import Source
 from fcslam.sources.faults import Faults
 from fcslam.wire.checks import check_name
 from fcslam.wire.ledger import Counter
+from fcslam.wire.messages import Packet
 from fcslam.wire.packets import SizedPacket, measure
 
 
@@ -73,28 +74,60 @@ def run_mission(
     """
     _check_robots(sources)
     _check_vetoes(vetoes, [source.name for source in sources])
-    cloud = Cloud(config.fleet, config.seed)
+    cloud = MissionCloud(config)
     cloud.fleet.edit(vetoes)
-    traffic = Counter()
     meter = _Meter(watch, cloud.fleet, [source.name for source in sources])
     with drive(sources, config.robot) as robots:
         streams = [_packets(legs, meter) for legs in robots]
         for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
-            try:
-                replies = cloud.apply(sent.packet)
-            except PacketError as error:
-                raise FcslamError(f"{sent.packet.robot}: the cloud refused a packet: {error}") from error
-            for packet in (sent, *map(measure, replies)):
-                traffic.accept(packet.label, packet.size)
+            cloud.apply(sent)
     meter.report(fusing=True)
-    scans = (Metric("scans", meter.scans, "1"), Metric("recorded_time", meter.recorded_s, "s"))
     tracks = {
         session_name(robot, epoch): track
         for robot, sessions in meter.tracks.items()
         for epoch, track in enumerate(sessions)
     }
-    metrics = (*scans, *traffic_metrics(traffic.ledger(), tracks))
-    return run_of(cloud.finalize(), tracks, metrics, dump(config), config.map)
+    return cloud.run(tracks, meter.scans, meter.recorded_s)
+
+
+class MissionCloud:
+    """The cloud of a mission within one process; it counts what is sent."""
+
+    def __init__(self, config: MissionConfig) -> None:
+        self.config = config
+        self._cloud = Cloud(config.fleet, config.seed)
+        self._traffic = Counter()
+
+    @property
+    def fleet(self) -> Fleet:
+        """The fleet, for vetoes and counts."""
+        return self._cloud.fleet
+
+    def apply(self, sent: SizedPacket) -> list[Packet]:
+        """Apply the next packet of a robot; returns the replies to it.
+
+        Raises:
+            FcslamError: the cloud refuses it.
+        """
+        try:
+            replies = self._cloud.apply(sent.packet)
+        except PacketError as error:
+            raise FcslamError(f"{sent.packet.robot}: the cloud refused a packet: {error}") from error
+        for packet in (sent, *map(measure, replies)):
+            self._traffic.accept(packet.label, packet.size)
+        return replies
+
+    def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
+        """The result of all packets so far.
+
+        Args:
+            tracks: the scans of every session that sent packets; gives the order of the sessions.
+            scans: number of scans.
+            recorded_s: length of the recordings together, seconds.
+        """
+        counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
+        metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
+        return run_of(self._cloud.finalize(), tracks, metrics, dump(self.config), self.config.map)
 
 
 def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:

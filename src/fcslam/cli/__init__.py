@@ -8,9 +8,8 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import certificates, config, demo, evaluate, extract, federate, serve, simulate, train
+from fcslam.cli import certificates, config, demo, evaluate, extract, federate, live, serve, simulate, train
 from fcslam.cli import convert as conversion
-from fcslam.cli import localize as localization
 from fcslam.cli import map as mapping
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
@@ -38,13 +37,6 @@ app.command(
     ),
 )(mapping.map_recordings)
 app.command(
-    "localize",
-    epilog=examples(
-        "fcslam localize today.bag --map runs/building",
-        "fcslam localize today.bag --map office.yaml --initial-pose 2,3.5,1.57",
-    ),
-)(localization.localize)
-app.command(
     "convert",
     epilog=examples(
         "fcslam convert robot1.clf.gz robot1.bag",
@@ -67,9 +59,14 @@ app.command(
     epilog=examples(
         "fcslam robot robot1.clf.gz --server http://127.0.0.1:8340 --state state",
         "fcslam robot robot1.bag --server https://cloud:8340 --state s --token-file t",
+        "fcslam robot ros2:/robot1 -o runs/robot1",
         "fcslam robot --explain-traffic",
     ),
 )(robots.robot)
+app.command(
+    "record",
+    epilog=examples("fcslam record ros2:/robot1 -o day.mcap", "fcslam record ros1:/ -o day.bag --duration 600"),
+)(live.record)
 app.command(
     "serve",
     epilog=examples(

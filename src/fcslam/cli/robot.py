@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.mission_options import ConfigFile, mission_config
-from fcslam.cli.options import Quiet
-from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.options import Quiet, output_option
+from fcslam.cli.output import RUNS, answers, notices, print_line
 from fcslam.cli.recordings import (
     CameraTopic,
     LaserPose,
@@ -22,6 +22,7 @@ from fcslam.cli.recordings import (
     print_faults,
     print_notes,
 )
+from fcslam.cli.ros_options import DomainId, RosParameters, UseSimTime, node_parameters
 from fcslam.cli.warm_up import compiled
 
 if TYPE_CHECKING:
@@ -100,15 +101,27 @@ def robot(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="LOG", help="The robot's recording. The file names the robot; NAME=LOG gives another name."
+            metavar="LOG",
+            help="The robot's recording, which names the robot; NAME=LOG gives another name. Or a live robot: "
+            "ros2:/NAMESPACE or ros1:/NAMESPACE, without a namespace ros2:/.",
         ),
     ],
     *,
-    server: Annotated[str, typer.Option(metavar="URL", help="Address of the cloud, as in https://cloud.example:8443.")],
+    server: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Address of the cloud, as in https://cloud.example:8443. A live robot without one maps alone.",
+        ),
+    ] = None,
     state: Annotated[
-        Path,
+        Path | None,
         typer.Option(help="Folder of the packets that the cloud has not confirmed. Each robot needs its own; keep it."),
-    ],
+    ] = None,
+    output: Annotated[
+        Path | None,
+        output_option("Run folder of a live robot that maps alone.", RUNS),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
     ] = False,
@@ -130,15 +143,30 @@ def robot(
     odom_topic: OdomTopic = None,
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
+    domain: DomainId = None,
+    ros_parameters: RosParameters = None,
+    use_sim_time: UseSimTime = False,
     quiet: Quiet = False,
     _explain: ExplainTraffic = False,
 ) -> None:
-    """Map a recording as one robot and send places and keyscans to the cloud, through outages and restarts."""
+    """Map a recording or a live robot, and send places and keyscans to the cloud, through outages and restarts."""
+    from fcslam.bridges.addresses import is_address
+    from fcslam.cli.live import map_live
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.errors import InputError
     from fcslam.robot.agent import PlaybackPace
+    from fcslam.sources import BagOptions
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
+    if is_address(source):
+        if server is not None:
+            raise InputError("a live robot maps alone so far; leave out --server")
+        options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose) or BagOptions()
+        parameters = node_parameters(ros_parameters, use_sim_time)
+        map_live(source, name, mission_config(config), options, domain, parameters, output, notices(quiet))
+        return
+    server, state = _required(server, state)
     keep_private()
     pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
     settings = mission_config(config).robot
@@ -163,6 +191,17 @@ def robot(
             raise
         print_faults(console, {recording.name: recording.faults.plus(Fault.ODOMETRY_JUMP, agent.odometry_jumps)})
         _report(agent, state, server)
+
+
+def _required(server: str | None, state: Path | None) -> tuple[str, Path]:
+    """What the robot of a recording needs."""
+    from fcslam.errors import InputError
+
+    if server is None or state is None:
+        raise InputError(
+            "a recording needs --server and --state; `fcslam map` maps it without, and ros2:/NAMESPACE is a live robot"
+        )
+    return server, state
 
 
 @contextmanager

@@ -146,7 +146,7 @@ class LidarFrontend:
         # 2. After enough motion the scan becomes a keyscan.
         laser = self._lasers.index(scan.laser)
         keyscan = self._add_keyscan(scan, tracked, laser) if self._is_keyscan(tracked, laser) else None
-        return Step(self._scan_pose(scan.stamp, tracked), keyscan)
+        return Step(self.scan_pose(scan.stamp, tracked), keyscan)
 
     @property
     def lasers(self) -> tuple[LaserModel, ...]:
@@ -180,7 +180,8 @@ class LidarFrontend:
             or abs(motion[2]) >= gate.minimum_travel_heading_rad
         )
 
-    def _scan_pose(self, stamp: float, tracked: TrackedScan) -> ScanPose:
+    def scan_pose(self, stamp: float, tracked: TrackedScan) -> ScanPose:
+        """Pose of a localized scan relative to the newest keyscan, of which there is one after the first scan."""
         assert self._newest is not None  # the first scan is a keyscan
         return ScanPose(stamp, self._count - 1, se2.between(self._newest.T_local_base, tracked.T_local_base))
 

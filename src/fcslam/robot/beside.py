@@ -62,10 +62,15 @@ class Beside:
         return self._executor.submit(_process, self._robot, input)
 
 
+def worker_process() -> ProcessPoolExecutor:
+    """An executor with one worker, another process with a lower priority than this one."""
+    return ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+
+
 @contextmanager
 def backend_process(robot: str, config: SessionConfig) -> Iterator[Beside]:
     """A back end in a process of its own, which ends with this block."""
-    executor = ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+    executor = worker_process()
     try:
         yield Beside(robot, config, executor)
     finally:

@@ -8,6 +8,7 @@ processed normally. If they show another place, the robot is lost: its session e
 one begins with them, as after a restart. So no unmeasured motion enters a map.
 """
 
+import math
 from collections import deque
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from pydantic import Field
 from fcslam.errors import FeatureError
 from fcslam.lidar.frontend import LidarFrontend, ScanPose
 from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
-from fcslam.lidar.tracker import TrackingResult
+from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord
 from fcslam.robot.backend import (
     BackendInput,
@@ -31,7 +32,6 @@ from fcslam.robot.backend import (
     essential,
 )
 from fcslam.robot.beside import BackendRunner, Inline
-from fcslam.robot.map_localizer import MapLocalizationConfig
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.messages import Body, Hello, Packet
@@ -45,9 +45,6 @@ class RobotConfig(SessionConfig):
     odometry: OdometryLimits = Field(
         default=OdometryLimits(), description="jumps of the wheel odometry, which scan matching bridges"
     )
-    localization: MapLocalizationConfig = Field(
-        default=MapLocalizationConfig(), description="localisation in a finished map, which does not change"
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +56,18 @@ class _Waiting:
     epoch: int
     time: float
     """The largest stamp so far."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewestScan:
+    """The tracker's result for the newest scan."""
+
+    pose: ScanPose
+    tracked: TrackedScan
+    quality: float
+    """Share of the points in known area that lie on a surface; NaN if the scan was not matched."""
+    is_deferred: bool
+    """Whether it waits for the decision whether the robot is lost."""
 
 
 class RobotFrontend:
@@ -87,8 +96,10 @@ class RobotFrontend:
         self._sequence = 0
         self._hello: Hello | None = None
         """The last hello of the present session."""
+        self.newest: NewestScan | None = None
+        """The newest scan; None before the first."""
         self._newest: tuple[LaserScan, ScanPose] | None = None
-        """The newest scan of the present session."""
+        """The newest scan of the present session that was processed."""
         self._scans: dict[tuple[float, float, float], LaserScan] = {}
         """The newest scan of each laser, by its mounting."""
         self._deferred: list[LaserScan | CameraImage] = []
@@ -103,14 +114,14 @@ class RobotFrontend:
         return self.tracks[-1]
 
     @property
-    def travel_m(self) -> float:
-        """Path length of the present session up to its newest keyscan, metres; turns count a little."""
-        return self._lidar.travel_m
-
-    @property
     def backlog(self) -> int:
         """Number of inputs that the back end has not handled yet."""
         return len(self._waiting)
+
+    @property
+    def newest_output(self) -> "Future[list[Body]] | None":
+        """Done when the back end has handled everything so far; None if it has."""
+        return self._waiting[-1].output if self._waiting else None
 
     def process(self, record: SensorRecord) -> list[Packet]:
         """Process the next record of the recording; returns the packets that are ready."""
@@ -173,6 +184,7 @@ class RobotFrontend:
         if self._T_local_deferred is None:
             self._T_local_deferred = tracking.tracked.T_local_base
         self._deferred.append(scan)
+        self.newest = _newest(self._lidar.scan_pose(scan.stamp, tracking.tracked), tracking, is_deferred=True)
         scans = [record for record in self._deferred if isinstance(record, LaserScan)]
         if not can_decide(scans, config):
             return
@@ -207,6 +219,7 @@ class RobotFrontend:
                 self.scan_poses.extend(keyscan.odometry.T_i_j)
             self._submit(NewKeyscan(keyscan, self._lidar.lasers))
         self.scan_poses.add(step.pose)
+        self.newest = _newest(step.pose, tracking, is_deferred=False)
         self._newest = scan, step.pose
         self._scans[scan.laser.T_base_laser] = scan
 
@@ -239,3 +252,8 @@ class RobotFrontend:
         is_known = last is not None and last.lasers == lasers
         hello = Hello(self.robot, done.epoch, lasers, {} if last is None else last.detector_versions)
         return [*([] if is_known else [hello]), *essential(done.input)]
+
+
+def _newest(pose: ScanPose, tracking: TrackingResult, is_deferred: bool) -> NewestScan:
+    quality = tracking.explained / tracking.known if tracking.known > 0.0 else math.nan
+    return NewestScan(pose, tracking.tracked, quality, is_deferred)

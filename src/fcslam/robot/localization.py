@@ -21,6 +21,11 @@ class Localizer:
             self._corrected = correction, self._clock()
 
     @property
+    def correction(self) -> Correction | None:
+        """The newest correction; None before the first one."""
+        return None if self._corrected is None else self._corrected[0]
+
+    @property
     def map_index(self) -> int | None:
         """Index of the robot's map; None before the first correction."""
         return None if self._corrected is None else self._corrected[0].map_index

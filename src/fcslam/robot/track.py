@@ -40,6 +40,11 @@ class ScanTrack:
         """Append the next keyscan by the motion to it from the one before, shape (3,), as it is sent to the cloud."""
         self._T_odom_keyscan.extend(se2.compose(np.array(self._T_odom_keyscan[-3:]), motion))
 
+    def in_odom(self, pose: ScanPose) -> FloatArray:
+        """``T_odom_base`` of a scan whose keyscan is in this track, shape (3,), metres and radians."""
+        first = 3 * pose.keyscan
+        return se2.compose(np.array(self._T_odom_keyscan[first : first + 3]), pose.T_keyscan_base)
+
     @property
     def stamps(self) -> FloatArray:
         """Stamp of each scan, shape (N,), seconds."""
@@ -55,12 +60,11 @@ class ScanTrack:
         """Pose of each scan in its keyscan's base, shape (N, 3), metres and radians."""
         return np.array(self._T_keyscan_base).reshape(-1, 3)
 
-    def T_odom_base_of(self, index: int) -> FloatArray:
-        """Pose of one scan in ``odom``, shape (3,), metres and radians."""
-        scan = self[index]
-        T_odom_keyscan = np.array(self._T_odom_keyscan[3 * scan.keyscan : 3 * scan.keyscan + 3])
-        return se2.compose(T_odom_keyscan, scan.T_keyscan_base)
+    @property
+    def T_odom_keyscan(self) -> FloatArray:
+        """Pose of each keyscan in ``odom``, shape (K, 3), metres and radians."""
+        return np.array(self._T_odom_keyscan).reshape(-1, 3)
 
     def T_odom_base(self) -> FloatArray:
         """Pose of each scan in ``odom``, shape (N, 3), metres and radians."""
-        return se2.compose(np.array(self._T_odom_keyscan).reshape(-1, 3)[self.keyscans], self.T_keyscan_base)
+        return se2.compose(self.T_odom_keyscan[self.keyscans], self.T_keyscan_base)

@@ -141,7 +141,7 @@ def _scans(bag: BagFile) -> list[Topic]:
 
 
 def _measured(bag: BagFile) -> list[Topic]:
-    return [topic for topic in _heard(bag) if topic.type == ODOMETRY and not _is_truth(topic)]
+    return [topic for topic in _heard(bag) if topic.type == ODOMETRY and not is_truth(topic.name)]
 
 
 def _common(candidates: Sequence[Sequence[Topic]]) -> list[Topic]:
@@ -237,8 +237,9 @@ def _slashed(name: str) -> str:
     return "/" + name.strip("/")
 
 
-def _is_truth(topic: Topic) -> bool:
-    return any(truth in topic.name.lower() for truth in _TRUTHS)
+def is_truth(name: str) -> bool:
+    """Whether a topic of this name holds the ground truth."""
+    return any(truth in name.lower() for truth in _TRUTHS)
 
 
 def _basename(topic: Topic) -> str:

@@ -1,0 +1,1 @@
+"""Live robots on a ROS network, without a ROS installation: messages in, map and pose out."""

@@ -1,0 +1,81 @@
+"""What a bridge needs from a ROS network, whatever carries the messages.
+
+Messages are bytes here; ``sources.bags.codec`` decodes them, as those of bags.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+Deliver = Callable[[bytes], None]
+"""Called with the bytes of each message, in a thread of the network."""
+Publish = Callable[[bytes], None]
+"""Sends the bytes of one message. Any thread may call it."""
+
+_TOPICS_NAMED = 15
+
+
+class Quality(NamedTuple):
+    """Quality of service of a publisher or a subscription."""
+
+    reliable: bool
+    """Lost messages are sent again."""
+    latched: bool = False
+    """A late subscriber gets the last messages (transient local)."""
+    depth: int = 10
+    """Number of messages that are kept."""
+
+
+class Endpoint(NamedTuple):
+    """A publisher or a subscription in the network."""
+
+    topic: str
+    """With a leading slash."""
+    kind: str
+    """Type of the messages as in ROS 1, without ``msg/``."""
+    publishes: bool
+    quality: Quality
+    own: bool = False
+    """Whether it belongs to this process."""
+
+
+class RosNetwork(Protocol):
+    """A connection to a ROS network."""
+
+    ros1: bool
+    """Whether messages are those of ROS 1."""
+
+    def endpoints(self) -> Sequence[Endpoint]:
+        """The publishers and subscriptions that are known now."""
+
+    def subscribe(self, topic: str, kind: str, quality: Quality, deliver: Deliver) -> None:
+        """Deliver the messages of a topic from now on."""
+
+    def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
+        """Begin to publish a topic."""
+
+    def close(self) -> None:
+        """Leave the network; nothing is delivered afterwards."""
+
+
+def qos_conflict(offered: Quality, requested: Quality) -> str | None:
+    """Why a subscription gets nothing from a publisher; None if it does."""
+    if requested.reliable and not offered.reliable:
+        return "asks for reliable messages, and the publisher is best effort"
+    if requested.latched and not offered.latched:
+        return "asks for transient local messages, and the publisher is volatile"
+    return None
+
+
+def published(endpoints: Sequence[Endpoint]) -> dict[str, str]:
+    """The topics that others publish, with their types, in the order of their names."""
+    return {point.topic: point.kind for point in sorted(endpoints) if point.publishes and not point.own}
+
+
+def named_topics(endpoints: Sequence[Endpoint]) -> str:
+    """A list of the topics that others publish, with their types, for messages."""
+    topics = published(endpoints)
+    if not topics:
+        return "nobody publishes anything that this process sees"
+    named = ", ".join(f"{topic} ({kind})" for topic, kind in list(topics.items())[:_TOPICS_NAMED])
+    more = f" and {len(topics) - _TOPICS_NAMED} more" if len(topics) > _TOPICS_NAMED else ""
+    return f"the topics are {named}{more}"

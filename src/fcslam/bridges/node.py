@@ -1,0 +1,322 @@
+"""A live robot on a ROS network: reads its sensors, maps, and publishes map and pose.
+
+Messages are read in the thread that calls ``run``. A second thread publishes ``map -> odom`` at a fixed rate, a third
+one the map, the path and diagnostics, so that neither delays the pose of a scan.
+"""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from fcslam.bridges.clock import CLOCK, CLOCK_TOPIC, RosClock
+from fcslam.bridges.network import Endpoint, Quality, RosNetwork, named_topics, qos_conflict
+from fcslam.bridges.outputs import MAP, POSE, OutputNames, Outputs, nanoseconds
+from fcslam.bridges.parameters import NodeParameters
+from fcslam.bridges.sensors import LiveSensors, Notify
+from fcslam.bridges.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
+from fcslam.bridges.transform_stream import TransformStream
+from fcslam.errors import FcslamError, NetworkError
+from fcslam.records import LaserScan, SensorRecord
+from fcslam.runs import RobotTrajectory
+from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
+from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, SCAN, MessageCodec
+from fcslam.sources.bags.options import BagOptions
+from fcslam.storage.files import write_file
+
+if TYPE_CHECKING:
+    from fcslam.live.records import RobotPose
+
+STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
+SAVE_MAP, FINISH, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "initialpose"
+_LONGEST_INBOX = 20_000
+"""Most messages that wait to be read; beyond, newer ones are lost."""
+_POLL_S = 0.1
+_SILENCE_S = 2.0
+"""A pause of the scans that is longer is told."""
+_DEPTHS = {SCAN: 100, COMPRESSED_IMAGE: 10, IMAGE: 10, CAMERA_INFO: 1}
+_DEPTH = 1000
+"""Messages that the middleware keeps for this process; of odometry and tf there are many."""
+
+
+class LiveRobot(Protocol):
+    """The robot that maps; ``fcslam.Robot`` is one."""
+
+    name: str
+
+    def add(self, record: SensorRecord) -> "RobotPose | None":
+        """The next record; returns the pose of a scan."""
+
+    def map(self) -> OccupancyMap:
+        """The map now."""
+
+    def trajectory(self) -> RobotTrajectory:
+        """The poses of all scans now."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Message:
+    topic: str
+    payload: bytes
+    received_ns: int
+
+
+def await_sensors(
+    network: RosNetwork, namespace: str, options: BagOptions, timeout_s: float, settle_s: float = 1.0
+) -> SensorTopics:
+    """The topics of the robot's sensors, once they are there; ``settle_s`` later, so that all of them are.
+
+    Raises:
+        NetworkError: a topic is missing, or of another type.
+    """
+    end_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            choose_sensor_topics(network.endpoints(), namespace, options)
+            time.sleep(settle_s)
+            return choose_sensor_topics(network.endpoints(), namespace, options)
+        except NetworkError:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(_POLL_S)
+
+
+class RobotNode:
+    """One robot between a ROS network and its map."""
+
+    def __init__(
+        self,
+        network: RosNetwork,
+        namespace: str,
+        topics: SensorTopics,
+        options: BagOptions,
+        robot: LiveRobot,
+        parameters: NodeParameters,
+        notify: Notify,
+    ) -> None:
+        """Begin to receive and to publish.
+
+        Raises:
+            NetworkError: another node publishes what this one would.
+        """
+        self._network, self._namespace, self._topics = network, namespace, topics
+        self._robot, self._parameters, self._notify = robot, parameters, notify
+        self._codec = MessageCodec(network.ros1)
+        self._inbox: queue.SimpleQueue[_Message] = queue.SimpleQueue()
+        self._stop = threading.Event()
+        self._told: set[str] = set()
+        self.scans = self._lost_messages = 0
+        self._pose: RobotPose | None = None
+        self._clock = RosClock(parameters.use_sim_time)
+        self._refuse_namesake()
+        names = OutputNames(map_frame=parameters.map_frame, tf=topics.transforms[0])
+        self._outputs = Outputs(network, namespace, names)
+        self._transforms = TransformStream(
+            nanoseconds(parameters.transform_bound), nanoseconds(parameters.transform_timeout)
+        )
+        self.sensors = LiveSensors(topics, namespace, options, network.ros1, self._tell_once)
+        self._restarts = 0
+        self._subscribe()
+
+    def run(self, watch: Callable[[int], None] = lambda _: None) -> None:
+        """Map until ``stop``; ``watch`` gets the number of scans so far after each.
+
+        Raises:
+            NetworkError: the robot cannot be mapped: the odometry, a mounting or /clock is missing.
+        """
+        threads = [
+            threading.Thread(target=self._publish_transforms, name="tf", daemon=True),
+            threading.Thread(target=self._publish_maps, name="maps", daemon=True),
+        ]
+        for thread in threads:
+            thread.start()
+        began_s = heard_s = time.monotonic()
+        is_silent = False
+        try:
+            while not self._stop.is_set():
+                message = self._next()
+                now_s = time.monotonic()
+                before = self.scans
+                records = (
+                    self.sensors.wait(now_s)
+                    if message is None
+                    else self.sensors.add(message.topic, message.payload, now_s, message.received_ns)
+                )
+                for record in records:
+                    self._map(record)
+                    watch(self.scans)
+                if message is not None and self._topics.kinds[message.topic] == SCAN:
+                    if is_silent:
+                        self._notify(f"scans arrive again after {now_s - heard_s:.0f} s")
+                    heard_s, is_silent = now_s, False
+                elif not is_silent and now_s > heard_s + _SILENCE_S and before:
+                    self._notify(f"no scan for {_SILENCE_S:.0f} s; the robot waits for the network or the driver")
+                    is_silent = True
+                if not self._clock.is_running and now_s > began_s + self._parameters.topic_timeout:
+                    raise NetworkError(
+                        "use_sim_time is set and nobody publishes /clock; start the simulator, play the bag with "
+                        f"--clock, or leave use_sim_time out; {named_topics(self._network.endpoints())}"
+                    )
+        finally:
+            self._stop.set()
+            for thread in threads:
+                thread.join()
+        for record in self.sensors.finish():
+            self._map(record)
+
+    def stop(self) -> None:
+        """End ``run`` soon. Any thread may call this."""
+        self._stop.set()
+
+    def publish_map(self) -> None:
+        """Publish the map and the path as they are now, if there is a scan.
+
+        Raises:
+            FcslamError: the map is gone.
+        """
+        if self._pose is None:
+            return
+        stamp_ns = nanoseconds(self._pose.stamp)
+        if self._outputs.map(stamp_ns, self._robot.map()):
+            trajectory = self._robot.trajectory()
+            self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
+
+    def _next(self) -> _Message | None:
+        try:
+            return self._inbox.get(timeout=_POLL_S)
+        except queue.Empty:
+            return None
+
+    def _map(self, record: SensorRecord) -> None:
+        pose = self._robot.add(record)
+        if self.sensors.restarts != self._restarts:
+            self._restarts = self.sensors.restarts
+            self._transforms.restart()
+        if not isinstance(record, LaserScan) or pose is None:
+            return
+        self.scans += 1
+        self._pose = pose
+        stamp_ns = nanoseconds(pose.stamp)
+        if pose.T_map_odom is not None:
+            self._transforms.add(stamp_ns, self._clock.now_ns(), pose.T_map_odom)
+        self._outputs.pose(stamp_ns, pose.T_map_base, pose.covariance)
+
+    def _publish_transforms(self) -> None:
+        period_s = self._parameters.transform_publish_period
+        due_s = time.monotonic()
+        while not self._stop.wait(max(0.0, due_s - time.monotonic())):
+            transform = self._transforms.due(self._clock.now_ns())
+            if transform is not None:
+                self._outputs.transform(transform.stamp_ns, self.sensors.odom_frame, transform.T_map_odom)
+            due_s = max(due_s + period_s, time.monotonic() - period_s)
+
+    def _publish_maps(self) -> None:
+        """Publish diagnostics every second and the map every interval."""
+        due_s = 0.0
+        drawn = 0
+        while not self._stop.wait(1.0):
+            self.watch_network()
+            self._diagnose()
+            if time.monotonic() < due_s or self.scans == drawn:
+                continue
+            drawn, due_s = self.scans, time.monotonic() + self._parameters.map_update_interval
+            try:
+                self.publish_map()
+            except FcslamError as error:
+                self._tell_once(f"no map is published any more: {error}")
+
+    def _diagnose(self) -> None:
+        pose = self._pose
+        trouble = "no scan yet" if pose is None else "" if pose.is_localized else "lost: the scans contradict the map"
+        values: dict[str, object] = {"scans": self.scans, "messages lost": self._lost_messages}
+        if pose is not None:
+            values |= {"quality": f"{pose.quality:.3f}", "map": pose.map_index, "stamp": f"{pose.stamp:.3f}"}
+        faults = self.sensors.audit.faults()
+        values |= {"faults": str(faults)} if faults else {}
+        self._outputs.diagnostics(self._clock.now_ns(), self._robot.name, trouble, values)
+
+    def _subscribe(self) -> None:
+        offered = [point for point in self._network.endpoints() if point.publishes]
+        for topic, kind in self._topics.kinds.items():
+            # Ask for reliable messages where all publishers offer them: then none is lost.
+            reliable = all(point.quality.reliable for point in offered if point.topic == topic)
+            latched = topic.rsplit("/", 1)[-1] == TF_STATIC
+            quality = Quality(reliable or latched, latched, _DEPTHS.get(kind, _DEPTH))
+            self._network.subscribe(topic, kind, quality, self._deliver(topic))
+        commands: list[tuple[str, str, Callable[[bytes], None]]] = [
+            (SAVE_MAP, STRING, self._save_map),
+            (FINISH, EMPTY, lambda _: self.stop()),
+            (INITIAL_POSE, POSE, self._refuse_pose),
+        ]
+        for name, kind, command in commands:
+            self._network.subscribe(resolved(self._namespace, name), kind, Quality(reliable=True), command)
+        if self._clock.simulated:
+            self._network.subscribe(
+                CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload: self._clock.tick(payload, self._codec)
+            )
+
+    def _deliver(self, topic: str) -> Callable[[bytes], None]:
+        def deliver(payload: bytes) -> None:
+            if self._inbox.qsize() < _LONGEST_INBOX:
+                self._inbox.put(_Message(topic, payload, self._clock.now_ns()))
+                return
+            self._lost_messages += 1
+            self._tell_once("messages come faster than this computer can map; some are lost")
+
+        return deliver
+
+    def _save_map(self, payload: bytes) -> None:
+        """Write the files of map_server; the message is their path, without suffix."""
+        try:
+            path = Path(self._codec.decode(payload, STRING).data or self._robot.name)
+            occupancy = self._robot.map()
+            write_file(path.with_name(f"{path.name}.pgm"), pgm_bytes(occupancy))
+            write_file(path.with_name(f"{path.name}.yaml"), map_yaml(occupancy, f"{path.name}.pgm"))
+        except (ValueError, OSError, FcslamError) as error:
+            self._notify(f"the map cannot be saved: {error}")
+        else:
+            self._notify(f"map saved: {path}.pgm, {path}.yaml")
+
+    def _refuse_pose(self, _: bytes) -> None:
+        self._tell_once("an initial pose is ignored: the robot maps, and its first scan is the origin of the map")
+
+    def _refuse_namesake(self) -> None:
+        taken = resolved(self._namespace, MAP)
+        if any(point.publishes and not point.own and point.topic == taken for point in self._network.endpoints()):
+            raise NetworkError(
+                f"another node publishes {taken}: a second robot of this name, or a map_server; stop it, or give each "
+                "robot a namespace of its own"
+            )
+
+    def watch_network(self) -> None:
+        """Tell once which peers get nothing, and whether another robot has this name."""
+        endpoints = self._network.endpoints()
+        own = [point for point in endpoints if point.own]
+        for point in endpoints:
+            if point.own:
+                continue
+            for mine in own:
+                if mine.topic == point.topic:
+                    self._tell_once(_mismatch(mine, point))
+        taken = resolved(self._namespace, MAP)
+        if any(point.publishes and not point.own and point.topic == taken for point in endpoints):
+            self._tell_once(f"another node publishes {taken} now, too; two robots must not have one name")
+
+    def _tell_once(self, line: str) -> None:
+        if line and line not in self._told:
+            self._told.add(line)
+            self._notify(line)
+
+
+def _mismatch(mine: Endpoint, other: Endpoint) -> str:
+    """Why one of two endpoints of a topic does not get the messages of the other; empty if it does."""
+    if mine.kind != other.kind:
+        return f"{mine.topic}: another node takes it as {other.kind}, and not as {mine.kind}"
+    if mine.publishes == other.publishes:
+        return ""
+    offered, requested = (mine, other) if mine.publishes else (other, mine)
+    conflict = qos_conflict(offered.quality, requested.quality)
+    return f"{mine.topic}: a subscription {conflict}, so it gets nothing; change its QoS" * bool(conflict)

@@ -1,0 +1,258 @@
+"""What a robot tells the ROS network: map, pose, path, closures, tf and diagnostics.
+
+Frames are those of REP 105. The robot publishes ``map -> odom``; the driver of the base publishes
+``odom -> base``.
+"""
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import hypot
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.bridges.network import Publish, Quality, RosNetwork
+from fcslam.bridges.topics import resolved
+from fcslam.records import FloatArray
+from fcslam.runs.map_files import Cells, Occupancy, OccupancyMap
+from fcslam.sources.bags.codec import GRID_UPDATE, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.transforms import in_space
+
+GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
+MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"
+
+MAP: Final = "map"
+"""Topic of the map in the robot's namespace."""
+LATCHED: Final = Quality(reliable=True, latched=True, depth=1)
+STREAMED: Final = Quality(reliable=True, depth=10)
+TRANSFORMED: Final = Quality(reliable=True, depth=100)
+
+GRID_VALUES: Final = {Occupancy.UNKNOWN: -1, Occupancy.FREE: 0, Occupancy.OCCUPIED: 100}
+SMALL_MAP_CELLS: Final = 1_000_000
+"""A map of at most so many cells is published whole at every change."""
+PATH_STEP_M: Final = 0.1
+"""Least distance between two poses of the published path."""
+LINE_WIDTH_M: Final = 0.05
+_OK, _WARN = 0, 1
+_LINE_LIST, _ADD = 5, 0
+
+
+@dataclass(frozen=True, slots=True)
+class OutputNames:
+    """Topics and frames of what a robot publishes; topics without a leading slash are in its namespace."""
+
+    map_frame: str = "map"
+    tf: str = "/tf"
+    diagnostics: str = "/diagnostics"
+
+
+class Grid(NamedTuple):
+    """An occupancy grid as ROS has it."""
+
+    values: NDArray[np.int8]
+    """-1 unknown, 0 free, 100 occupied; shape (H, W), from the lowest y."""
+    resolution_m: float
+    origin_xy: tuple[float, float]
+
+
+class Region(NamedTuple):
+    """Cells of a grid."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+class Outputs:
+    """The publishers of one robot. Any thread may call."""
+
+    def __init__(self, network: RosNetwork, namespace: str, names: OutputNames) -> None:
+        def publisher(name: str, kind: str, quality: Quality) -> Publish:
+            return network.publisher(resolved(namespace, name), kind, quality)
+
+        self._codec = MessageCodec(network.ros1)
+        self._names = names
+        self._lock = threading.Lock()
+        self._map = publisher(MAP, GRID, LATCHED)
+        self._updates = publisher(f"{MAP}_updates", GRID_UPDATE, LATCHED)
+        self._pose = publisher("pose", POSE, STREAMED)
+        self._path = publisher("path", PATH, LATCHED)
+        self._closures = publisher("closures", MARKERS, LATCHED)
+        self._tf = publisher(names.tf, TRANSFORMS, TRANSFORMED)
+        self._diagnostics = publisher(names.diagnostics, DIAGNOSTICS, STREAMED)
+        self._whole: Grid | None = None
+        """The newest map that was published whole."""
+        self._shown: Grid | None = None
+        """The newest map that subscribers have."""
+
+    def transform(self, stamp_ns: int, odom_frame: str, T_map_odom: FloatArray) -> None:
+        """Publish ``map -> odom`` for this stamp."""
+        header = self._codec.header(stamp_ns, self._names.map_frame)
+        self._send(self._tf, TRANSFORMS, self._codec.transforms(header, odom_frame, in_space(T_map_odom)))
+
+    def pose(self, stamp_ns: int, T_map_base: FloatArray, covariance: FloatArray) -> None:
+        """Publish the pose of a scan with its covariance (3, 3) over (x, y, theta)."""
+        make = self._codec.make
+        whole = np.zeros((6, 6))
+        planar = np.ix_((0, 1, 5), (0, 1, 5))
+        whole[planar] = covariance
+        posed = make(
+            "geometry_msgs/PoseWithCovariance", pose=self._codec.pose(in_space(T_map_base)), covariance=whole.ravel()
+        )
+        header = self._codec.header(stamp_ns, self._names.map_frame)
+        self._send(self._pose, POSE, make(POSE, header=header, pose=posed))
+
+    def path(self, stamp_ns: int, stamps: FloatArray, T_map_base: FloatArray) -> None:
+        """Publish the path: stamps (N,) in seconds and poses (N, 3), thinned to steps of ``PATH_STEP_M``."""
+        header, make = self._codec.header, self._codec.make
+        frame = self._names.map_frame
+        poses = [
+            make(
+                "geometry_msgs/PoseStamped",
+                header=header(nanoseconds(stamps[at]), frame),
+                pose=self._codec.pose(in_space(T_map_base[at])),
+            )
+            for at in _steps(T_map_base)
+        ]
+        self._send(self._path, PATH, make(PATH, header=header(stamp_ns, frame), poses=poses))
+
+    def closures(self, stamp_ns: int, ends_xy: FloatArray) -> None:
+        """Publish the accepted closures as lines between two places (N, 2, 2), metres in ``map``."""
+        make, vector = self._codec.make, self._codec.vector
+        duration = make("builtin_interfaces/Duration", sec=0, nanosec=0)
+        mesh = {} if self._codec.ros1 else self._new_fields(make)
+        marker = make(
+            "visualization_msgs/Marker",
+            header=self._codec.header(stamp_ns, self._names.map_frame),
+            ns="closures",
+            id=0,
+            type=_LINE_LIST,
+            action=_ADD,
+            pose=self._codec.pose(in_space(np.zeros(3))),
+            scale=vector("Vector3", LINE_WIDTH_M),
+            color=make("std_msgs/ColorRGBA", r=0.1, g=0.6, b=0.2, a=0.8),
+            lifetime=duration,
+            frame_locked=False,
+            points=[vector("Point", x, y) for x, y in ends_xy.reshape(-1, 2).tolist()],
+            colors=[],
+            text="",
+            mesh_resource="",
+            mesh_use_embedded_materials=False,
+            **mesh,
+        )
+        self._send(self._closures, MARKERS, make(MARKERS, markers=[marker]))
+
+    def map(self, stamp_ns: int, occupancy: OccupancyMap) -> bool:
+        """Publish the map if it changed; returns whether it did.
+
+        A small map goes out whole. Of a large map, only the cells go out that differ from the last whole one. So a
+        late subscriber, who gets that one, is complete after any update.
+        """
+        grid = grid_of(occupancy)
+        with self._lock:
+            if self._shown is not None and _is_same(self._shown, grid):
+                return False
+            whole, self._shown = self._whole, grid
+            region = None if whole is None else changed_region(whole, grid)
+            if region is None or grid.values.size <= SMALL_MAP_CELLS:
+                self._whole = grid
+                self._send(self._map, GRID, self._grid_message(stamp_ns, grid))
+            else:
+                self._send(self._updates, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
+            return True
+
+    def diagnostics(self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object]) -> None:
+        """Publish the state of the robot; ``trouble`` is empty if all is well."""
+        make = self._codec.make
+        pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(value)) for key, value in values.items()]
+        status = make(
+            "diagnostic_msgs/DiagnosticStatus",
+            level=_WARN if trouble else _OK,
+            name=f"fcslam: {robot}",
+            message=trouble or "mapping",
+            hardware_id=robot,
+            values=pairs,
+        )
+        header = self._codec.header(stamp_ns, "")
+        self._send(self._diagnostics, DIAGNOSTICS, make(DIAGNOSTICS, header=header, status=[status]))
+
+    def _send(self, publish: Publish, kind: str, message: Any) -> None:
+        publish(self._codec.encode(message, kind))
+
+    def _new_fields(self, make: Any) -> dict[str, Any]:
+        """Fields of a marker that ROS 1 does not have."""
+        image = make(
+            "sensor_msgs/CompressedImage", header=self._codec.header(0, ""), format="", data=np.zeros(0, np.uint8)
+        )
+        mesh = make("visualization_msgs/MeshFile", filename="", data=np.zeros(0, np.uint8))
+        return {"texture_resource": "", "texture": image, "uv_coordinates": [], "mesh_file": mesh}
+
+    def _grid_message(self, stamp_ns: int, grid: Grid) -> Any:
+        height, width = grid.values.shape
+        info = self._codec.make(
+            "nav_msgs/MapMetaData",
+            map_load_time=self._codec.time(stamp_ns),
+            resolution=grid.resolution_m,
+            width=width,
+            height=height,
+            origin=self._codec.pose(in_space(np.array((*grid.origin_xy, 0.0)))),
+        )
+        header = self._codec.header(stamp_ns, self._names.map_frame)
+        return self._codec.make(GRID, header=header, info=info, data=grid.values.ravel())
+
+    def _update_message(self, stamp_ns: int, grid: Grid, region: Region) -> Any:
+        cells = grid.values[region.y : region.y + region.height, region.x : region.x + region.width]
+        header = self._codec.header(stamp_ns, self._names.map_frame)
+        return self._codec.make(
+            GRID_UPDATE, header=header, **region._asdict(), data=np.ascontiguousarray(cells).ravel()
+        )
+
+
+def grid_of(occupancy: OccupancyMap) -> Grid:
+    """The map with the values of ROS."""
+    return Grid(_values(occupancy.cells), occupancy.resolution_m, occupancy.origin_xy)
+
+
+def changed_region(before: Grid, after: Grid) -> Region | None:
+    """The smallest rectangle with all cells that changed; None if the grids do not cover the same cells.
+
+    Equal grids have a region of one cell.
+    """
+    if before[1:] != after[1:] or before.values.shape != after.values.shape:
+        return None
+    differs = before.values != after.values
+    rows, columns = np.flatnonzero(differs.any(axis=1)), np.flatnonzero(differs.any(axis=0))
+    if not len(rows):
+        return Region(0, 0, 1, 1)
+    x, y = int(columns[0]), int(rows[0])
+    return Region(x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1)
+
+
+def nanoseconds(stamp: float) -> int:
+    """A stamp in seconds as ROS counts, not below 0."""
+    return max(0, round(stamp * 1e9))
+
+
+def _values(cells: Cells) -> NDArray[np.int8]:
+    table = np.zeros(len(Occupancy), np.int8)
+    for known, value in GRID_VALUES.items():
+        table[known] = value
+    return np.asarray(table[cells])
+
+
+def _is_same(before: Grid, after: Grid) -> bool:
+    return before[1:] == after[1:] and np.array_equal(before.values, after.values)
+
+
+def _steps(poses: FloatArray) -> Sequence[int]:
+    """Indices of poses (N, 3) that are a step apart, and of the last one."""
+    kept: list[int] = []
+    for at, (x, y, _) in enumerate(poses.tolist()):
+        if not kept or hypot(x - poses[kept[-1], 0], y - poses[kept[-1], 1]) >= PATH_STEP_M:
+            kept.append(at)
+    if kept and kept[-1] != len(poses) - 1:
+        kept.append(len(poses) - 1)
+    return kept

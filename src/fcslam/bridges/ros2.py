@@ -1,0 +1,204 @@
+"""A ROS 2 network over DDS, by Eclipse Cyclone DDS from PyPI.
+
+The types of messages are not declared: DDS carries them as bytes. Publishers and subscriptions of Fast DDS, the usual
+middleware of ROS 2, match by name only if Cyclone is told to ignore descriptions of types.
+"""
+
+import os
+import re
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+from fcslam.bridges.network import Deliver, Endpoint, Publish, Quality
+from fcslam.errors import NetworkError
+
+INSTALL: Final = "pip install 'fcslam[ros2]'"
+_PARTICIPANTS: Final = 32
+"""Most participants on one computer that are asked whether they are there, where there is no multicast."""
+_ENDPOINTS_READ = 4096
+_MESSAGES_TAKEN = 64
+_WAIT_NS = 200_000_000
+_BLOCKING_NS = 100_000_000
+_TOPIC, _TYPE = re.compile(r"rt(/.+)"), re.compile(r"(\w+)::msg::dds_::(\w+)_")
+_PEER = re.compile(r"[\w.:-]+", re.ASCII)
+
+
+class Ros2Network:
+    """A participant of one DDS domain. A process has at most one for each domain."""
+
+    ros1 = False
+
+    def __init__(self, domain: int, environment: Mapping[str, str] = os.environ) -> None:
+        """Join ``domain``.
+
+        Raises:
+            NetworkError: Cyclone DDS is not installed or cannot start.
+        """
+        try:
+            from cyclonedds import builtin, core
+            from cyclonedds import domain as domains
+        except ImportError as error:
+            raise NetworkError(f"ROS 2 needs cyclonedds ({error}); install it: {INSTALL}") from error
+        try:
+            self._domain = domains.Domain(domain, configuration(environment))
+            self._participant = domains.DomainParticipant(domain)
+        except core.DDSException as error:
+            raise NetworkError(
+                f"DDS domain {domain} cannot be joined ({error}); check the network and CYCLONEDDS_URI"
+            ) from error
+        self._alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
+        self._any = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
+        self._waitset = core.WaitSet(self._participant)
+        self._builtin = [
+            (publishes, builtin.BuiltinDataReader(self._participant, topic))
+            for publishes, topic in (
+                (True, builtin.BuiltinTopicDcpsPublication),
+                (False, builtin.BuiltinTopicDcpsSubscription),
+            )
+        ]
+        self._readers: tuple[tuple[Any, Deliver], ...] = ()
+        self._topics: dict[tuple[str, str], Any] = {}
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._receive, name="dds", daemon=True)
+        self._thread.start()
+
+    def endpoints(self) -> Sequence[Endpoint]:
+        """As in RosNetwork."""
+        from cyclonedds.core import ReadCondition
+
+        own = self._participant.guid
+        found = []
+        for publishes, reader in self._builtin:
+            for sample in reader.read(_ENDPOINTS_READ, ReadCondition(reader, self._alive)):
+                topic, kind = _TOPIC.fullmatch(sample.topic_name or ""), _TYPE.fullmatch(sample.type_name or "")
+                if topic and kind:
+                    quality = _quality_of(sample.qos)
+                    mine = sample.participant_key == own
+                    found.append(Endpoint(topic[1], f"{kind[1]}/{kind[2]}", publishes, quality, mine))
+        return found
+
+    def subscribe(self, topic: str, kind: str, quality: Quality, deliver: Deliver) -> None:
+        """As in RosNetwork."""
+        from cyclonedds.core import Policy, ReadCondition
+        from cyclonedds.sub import DataReader
+
+        reader = DataReader(self._participant, self._topic(topic, kind), _qos(quality, Policy.IgnoreLocal.Participant))
+        self._readers = (*self._readers, (reader, deliver))
+        self._waitset.attach(ReadCondition(reader, self._any))
+
+    def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
+        """As in RosNetwork."""
+        from cyclonedds.core import DDSException
+        from cyclonedds.pub import DataWriter
+
+        writer = DataWriter(self._participant, self._topic(topic, kind), _qos(quality))
+        message = raw_type(kind)
+
+        def publish(payload: bytes) -> None:
+            try:
+                writer.write(message.of(payload))
+            except DDSException:  # a slow subscriber; the next message follows
+                return
+
+        return publish
+
+    def close(self) -> None:
+        """As in RosNetwork."""
+        self._closed.set()
+        self._thread.join()
+
+    def _topic(self, name: str, kind: str) -> Any:
+        from cyclonedds.topic import Topic
+
+        if (name, kind) not in self._topics:
+            self._topics[name, kind] = Topic(self._participant, f"rt{name}", raw_type(kind))
+        return self._topics[name, kind]
+
+    def _receive(self) -> None:
+        while not self._closed.is_set():
+            self._waitset.wait(_WAIT_NS)
+            for reader, deliver in self._readers:
+                for sample in reader.take(_MESSAGES_TAKEN):
+                    payload = getattr(sample, "payload", None)  # None: the publisher has gone
+                    if payload is not None:
+                        deliver(payload)
+
+
+@cache
+def raw_type(kind: str) -> Any:
+    """A type of DDS messages that are kept as bytes, named as ROS 2 names ``kind``."""
+    from cyclonedds.idl import IdlStruct
+    from cyclonedds.idl.types import uint8
+
+    package, name = kind.split("/")
+
+    @dataclass
+    class _DdsMessage(IdlStruct, typename=f"{package}.msg.dds_.{name}_"):  # type: ignore[misc, call-arg]
+        placeholder: uint8  # DDS has no empty types
+
+        @classmethod
+        def of(cls, payload: bytes) -> "_DdsMessage":
+            message = cls(0)
+            message.payload = payload
+            return message
+
+        def serialize(self, *_: Any, **__: Any) -> bytes:
+            return bytes(self.payload)
+
+        @classmethod
+        def deserialize(cls, data: bytes, *_: Any, **__: Any) -> "_DdsMessage":
+            return cls.of(data)
+
+    return _DdsMessage
+
+
+def configuration(environment: Mapping[str, str]) -> str:
+    """The configuration of Cyclone DDS that follows from the variables by which ROS 2 is configured.
+
+    ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and ROS_LOCALHOST_ONLY mean what they mean in ROS 2. What
+    CYCLONEDDS_URI says comes last and counts.
+
+    Raises:
+        NetworkError: a peer is no address.
+    """
+    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET").upper()
+    local = reach in ("LOCALHOST", "OFF") or environment.get("ROS_LOCALHOST_ONLY") == "1"
+    peers = [peer for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer]
+    for peer in peers:
+        if not _PEER.fullmatch(peer):
+            raise NetworkError(f"ROS_STATIC_PEERS has {peer!r}, which is no address; separate addresses by semicolons")
+    peers += ["127.0.0.1"] * (reach != "OFF")
+    addresses = "".join(f'<Peer Address="{peer}"/>' for peer in peers)
+    own = (
+        '<CycloneDDS><Domain Id="any">'
+        f"<General><AllowMulticast>{'false' if local else 'default'}</AllowMulticast></General>"
+        "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f"<MaxAutoParticipantIndex>{_PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{addresses}</Peers></Discovery>"
+        "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
+        "</Domain></CycloneDDS>"
+    )
+    return ",".join(filter(None, (own, environment.get("CYCLONEDDS_URI"))))
+
+
+def _qos(quality: Quality, *others: Any) -> Any:
+    from cyclonedds.core import Policy, Qos
+
+    return Qos(
+        Policy.Reliability.Reliable(_BLOCKING_NS) if quality.reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if quality.latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(quality.depth),
+        *others,
+        *([Policy.DurabilityService(0, Policy.History.KeepLast(quality.depth), -1, -1, -1)] * quality.latched),
+    )
+
+
+def _quality_of(qos: Any) -> Quality:
+    """The quality of service of somebody else; what a policy does not say is the weakest."""
+    from cyclonedds.core import Policy
+
+    reliable = qos[Policy.Reliability] not in (None, Policy.Reliability.BestEffort)
+    latched = qos[Policy.Durability] not in (None, Policy.Durability.Volatile)
+    return Quality(reliable, latched)

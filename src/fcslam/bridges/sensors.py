@@ -1,0 +1,307 @@
+"""Messages of a live robot in, sensor records out, as a bag would give them.
+
+The first messages wait until the mounting of every laser is known; then they are read, so none is lost. A scan waits
+for the odometry at its stamp. If that does not come, it gets the nearest pose within 1 s, or it is left out.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+
+from fcslam.bridges.topics import SensorTopics
+from fcslam.errors import NetworkError
+from fcslam.records import Beams, SensorRecord
+from fcslam.sources.bags.camera import Calibration, calibration_of, image_of
+from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN, MessageCodec
+from fcslam.sources.bags.merging import ScanMerger
+from fcslam.sources.bags.messages import (
+    BeamsError,
+    ScanMessage,
+    is_odometry,
+    odometry_in,
+    odometry_of,
+    scan_of,
+    transforms_of,
+)
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan
+from fcslam.sources.bags.rig import (
+    USUAL_BASES,
+    Rig,
+    TiltedLaserError,
+    level_mounting,
+    mounted_camera,
+    rig_of,
+    tilt_note,
+)
+from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree
+from fcslam.sources.faults import Audit, Fault
+from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate, usual_beams
+
+SCANS_FOR_RIG = 5
+"""Number of first scans of each laser that decide which beams it has."""
+PATIENCE_S = 5.0
+"""Time that a live robot waits for the first odometry, for the mounting of a laser and for a calibration."""
+ODOMETRY_PATIENCE_S = 1.0
+"""Time that a scan waits for its odometry."""
+STEPS_BACK_FOR_RESTART = 3
+"""Number of scans in a row that are far back in time until the clock is taken to have stepped back."""
+_LONGEST_WAIT = 10_000
+"""Most first messages that wait for the mounting."""
+
+Notify = Callable[[str], None]
+"""Takes one line for the user."""
+
+
+class LiveSensors:
+    """Reads the messages of one robot, one at a time."""
+
+    def __init__(self, topics: SensorTopics, namespace: str, options: BagOptions, ros1: bool, notify: Notify) -> None:
+        """``namespace`` is "" or begins with a slash."""
+        self.audit = Audit("message")
+        """Faults so far."""
+        self.odom_frame = self.base_frame = ""
+        """Frames of the odometry, once it is there."""
+        self.restarts = 0
+        """Number of times that the clock stepped back."""
+        self.newest_stamp: float | None = None
+        """Stamp of the newest scan that was read."""
+        self._topics, self._options, self._notify = topics, options, notify
+        self._prefix = namespace.strip("/")
+        self._codec = MessageCodec(ros1)
+        self._tree = TransformTree()
+        self._edge: tuple[str, str] | None = None
+        """Frames of the odometry in tf."""
+        self._calibration: Calibration | None = None
+        self._first: list[list[ScanMessage]] = [[] for _ in topics.scans]
+        self._rig: Rig | None = None
+        self._early: deque[tuple[int, Message]] = deque(maxlen=_LONGEST_WAIT)
+        self._counts: Counter[str] = Counter()
+        self._began: float | None = None
+        self._misplaced = 0
+        self._waiting_since: float | None = None
+        self._beams: list[Beams] = []
+        """Usual beams of each laser, once they are known."""
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the mounting of every laser is known."""
+        return self._rig is not None
+
+    def add(self, topic: str, payload: bytes, now_s: float, received_ns: int) -> Iterator[SensorRecord]:
+        """Read the next message; yields the records that are complete.
+
+        Args:
+            topic: where the message comes from.
+            payload: its bytes.
+            now_s: any clock that only grows.
+            received_ns: the time of a message without a stamp.
+
+        Raises:
+            NetworkError: the robot cannot be mapped: a mounting or the odometry is missing.
+        """
+        self._counts[topic] += 1
+        try:
+            items = self._decoded(topic, payload, received_ns)
+        except BeamsError as error:
+            if not self.audit.faults()[Fault.BAD_BEAMS].count:
+                self._notify(f"scans of {topic} are left out: {error}; correct the driver")
+            self.audit.add(Fault.BAD_BEAMS, self._counts[topic])
+            return
+        except ValueError:
+            broken = Fault.BROKEN_IMAGE if topic == self._topics.camera else Fault.BROKEN_MESSAGE
+            if not self.audit.faults()[broken].count:
+                self._notify(f"{topic}: {broken}")
+            self.audit.add(broken, self._counts[topic])
+            return
+        for item in items:
+            if self._rig is None:
+                self._early.append((self._counts[topic], item))
+            else:
+                yield from self._read(self._counts[topic], item)
+        yield from self.wait(now_s)
+
+    def wait(self, now_s: float) -> Iterator[SensorRecord]:
+        """Yield what need not wait any longer at the time ``now_s``, if there is no message.
+
+        Raises:
+            NetworkError: as in ``add``.
+        """
+        self._began = now_s if self._began is None else self._began
+        if self._rig is None:
+            self._rig = self._rig_now(now_s)
+            if self._rig is None:
+                return
+            self._begin()
+            while self._early:
+                yield from self._read(*self._early.popleft())
+        if not self._pairing.waiting:
+            self._waiting_since = None
+        elif self._waiting_since is None:
+            self._waiting_since = now_s
+        elif now_s > self._waiting_since + ODOMETRY_PATIENCE_S:
+            self._waiting_since = None
+            for number, entry in self._pairing.flush():
+                yield from self._recorded(number, entry)
+
+    def finish(self) -> Iterator[SensorRecord]:
+        """Yield all that waits, as no more messages come."""
+        if self._rig is None:
+            return
+        for number, item in self._merger.flush():
+            for paired, entry in self._pairing.add(number, item):
+                yield from self._recorded(paired, entry)
+        for number, entry in self._pairing.flush():
+            yield from self._recorded(number, entry)
+
+    def _begin(self) -> None:
+        """Begin to read scans; those before have no part in it."""
+        self._merger, self._pairing = ScanMerger(len(self._topics.scans)), OdometryPairing()
+        self._gates = [ScanGate(beams, self.audit) for beams in self._beams]
+
+    def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Message]:
+        """Raises ValueError if the message is invalid."""
+        kind = self._topics.kinds[topic]
+        content = self._codec.decode(payload, kind)
+        if kind == SCAN:
+            laser = self._topics.scans.index(topic)
+            scan = scan_of(content, received_ns)._replace(laser=laser)
+            if self._rig is None:
+                self._first[laser].append(scan)
+            return [scan]
+        if kind == ODOMETRY:
+            reading = odometry_of(content, received_ns)
+            self.odom_frame, self.base_frame = reading.odom_frame, reading.base_frame
+            return [reading]
+        if kind in (COMPRESSED_IMAGE, IMAGE):
+            return [image_of(content, kind, received_ns)]
+        if kind == CAMERA_INFO:
+            self._calibration = self._calibration or calibration_of(content)
+            return []
+        return self._transforms(content, received_ns)
+
+    def _transforms(self, content: object, received_ns: int) -> list[Message]:
+        readings: list[Message] = []
+        for transform in transforms_of(content, received_ns):
+            if self._rig is None:
+                self._tree.add(transform.parent, transform.child, transform.T_parent_child)
+            if self._topics.odometry is not None:
+                continue
+            frames = transform.parent, transform.child
+            if self._edge is None and is_odometry(transform) and self._is_own(transform.parent):
+                self._edge, (self.odom_frame, self.base_frame) = frames, frames
+            if frames == self._edge:
+                readings.append(odometry_in(transform))
+        return readings
+
+    def _is_own(self, frame: str) -> bool:
+        """Whether a frame is not that of another robot on the same tf."""
+        prefix, _, _ = frame.rpartition("/")
+        return not prefix or not self._prefix or prefix == self._prefix
+
+    def _rig_now(self, now_s: float) -> Rig | None:
+        """The rig if enough is known; None to wait for more."""
+        is_late = self._began is not None and now_s > self._began + PATIENCE_S
+        if not self._is_heard(is_late):
+            return None
+        base_frame = self.base_frame or next((frame for frame in USUAL_BASES if frame in self._tree), USUAL_BASES[-1])
+        usual = [usual_beams([scan.beams for scan in scans]) for scans in self._first]
+        first = [
+            next(scan for scan in scans if scan.beams == beams) for scans, beams in zip(self._first, usual, strict=True)
+        ]
+        try:
+            mountings = self._mountings(first, base_frame)
+        except NoTransformError as error:
+            if not is_late:
+                return None
+            raise NetworkError(
+                f"tf has {error}, so it does not say where a laser sits; start robot_state_publisher or "
+                "static_transform_publisher, or give --laser-pose X,Y,THETA (metres, radians)"
+            ) from error
+        camera, note = None, ""
+        if self._topics.camera is not None:
+            camera, note = mounted_camera(self._calibration, self._tree, base_frame)
+            if camera is None and not is_late:
+                return None
+        self._tell_rig(mountings, note)
+        self._beams = usual
+        self._first = [[] for _ in first]
+        return rig_of(first, mountings, camera)
+
+    def _is_heard(self, is_late: bool) -> bool:
+        """Whether there are scans of every laser, and odometry."""
+        for topic, scans in zip(self._topics.scans, self._first, strict=True):
+            if not scans and is_late:
+                raise NetworkError(f"{topic}: no scan that can be read arrived within {PATIENCE_S:.0f} s")
+        if is_late and not self.odom_frame:
+            raise NetworkError(
+                f"no odometry: {self._topics.odometry or 'tf from odom to base'} is silent; the driver of the base "
+                "publishes it; start it, or choose another topic by --odom-topic"
+            )
+        enough = all(len(scans) >= (1 if is_late else SCANS_FOR_RIG) for scans in self._first)
+        return enough and bool(self.odom_frame)
+
+    def _tell_rig(self, mountings: list[Mounting], camera_note: str) -> None:
+        if camera_note:
+            self._notify(f"the camera of {self._topics.camera} {camera_note}")
+        for topic, mounted in zip(self._topics.scans, mountings, strict=True):
+            if tilt_note(mounted):
+                self._notify(f"the laser of {topic} is {tilt_note(mounted)}")
+
+    def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
+        if self._options.laser_poses:
+            return [Mounting(pose, upside_down=False, tilt_rad=0.0) for pose in self._options.laser_poses]
+        mountings = []
+        for topic, scan in zip(self._topics.scans, first, strict=True):
+            try:
+                mountings.append(level_mounting(self._tree, base_frame, scan.frame))
+            except TiltedLaserError as error:
+                raise NetworkError(
+                    f"the laser of {topic} is {error} and does not look along the floor; choose a level one by "
+                    "--scan-topic, or say its pose by --laser-pose"
+                ) from error
+        return mountings
+
+    def _read(self, number: int, item: Message) -> Iterator[SensorRecord]:
+        self._watch_clock(item)
+        for merged, message in self._merger.add(number, item):
+            for paired, entry in self._pairing.add(merged, message):
+                self._waiting_since = None
+                yield from self._recorded(paired, entry)
+
+    def _watch_clock(self, item: Message) -> None:
+        """Begin anew if the clock stepped back and stays there, as when a bag is played again."""
+        if not isinstance(item, ScanMessage):
+            return
+        newest = self.newest_stamp
+        if newest is None or item.stamp >= newest - MAX_STEP_BACK_S:
+            self._misplaced = 0
+            self.newest_stamp = item.stamp if newest is None else max(newest, item.stamp)
+            return
+        self._misplaced += 1
+        if self._misplaced >= STEPS_BACK_FOR_RESTART:
+            self._notify(
+                f"the clock of the scans stepped back by {newest - item.stamp:.1f} s, as when a bag is played again; "
+                "the robot goes on from there"
+            )
+            self.restarts += 1
+            self._misplaced, self.newest_stamp = 0, item.stamp
+            self._begin()
+
+    def _recorded(self, number: int, entry: Entry) -> Iterator[SensorRecord]:
+        rig = self._rig
+        assert rig is not None  # nothing is read before
+        if isinstance(entry, PosedScan):
+            if not self._gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
+                return
+            if entry.fault is not None:
+                self.audit.add(entry.fault, number)
+            if entry.fault is Fault.NO_ODOMETRY:
+                if self.audit.faults()[Fault.NO_ODOMETRY].count == 1:
+                    self._notify("a scan has no odometry within 1 s and is left out; is the driver of the base alive?")
+                return
+            yield rig.scan(entry)
+        elif isinstance(entry, PosedImage) and rig.camera is not None:
+            try:
+                yield rig.image(entry)
+            except ValueError:
+                self.audit.add(Fault.BROKEN_IMAGE, number)

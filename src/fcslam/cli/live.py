@@ -1,0 +1,149 @@
+"""A live robot on a ROS network, for `fcslam robot` and `fcslam record`."""
+
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.cli.options import Force, Quiet
+from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
+from fcslam.cli.recordings import CameraTopic, OdomTopic, ScanTopic, bag_options, print_faults
+from fcslam.cli.ros_options import DomainId, stopping
+from fcslam.cli.warm_up import compiled
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.bridges.parameters import NodeParameters
+    from fcslam.mission import MissionConfig
+    from fcslam.sources import BagOptions
+
+_SCANS_PER_LINE = 600
+"""A line of progress is printed each time that many scans have come."""
+
+
+def map_live(
+    address: str,
+    name: str | None,
+    config: "MissionConfig",
+    options: "BagOptions",
+    domain: int | None,
+    parameters: "NodeParameters",
+    output: Path | None,
+    console: "Console",
+) -> None:
+    """Map the robot at ``address`` until it is stopped, and write the run to ``output``.
+
+    Raises:
+        InputError: the network, its topics or the output cannot be used.
+    """
+    from fcslam.bridges.addresses import open_network, parse_address
+    from fcslam.bridges.node import RobotNode, await_sensors
+    from fcslam.live.robot import Robot
+    from fcslam.runs import prepare_output
+
+    place = parse_address(address)
+    output = new_folder(RUNS) if output is None else output
+    prepare_output(output, force=False)
+
+    def notify(line: str) -> None:
+        print_line(console, line)
+
+    with (
+        closing(open_network(place, domain)) as network,
+        compiled(console),
+        Robot(name or place.robot, config=config, on_event=lambda event: notify(event.text)) as robot,
+    ):
+        topics = await_sensors(network, place.namespace, options, parameters.topic_timeout)
+        for note in topics.notes:
+            notify(note)
+        node = RobotNode(network, place.namespace, topics, options, robot, parameters, notify)
+        heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
+        notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
+        with stopping(node.stop):
+            node.run(_every(_SCANS_PER_LINE, lambda scans: notify(f"{scans} scans")))
+        if not node.scans:
+            notify("no scan was mapped; nothing is written")
+            return
+        robot.finish()
+        node.publish_map()
+        run = robot.save(output)
+        print_faults(console, {robot.name: node.sensors.audit.faults()})
+    print_line(answers(), f"{node.scans} scans, {len(run.trajectories)} sessions: {output}")
+
+
+def record(
+    source: Annotated[
+        str, typer.Argument(metavar="ADDRESS", help="The robot: ros2:/NAMESPACE or ros1:/NAMESPACE; ros2:/ has none.")
+    ],
+    *,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="File to write: .mcap from ROS 2, .bag from ROS 1.")
+    ],
+    duration: Annotated[
+        float | None, typer.Option(min=0.1, help="Time to record, in seconds.", show_default="until Ctrl-C")
+    ] = None,
+    domain: DomainId = None,
+    scan_topic: ScanTopic = None,
+    odom_topic: OdomTopic = None,
+    camera_topic: CameraTopic = None,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Record the sensors of a live robot: everything that `fcslam map` needs."""
+    from threading import Timer
+
+    from fcslam.bridges.addresses import is_address, open_network, parse_address
+    from fcslam.bridges.node import await_sensors
+    from fcslam.bridges.parameters import NodeParameters
+    from fcslam.bridges.record import record as record_messages
+    from fcslam.errors import InputError
+    from fcslam.sources import BagOptions
+
+    console = notices(quiet)
+    if not is_address(source):
+        raise InputError(f"{source}: is no address of a live robot; give one as in ros2:/robot1")
+    place = parse_address(source)
+    _prepare(output, place.network, force)
+    options = bag_options(scan_topic, odom_topic, camera_topic, None) or BagOptions()
+    stop = Event()
+    with closing(open_network(place, domain)) as network:
+        topics = await_sensors(network, place.namespace, options, NodeParameters().topic_timeout)
+        print_line(console, f"records {', '.join(topics.kinds)}; Ctrl-C ends the recording")
+        timer = Timer(duration or 0.0, stop.set)
+        timer.daemon = True
+        with stopping(stop.set):
+            if duration is not None:
+                timer.start()
+            counts = record_messages(network, topics, output, stop, lambda line: print_line(console, line))
+        timer.cancel()
+    print_line(answers(), f"{_listed(counts)}: {output}")
+
+
+def _prepare(output: Path, network: str, force: bool) -> None:
+    """Check before the recording that it can be written."""
+    from fcslam.errors import OutputError
+
+    suffix = {"ros1": ".bag", "ros2": ".mcap"}[network]
+    if output.suffix != suffix:
+        raise OutputError(f"{output}: a recording of {network} is a {suffix} file; choose such a name")
+    if output.exists() and not force:
+        raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
+    if not output.parent.is_dir():
+        raise OutputError(f"{output}: there is no folder {output.parent}; make it first")
+
+
+def _every(count: int, tell: Callable[[int], None]) -> Callable[[int], None]:
+    def watch(number: int) -> None:
+        if number % count == 0:
+            tell(number)
+
+    return watch
+
+
+def _listed(counts: Counter[str]) -> str:
+    return ", ".join(f"{count} of {topic}" for topic, count in sorted(counts.items())) or "no messages"

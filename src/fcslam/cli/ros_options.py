@@ -1,0 +1,64 @@
+"""Options of commands that read a live robot from a ROS network."""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from fcslam.bridges.parameters import NodeParameters
+
+_ROS = "ROS networks"
+
+DomainId = Annotated[
+    int | None,
+    typer.Option("--domain", metavar="ID", show_default="$ROS_DOMAIN_ID, or 0", help="Domain of ROS 2.",
+                 rich_help_panel=_ROS),
+]  # fmt: skip
+RosParameters = Annotated[
+    Path | None,
+    typer.Option(
+        "--ros-parameters", metavar="FILE", rich_help_panel=_ROS,
+        help="Parameters (YAML), as of a ROS 2 node; those of slam_toolbox that mean the same have its names.",
+    ),
+]  # fmt: skip
+UseSimTime = Annotated[
+    bool, typer.Option("--use-sim-time", help="Time is what /clock says, as in a simulator.", rich_help_panel=_ROS)
+]
+
+
+def node_parameters(file: Path | None, use_sim_time: bool) -> "NodeParameters":
+    """The parameters in ``file``, or the default ones, with the changes of the command line.
+
+    Raises:
+        ConfigError: the file cannot be read, or a parameter is unknown or out of range.
+    """
+    from fcslam.bridges.parameters import load_parameters
+
+    parameters = load_parameters(file)
+    return parameters.model_copy(update={"use_sim_time": True}) if use_sim_time else parameters
+
+
+@contextmanager
+def stopping(stop: Callable[[], None]) -> Iterator[None]:
+    """Call ``stop`` at Ctrl-C and SIGTERM, so that what was mapped or recorded is kept; a second Ctrl-C interrupts."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    stopped = threading.Event()
+
+    def end(*_: object) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt
+        stopped.set()
+        stop()
+
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,115 @@
+"""Checks what a user's program feeds into a live robot, and makes records of it."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fcslam.cloud.sessions import check_robot
+from fcslam.errors import InputError, PacketError
+from fcslam.geometry.beams import is_field_of_view
+from fcslam.records import FloatArray, LaserModel, LaserScan, frozen
+from fcslam.runs import check_names
+from fcslam.sources.gate import MAX_STEP_BACK_S
+from fcslam.wire.checks import check_name
+
+Lasers = LaserModel | Mapping[str, LaserModel]
+
+
+def checked_robot(name: str) -> str:
+    """The name of a robot.
+
+    Raises:
+        InputError: a robot cannot be called so.
+    """
+    try:
+        check_name(name, "robot")
+        check_robot(name)
+    except PacketError as error:
+        raise InputError(f"{error}; give the robot another name") from error
+    check_names([name])
+    return name
+
+
+def checked_lasers(lasers: Lasers | None) -> dict[str, LaserModel]:
+    """The lasers by name; the name of the only one is empty.
+
+    Raises:
+        InputError: one of them cannot be a laser, or two look alike.
+    """
+    if lasers is None:
+        return {}
+    named = dict(lasers) if isinstance(lasers, Mapping) else {"": lasers}
+    for name, laser in named.items():
+        numbers = laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m, *laser.T_base_laser
+        where = f"laser {name!r}" if name else "laser"
+        if not all(map(math.isfinite, numbers)) or laser.max_range_m <= 0.0:
+            raise InputError(f"{where}: {laser} needs finite numbers and a max_range_m above 0 metres")
+        if not is_field_of_view(laser.beams):
+            raise InputError(
+                f"{where}: {laser.beam_count} beams that are {math.degrees(laser.angle_increment_rad):.4g} degrees "
+                "apart are not of one turn; check beam_count and angle_increment_rad, which is in radians"
+            )
+    if len(set(named.values())) < len(named):
+        raise InputError("two lasers have the same beams and the same T_base_laser; give each its own mounting")
+    return named
+
+
+def checked_scan(
+    ranges_m: ArrayLike, stamp: float, odometry: ArrayLike, laser: LaserModel, newest_s: float
+) -> LaserScan:
+    """A scan as a record; negative ranges are made invalid.
+
+    Args:
+        ranges_m: shape (beam_count,).
+        stamp: seconds.
+        odometry: shape (3,).
+        laser: the laser.
+        newest_s: the largest stamp so far.
+
+    Raises:
+        InputError: a shape is wrong, stamp or odometry are not finite, or the clock went back.
+    """
+    try:
+        ranges = np.array(ranges_m, np.float32)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"ranges_m: not an array of numbers ({error})") from error
+    if ranges.shape != (laser.beam_count,):
+        raise InputError(
+            f"ranges_m: shape {ranges.shape}, but the laser has {laser.beam_count} beams; give one range for each"
+        )
+    ranges[ranges < 0.0] = np.nan
+    ranges.setflags(write=False)
+    return LaserScan(checked_stamp(stamp, newest_s), ranges, laser, checked_odometry(odometry))
+
+
+def checked_stamp(stamp: float, newest_s: float) -> float:
+    """A stamp, seconds.
+
+    Raises:
+        InputError: it is not finite, or far before ``newest_s``.
+    """
+    if not math.isfinite(stamp):
+        raise InputError(f"stamp: {stamp} is no time; give seconds")
+    if stamp < newest_s - MAX_STEP_BACK_S:
+        raise InputError(
+            f"stamp: {stamp:.6f} s is {newest_s - stamp:.3g} s before the newest scan; the clock went back. Stamps may "
+            f"step back by {MAX_STEP_BACK_S:g} s at most; after a change of the clock, make a new Robot"
+        )
+    return float(stamp)
+
+
+def checked_odometry(odometry: ArrayLike) -> FloatArray:
+    """A pose of the wheel odometry, shape (3,).
+
+    Raises:
+        InputError: it has another shape, or a number is not finite.
+    """
+    try:
+        pose: FloatArray = frozen(odometry)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"odometry: not a pose ({error}); give (x, y, theta)") from error
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise InputError(f"odometry: {odometry!r} is not a pose; give (x, y, theta) in metres and radians, or None")
+    return pose

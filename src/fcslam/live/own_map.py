@@ -1,0 +1,144 @@
+"""The map of a live robot, in the worker of its back end: the cloud of a mission with one robot.
+
+So a robot alone closes loops and draws maps as ``fcslam map`` does, and no scan waits for it.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from fcslam.cloud.report import Track, fuse_members
+from fcslam.errors import FcslamError
+from fcslam.geometry import se2
+from fcslam.maps.fusion import fuse
+from fcslam.mission import MissionCloud, MissionConfig
+from fcslam.records import Correction, FloatArray, frozen
+from fcslam.runs import Run
+from fcslam.runs.map_files import OccupancyMap
+from fcslam.wire.messages import Packet
+from fcslam.wire.packets import measure
+
+Answer = TypeVar("Answer")
+Correct = Callable[[int, Correction], None]
+"""Takes a correction and the epoch of its session; called in another thread."""
+
+
+class OwnMap:
+    """Gets all packets of one robot, in their order, and corrects its poses. Any thread may call."""
+
+    def __init__(self, robot: str, config: MissionConfig, executor: Executor, correct: Correct) -> None:
+        """``executor`` has one worker."""
+        self._robot, self._config, self._executor, self._correct = robot, config, executor, correct
+        self.failure: str | None = None
+        """Why the map stopped growing; None if it grows."""
+        self._applying: deque[Future[list[tuple[int, Correction]]]] = deque()
+        executor.submit(_open, robot, config).result()
+
+    def put(self, packets: Sequence[Packet]) -> None:
+        """Apply the next packets, later."""
+        if packets and self.failure is None:
+            applied = self._submit(_apply, packets)
+            self._applying.append(applied)
+            applied.add_done_callback(self._take)
+
+    @property
+    def backlog(self) -> int:
+        """Number of batches of packets that are not applied yet."""
+        while self._applying and self._applying[0].done():
+            self._applying.popleft()
+        return len(self._applying)
+
+    def draw(self, session: str, T_map_own: FloatArray) -> OccupancyMap:
+        """The map that a session is in, moved into another frame.
+
+        Args:
+            session: its name.
+            T_map_own: pose of the robot's own map in ``map``, shape (3,), metres and radians.
+
+        Raises:
+            FcslamError: the worker has ended.
+        """
+        return self._answer(self._submit(_draw, session, T_map_own))
+
+    def poses(self, session: str) -> FloatArray:
+        """``T_own_base`` of the session's keyscans so far, shape (K, 3), metres and radians.
+
+        Raises:
+            FcslamError: the worker has ended.
+        """
+        return self._answer(self._submit(_poses, session))
+
+    def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
+        """The result of all packets so far; arguments as in ``MissionCloud.run``.
+
+        Raises:
+            FcslamError: the worker has ended.
+        """
+        return self._answer(self._submit(_run, tracks, scans, recorded_s))
+
+    def _submit(self, function: Callable[..., Answer], *arguments: object) -> Future[Answer]:
+        try:
+            return self._executor.submit(function, self._robot, *arguments)
+        except RuntimeError as error:  # the worker has ended, or the executor was shut down
+            failed: Future[Answer] = Future()
+            failed.set_exception(error)
+            return failed
+
+    def _take(self, done: Future[list[tuple[int, Correction]]]) -> None:
+        if done.cancelled():
+            return
+        error = done.exception()
+        if error is not None:
+            self.failure = self.failure or f"{type(error).__name__}: {error}"
+            return
+        for epoch, correction in done.result():
+            self._correct(epoch, correction)
+
+    def _answer(self, asked: Future[Answer]) -> Answer:
+        try:
+            return asked.result()
+        except FcslamError:
+            raise
+        except Exception as error:
+            raise FcslamError(f"{self._robot}: the robot's map is gone: {type(error).__name__}: {error}") from error
+
+
+_clouds: dict[str, MissionCloud] = {}
+"""The maps of robots in this worker, by robot."""
+
+
+def _open(robot: str, config: MissionConfig) -> None:
+    _clouds[robot] = MissionCloud(config)
+
+
+def _apply(robot: str, packets: Sequence[Packet]) -> list[tuple[int, Correction]]:
+    """Apply packets; returns the corrections with their epochs."""
+    replies = [reply for packet in packets for reply in _clouds[robot].apply(measure(packet))]
+    return [(reply.epoch, reply.body) for reply in replies if isinstance(reply.body, Correction)]
+
+
+def _draw(robot: str, session: str, T_map_own: FloatArray) -> OccupancyMap:
+    cloud = _clouds[robot]
+    robots = {mapped.robot: mapped for mapped in cloud.fleet.estimate().robots}
+    if session not in robots:  # before the first keyscan
+        return fuse((), np.empty((0, 3)), {}, cloud.config.map)
+    index = robots[session].map_index
+    members = [
+        replace(mapped, T_map_base=frozen(se2.compose(T_map_own, mapped.T_map_base)))
+        for mapped in robots.values()
+        if mapped.map_index == index
+    ]
+    return fuse_members(members, cloud.config.map)
+
+
+def _poses(robot: str, session: str) -> FloatArray:
+    mapped = (mapped.T_map_base for mapped in _clouds[robot].fleet.estimate().robots if mapped.robot == session)
+    return next(mapped, np.empty((0, 3)))
+
+
+def _run(robot: str, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
+    return _clouds[robot].run(tracks, scans, recorded_s)

@@ -1,0 +1,97 @@
+"""What a live robot tells, as frozen records."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from fcslam.geometry import se2
+from fcslam.lidar.frontend import motion_information
+from fcslam.lidar.odometry import OdometryConfig
+from fcslam.lidar.tracker import TrackedScan
+from fcslam.records import FloatArray, frozen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotPose:
+    """Where a robot is at one scan, in its map."""
+
+    stamp: float
+    """Of the scan, seconds."""
+    T_map_base: FloatArray
+    """Pose (x, y, theta) of ``base`` in the robot's map, shape (3,), metres and radians. It jumps when a correction
+    arrives; ``T_map_odom`` holds the jump, so a controller that works in ``odom`` sees none."""
+    T_odom_base: FloatArray | None
+    """The odometry that was given with the scan, shape (3,); None without odometry."""
+    quality: float
+    """Share of the scan's points in known area that lie on known surfaces, in [0, 1]; NaN if the scan was not
+    compared: it is the first one, or the robot stands still."""
+    is_localized: bool
+    """False while the scans contradict the map, and after that until the robot's place in the map is found again."""
+    map_index: int | None
+    """Identifies the map; robots with the same index share it. It may change when maps join. None: the robot is in
+    a map of its own that has no index yet."""
+    _motion: FloatArray
+    """Since the last keyscan, shape (3,)."""
+    _tracked: TrackedScan
+    _odometry: OdometryConfig
+
+    @property
+    def x(self) -> float:
+        """Metres."""
+        return float(self.T_map_base[0])
+
+    @property
+    def y(self) -> float:
+        """Metres."""
+        return float(self.T_map_base[1])
+
+    @property
+    def theta(self) -> float:
+        """Radians, in [-pi, pi)."""
+        return float(self.T_map_base[2])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of ``T_map_base`` over (x, y, theta) along the axes of ``map``, shape (3, 3), m^2, m rad, rad^2.
+
+        It is that of the match with the surfaces that the robot saw last. The error of the map is not part of it.
+        """
+        information = motion_information(self._motion, self._tracked, self._odometry)
+        cos, sin = np.cos(self.T_map_base[2]), np.sin(self.T_map_base[2])
+        turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+        return frozen(turn @ np.linalg.inv(information) @ turn.T)
+
+    @property
+    def T_map_odom(self) -> FloatArray | None:
+        """Where the frame of the given odometry lies in the map, shape (3,): the transform ``map -> odom`` of ROS
+        REP 105. None without odometry."""
+        if self.T_odom_base is None:
+            return None
+        return frozen(se2.compose(self.T_map_base, se2.inverse(self.T_odom_base)))
+
+
+class EventKind(StrEnum):
+    """What can happen to a live robot besides its scans."""
+
+    LOST = "lost"
+    """The scans contradict the map: the robot maps in a new session until its place is found."""
+    RELOCALISED = "relocalised"
+    """The place of a lost robot in the map is found."""
+    JOINED = "joined"
+    """The robot's map got another index: it joined another map, or maps were renumbered."""
+    CORRECTED = "corrected"
+    """A correction moved the robot in its map, as a loop closure does."""
+    FAILED = "failed"
+    """A part of the robot stopped working; it goes on without."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotEvent:
+    """Something that happened to a live robot."""
+
+    kind: EventKind
+    stamp: float
+    """Of the newest scan, seconds."""
+    text: str
+    """One line for people."""

@@ -1,0 +1,115 @@
+"""Plays a recording as a real ROS 2 robot, and afterwards subscribes to its map as Nav2 does; runs with rclpy.
+
+    python rclpy_player.py SCANS.npz NAMESPACE SPEED
+
+The file holds stamps (N,), ranges (N, B), odometry (N, 3) and laser (angle_min, angle_increment, range_max). At the end
+it prints one line of JSON: what it played and what it saw.
+"""
+
+import json
+import sys
+import time
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Empty
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LONGEST_WAIT_S = 90.0
+
+
+def stamped(message, stamp, frame):
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(stamp * 1e9), 10**9)
+    message.header.frame_id = frame
+    return message
+
+
+class Driver:
+    """The node of the robot's drivers."""
+
+    def __init__(self, namespace):
+        self.node = rclpy.create_node("driver")
+        self.scans = self.node.create_publisher(LaserScan, f"{namespace}/scan", qos_profile_sensor_data)
+        self.odometry = self.node.create_publisher(Odometry, f"{namespace}/odom", 10)
+        self.finish = self.node.create_publisher(Empty, f"{namespace}/fcslam/finish", 10)
+        self.latencies, self.sent = [], {}
+        self.node.create_subscription(PoseWithCovarianceStamped, f"{namespace}/pose", self.saw, 100)
+
+    def saw(self, pose):
+        stamp_ns = pose.header.stamp.sec * 10**9 + pose.header.stamp.nanosec
+        near = min(self.sent, key=lambda known: abs(known - stamp_ns), default=None)
+        if near is not None and abs(near - stamp_ns) < 1000:
+            self.latencies.append(time.monotonic() - self.sent.pop(near))
+
+    def spin_while(self, condition, longest_s):
+        end = time.monotonic() + longest_s
+        while condition() and time.monotonic() < end:
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def play(self, recording, speed):
+        """Publish all scans, each with its odometry, when they are due."""
+        self.spin_while(
+            lambda: not (self.scans.get_subscription_count() and self.odometry.get_subscription_count()), LONGEST_WAIT_S
+        )
+        time.sleep(0.5)
+        stamps, began = recording["stamps"], time.monotonic()
+        for stamp, ranges, pose in zip(stamps, recording["ranges"], recording["odometry"], strict=True):
+            due = began + (stamp - stamps[0]) / speed
+            self.spin_while(lambda due=due: time.monotonic() < due, LONGEST_WAIT_S)
+            self.publish(stamp, ranges, pose, recording["laser"].tolist())
+        self.spin_while(lambda: self.sent, 2.0)
+
+    def publish(self, stamp, ranges, pose, laser):
+        reading = stamped(Odometry(), stamp, "odom")
+        reading.child_frame_id = "base_link"
+        reading.pose.pose.position.x, reading.pose.pose.position.y = float(pose[0]), float(pose[1])
+        reading.pose.pose.orientation.z = float(np.sin(pose[2] / 2))
+        reading.pose.pose.orientation.w = float(np.cos(pose[2] / 2))
+        self.odometry.publish(reading)
+        scan = stamped(LaserScan(), stamp, "laser")
+        scan.angle_min, scan.angle_increment, scan.range_max = laser
+        scan.angle_max = scan.angle_min + scan.angle_increment * (len(ranges) - 1)
+        scan.ranges = ranges.tolist()
+        self.sent[round(stamp * 1e9)] = time.monotonic()
+        self.scans.publish(scan)
+
+    def look(self, namespace):
+        """Subscribe late, as Nav2 does; returns the seconds until the map came, the map and the path."""
+        maps, paths = [], []
+        asked = time.monotonic()
+        late = [
+            self.node.create_subscription(OccupancyGrid, f"{namespace}/map", maps.append, LATCHED),
+            self.node.create_subscription(Path, f"{namespace}/path", paths.append, LATCHED),
+        ]
+        self.spin_while(lambda: not maps, 10.0)
+        map_s = time.monotonic() - asked
+        self.spin_while(lambda: not paths, 10.0)
+        return map_s, maps, paths, late
+
+
+def main(path, namespace, speed):
+    recording = np.load(path)
+    rclpy.init()
+    driver = Driver(namespace)
+    driver.play(recording, speed)
+    map_s, maps, paths, _ = driver.look(namespace)
+    driver.finish.publish(Empty())
+    time.sleep(0.5)
+    answer = {"played": len(recording["stamps"]), "posed": len(driver.latencies)}
+    if driver.latencies:
+        answer["latency_ms"] = [1e3 * float(np.quantile(driver.latencies, share)) for share in (0.5, 0.9, 0.99)]
+    if maps:
+        grid = maps[-1]
+        answer |= {"map_s": map_s, "frame": grid.header.frame_id, "values": sorted(set(grid.data))}
+        answer |= {"width": grid.info.width, "height": grid.info.height}
+    answer["path"] = len(paths[-1].poses) if paths else 0
+    sys.stdout.write(json.dumps(answer) + "\n")
+    rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], float(sys.argv[3]))

@@ -1,0 +1,145 @@
+"""Messages of a live robot become the records of a bag."""
+
+import numpy as np
+import pytest
+
+from fcslam.bridges.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, LiveSensors
+from fcslam.bridges.topics import SensorTopics
+from fcslam.errors import NetworkError
+from fcslam.sources import BagOptions
+from tests.bridges.ros_messages import KINDS, LASER_POSE, encoded, odometry, scan, transform
+
+RANGES = np.full(180, 5.0)
+
+
+class Robot:
+    """Feeds messages to sensors and keeps what comes out."""
+
+    def __init__(self, odometry="/odom", **options):
+        self.said = []
+        topics = SensorTopics(KINDS, ("/scan",), odometry, ("/tf", "/tf_static"))
+        self.sensors = LiveSensors(topics, "", BagOptions(**options), False, self.said.append)
+        self.records = []
+        self.now_s = 0.0
+
+    def hears(self, topic, message):
+        payload = message if isinstance(message, bytes) else encoded(KINDS[topic], message)
+        self.records += self.sensors.add(topic, payload, self.now_s, 1)
+        return self
+
+    def drives(self, stamps, offset=0.0):
+        for stamp in stamps:
+            self.hears("/odom", odometry(stamp + offset, (stamp, 0.0, 0.0)))
+            self.hears("/scan", scan(stamp + offset, RANGES))
+        return self
+
+    def waits(self, until_s):
+        self.now_s = until_s
+        self.records += self.sensors.wait(until_s)
+
+    @property
+    def stamps(self):
+        return [record.stamp for record in self.records]
+
+
+@pytest.fixture
+def robot():
+    return Robot().hears("/tf_static", transform(0.0, "base_link", "laser"))
+
+
+def test_no_scan_is_lost_while_the_mounting_is_not_known():
+    robot = Robot().drives(np.arange(1.0, 9.0))
+    assert robot.records == []
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    assert robot.stamps == list(np.arange(1.0, 9.0))
+    assert robot.records[0].laser.T_base_laser == pytest.approx(LASER_POSE)
+    assert robot.records[3].T_odom_base == pytest.approx([4.0, 0.0, 0.0])
+    assert (robot.sensors.odom_frame, robot.sensors.base_frame) == ("odom", "base_link")
+
+
+def test_a_scan_waits_for_its_odometry(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/scan", scan(6.5, RANGES))
+    assert robot.stamps[-1] == 6.0
+    robot.hears("/odom", odometry(7.0, (7.0, 0.0, 0.0)))
+    assert robot.stamps[-1] == 6.5
+    assert robot.records[-1].T_odom_base[0] == pytest.approx(6.5)
+
+
+def test_a_scan_whose_odometry_does_not_come_gets_the_nearest(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/scan", scan(6.5, RANGES))
+    robot.hears("/scan", scan(8.5, RANGES))
+    robot.waits(0.5 * ODOMETRY_PATIENCE_S)
+    assert robot.stamps[-1] == 6.0
+    robot.waits(1.1 * ODOMETRY_PATIENCE_S)
+    assert robot.stamps[-1] == 6.5
+    assert robot.records[-1].T_odom_base[0] == pytest.approx(6.0)
+    assert len(robot.said) == 1
+    assert "no odometry within 1 s" in robot.said[0]
+
+
+def test_odometry_from_tf():
+    robot = Robot(odometry=None).hears("/tf_static", transform(0.0, "robot/base", "laser"))
+    for stamp in np.arange(1.0, 8.0):
+        robot.hears("/tf", transform(stamp, "map", "robot/odom", (9.0, 9.0, 0.0)))
+        robot.hears("/tf", transform(stamp, "robot/odom", "robot/base", (stamp, 0.0, 0.0)))
+        robot.hears("/scan", scan(stamp, RANGES))
+    assert robot.records[-1].T_odom_base == pytest.approx([7.0, 0.0, 0.0])
+    assert robot.sensors.odom_frame == "robot/odom"
+
+
+def test_a_bag_that_is_played_again_goes_on(robot):
+    robot.drives(np.arange(100.0, 110.0))
+    robot.drives(np.arange(10.0, 20.0))
+    assert robot.stamps[-5:] == list(np.arange(15.0, 20.0))
+    assert len(robot.said) == 1
+    assert "stepped back by 97.0 s" in robot.said[0]
+    assert robot.sensors.restarts == 1
+
+
+def test_one_scan_far_back_in_time_is_left_out(robot):
+    robot.drives([*np.arange(100.0, 110.0), 50.0, 110.0])
+    assert robot.stamps == list(np.arange(100.0, 111.0))
+    assert robot.said == []
+
+
+def test_damaged_messages_are_told_once(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/scan", b"no message").hears("/scan", b"nor this").drives([7.0])
+    assert robot.stamps[-1] == 7.0
+    assert len(robot.said) == 1
+    robot.hears("/scan", scan(8.0, RANGES, increment=0.0))
+    assert "angle_increment is 0; correct the driver" in robot.said[1]
+
+
+def test_a_missing_mounting_says_who_could_publish_it():
+    robot = Robot().drives(np.arange(1.0, 9.0))
+    with pytest.raises(NetworkError, match=r"no transform from 'base_link' to 'laser'.*robot_state_publisher"):
+        robot.waits(PATIENCE_S + 1.0)
+
+
+def test_a_mounting_on_the_command_line_needs_no_tf():
+    robot = Robot(laser_poses=((0.1, 0.0, 0.0),)).drives(np.arange(1.0, 1.0 + SCANS_FOR_RIG))
+    assert len(robot.records) == SCANS_FOR_RIG
+
+
+def test_silence_of_the_odometry_is_told():
+    robot = Robot(laser_poses=((0.1, 0.0, 0.0),))
+    robot.hears("/scan", scan(1.0, RANGES))
+    with pytest.raises(NetworkError, match="no odometry: /odom is silent"):
+        robot.waits(PATIENCE_S + 1.0)
+
+
+def test_silence_of_a_laser_is_told(robot):
+    with pytest.raises(NetworkError, match="/scan: no scan that can be read arrived within 5 s"):
+        robot.waits(PATIENCE_S + 1.0)
+
+
+def test_a_tilted_laser_is_refused():
+    robot = Robot()
+    lying = transform(0.0, "base_link", "laser")
+    lying.transforms[0].transform.rotation = type(lying.transforms[0].transform.rotation)(x=0.7071, y=0, z=0, w=0.7071)
+    robot.hears("/tf_static", lying)
+    with pytest.raises(NetworkError, match="tilted by 90 degrees"):
+        robot.drives(np.arange(1.0, 9.0))

@@ -1,0 +1,26 @@
+"""An executor without a thread: what is submitted is done at once, or when it is told to."""
+
+from concurrent.futures import BrokenExecutor, Executor, Future
+
+
+class SameThread(Executor):
+    def __init__(self):
+        self._tasks = []
+        self.holds = self.is_broken = False
+
+    def submit(self, function, /, *arguments):
+        future = Future()
+        self._tasks.append((future, function, arguments))
+        if not self.holds:
+            self.work()
+        return future
+
+    def work(self):
+        tasks, self._tasks = self._tasks, []
+        for future, function, arguments in tasks:
+            try:
+                if self.is_broken:
+                    raise BrokenExecutor("it was killed")
+                future.set_result(function(*arguments))
+            except Exception as error:
+                future.set_exception(error)

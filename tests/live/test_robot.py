@@ -1,0 +1,227 @@
+"""A live robot: the poses of a tracker at once, and in the end the run of a recording."""
+
+import logging
+import math
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fcslam
+from fcslam.errors import FcslamError, InputError
+from fcslam.geometry import se2
+from fcslam.robot.frontend import RobotFrontend
+from fcslam.sources import open_source, write_carmen
+from tests import small_fleet
+from tests.live.same_thread import SameThread
+from tests.robot.kidnapping import kidnapping
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return list(small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
+
+
+@pytest.fixture
+def robot(scans):
+    with fcslam.Robot("anna", scans[0].laser, executor=SameThread()) as robot:
+        yield robot
+
+
+def drive(robot, scans):
+    return [robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base) for scan in scans]
+
+
+def test_each_pose_is_that_of_the_tracker(robot, scans):
+    poses = drive(robot, scans)
+    frontend = RobotFrontend("anna", fcslam.MissionConfig().robot)
+    for scan in scans:
+        frontend.process(scan)
+    assert np.allclose([pose.T_map_base for pose in poses], frontend.scan_poses.T_odom_base(), atol=1e-3)
+    assert [pose.stamp for pose in poses] == [scan.stamp for scan in scans]
+    assert all(pose.is_localized for pose in poses)
+    assert {pose.map_index for pose in poses} <= {None, 0}
+    assert all(pose.quality > 0.8 for pose in poses[1:] if not math.isnan(pose.quality))
+    assert robot.pose is poses[-1]
+
+
+def test_the_frame_of_the_odometry_carries_the_correction(robot, scans):
+    for pose, scan in zip(drive(robot, scans), scans, strict=True):
+        assert np.allclose(se2.compose(pose.T_map_odom, scan.T_odom_base), pose.T_map_base)
+        assert pose.T_odom_base is scan.T_odom_base
+
+
+def test_the_covariance_is_one_in_the_axes_of_the_map(robot, scans):
+    for pose in drive(robot, scans):
+        covariance = pose.covariance
+        assert covariance.shape == (3, 3)
+        assert np.allclose(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance).min() > 0.0
+        assert math.sqrt(covariance[0, 0]) < 0.2
+
+
+@pytest.mark.slow
+def test_the_finished_run_is_that_of_the_recording(scans, tmp_path):
+    write_carmen(tmp_path / "anna.clf", scans)
+    mapped = fcslam.map_recordings(tmp_path / "anna.clf")
+    with fcslam.Robot("anna", executor=SameThread()) as robot:
+        for record in open_source(tmp_path / "anna.clf").records():
+            robot.add(record)
+        robot.finish()
+        saved = robot.save(tmp_path / "run")
+    assert saved.trajectories["anna"].T_map_base.tobytes() == mapped.trajectories["anna"].T_map_base.tobytes()
+    assert saved.map_files == mapped.map_files
+    assert saved.metrics == mapped.metrics
+    assert saved.pose_graph_g2o == mapped.pose_graph_g2o
+    assert saved.config_yaml == mapped.config_yaml
+    assert fcslam.open_run(tmp_path / "run").map_files == mapped.map_files
+
+
+def test_map_and_trajectory_are_there_at_any_time(robot, scans):
+    assert (robot.map().cells == fcslam.Occupancy.UNKNOWN).all()
+    assert len(robot.trajectory().stamps) == 0
+    poses = drive(robot, scans)
+    drawn, path = robot.map(), robot.trajectory()
+    assert drawn.cells.shape[0] * drawn.resolution_m > 3.0
+    assert {*np.unique(drawn.cells)} == set(fcslam.Occupancy)
+    assert np.array_equal(path.stamps, [scan.stamp for scan in scans])
+    assert np.allclose(path.T_map_base[-1], poses[-1].T_map_base, atol=0.05)
+    seen = robot.add_scan(scans[-1].ranges_m, scans[-1].stamp, scans[-1].T_odom_base)
+    column, row = np.floor((seen.T_map_base[:2] - drawn.origin_xy) / drawn.resolution_m).astype(int)
+    assert drawn.cells[row, column] == fcslam.Occupancy.FREE, "where the robot stands"
+
+
+def test_poses_do_not_wait_for_the_worker(scans):
+    executor = SameThread()
+    with fcslam.Robot("anna", scans[0].laser, executor=executor) as robot:
+        executor.holds = True
+        poses = drive(robot, scans)
+        assert [pose.map_index for pose in poses] == [None] * len(scans)
+        executor.holds = False
+        executor.work()
+        assert len(robot.trajectory().stamps) == len(scans)
+
+
+def test_a_run_can_be_saved_before_the_end(robot, scans, tmp_path):
+    drive(robot, scans[:30])
+    run = robot.save(tmp_path / "run")
+    assert len(run.trajectories["anna"].stamps) == 30
+    drive(robot, scans[30:])
+    with pytest.raises(fcslam.OutputError, match="already holds a run"):
+        robot.save(tmp_path / "run")
+    assert len(robot.save(tmp_path / "run", force=True).trajectories["anna"].stamps) == len(scans)
+
+
+@pytest.mark.slow
+def test_a_lost_robot_says_so_and_finds_its_place_again():
+    scans, moment = kidnapping()
+    events = []
+
+    def settled(pose):
+        return not moment < pose.stamp < lost.stamp
+
+    with fcslam.Robot("anna", scans[0].laser, executor=SameThread(), on_event=events.append) as robot:
+        poses = drive(robot, scans)
+    lost, found = (event for event in events if event.kind is not fcslam.EventKind.CORRECTED)
+    assert (lost.kind, found.kind) == (fcslam.EventKind.LOST, fcslam.EventKind.RELOCALISED)
+    assert moment < lost.stamp < found.stamp
+    assert all(pose.is_localized == (not lost.stamp <= pose.stamp < found.stamp) for pose in poses if settled(pose))
+
+
+def test_a_worker_that_ends_is_told_once_and_the_robot_goes_on(scans, caplog):
+    executor, events = SameThread(), []
+    with fcslam.Robot("anna", scans[0].laser, executor=executor, on_event=events.append) as robot:
+        drive(robot, scans[:10])
+        executor.is_broken = True
+        with caplog.at_level(logging.WARNING):
+            poses = drive(robot, scans[10:])
+        with pytest.raises(FcslamError, match="anna: the robot's map is gone: BrokenExecutor: it was killed"):
+            robot.map()
+    assert len(poses) == len(scans) - 10
+    assert {event.kind for event in events} == {fcslam.EventKind.FAILED}
+    assert len(caplog.records) == len(events) <= 2
+
+
+def test_invalid_ranges_are_no_points(robot, scans):
+    clean = RobotFrontend("anna", fcslam.MissionConfig().robot)
+    for scan in scans:
+        clean.process(scan)
+        ranges = np.array(scan.ranges_m)
+        for number, invalid in enumerate((math.nan, -1.0, math.inf, -math.inf)):
+            ranges[number::8] = invalid
+        pose = robot.add_scan(ranges.tolist(), scan.stamp, tuple(scan.T_odom_base))
+    assert np.allclose(pose.T_map_base, clean.scan_poses.T_odom_base()[-1], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"ranges_m": [1.0]}, r"ranges_m: shape \(1,\), but the laser has 180 beams"),
+        ({"ranges_m": "far"}, "ranges_m: not an array of numbers"),
+        ({"stamp": math.nan}, "stamp: nan is no time"),
+        ({"odometry": (0.0, 0.0)}, "odometry: .* is not a pose"),
+        ({"odometry": (0.0, math.nan, 0.0)}, "odometry: .* is not a pose"),
+        ({"laser": "rear"}, "laser 'rear' is not known"),
+        ({"stamp": 0.0}, "the clock went back"),
+    ],
+)
+def test_a_scan_that_cannot_be_is_refused_and_the_next_one_is_not(robot, scans, change, reason):
+    late = [replace(scan, stamp=scan.stamp + 100.0) for scan in scans]
+    drive(robot, late[:1])
+    good = {"ranges_m": late[1].ranges_m, "stamp": late[1].stamp, "odometry": late[1].T_odom_base}
+    with pytest.raises(InputError, match=reason) as raised:
+        robot.add_scan(**{**good, **change})
+    assert "\n" not in str(raised.value)
+    assert robot.add_scan(**good).is_localized
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ({"name": "a/b"}, "'a/b' is no name"),
+        ({"name": "a+1"}, "give the robot another name"),
+        ({"laser": fcslam.LaserModel(360, 0.0, 1.0, 10.0)}, "are not of one turn"),
+        ({"laser": fcslam.LaserModel(1, 0.0, 0.1, 10.0)}, "are not of one turn"),
+        ({"laser": fcslam.LaserModel(9, 0.0, 0.1, 0.0)}, "max_range_m above 0"),
+        ({"laser": {"a": fcslam.LaserModel(9, 0.0, 0.1, 5.0), "b": fcslam.LaserModel(9, 0.0, 0.1, 5.0)}}, "two lasers"),
+        ({"config": {"robots": 1}}, "unknown key 'robots'"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_one_line(arguments, reason):
+    with pytest.raises(InputError, match=reason) as raised:
+        fcslam.Robot(**{"name": "anna", **arguments}, executor=SameThread())
+    assert "\n" not in str(raised.value)
+
+
+def test_nothing_comes_after_the_end(robot, scans):
+    drive(robot, scans[:3])
+    robot.finish()
+    robot.finish()
+    with pytest.raises(InputError, match="the robot is finished"):
+        drive(robot, scans[3:4])
+    with pytest.raises(InputError, match="the robot is finished"):
+        robot.add(scans[3])
+    assert len(robot.trajectory().stamps) == 3
+
+
+@pytest.mark.slow
+def test_another_thread_may_ask_meanwhile(scans):
+    with fcslam.Robot("anna", scans[0].laser) as robot:  # with a process of its own
+        stop, drawn = threading.Event(), []
+
+        def look():
+            while not stop.is_set():
+                drawn.append(robot.map())
+                robot.trajectory()
+
+        thread = threading.Thread(target=look)
+        thread.start()
+        try:
+            drive(robot, scans)
+        finally:
+            stop.set()
+            thread.join()
+        assert len(robot.trajectory().stamps) == len(scans)
+        assert robot.map().cells.size > 1
+    assert drawn
