@@ -31,6 +31,8 @@ class FakeCloud:
 
     detector_updates: dict[DetectorFile, bytes] = field(default_factory=dict)
     """Detectors that it announces all the time, and their contents; one without cannot be had."""
+    removed: bool = False
+    """Whether the session is removed."""
     fetched: list[str] = field(default_factory=list)
 
     def detector(self, channel, version):
@@ -71,7 +73,7 @@ class FakeCloud:
             answer += [encode(packet(DetectorUpdate("alice", file))) for file in self.detector_updates]
         if self.correction > correction:
             answer.append(encode(replace(packet(replace(CORRECTION, version=self.correction)), epoch=epoch)))
-        return HttpResponse(tuple(answer), refused=len(self.refused))
+        return HttpResponse(tuple(answer), refused=len(self.refused), removed=self.removed)
 
 
 class Network:

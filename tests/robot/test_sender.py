@@ -209,6 +209,15 @@ def test_what_was_refused_in_an_answer_that_was_lost_is_set_aside(robot):
     assert "1; the last is packet 1 of start 0: unwanted" in robot.sender.refused_notice
 
 
+def test_a_robot_says_that_it_is_removed_and_no_longer_when_it_is_back(robot):
+    robot.outbox.put([said(k) for k in range(2)])
+    for removed in (False, True, False):
+        robot.sender._transport.cloud.removed = removed
+        robot.now += 10.0
+        robot.sender.step()
+        assert (robot.sender.removed_notice is not None) == removed
+
+
 def test_what_the_cloud_refuses_after_it_confirmed_it_is_told(robot):
     network = robot.sender._transport
     robot.outbox.put([said(k) for k in range(3)])

@@ -95,13 +95,14 @@ def test_a_ring_while_a_worker_ends_or_after_it_is_not_heard(supervised, tmp_pat
 
 
 def test_a_worker_is_ready_when_it_says_so_and_no_longer_when_it_is_gone(supervised, tmp_path):
-    ready = 'print(\'{"event": "ready", "number": 0}\', flush=True);'
+    ready = 'print(\'{"event": "progress", "number": 12}\\n{"event": "ready", "number": 0}\', flush=True);'
     supervisor, told = supervised(SAYS + WAITS + ready + "sys.stdin.buffer.read()")
     wait(lambda: told)
     assert not supervisor.is_ready
     (tmp_path / "go").touch()
     wait(lambda: supervisor.is_ready)
     assert told == [("live", 7)], "that is for nobody else"
+    assert supervisor.applied == 12
     supervisor.stop()
     assert not supervisor.is_ready
 

@@ -13,10 +13,11 @@ import pytest
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.mission import MissionConfig, run_mission
-from fcslam.records import ClosureStatus, Removal, Undo, Veto
+from fcslam.records import ClosureStatus, Place, Removal, Undo, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service import worker as worker_module
+from fcslam.service.crash_log import MOST_CRASHES
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, MissionStore, StoredPacket
 from fcslam.service.worker import AT_ONCE, SNAPSHOT_EVERY_S, Worker
@@ -322,6 +323,97 @@ def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch)
     assert cloud.store.refusals("a") == []
     cloud.restart()
     assert len(cloud.finalize().trajectories["a"].stamps) == len(POSES)
+
+
+def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_on(cloud, monkeypatch, tmp_path):
+    packets = two_robots()
+    bad = next(k for k, packet in enumerate(packets) if k > 70 and isinstance(packet.body, Place))
+    reference = Cloud(tmp_path / "reference")
+    reference.put(packets)
+    reference.store.refuse(packets[bad].robot, 0, packets[bad].sequence, "beforehand")
+    expected = content(reference.finalize())
+    reference.store.close()
+    fleet = type(cloud.worker._fleet)
+    apply = fleet.apply
+
+    def hungry(self, packet):
+        if packet.sequence == packets[bad].sequence and packet.robot == packets[bad].robot:
+            raise MemoryError
+        apply(self, packet)
+
+    monkeypatch.setattr(fleet, "apply", hungry)
+    cloud.put(packets)
+    for _ in range(MOST_CRASHES):
+        with pytest.raises(MemoryError):
+            cloud.work()
+        assert cloud.store.refusals(packets[bad].robot) == []
+        cloud.restart()
+    run = cloud.finalize()
+    ((_, sequence, reason),) = cloud.store.refusals(packets[bad].robot)
+    assert (sequence, reason) == (packets[bad].sequence, "3 workers in a row ended while they applied it")
+    assert content(run) == expected
+
+
+def test_workers_that_end_elsewhere_refuse_nothing(cloud, monkeypatch):
+    """Killed at a packet, then at another one, and so on: no packet is to blame."""
+    cloud.put(two_robots())
+    fleet, ends = type(cloud.worker._fleet), iter([20, 30, 20, 30, 40])
+    apply, left = fleet.apply, [next(ends)]
+
+    def fragile(self, packet):
+        left[0] -= 1
+        if left[0] == 0:
+            raise MemoryError
+        apply(self, packet)
+
+    monkeypatch.setattr(fleet, "apply", fragile)
+    for end in ends:
+        with pytest.raises(MemoryError):
+            cloud.work()
+        cloud.restart()
+        left[0] = end
+    left[0] = -1
+    cloud.work()
+    assert [cloud.store.refusals(robot) for robot in "ab"] == [[], []]
+    assert cloud.store.applied() == len(two_robots())
+
+
+def test_a_result_that_ends_worker_after_worker_fails_and_the_mission_goes_on(cloud, monkeypatch):
+    cloud.put(two_robots())
+    cloud.work()
+
+    class Killed(BaseException):
+        """As by the kernel, which needs the memory."""
+
+    def killed(*_):
+        raise Killed
+
+    number = cloud.store.ask_to_finalize()
+    with monkeypatch.context() as patched:
+        patched.setattr(Worker, "_result", killed)
+        for _ in range(MOST_CRASHES):
+            with pytest.raises(Killed):
+                cloud.work()
+            cloud.restart()
+        cloud.work()
+    assert "3 workers in a row" in cloud.store.finalization(number).failure
+    assert len(cloud.finalize().trajectories) == 2
+
+
+def test_a_packet_refused_while_it_waits_is_not_applied_after_a_restart(cloud):
+    packets = stream("a", POSES, start_s=0.0)
+    cloud.put([*packets[:-2], packets[-1]])
+    cloud.work()
+    cloud.now += 60.0
+    cloud.work()
+    cloud.store.refuse("a", 0, packets[-1].sequence, "by hand")
+    cloud.restart()
+    cloud.put(packets[-2:-1])
+    applied = []
+    cloud.worker._fleet.apply = applied.append
+    cloud.work()
+    assert cloud.store.applied() == len(packets)
+    assert [packet.sequence for packet in applied] == [packets[-2].sequence]
 
 
 @pytest.mark.slow

@@ -166,7 +166,8 @@ class Agent:
         failure = self._frontend.backend_failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
-        found = sender.notice, sender.refused_notice, self._detector_updates.notice, broken, jumps
+        told = sender.notice, sender.refused_notice, sender.removed_notice, self._detector_updates.notice
+        found = *told, broken, jumps
         notices = tuple(filter(None, found))
         left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
         return AgentProgress(

@@ -18,6 +18,7 @@ SEND_INTERVAL_S = 1.0
 """Time between two batches if the first took all waiting packets: a request itself costs some hundred bytes."""
 ASK_AFTER_S = 5.0
 """A robot without waiting packets asks for its correction after this time, which also shows that it is alive."""
+REMOVED = "an administrator removed this session: the cloud stores its packets, but they have no effect"
 FIRST_RETRY_S, LONGEST_RETRY_S = 0.5, 30.0
 
 
@@ -67,6 +68,8 @@ class Sender:
         """Message about packets of earlier starts that belong to another mission; None if there were none."""
         self.refused_notice: str | None = None
         """Message about refused packets, some of them refused after confirmation; None if there were none."""
+        self.removed_notice: str | None = None
+        """Message that this session is removed from the mission; None if it is not."""
         self.failure: Exception | None = None
         """The error that ended ``run``."""
 
@@ -142,6 +145,7 @@ class Sender:
         reply = self._transport.send(packets, self._correction)
         self._last_reply_s = self._clock()
         self._read(reply)
+        self.removed_notice = REMOVED if reply.removed else None
         if batch is not None and reply.refusal is not None:
             sequence = batch.first + reply.refusal.index
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import ReplyState, replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
@@ -51,6 +52,8 @@ class IntakeReply:
     """Acknowledgements and, if they are news, a correction and detectors."""
     refused: int
     """How many of the robot's packets were refused, by the worker too."""
+    removed: bool
+    """Whether an administrator removed the session of its newest packet."""
 
 
 class SessionState(NamedTuple):
@@ -105,7 +108,8 @@ class Intake:
         if refusal:
             raise refusal
         epochs = sorted({epoch for _, epoch, _ in numbers}) or [s.epoch for s in self.sessions(robot)[-1:]]
-        return IntakeReply(self._replies(robot, epochs, known_correction), self._store.refusal_count(robot))
+        removed = bool(epochs) and is_removed(session_name(robot, epochs[-1]), in_force(self._store.edits()))
+        return IntakeReply(self._replies(robot, epochs, known_correction), self._store.refusal_count(robot), removed)
 
     def last_heard_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never since the service started."""

@@ -5,6 +5,7 @@ missions/<name>/mission.sqlite       what was received: all that must not be los
                 live/                the run folder of what is believed now
                 runs/<number>/       the run folders that were asked for
                 worker.state         the worker's state some packets ago, for a quick restart; may be deleted
+                worker.task          what the worker is doing, to refuse a packet that ends worker after worker
                 worker.lock          held by the mission's worker
 open                                 name of the open mission
 lock                                 held by the service that uses the folder
@@ -43,6 +44,11 @@ class MissionFolder:
     def snapshot(self) -> Path:
         """The worker's state, from which the next worker goes on; it may be deleted."""
         return self.path / "worker.state"
+
+    @property
+    def worker_task(self) -> Path:
+        """What the worker is doing, for the worker after it."""
+        return self.path / "worker.task"
 
     @property
     def worker_lock(self) -> Path:

@@ -19,6 +19,9 @@ STEADY_S = 60.0
 READY = "ready"
 """The event by which a worker reports that it is ready; the supervisor does not pass it on."""
 
+PROGRESS = "progress"
+"""The event by which a worker reports how many packets it has applied; the supervisor keeps the number."""
+
 Listen = Callable[[str, int], None]
 """Called with a worker's events, on a separate thread."""
 
@@ -37,6 +40,10 @@ class RunningWorker(Protocol):
     @property
     def is_ready(self) -> bool:
         """Whether it runs and has compiled its code."""
+
+    @property
+    def applied(self) -> int:
+        """How many packets the present worker has applied, those of its snapshot included."""
 
     def ring(self) -> None:
         """Notify the worker of new packets or requests."""
@@ -63,6 +70,7 @@ class Supervisor:
         self._process: subprocess.Popen[bytes] | None = None
         self._starts = 0
         self._is_ready = False
+        self._applied = 0
         self._thread = threading.Thread(target=self._run, name=f"worker of {folder.name}", daemon=True)
         self._thread.start()
 
@@ -81,6 +89,11 @@ class Supervisor:
     def is_ready(self) -> bool:
         """Whether the worker runs and reported that it is ready."""
         return self._is_ready and self.pid is not None
+
+    @property
+    def applied(self) -> int:
+        """How many packets the present worker has applied, those of its snapshot included."""
+        return self._applied
 
     def ring(self) -> None:
         """Notify the worker of new packets or requests."""
@@ -120,7 +133,7 @@ class Supervisor:
             assert process.stdout is not None
             os.set_blocking(process.stdin.fileno(), False)
             with self._lock:
-                self._process, self._is_ready = process, False
+                self._process, self._is_ready, self._applied = process, False, 0
                 self._starts += 1
                 if self._stopping.is_set():
                     self._end_input()
@@ -138,6 +151,8 @@ class Supervisor:
             event, number = str(message["event"]), int(message["number"])
             if event == READY:
                 self._is_ready = True
+            elif event == PROGRESS:
+                self._applied = number
             else:
                 self._listen(event, number)
         except (ValueError, TypeError, KeyError):

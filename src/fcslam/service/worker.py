@@ -7,7 +7,7 @@ Killed at any moment it goes on from there, or from turn 0, and says nothing new
     python -m fcslam.service.worker MISSION_FOLDER
 
 A byte on stdin says that there is something to do, its end that the service is gone. On stdout there is a line when it
-is ready, for every change of the live run folder and for every answered request.
+is ready, for its progress, for every change of the live run folder and for every answered request.
 """
 
 import fcntl
@@ -45,9 +45,10 @@ from fcslam.errors import InputError, PacketError
 from fcslam.processes import obey_parent
 from fcslam.records import Edit, Removal
 from fcslam.runs import Metric, Run
+from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
-from fcslam.service.supervisor import READY
+from fcslam.service.supervisor import PROGRESS, READY
 from fcslam.service.warmup import warm_up_fleet
 from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.ledger import Ledger
@@ -102,6 +103,7 @@ class Worker:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._tell, self._start = folder, store, clock, tell, start
+        self._crashes = CrashLog(folder.worker_task)
         self._ready: deque[StoredPacket] = deque()
         """Packets that may take effect and did not yet."""
         self._fleet = Fleet(self._config.fleet, self._config.seed)
@@ -122,6 +124,7 @@ class Worker:
         self._resume()
         self._reported, self._report_at = self._resumed_at, -math.inf
         self._written, self._write_at = self._applied, clock() + SNAPSHOT_EVERY_S
+        tell(PROGRESS, self._applied)
 
     def step(self) -> bool:
         """Do one piece of work; False: there is none."""
@@ -164,6 +167,7 @@ class Worker:
         self._fleet, self._log = Fleet(self._config.fleet, self._config.seed), PacketLog()
         self._arrivals, self._read_hash = 0, b""
         self._times.clear()
+        self._tell(PROGRESS, 0)
 
     @property
     def _applied(self) -> int:
@@ -180,7 +184,10 @@ class Worker:
             self._apply(self._ready.popleft())
             if self._clock() > began + AT_ONCE_S:
                 break
+        self._crashes.end()
         self._report()
+        if self._applied > applied:
+            self._tell(PROGRESS, self._applied)
         return self._arrivals > arrivals or self._applied > applied
 
     def _report(self) -> bool:
@@ -255,12 +262,20 @@ class Worker:
 
     def _apply(self, packet: StoredPacket) -> None:
         """One packet takes effect, or is refused and from now on counts as refused."""
+        if packet.refusal is not None:  # by a worker before, since it arrived
+            self._log.refuse(PacketNumber(session_name(packet.robot, packet.epoch), packet.sequence))
+            return
+        task = f"packet {packet.sequence} of {session_name(packet.robot, packet.epoch)}"
+        if self._crashes.is_fatal(task):
+            self._refuse(packet, f"{MOST_CRASHES} workers in a row ended while they applied it")
+            return
+        self._crashes.begin(task)
         try:
             self._fleet.apply(decode(packet.data))
         except PacketError as error:
             self._refuse(packet, str(error))
         except MemoryError:
-            raise  # the machine's fault, not the packet's: the next worker tries again
+            raise  # most often the machine's fault, not the packet's: the next workers try again
         except Exception as error:
             # What it left behind is unknown: the next worker starts again without it.
             self._refuse(packet, f"the cloud failed on it: {type(error).__name__}: {error}")
@@ -291,6 +306,11 @@ class Worker:
 
     def _answer(self, asked: Finalization) -> None:
         name = str(asked.number)
+        task = f"result {name}"
+        if self._crashes.is_fatal(task):
+            self._store.answer(asked.number, None, f"{MOST_CRASHES} workers in a row ended while they computed it")
+            return
+        self._crashes.begin(task)
         try:
             self._run(self._result(), self._store.traffic()).save(self._folder.run(name), force=True)
         except (
@@ -300,6 +320,7 @@ class Worker:
             self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:
             self._store.answer(asked.number, name)
+        self._crashes.end()
         self._published = -1
         self._tell("finalized", asked.number)
 

@@ -13,6 +13,8 @@ CORRECTION_HEADER = "Fcslam-Correction"
 AGENT_HEADER = "Fcslam-Agent"
 """128 random bits in hexadecimal that distinguish two agents of the same name."""
 
+REMOVED_HEADER = "Fcslam-Removed"
+"""Of a response: 1 if an administrator removed the robot's session, so that its packets have no effect, else 0."""
 REFUSED_HEADER = "Fcslam-Refused"
 """In a reply: number of the robot's packets that were refused."""
 

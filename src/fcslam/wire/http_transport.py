@@ -10,7 +10,15 @@ from urllib.parse import quote, urlsplit
 
 from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
 from fcslam.records import Channel
-from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, REFUSED_HEADER, read_batch, write_batch
+from fcslam.wire.batches import (
+    AGENT_HEADER,
+    CORRECTION_HEADER,
+    MEDIA_TYPE,
+    REFUSED_HEADER,
+    REMOVED_HEADER,
+    read_batch,
+    write_batch,
+)
 from fcslam.wire.keys import no_passphrase
 
 if TYPE_CHECKING:
@@ -42,6 +50,8 @@ class HttpResponse:
     refusal: Refusal | None = None
     refused: int = 0
     """Number of the robot's refused packets so far; some were refused after they were stored."""
+    removed: bool = False
+    """Whether the robot's session is removed: its packets are stored and have no effect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +162,9 @@ class HttpTransport:
         self._require(response, 200)
         try:
             return HttpResponse(
-                tuple(read_batch(response.content)), refused=int(response.headers.get(REFUSED_HEADER, 0))
+                tuple(read_batch(response.content)),
+                refused=int(response.headers.get(REFUSED_HEADER, 0)),
+                removed=response.headers.get(REMOVED_HEADER) == "1",
             )
         except (PacketError, ValueError) as error:
             raise UnavailableError(f"{self._url}: the reply is broken ({error})") from error

@@ -55,6 +55,10 @@ class InlineWorker:
         self._store = MissionStore(folder.store)
         self._worker = Worker(folder, self._store, lambda: self._now, lambda *_: None, InlineTask)
 
+    @property
+    def applied(self) -> int:
+        return self._worker._applied
+
     def ring(self) -> None:
         self._now += 1000.0
         while self._worker.step():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
 from tests.service.http.desk import A, Desk, put_detector
 
-OPEN = {"/healthz", "/openapi.json"}
+OPEN = {"/healthz", "/readyz", "/openapi.json"}
 VALUES = {
     "number": 1,
     "robot": "a", "k": "0", "suffix": "png", "z": "0", "x": "0", "y": "0", "session": "a", "name": "mission",
@@ -53,7 +53,7 @@ def content(desk):
 
 
 def test_the_routes_are_all_there(routes):
-    assert len(routes) >= 28
+    assert len(routes) >= 29
     assert {path for _, path, route in routes if not isinstance(route.route, APIRoute)} <= OPEN
 
 

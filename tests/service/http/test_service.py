@@ -12,6 +12,7 @@ from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.records import Channel, Correction, Keyscan
 from fcslam.runs import open_run
 from fcslam.service import intake
+from fcslam.service.http import operations
 from fcslam.service.http import prometheus as measures
 from fcslam.service.mission_store import MissionStore
 from fcslam.wire import fcslam_pb2 as pb
@@ -233,6 +234,32 @@ def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
     ):  # fmt: skip
         assert mapped.ask("POST", f"{API}/{path}", "boss", json=wrong).status_code == status
     assert mapped.ask("POST", f"{API}/removals", "eye", json={"robot": "b"}).status_code == 403
+
+
+def test_a_robot_is_told_that_it_is_removed(mapped):
+    assert mapped.send("b", []).headers["Fcslam-Removed"] == "0"
+    mapped.ask("POST", f"{API}/removals", "boss", json={"robot": "b", "epoch": 0})
+    assert mapped.send("b", []).headers["Fcslam-Removed"] == "1"
+    assert mapped.send("a", []).headers["Fcslam-Removed"] == "0"
+    assert [robot["removed"] for robot in get(mapped, "robots").json()] == [False, True]
+
+
+def test_the_service_is_ready_when_the_worker_has_caught_up(desk, monkeypatch):
+    assert desk.ask("GET", "/readyz").json() == {"status": "ready", "backlog": 0}
+    worker = desk.state.mission.worker
+    with monkeypatch.context() as patched:
+        patched.setattr(worker, "ring", lambda: None)
+        patched.setattr(operations, "LARGEST_BACKLOG", 5)
+        for count, status in ((5, 200), (6, 503)):
+            desk.told(desk.send("a", A[:count]))
+            answer = desk.ask("GET", "/readyz")
+            assert (answer.status_code, answer.json()["backlog"]) == (status, count)
+        assert "6 packets" in answer.json()["error"]
+        assert desk.ask("GET", "/healthz").status_code == 200
+    worker.ring()
+    assert desk.ask("GET", "/readyz").json() == {"status": "ready", "backlog": 0}
+    worker.is_ready = False
+    assert desk.ask("GET", "/readyz").status_code == 503
 
 
 def test_missions_are_begun_opened_and_rest_as_they_were(mapped):

@@ -1,17 +1,21 @@
-"""Routes for operators: health and metrics."""
+"""Routes for operators: health, readiness and metrics."""
 
 from fastapi import APIRouter, HTTPException
-from fastapi.responses import Response
+from fastapi.responses import JSONResponse, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from fcslam.errors import StoreError
 from fcslam.service.http.authentication import Role
-from fcslam.service.http.responses import Health, content, refusals
+from fcslam.service.http.problems import problem
+from fcslam.service.http.responses import Health, Readiness, Unready, content, refusals
 from fcslam.service.http.state import ServiceState
+
+LARGEST_BACKLOG = 200
+"""Packets that may wait for a worker that is ready: fifty robots send as many in two seconds."""
 
 
 def operations_router(state: ServiceState) -> APIRouter:
-    """Health for everybody, metrics for viewers."""
+    """Health and readiness for everybody, metrics for viewers."""
     router = APIRouter(tags=["operations"])
 
     @router.get("/healthz", responses=refusals(503))
@@ -28,6 +32,18 @@ def operations_router(state: ServiceState) -> APIRouter:
         if not state.mission.worker.is_ready:
             raise HTTPException(503, "the service takes packets, but the worker is starting")
         return Health()
+
+    @router.get("/readyz", response_model=Readiness, responses={503: {"model": Unready}})
+    def get_readiness() -> Readiness | JSONResponse:
+        """200 while the worker follows what robots send, 503 while it starts or catches up."""
+        backlog = state.mission.intake.ready_count() - state.mission.worker.applied
+        if state.closing or not state.mission.worker.is_ready:
+            return problem(
+                503, "the worker is stopping" if state.closing else "the worker is starting", backlog=backlog
+            )
+        if backlog > LARGEST_BACKLOG:
+            return problem(503, f"the worker is catching up: {backlog} packets have no effect yet", backlog=backlog)
+        return Readiness(backlog=backlog)
 
     @router.get(
         "/metrics",

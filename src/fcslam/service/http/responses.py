@@ -29,6 +29,19 @@ class Health(Settings):
     status: Literal["ok"] = "ok"
 
 
+class Readiness(Settings):
+    """The worker follows what robots send."""
+
+    status: Literal["ready"] = "ready"
+    backlog: int = Field(description="packets that arrived and have no effect yet")
+
+
+class Unready(Problem):
+    """The worker starts or catches up."""
+
+    backlog: int = Field(description="packets that arrived and have no effect yet")
+
+
 class PacketRefusal(Settings):
     """A refused packet; its number is used up."""
 
@@ -74,6 +87,7 @@ class SessionSummary(Settings):
     T_map_odom: Pose | None
     correction: int = Field(description="version of the newest correction; -1: none")
     quality: float = Field(description="how well other sessions support the pose, in [0, 1]; 0: no support")
+    removed: bool = Field(description="whether an administrator removed it, so that its packets have no effect")
     last_heard_s: float | None = Field(description="seconds since the robot's last batch")
 
 

@@ -12,7 +12,15 @@ from fcslam.service.http.limits import RateLimit, read_body
 from fcslam.service.http.responses import PacketProblem, PacketRefusal, RobotState, content, refusals
 from fcslam.service.http.state import ServiceState
 from fcslam.service.intake import IntakeReply
-from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, LENGTH, MEDIA_TYPE, REFUSED_HEADER, read_batch
+from fcslam.wire.batches import (
+    AGENT_HEADER,
+    CORRECTION_HEADER,
+    LENGTH,
+    MEDIA_TYPE,
+    REFUSED_HEADER,
+    REMOVED_HEADER,
+    read_batch,
+)
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES
 from fcslam.wire.packets import unpacked_size
 
@@ -21,7 +29,11 @@ NETWORK = "application/octet-stream"
 _REFUSED = {
     REFUSED_HEADER: {
         "schema": {"type": "integer", "minimum": 0}, "required": True, "description": "packets that count for nothing",
-    }
+    },
+    REMOVED_HEADER: {
+        "schema": {"type": "integer", "minimum": 0, "maximum": 1}, "required": True,
+        "description": "whether an administrator removed the session",
+    },
 }  # fmt: skip
 Name = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 
@@ -56,7 +68,8 @@ def robot_router(state: ServiceState) -> APIRouter:
         reply = await run_in_threadpool(take)
         mission.worker.ring()
         state.measures.answer(robot, reply.batch)
-        return Response(reply.batch, media_type=MEDIA_TYPE, headers={REFUSED_HEADER: str(reply.refused)})
+        headers = {REFUSED_HEADER: str(reply.refused), REMOVED_HEADER: str(int(reply.removed))}
+        return Response(reply.batch, media_type=MEDIA_TYPE, headers=headers)
 
     @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
     def get_state(robot: Name) -> RobotState:

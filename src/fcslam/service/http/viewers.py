@@ -9,6 +9,7 @@ from fastapi import APIRouter, HTTPException, Query
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, Response
 
+from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.sessions import session_name
 from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
 from fcslam.records import Channel, ClosureStatus
@@ -178,7 +179,7 @@ def _detectors(state: ServiceState) -> list[DetectorSummary]:
 
 def _sessions(state: ServiceState, robot: str) -> list[SessionSummary]:
     store, mapped = state.mission.store, _live_run(state).trajectories
-    sessions = []
+    sessions, changes = [], in_force(store.edits())
     for session in state.mission.intake.sessions(robot):
         name = session_name(robot, session.epoch)
         known, correction = mapped.get(name), store.correction(robot, session.epoch)
@@ -195,6 +196,7 @@ def _sessions(state: ServiceState, robot: str) -> list[SessionSummary]:
                 T_map_odom=correction.correction.T_map_odom.tolist() if correction else None,
                 correction=correction.correction.version if correction else -1,
                 quality=correction.correction.quality if correction else 0.0,
+                removed=is_removed(name, changes),
                 last_heard_s=state.mission.intake.last_heard_s(robot),
             )
         )
