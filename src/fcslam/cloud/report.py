@@ -20,6 +20,10 @@ from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 
+LEAST_DRAWN = 10
+"""Keyscans, 2.5 m of path, of a map besides the largest one that gets a picture. Sessions that ended at once need none,
+and a picture takes longer than all else about them."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
@@ -65,7 +69,7 @@ def run_of(
         metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
         pose_graph_g2o=g2o_text(result.graph),
-        map_files=_map_files(result, tuple(trajectories.values()), grid),
+        map_files=_map_files(result, trajectories, grid),
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
     )
 
@@ -122,17 +126,24 @@ def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> Closur
     )  # fmt: skip
 
 
-def _map_files(result: FleetResult, trajectories: Sequence[RobotTrajectory], grid: OccupancyConfig) -> dict[str, bytes]:
+def _map_files(
+    result: FleetResult, trajectories: Mapping[str, RobotTrajectory], grid: OccupancyConfig
+) -> dict[str, bytes]:
     """map.* of the largest map, map_<k>.* of robots that are not connected to it."""
+    maps: dict[int, list[MappedRobot]] = {}
+    for robot in result.robots:
+        maps.setdefault(robot.map_index, []).append(robot)
+    drawn = _drawn_closures(result)
     files: dict[str, bytes] = {}
-    for k in sorted({robot.map_index for robot in result.robots}):
-        members = [robot for robot in result.robots if robot.map_index == k]
+    for k, members in sorted(maps.items()):
         stem = "map" if k == 0 else f"map_{k}"
         fused = fuse_members(members, grid)
-        drawn = {t.robot: t.T_map_base for t in trajectories if t.map_index == k}
         files[f"{stem}.pgm"] = pgm_bytes(fused)
         files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
-        files[f"{stem}.png"] = map_png(fused, drawn, _drawn_closures(result.closures, members))
+        if k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN:
+            names = {robot.robot for robot in members}
+            ways = {name: robot.T_map_base for name, robot in trajectories.items() if name in names}
+            files[f"{stem}.png"] = map_png(fused, ways, drawn.get(k, ()))
     return files
 
 
@@ -143,14 +154,16 @@ def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> Occup
     return fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid)
 
 
-def _drawn_closures(closures: Sequence[LoopClosure], members: Sequence[MappedRobot]) -> list[DrawnClosure]:
-    """Accepted closures between robots, as lines of the picture."""
-    poses = {robot.robot: robot.T_map_base for robot in members}
-    return [
-        DrawnClosure(poses[c.i.robot][c.i.number][:2], poses[c.j.robot][c.j.number][:2], c.i.robot, c.j.robot)
-        for c in closures
-        if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot and c.i.robot in poses
-    ]
+def _drawn_closures(result: FleetResult) -> dict[int, list[DrawnClosure]]:
+    """Accepted closures between robots, as lines of the pictures, by map."""
+    mapped = {robot.robot: robot for robot in result.robots}
+    drawn: dict[int, list[DrawnClosure]] = {}
+    for c in result.closures:
+        if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot:
+            i, j = mapped[c.i.robot], mapped[c.j.robot]
+            line = DrawnClosure(i.T_map_base[c.i.number][:2], j.T_map_base[c.j.number][:2], i.robot, j.robot)
+            drawn.setdefault(i.map_index, []).append(line)
+    return drawn
 
 
 def _counts(result: FleetResult) -> list[Metric]:

@@ -117,7 +117,8 @@ def solve_jointly(
     """
     # 1. Optimise each robot's own graph.
     factors = FactorCache(evidence.graph)
-    own = [_solve_own_graph(evidence, robot, consistency, gnc, factors) for robot in evidence.robots]
+    initial = evidence.graph.poses()
+    own = [_solve_own_graph(evidence, robot, initial[robot], consistency, gnc, factors) for robot in evidence.robots]
     paths = [path for path, _ in own]
     # 2. Find the dominant cluster of closures between every two robots (PCM).
     links = _find_links(evidence, paths, consistency, examine)
@@ -127,7 +128,7 @@ def solve_jointly(
         frames, maps = _merge_frames(len(own), joining)
         within_maps = _edges_within_maps(evidence, maps)
         # 4. Solve with the supported closures, then decide all closures within maps by that solution.
-        supported = within_maps & _supported_edges(evidence, [weights for _, weights in own], joining)
+        supported = within_maps & _supported_edges(evidence, [inliers for _, inliers in own], joining)
         solution = _solve_supported(evidence, supported, paths, frames, bool(joining), gnc, factors)
         solution = _refine_inliers(factors, within_maps, solution, gnc)
         # 5. Withdraw isolated closures and decide once more.
@@ -148,18 +149,19 @@ def solve_jointly(
 def _solve_own_graph(
     evidence: JointEvidence,
     robot: NDArray[np.int64],
+    initial: FloatArray,
     consistency: ConsistencySettings,
     gnc: GncSettings | None,
     factors: FactorCache,
-) -> tuple[Trajectory, FloatArray]:
-    """Trajectory of one robot from its own measurements, and the weights (E,) of its edges; other edges have 0."""
+) -> tuple[Trajectory, NDArray[np.int64]]:
+    """Trajectory of one robot from its own measurements and initial poses, and those of its edges that are inliers."""
     graph = evidence.graph
     number = np.full(len(graph), -1)
     number[robot] = np.arange(len(robot))
     edges = graph.arrays()
     mine = np.flatnonzero((number[edges.i] >= 0) & (number[edges.j] >= 0) & ~evidence.excluded)
     own_graph = PoseGraph(
-        graph.poses()[robot],
+        initial,
         [
             e
             if (number[e.i], number[e.j]) == (e.i, e.j)  # as with one robot: an edge that is checked already
@@ -170,9 +172,7 @@ def _solve_own_graph(
     same = np.array_equal(robot, np.arange(len(graph)))  # then its factors are those of the joint graph
     own_factors = factors.restricted(own_graph, ~evidence.excluded[edges.robust]) if same else None
     solution = solve_single_robot(own_graph, consistency, gnc, own_factors)
-    weights = np.zeros(len(edges.i))
-    weights[mine] = solution.weights
-    return robot_trajectory(own_graph, solution.poses, consistency), weights
+    return robot_trajectory(own_graph, solution.poses, consistency), mine[solution.weights > INLIER_WEIGHT]
 
 
 def _find_links(
@@ -240,11 +240,13 @@ def _edges_within_maps(evidence: JointEvidence, maps: Sequence[int]) -> NDArray[
     return ~edges.robust | (within & ~evidence.excluded)
 
 
-def _supported_edges(evidence: JointEvidence, own: Sequence[FloatArray], links: Sequence[Link]) -> NDArray[np.bool_]:
+def _supported_edges(
+    evidence: JointEvidence, own: Sequence[NDArray[np.int64]], links: Sequence[Link]
+) -> NDArray[np.bool_]:
     """Odometry, inliers of a robot's own graph, and members of a link's cluster, shape (E,)."""
     supported = ~evidence.graph.arrays().robust
-    for weights in own:
-        supported |= weights > INLIER_WEIGHT
+    for inliers in own:
+        supported[inliers] = True
     for link in links:
         supported[link.members] = True
     return supported
