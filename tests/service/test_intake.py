@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.replies import SessionCorrection
 from fcslam.errors import PacketConflictError, PacketError
 from fcslam.records import Correction, frozen
@@ -80,6 +81,47 @@ def test_every_epoch_in_a_batch_is_acknowledged(desk):
     told = desk.take(DATA[0], encode(later))
     assert told == [Acknowledgement("a", 0, 0), Acknowledgement("a", 4, 0)]
     assert desk.take() == [Acknowledgement("a", 4, 0)], "a robot that only asks hears of its newest session"
+
+
+def limited(desk, **limits):
+    desk.intake = Intake(desk.store, lambda: desk.now, lambda: 1e9, limits=ClaimLimits(**limits))
+
+
+def test_of_many_sessions_the_later_ones_wait(desk):
+    limited(desk, sessions_per_hour=3)
+    hellos = [
+        encode(replace(PACKETS[0], epoch=epoch, body=replace(PACKETS[0].body, epoch=epoch))) for epoch in range(5)
+    ]
+    for hello in hellos[:3]:
+        desk.take(hello)
+    with pytest.raises(BusyError, match=r"3 sessions per hour.*1200 s") as busy:
+        desk.take(hellos[3])
+    assert busy.value.retry_after_s == pytest.approx(1200.0)
+    desk.take(*DATA[:3])
+    assert [session.epoch for session in desk.intake.sessions("a")] == [0, 1, 2], "nothing of it is stored"
+    desk.now += 1201.0
+    desk.take(hellos[3])
+    with pytest.raises(BusyError):
+        desk.take(hellos[4])
+
+
+def test_of_many_packets_the_later_ones_wait(desk, monkeypatch):
+    monkeypatch.setattr(module, "MAXIMUM_BATCH_PACKETS", 4)
+    limited(desk, packets_per_s=0.2)
+    desk.take(*DATA[:3])
+    with pytest.raises(BusyError, match=r"0\.2 packets per second.*15 s") as busy:
+        desk.take(*DATA[3:7])
+    assert busy.value.retry_after_s == pytest.approx(15.0)
+    desk.now += 15.0
+    assert desk.take(*DATA[3:7]) == [Acknowledgement("a", 0, 6)]
+    desk.take(robot="b")
+
+
+def test_a_robot_that_catches_up_with_a_day_is_not_slowed_more_than_its_worker(desk):
+    """20,000 packets at once, then 1,000 per second: the worker applies no more."""
+    assert desk.intake._packet_rate.wait_s("a", 20_000) == 0.0
+    desk.now += 1.0
+    assert desk.intake._packet_rate.wait_s("a", 1000) == 0.0
 
 
 def test_a_correction_is_told_once(desk):

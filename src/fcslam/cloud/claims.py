@@ -37,6 +37,16 @@ class ClaimLimits(Settings):
     sigma_rad: float = Field(
         default=0.0002, gt=0, description="least standard deviation of a heading that a robot measures [rad]"
     )
+    packets_per_s: float = Field(
+        default=1000.0,
+        gt=0,
+        description="packets per second that a service takes from a robot on average, twenty times as many at once",
+    )
+    sessions_per_hour: float = Field(
+        default=60.0,
+        ge=1,
+        description="sessions per hour that a service takes from a robot on average, and as many at once",
+    )
 
 
 def check_constraint(constraint: Constraint, largest_m: float, limits: ClaimLimits) -> None:

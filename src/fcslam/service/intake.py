@@ -1,10 +1,11 @@
 """Checks, stores and acknowledges batches of packets; knows no network and does not wait for the fleet."""
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import ReplyState, replies
@@ -12,7 +13,9 @@ from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, sessio
 from fcslam.errors import FcslamError, PacketConflictError, PacketError
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.service.mission_store import MissionStore, StoredPacket
+from fcslam.service.token_buckets import TokenBuckets
 from fcslam.wire.batches import read_batch, write_batch
+from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import UPLINK, Hello, PacketKind
 from fcslam.wire.packets import decode, encode, read_label, read_number
 
@@ -24,12 +27,18 @@ MOST_EARLY = 20_000
 """Largest number of packets of one robot, in all its sessions, that wait for one before them."""
 FURTHEST_AHEAD = 20_000
 """How far a packet's number may be ahead of the first missing packet of its session."""
-RETRY_AFTER_S = 2
+RETRY_AFTER_S = 2.0
 """Seconds that a robot waits before it sends refused packets again."""
+BURST_S = 20.0
+"""A robot may send as many packets at once as it may send in this time."""
 
 
 class BusyError(FcslamError):
     """The service cannot take the packets now; the robot sends them again later."""
+
+    def __init__(self, message: str, retry_after_s: float = RETRY_AFTER_S) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
 
 
 class LeaseError(FcslamError):
@@ -74,8 +83,13 @@ class Intake:
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
         announced: Callable[[], Mapping[Channel, DetectorFile]] = dict,
+        limits: ClaimLimits | None = None,
     ) -> None:
-        """``announced``: detectors that robots are to use."""
+        """``announced``: detectors that robots are to use; ``limits``: what a robot may send."""
+        self._limits = limits = limits or ClaimLimits()
+        burst = max(BURST_S * limits.packets_per_s, MAXIMUM_BATCH_PACKETS)
+        self._packet_rate = TokenBuckets(clock, limits.packets_per_s, burst)
+        self._session_rate = TokenBuckets(clock, limits.sessions_per_hour / 3600.0, limits.sessions_per_hour)
         self._store, self._clock, self._wall_clock, self._announced = store, clock, wall_clock, announced
         self._lock = threading.Lock()
         self._leases: dict[str, tuple[str, float]] = {}
@@ -96,8 +110,11 @@ class Intake:
         """
         self._lease(robot, agent)
         check_robot(robot)
-        packets, refusal = _checked(robot, read_batch(batch))
+        encoded = read_batch(batch)
+        self._limit_packets(robot, len(encoded))
+        packets, refusal = _checked(robot, encoded)
         numbers = [(packet.robot, packet.epoch, packet.sequence) for packet in packets]
+        self._limit_sessions(robot, {epoch for _, epoch, _ in numbers})
         self._make_room(robot, numbers)
         try:
             self._store.put(packets, self._wall_clock())
@@ -151,6 +168,21 @@ class Intake:
                     f"or wait {heard + LEASE_S - now:.0f} s if it is gone"
                 )
             self._leases[robot] = agent, now
+
+    def _limit_packets(self, robot: str, count: int) -> None:
+        wait_s = self._packet_rate.wait_s(robot, count)
+        if wait_s > 0.0:
+            limit = f"{self._limits.packets_per_s:g} packets per second (fleet.claims)"
+            raise BusyError(f"{robot}: over {limit}; send the others in {wait_s:.0f} s", wait_s)
+
+    def _limit_sessions(self, robot: str, epochs: Collection[int]) -> None:
+        with self._lock:
+            names = [session_name(robot, epoch) for epoch in epochs]
+            new = sum(1 for name in names if not self._log.next_sequence(name) and not self._log.waiting_count(name))
+        wait_s = self._session_rate.wait_s(robot, new) if new else 0.0
+        if wait_s > 0.0:
+            limit = f"{self._limits.sessions_per_hour:g} sessions per hour (fleet.claims)"
+            raise BusyError(f"{robot}: over {limit}; the next one can begin in {wait_s:.0f} s", wait_s)
 
     def _make_room(self, robot: str, numbers: Sequence[tuple[str, int, int]]) -> None:
         """Refuse, for now, what would make the queue or the robot's waiting packets too many."""

@@ -36,9 +36,11 @@ class OpenMission:
     ) -> None:  # fmt: skip
         self.folder = folder
         self.store = MissionStore(folder.store)
-        if self.store.fact(CONFIG) is None:
+        stored = self.store.fact(CONFIG)
+        if stored is None:
             self.store.remember(CONFIG, config.model_dump_json())
-        self.intake = Intake(self.store, clock, wall_clock, detectors.announced)
+        limits = (config if stored is None else CloudConfig.model_validate_json(stored)).fleet.claims
+        self.intake = Intake(self.store, clock, wall_clock, detectors.announced, limits)
         self.worker = launch(folder)
         self._wall_clock = wall_clock
 

@@ -1,6 +1,5 @@
 """Rate and size limits of requests."""
 
-import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -9,6 +8,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
 from fcslam.service.http.responses import content
+from fcslam.service.token_buckets import TokenBuckets
 
 BYTES_PER_S = 8.0 * 2**20
 """Bytes per second of one robot: a thousand times its rate while it drives, for the backlog after an outage."""
@@ -21,15 +21,13 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 
 class RateLimit:
-    """A token bucket for each robot. Any thread may call."""
+    """Bytes of each robot's requests. Any thread may call."""
 
     def __init__(
         self, clock: Callable[[], float], bytes_per_s: float = BYTES_PER_S, burst: float = BURST_BYTES
     ) -> None:
-        self._clock, self._rate, self._burst = clock, bytes_per_s, burst
-        self._level: dict[str, tuple[float, float]] = {}
-        """Level of each bucket and its time."""
-        self._lock = threading.Lock()
+        self._burst = burst
+        self._buckets = TokenBuckets(clock, bytes_per_s, burst)
 
     @property
     def largest(self) -> int:
@@ -38,14 +36,7 @@ class RateLimit:
 
     def wait_s(self, robot: str, size: int) -> float:
         """Count a request of ``size`` bytes; if it is over the limit, how long to wait, and it is not counted."""
-        with self._lock:
-            now = self._clock()
-            level, then = self._level.get(robot, (self._burst, now))
-            level = min(self._burst, level + (now - then) * self._rate) - REQUEST_BYTES - size
-            if level < 0.0:
-                return -level / self._rate
-            self._level[robot] = level, now
-            return 0.0
+        return self._buckets.wait_s(robot, REQUEST_BYTES + size)
 
 
 async def read_body(request: Request, longest: int) -> bytes:

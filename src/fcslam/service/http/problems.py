@@ -1,5 +1,6 @@
 """Every refusal is one line of JSON: {"error": what, where, what to do}."""
 
+import math
 from collections.abc import Mapping
 
 from fastapi import FastAPI, Request
@@ -18,7 +19,7 @@ from fcslam.errors import (
     ServiceError,
     StoreError,
 )
-from fcslam.service.intake import RETRY_AFTER_S, BusyError, LeaseError, RefusedPacketError
+from fcslam.service.intake import BusyError, LeaseError, RefusedPacketError
 
 STATUS: dict[type[FcslamError], int] = {
     BusyError: 429,
@@ -49,7 +50,7 @@ def add_handlers(app: FastAPI) -> None:
 
 def _on_fcslam_error(_: Request, error: Exception) -> JSONResponse:
     status = next((STATUS[kind] for kind in type(error).mro() if kind in STATUS), 500)
-    headers = {"Retry-After": str(RETRY_AFTER_S)} if status == 429 else None
+    headers = {"Retry-After": str(math.ceil(error.retry_after_s))} if isinstance(error, BusyError) else None
     index = getattr(error, "index", None)
     return problem(status, str(error), headers, **({} if index is None else {"index": index}))
 
