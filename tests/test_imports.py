@@ -39,6 +39,7 @@ ROOMS = [
     "simulation",
     "driving",
     "mission",
+    "localization",
     "api",
     "live",
     "evaluation",

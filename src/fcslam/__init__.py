@@ -33,12 +33,22 @@ from fcslam.errors import (
 )
 
 if TYPE_CHECKING:
-    from fcslam.api import map_recordings
+    from fcslam.api import localize, map_recordings
     from fcslam.live.records import EventKind, RobotEvent, RobotPose
     from fcslam.live.robot import Robot
     from fcslam.mission import MissionConfig, Progress
     from fcslam.records import Channel, ClosureStatus, LaserModel, Veto
-    from fcslam.runs import ClosureRow, LocalMap, Metric, Occupancy, OccupancyMap, RobotTrajectory, Run, open_run
+    from fcslam.runs import (
+        ClosureRow,
+        LocalizedPoses,
+        LocalMap,
+        Metric,
+        Occupancy,
+        OccupancyMap,
+        RobotTrajectory,
+        Run,
+        open_run,
+    )
     from fcslam.sources import BagOptions
 
 __version__ = "0.1.0"
@@ -57,6 +67,7 @@ __all__ = [
     "InputError",
     "LaserModel",
     "LocalMap",
+    "LocalizedPoses",
     "Metric",
     "MissionConfig",
     "Occupancy",
@@ -80,6 +91,7 @@ __all__ = [
     "UnavailableError",
     "Veto",
     "__version__",
+    "localize",
     "map_recordings",
     "open_run",
 ]
@@ -92,6 +104,7 @@ _LAZY: Final = {
     "EventKind": "fcslam.live.records",
     "LaserModel": "fcslam.records",
     "LocalMap": "fcslam.runs",
+    "LocalizedPoses": "fcslam.runs",
     "Metric": "fcslam.runs",
     "MissionConfig": "fcslam.mission",
     "Occupancy": "fcslam.runs",
@@ -103,6 +116,7 @@ _LAZY: Final = {
     "RobotTrajectory": "fcslam.runs",
     "Run": "fcslam.runs",
     "Veto": "fcslam.records",
+    "localize": "fcslam.api",
     "map_recordings": "fcslam.api",
     "open_run": "fcslam.runs",
 }

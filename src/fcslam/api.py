@@ -1,19 +1,22 @@
-"""Map recordings with one function call; `fcslam map` calls the same function."""
+"""Map recordings, or localise in a map, with one function call; the commands call the same functions."""
 
 import logging
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fcslam import sources
 from fcslam.config import load, parse
 from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
 from fcslam.mission import MissionConfig, Watch, run_mission
-from fcslam.records import Veto
-from fcslam.runs import Run, prepare_output
+from fcslam.records import FloatArray, Veto, frozen
+from fcslam.runs import OccupancyMap, Run, prepare_output
 from fcslam.sources import BagOptions, Source
+
+if TYPE_CHECKING:
+    from fcslam.localization import LocalizationProgress
 
 StrPath = str | os.PathLike[str]
 Recordings = StrPath | Iterable[StrPath | Source] | Mapping[str, StrPath]
@@ -65,6 +68,52 @@ def map_recordings(
     settings = settings_of(config, seed, join_maps)
     robots = split_recordings(_opened(recordings, bag_options), split)
     run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes), side_by_side(processes))
+    if output is not None:
+        run.save(output, force)
+    return run
+
+
+def localize(
+    recording: StrPath | Source,
+    map: StrPath | OccupancyMap,  # the word that users expect
+    *,
+    initial_pose: tuple[float, float, float] | None = None,
+    config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
+    output: StrPath | None = None,
+    bag_options: BagOptions | None = None,
+    progress: "Callable[[LocalizationProgress], None]" = lambda _: None,
+    force: bool = False,
+) -> Run:
+    """Localise the robot of a recording in a finished map, which does not change.
+
+    The robot's starting pose need not be known. A robot that does not know where it is has no pose, never a guess.
+
+    Args:
+        recording: a recording of any known format, or an object of your own that implements ``Source``.
+        map: a run folder, whose first map is used; the YAML file of a ROS map with the PGM file beside it; or a map.
+        initial_pose: about where the recording starts in the map, (x, y, theta), metres and radians; None: anywhere.
+        config: as for :func:`map_recordings`; ``robot`` counts.
+        output: run folder to write; by default nothing is written.
+        bag_options: topics and the pose of the laser, where a ROS bag leaves a choice.
+        progress: called every 50 scans.
+        force: replace a run that is at ``output``.
+
+    Returns:
+        A run whose trajectory holds the poses that the robot believed; ``localized`` has every scan with standard
+        deviations and quality.
+
+    Raises:
+        InputError: the recording, the map, the configuration or the output folder cannot be used.
+    """
+    from fcslam.localization import read_map, run_localization  # SciPy's images: mapping alone needs none
+
+    if output is not None:
+        prepare_output(Path(output), force)
+    settings = settings_of(config, None, None)
+    occupancy = map if isinstance(map, OccupancyMap) else read_map(Path(map))
+    (source,) = _opened([recording], bag_options)
+    initial: FloatArray | None = None if initial_pose is None else frozen(initial_pose)
+    run = run_localization(source, occupancy, settings, initial, progress)
     if output is not None:
         run.save(output, force)
     return run

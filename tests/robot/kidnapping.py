@@ -17,11 +17,15 @@ def drives() -> list[list[LaserScan]]:
 def kidnapping() -> tuple[list[LaserScan], float]:
     """Scans of the one, then of the other, as wheels tell them that never left the floor; when it happened."""
     before, after = drives()[0][:80], drives()[1]
-    last = before[-1]
-    after = [
-        replace(scan, stamp=last.stamp + scan.stamp - after[0].stamp + 0.3, T_odom_base=frozen(
-            se2.compose(last.T_odom_base, se2.between(after[0].T_odom_base, scan.T_odom_base))
+    return before + put_down(before[-1], after)[1:], before[-1].stamp
+
+
+def put_down(last: LaserScan, after: list[LaserScan]) -> list[LaserScan]:
+    """The scans of another drive as those of a robot that was carried there after its ``last`` scan."""
+    start = after[0]
+    return [
+        replace(scan, stamp=last.stamp + scan.stamp - start.stamp + 0.3, T_odom_base=frozen(
+            se2.compose(last.T_odom_base, se2.between(start.T_odom_base, scan.T_odom_base))
         ))
-        for scan in after[1:]
+        for scan in after
     ]  # fmt: skip
-    return before + after, last.stamp

@@ -10,6 +10,7 @@ import typer
 import fcslam
 from fcslam.cli import certificates, config, demo, evaluate, extract, federate, live, serve, simulate, train
 from fcslam.cli import convert as conversion
+from fcslam.cli import localize as localization
 from fcslam.cli import map as mapping
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
@@ -36,6 +37,13 @@ app.command(
         "fcslam map building.clf.gz --split 3 --quiet",
     ),
 )(mapping.map_recordings)
+app.command(
+    "localize",
+    epilog=examples(
+        "fcslam localize today.bag --map runs/building",
+        "fcslam localize today.bag --map office.yaml --initial-pose 2,3.5,1.57",
+    ),
+)(localization.localize)
 app.command(
     "convert",
     epilog=examples(

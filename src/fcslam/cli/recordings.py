@@ -59,7 +59,12 @@ def bag_options(
 
     if not scan_topics and odom_topic is None and camera_topic is None and not laser_poses:
         return None
-    return BagOptions(tuple(scan_topics or ()), odom_topic, camera_topic, tuple(map(_pose, laser_poses or ())))
+    return BagOptions(
+        tuple(scan_topics or ()),
+        odom_topic,
+        camera_topic,
+        tuple(pose("--laser-pose", text) for text in laser_poses or ()),
+    )
 
 
 def open_recording(argument: str, options: "BagOptions | None") -> "Source":
@@ -105,11 +110,16 @@ def print_faults(console: "Console", faults: "Mapping[str, Faults]") -> None:
             print_line(console, f"{name}: {found}")
 
 
-def _pose(text: str) -> tuple[float, float, float]:
+def pose(option: str, text: str) -> tuple[float, float, float]:
+    """The pose that an option gives as X,Y,THETA, metres and radians.
+
+    Raises:
+        InputError: it is no pose.
+    """
     try:
         x, y, theta = map(float, text.split(","))
     except ValueError:
         x = y = theta = math.nan
     if not all(map(math.isfinite, (x, y, theta))):
-        raise InputError(f"--laser-pose {text!r} is no pose; give metres and radians, as in --laser-pose 0.12,0,3.14")
+        raise InputError(f"{option} {text!r} is no pose; give metres and radians, as in {option} 0.12,0,3.14")
     return x, y, theta

@@ -64,7 +64,7 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
     """
     near = [(_near(scan, pose), pose) for scan, pose in scans]
     field = field_of(near)
-    surface = _spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
+    surface = spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
     passes, hits, corner = _beam_counts(near, surface.points)
     column, row = np.floor((surface.points - corner) / FREE_CELL_M).astype(np.int64).T
     passed, hit = passes[row, column], hits[row, column]
@@ -122,8 +122,8 @@ def _count_beams(points, origin, T, corner, number, latest, passes, hits):  # ty
                 passes[y, x] += 1
 
 
-def _spaced(surfels: PointScan) -> PointScan:
-    """First surfel of each cell of ``SPACING_M``."""
+def spaced(surfels: PointScan) -> PointScan:
+    """The first surfel of each cell of ``SPACING_M``."""
     cells = np.floor(surfels.points / SPACING_M).astype(np.int64)
     _, first = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)
     return surfels.only(np.sort(first))

@@ -87,15 +87,38 @@ def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | No
     if not len(a.surface) or not len(b.surface):
         return None
     middle = b.surface.points.mean(axis=0, keepdims=True)
-    distinct = [T_a_b]
+    refined = (align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [T_a_b]))
+    rivals = (rival for rival in refined if _is_elsewhere(rival.T_a_b, T_a_b, middle))
+    return max(rivals, key=lambda rival: rival.score_m, default=None)
+
+
+def two_best(a: Submap, b: Submap) -> tuple[MapAlignment, MapAlignment | None] | None:
+    """The best alignment of two maps from all headings and all positions, and the best one elsewhere, if any.
+
+    Args:
+        a, b: maps, each in the coordinate frame of its anchor.
+
+    Returns:
+        The two alignments; None if a map is empty.
+    """
+    if not len(a.surface) or not len(b.surface):
+        return None
+    middle = b.surface.points.mean(axis=0, keepdims=True)
+    refined = [align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [])]
+    best = max(refined, key=lambda alignment: alignment.score_m)
+    rivals = (rival for rival in refined if _is_elsewhere(rival.T_a_b, best.T_a_b, middle))
+    return best, max(rivals, key=lambda rival: rival.score_m, default=None)
+
+
+def _distinct_peaks(a: Submap, b: Submap, middle: FloatArray, known: list[FloatArray]) -> list[FloatArray]:
+    """The best transforms of the exhaustive search that are elsewhere than each other and than the ``known`` ones."""
+    distinct = list(known)
     for _, pose in sorted(_coarse_peaks(a, b), key=lambda peak: -peak[0]):
         if all(_is_elsewhere(pose, other, middle) for other in distinct):
             distinct.append(pose)
-        if len(distinct) > REFINED:
+        if len(distinct) >= REFINED + len(known):
             break
-    refined = (align_map(a, b, pose) for pose in distinct[1:])
-    rivals = (rival for rival in refined if _is_elsewhere(rival.T_a_b, T_a_b, middle))
-    return max(rivals, key=lambda rival: rival.score_m, default=None)
+    return distinct[len(known) :]
 
 
 def _is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool:

@@ -32,6 +32,7 @@ from fcslam.robot.backend import (
     essential,
 )
 from fcslam.robot.beside import BackendRunner, Inline
+from fcslam.robot.map_localizer import MapLocalizationConfig
 from fcslam.robot.odometry_gate import OdometryGate, OdometryLimits
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.messages import Body, Hello, Packet
@@ -44,6 +45,9 @@ class RobotConfig(SessionConfig):
     lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost and starts a new session")
     odometry: OdometryLimits = Field(
         default=OdometryLimits(), description="jumps of the wheel odometry, which scan matching bridges"
+    )
+    localization: MapLocalizationConfig = Field(
+        default=MapLocalizationConfig(), description="localisation in a finished map, which does not change"
     )
 
 
@@ -112,6 +116,11 @@ class RobotFrontend:
     def scan_poses(self) -> ScanTrack:
         """Poses of the scans of the present session."""
         return self.tracks[-1]
+
+    @property
+    def travel_m(self) -> float:
+        """Path length of the present session up to its newest keyscan, metres; turns count a little."""
+        return self._lidar.travel_m
 
     @property
     def backlog(self) -> int:

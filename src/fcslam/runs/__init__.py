@@ -10,7 +10,7 @@ from fcslam.runs.folder import (
     prepare_output,
 )
 from fcslam.runs.map_files import Occupancy, OccupancyMap
-from fcslam.runs.records import ClosureRow, LocalMap, Metric, RobotTrajectory
+from fcslam.runs.records import ClosureRow, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.separations import Separation, separations
 from fcslam.runs.tables import metrics_json, read_vetoes
 from fcslam.runs.trajectories import read_tum, write_tum
@@ -21,6 +21,7 @@ __all__ = [
     "TRAJECTORIES",
     "ClosureRow",
     "LocalMap",
+    "LocalizedPoses",
     "Metric",
     "Occupancy",
     "OccupancyMap",

@@ -7,6 +7,8 @@
     metrics.json               [{name, value, unit}]
     config.yaml                the complete configuration of the run
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
+    localization/<robot>.csv   instead of local: of a robot that was localised in a finished map, pose, standard
+                               deviations and quality at every laser scan
     local/<robot>.tum          as trajectories/, in the robot's own map, which nothing but its own measurements made
     local/<robot>.pgm, .yaml   that map
 
@@ -24,19 +26,22 @@ from pathlib import Path
 
 from fcslam.errors import EvaluationError, OutputError
 from fcslam.runs.map_files import OccupancyMap, parse_map
-from fcslam.runs.records import ClosureRow, LocalMap, Metric, RobotTrajectory
+from fcslam.runs.records import ClosureRow, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import (
     metrics_json,
     read_closures,
+    read_localized,
     read_metrics,
     read_robots,
     write_closures,
+    write_localized,
     write_robots,
 )
 from fcslam.runs.trajectories import read_tum, write_tum
 from fcslam.storage.files import replacing_folder
 
 TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
+LOCALIZATION = "localization"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 
 _SAFE_NAME = re.compile(r"\w[\w.+-]*")
@@ -67,6 +72,8 @@ class Run:
     """File name to content: map.pgm, map.yaml, map.png, map_1.pgm ..."""
     local_maps: Mapping[str, LocalMap] = field(default_factory=dict)
     """By robot: every robot's own map. Live results of the service have none, and their folder has no ``local``."""
+    localized: Mapping[str, LocalizedPoses] = field(default_factory=dict)
+    """By robot: poses in a finished map; ``fcslam.localize`` makes them."""
 
     @cached_property
     def maps(self) -> Mapping[int, OccupancyMap]:
@@ -161,6 +168,7 @@ def open_run(folder: str | os.PathLike[str]) -> Run:
             pose_graph_g2o=(path / POSE_GRAPH).read_text(encoding="utf-8"),
             map_files={file.name: file.read_bytes() for file in sorted(path.glob("map*.*"))},
             local_maps=_read_local_maps(path / LOCAL, maps),
+            localized={file.stem: read_localized(file) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
     except (OSError, ValueError, csv.Error) as error:
         raise EvaluationError(f"{path}: a broken run folder ({error})") from error
@@ -183,6 +191,10 @@ def _write(run: Run, folder: Path) -> None:
         (folder / LOCAL).mkdir()
     for local in run.local_maps.values():
         _write_local_map(folder / LOCAL, local)
+    if run.localized:
+        (folder / LOCALIZATION).mkdir()
+    for poses in run.localized.values():
+        write_localized(folder / LOCALIZATION / f"{poses.robot}.csv", poses)
     write_robots(folder / ROBOTS, run.trajectories.values())
     write_closures(folder / CLOSURES, run.closures)
     (folder / METRICS).write_text(metrics_json(run.metrics.values()), encoding="utf-8")

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fcslam.records import Channel, ClosureStatus, FloatArray, Reason
+from fcslam.records import Channel, ClosureStatus, FloatArray, Reason, frozen
 from fcslam.runs.map_files import OccupancyMap, parse_map
 
 
@@ -26,6 +27,32 @@ class RobotTrajectory:
         """Length of the polygon through the positions."""
         steps = np.diff(self.T_map_base[:, :2], axis=0)
         return float(np.sum(np.hypot(steps[:, 0], steps[:, 1])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalizedPoses:
+    """Where a robot believed to be in a finished map, at every laser scan of its recording."""
+
+    robot: str
+    stamps: FloatArray
+    """Shape (N,), seconds of the recording's own clock."""
+    T_map_base: FloatArray
+    """Poses (x, y, theta) of ``base``, metres and radians, shape (N, 3); NaN where the robot was not localised."""
+    sigma: FloatArray
+    """Standard deviations of x, y (m) and theta (rad), shape (N, 3); NaN where the robot was not localised."""
+    quality: FloatArray
+    """Share of the walls seen lately, where the map knows the area, that lie on walls of the map, shape (N,); 0 where
+    the robot was not localised."""
+
+    @property
+    def is_localized(self) -> NDArray[np.bool_]:
+        """Whether the robot knew where it was, shape (N,)."""
+        return ~np.isnan(self.T_map_base[:, 0])
+
+    def believed(self) -> RobotTrajectory:
+        """The poses that the robot believed, in map 0."""
+        known = self.is_localized
+        return RobotTrajectory(self.robot, 0, frozen(self.stamps[known]), frozen(self.T_map_base[known]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,14 +7,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from fcslam.errors import ConfigError
-from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, Veto, frozen
-from fcslam.runs.records import ClosureRow, Metric, RobotTrajectory
+from fcslam.records import Channel, ClosureStatus, FloatArray, Reason, ReasonCode, Veto, frozen
+from fcslam.runs.records import ClosureRow, LocalizedPoses, Metric, RobotTrajectory
 
 _Value = TypeVar("_Value")
 
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
 _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
+_LOCALIZED_COLUMNS = ["stamp", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "quality"]
 _REASON_COLUMNS = ["reason", "value", "limit", "setting"]
 _CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", *_REASON_COLUMNS]
 
@@ -45,6 +48,26 @@ def read_closures(path: Path) -> tuple[ClosureRow, ...]:
         ValueError: a column is missing or a value is not what the column holds.
     """
     return tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS))
+
+
+def write_localized(path: Path, poses: LocalizedPoses) -> None:
+    """Write localization/<robot>.csv: nine digits after the point, empty cells where the robot was not localised."""
+    table = np.column_stack((poses.stamps, poses.T_map_base, poses.sigma, poses.quality)).tolist()
+    fields = (["" if math.isnan(value) else f"{value:.9f}" for value in row] for row in table)
+    _write_csv(path, _LOCALIZED_COLUMNS, fields)
+
+
+def read_localized(path: Path) -> LocalizedPoses:
+    """Every line of localization/<robot>.csv.
+
+    Raises:
+        ValueError: a column is missing or a value is no number.
+    """
+    rows = [
+        [float(row[column] or "nan") for column in _LOCALIZED_COLUMNS] for row in _read_csv(path, _LOCALIZED_COLUMNS)
+    ]
+    table: FloatArray = frozen(np.array(rows, dtype=np.float64).reshape(-1, len(_LOCALIZED_COLUMNS)))
+    return LocalizedPoses(path.stem, table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7])
 
 
 def read_vetoes(path: Path) -> tuple[Veto, ...]:

@@ -1,0 +1,79 @@
+"""A finished occupancy map as a submap: its walls as surfaces, its free cells as free space.
+
+Scans and submaps of a robot are matched with it as with a submap that keyscans made, so one code serves both. The map
+may come from any program; nothing but its cells counts.
+"""
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+from fcslam.errors import SourceError
+from fcslam.lidar.field import CELL_M, MOST_SURFELS, TABLE, TILE, SurfelField
+from fcslam.lidar.scan import PointScan
+from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap, spaced
+from fcslam.records import FloatArray
+from fcslam.runs.map_files import Occupancy, OccupancyMap
+
+NORMAL_M = 0.1
+"""Width of the Gaussian over free cells whose slope is the normal of a wall."""
+ADJACENT_CELLS = 1.5
+"""An occupied cell is part of a surface if a free cell is this near, in cells; what lies behind it is never seen."""
+WIDEST_M = TABLE * TILE * CELL_M - 2.0
+"""Largest extent of a map in x or y."""
+COARSEST_M = 0.25
+"""Largest side of a cell."""
+
+
+def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
+    """The surfaces and the free space of a map, in the coordinate frame of the map.
+
+    Args:
+        occupancy: the map.
+        name: what messages call it.
+
+    Raises:
+        SourceError: it shows no wall beside free space, is too large, or its cells are too coarse to match scans with.
+    """
+    side = occupancy.resolution_m
+    if side > COARSEST_M:
+        raise SourceError(f"{name}: cells of {side:g} m are too coarse; localisation needs {COARSEST_M:g} m or finer")
+    surface = _surface(occupancy)
+    if not len(surface):
+        raise SourceError(f"{name}: shows no wall beside free space; is it the right map?")
+    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+    if (high - low).max() > WIDEST_M:
+        raise SourceError(f"{name}: extends over {(high - low).max():.0f} m; at most {WIDEST_M:.0f} m can be used")
+    field = SurfelField(0.5 * (low + high))
+    field.insert(surface, np.zeros(3))
+    if field.arrays.used[1] == MOST_SURFELS:
+        raise SourceError(f"{name}: has too many walls; at most {0.05e-3 * MOST_SURFELS:.1f} km can be used")
+    field.compact()
+    surfels = PointScan(field.points, field.normals, field.solitary, np.zeros(2))
+    return Submap(field, spaced(surfels), _free_space(occupancy))
+
+
+def _surface(occupancy: OccupancyMap) -> PointScan:
+    """Occupied cells beside free ones as points with normals towards the free side."""
+    free = occupancy.cells == Occupancy.FREE
+    beside = (occupancy.cells == Occupancy.OCCUPIED) & (distance_transform_edt(~free) <= ADJACENT_CELLS)
+    rows, columns = np.nonzero(beside)
+    slope = np.gradient(gaussian_filter(free.astype(np.float32), NORMAL_M / occupancy.resolution_m))
+    normals = np.stack((slope[1][rows, columns], slope[0][rows, columns]), axis=1).astype(np.float64)
+    length = np.hypot(normals[:, 0], normals[:, 1])[:, None]
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0.0)
+    points = (np.stack((columns, rows), axis=1) + 0.5) * occupancy.resolution_m + np.array(occupancy.origin_xy)
+    return PointScan(points, normals, np.zeros(len(points), bool), np.zeros(2))
+
+
+def _free_space(occupancy: OccupancyMap) -> FreeSpace:
+    """Free cells of the size that submaps have: free where every cell of the map at its corners and middle is."""
+    corner: FloatArray = np.array(occupancy.origin_xy)
+    extent = occupancy.resolution_m * np.array(occupancy.cells.shape[::-1])
+    columns, rows = np.floor(extent / FREE_CELL_M + 1e-9).astype(np.int64)
+    cells = np.ones((rows, columns), bool)
+    for share in (0.02, 0.5, 0.98):
+        row = ((np.arange(rows) + share) * FREE_CELL_M / occupancy.resolution_m).astype(np.int64)
+        for other in (0.02, 0.5, 0.98):
+            column = ((np.arange(columns) + other) * FREE_CELL_M / occupancy.resolution_m).astype(np.int64)
+            cells &= occupancy.cells[np.ix_(row, column)] == Occupancy.FREE
+    return FreeSpace(cells, corner)

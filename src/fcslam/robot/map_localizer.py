@@ -1,0 +1,274 @@
+"""Localisation of one robot in a finished map, which does not change.
+
+The robot tracks its scans as always (``fcslam.robot.frontend``); this takes the place of the back end. Until the pose
+in the map is known, the walls around the newest keyscans are aligned with the map exhaustively. An alignment counts
+only if it is clearly better than the best one elsewhere, and the less clear it is, the more stretches must agree. So a
+robot in a building that the map does not show stays without a pose. From then on every keyscan is matched with the
+map, and the walls are compared with it now and then. A robot that sees other walls than the map is not localised any
+more, and the search begins again.
+"""
+
+from collections import deque
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from fcslam.config import Settings
+from fcslam.geometry import se2
+from fcslam.lidar.frontend import POINT_INFORMATION_SHARE, LidarConfig, MappedKeyscan
+from fcslam.lidar.matching import match_scan
+from fcslam.lidar.submap import Agreement, Submap, agreement, build_submap
+from fcslam.records import FloatArray, frozen
+from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
+from fcslam.wire.messages import Body
+
+AGREES_M, AGREES_RAD = 0.5, 0.1
+"""Alignments of two stretches this near each other are one; in between the robot's own motion may drift."""
+LEAST_RIVAL_M = 5.0
+"""The best alignment elsewhere scores at least as much: a few walls are never unique."""
+FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.05, 0.01
+"""Standard deviations of a pose that the exhaustive search found."""
+
+
+class MapLocalizationConfig(Settings):
+    """Localisation in a finished map."""
+
+    first_m: float = Field(default=3.0, gt=0, description="travel before the first search of the whole map [m]")
+    growth: float = Field(default=1.2, gt=1.0, description="length of a stretch, relative to that at the search before")
+    window_m: float = Field(default=15.0, gt=0, description="longest stretch whose walls are searched for [m]")
+    ratio: float = Field(
+        default=1.5,
+        ge=1.0,
+        description="least ratio of the score of the best alignment with the map to that of the best one elsewhere; "
+        "below it, the alignment does not count",
+    )
+    evidence: float = Field(
+        default=3.0,
+        ge=1.0,
+        description="evidence that fixes the pose: the number of separate stretches whose best alignments agree, plus "
+        "the least of their ratios, less one",
+    )
+    violation: float = Field(
+        default=0.10, ge=0, le=1, description="largest share of the walls in free space of the map, or the reverse"
+    )
+    supported: float = Field(
+        default=0.30,
+        ge=0,
+        le=1,
+        description="least share of a keyscan's points on walls of the map; below it, the robot's own motion alone "
+        "counts",
+    )
+    check_m: float = Field(default=2.0, gt=0, description="travel between two comparisons with the map [m]")
+    checked_m: float = Field(default=5.0, gt=0, description="the walls that are compared are of the last metres [m]")
+    overlap: float = Field(
+        default=0.25, ge=0, le=1, description="least share of the walls in known area; below it, nothing is compared"
+    )
+    lost_explained: float = Field(
+        default=0.60, ge=0, le=1, description="a robot that is lost sees a smaller share of its walls in the map"
+    )
+    lost_violation: float = Field(
+        default=0.20, ge=0, le=1, description="and a larger share of its walls in free space of the map"
+    )
+    unseen_m: float = Field(
+        default=20.0, gt=0, description="travel without known walls after which the robot is not localised any more [m]"
+    )
+    initial_m: float = Field(default=1.5, gt=0, description="largest error of a given initial position [m]")
+    initial_rad: float = Field(default=0.5, gt=0, description="largest error of a given initial heading [rad]")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapEstimate:
+    """Where a robot is in the map, as of its newest keyscan."""
+
+    T_map_odom: FloatArray
+    """Pose of the session's ``odom`` frame in the map, shape (3,), metres and radians."""
+    covariance: FloatArray
+    """Of the keyscan's pose in the map, over (x, y, theta), shape (3, 3)."""
+    quality: float
+    """Share of the walls seen lately, where the map knows the area, that lie on walls of the map; in [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Vote:
+    """The best alignment of one stretch."""
+
+    T_map_odom: FloatArray
+    ratio: float
+    """Of its score to the best one elsewhere."""
+
+
+class MapLocalizer:
+    """Localises one robot by its keyscans; a ``BackendRunner`` for ``RobotFrontend``. It sends nothing."""
+
+    def __init__(
+        self, frozen_map: Submap, config: MapLocalizationConfig, lidar: LidarConfig, initial: FloatArray | None = None
+    ) -> None:
+        """Begin without a pose.
+
+        Args:
+            frozen_map: the map (``fcslam.lidar.frozen_map``).
+            config: thresholds.
+            lidar: settings of scan matching.
+            initial: about where the first session starts in the map, shape (3,), metres and radians; None: anywhere.
+        """
+        self._map, self._config, self._lidar = frozen_map, config, lidar
+        self._initial = initial
+        self.estimate: MapEstimate | None = None
+        """None while the robot does not know where it is in the map."""
+        self.fixes = 0
+        """How often a search found the robot."""
+        self.losses = 0
+        """How often the robot was localised and is not any more, ends of sessions included."""
+        self._begin()
+
+    def submit(self, input: BackendInput) -> "Future[list[Body]]":
+        """Handle the next input of the front end at once."""
+        match input:
+            case NewKeyscan():
+                self._add(input.keyscan)
+            case SessionEnd():
+                self._lose()
+                self._begin()
+                self._initial = None  # the robot was put down elsewhere
+        done: Future[list[Body]] = Future()
+        done.set_result([])
+        return done
+
+    def _begin(self) -> None:
+        self._recent: deque[MappedKeyscan] = deque()
+        """The keyscans of the last ``window_m``."""
+        self._T_map_base: FloatArray | None = None
+        """Pose of the newest keyscan; None: unknown."""
+        self._covariance: FloatArray = np.zeros((3, 3))
+        self._quality = 0.0
+        self._votes: list[_Vote] = []
+        """The alignments of separate stretches that agree so far."""
+        self._searched_m = 0.0
+        """Travel at the end of the last stretch that voted."""
+        self._next_search_m = self._config.first_m
+        self._checked_m = self._seen_m = 0.0
+        """Travel at the last comparison with the map, and at the last one that found known walls."""
+
+    def _add(self, keyscan: MappedKeyscan) -> None:
+        before = self._recent[-1] if self._recent else None
+        self._recent.append(keyscan)
+        while self._recent[0].travel_m < keyscan.travel_m - self._config.window_m:
+            self._recent.popleft()
+        if self._T_map_base is not None and before is not None:
+            # 1. Prediction by the robot's own motion, correction by the map.
+            self._T_map_base = self._match(self._predict(self._T_map_base, before, keyscan), keyscan)
+            # 2. Now and then, compare the walls around the robot with the map.
+            if keyscan.travel_m >= self._checked_m + self._config.check_m:
+                self._check(keyscan)
+        if self._T_map_base is None and keyscan.travel_m >= self._next_search_m:
+            # 3. Without a pose, search the whole map.
+            self._search(keyscan)
+        self._publish(keyscan)
+
+    def _predict(self, T_map_base: FloatArray, before: MappedKeyscan, keyscan: MappedKeyscan) -> FloatArray:
+        """The pose moved with the robot; the covariance grows by that of the motion."""
+        predicted = se2.compose(T_map_base, se2.between(before.T_local_base, keyscan.T_local_base))
+        dx, dy = predicted[:2] - T_map_base[:2]
+        lever = np.array(((1.0, 0.0, -dy), (0.0, 1.0, dx), (0.0, 0.0, 1.0)))
+        turn = _turn(predicted[2])
+        assert keyscan.odometry is not None  # only the first keyscan of a session has no motion
+        motion = turn @ np.linalg.inv(keyscan.odometry.information) @ turn.T
+        self._covariance = lever @ self._covariance @ lever.T + motion
+        return predicted
+
+    def _match(self, T_map_guess: FloatArray, keyscan: MappedKeyscan) -> FloatArray:
+        """The pose matched with the map, with the guess as prior."""
+        tracker = self._lidar.tracker
+        points = keyscan.points.thinned(tracker.point_spacing_m, tracker.point_limit)
+        prior: FloatArray = np.asarray(np.linalg.inv(self._covariance))
+        # Errors of neighbouring points are correlated; the match counts them in full, so the prior is scaled instead.
+        match = match_scan(points, self._map.field, T_map_guess, prior / POINT_INFORMATION_SHARE, tracker.matching)
+        if match.explained < self._config.supported:
+            return T_map_guess
+        self._covariance = np.asarray(np.linalg.inv(prior + POINT_INFORMATION_SHARE * match.information))
+        return match.T_field_base
+
+    def _check(self, keyscan: MappedKeyscan) -> None:
+        assert self._T_map_base is not None
+        config = self._config
+        self._checked_m = keyscan.travel_m
+        found = self._agreement(self._T_map_base, config.checked_m)
+        if found.overlap >= config.overlap:
+            self._seen_m, self._quality = keyscan.travel_m, found.explained
+            if found.explained < config.lost_explained and found.violation > config.lost_violation:
+                self._lose()
+        elif keyscan.travel_m > self._seen_m + config.unseen_m:
+            self._lose()
+
+    def _agreement(self, T_map_base: FloatArray, reach_m: float) -> Agreement:
+        return agreement(self._submap(reach_m), self._map, T_map_base)
+
+    def _submap(self, reach_m: float) -> Submap:
+        """The walls of the last metres, in the base of the newest keyscan."""
+        newest = self._recent[-1]
+        kept = [k for k in self._recent if k.travel_m >= newest.travel_m - reach_m]
+        return build_submap([(k.points, se2.between(newest.T_local_base, k.T_local_base)) for k in kept])
+
+    def _search(self, keyscan: MappedKeyscan) -> None:
+        """Align the walls of the newest stretch with the whole map."""
+        from fcslam.lidar.uniqueness import align_map, two_best  # SciPy's transforms take long to load
+
+        config = self._config
+        length_m = min(keyscan.travel_m - self._searched_m, config.window_m)
+        submap = self._submap(length_m)
+        self._next_search_m = keyscan.travel_m + max(config.check_m, (config.growth - 1.0) * length_m)
+        if self._initial is not None:
+            guess = se2.compose(self._initial, keyscan.T_local_base)
+            near = align_map(self._map, submap, guess)
+            off = se2.between(guess, near.T_a_b)
+            is_near = np.hypot(off[0], off[1]) <= config.initial_m and abs(off[2]) <= config.initial_rad
+            if is_near and near.score_m >= LEAST_RIVAL_M and near.violation <= config.violation:
+                self._fix(near.T_a_b, keyscan)
+                return
+        found = two_best(self._map, submap)
+        if found is None:
+            return
+        best, rival = found
+        ratio = best.score_m / (LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m))
+        if ratio < config.ratio or best.violation > config.violation:
+            return
+        vote = _Vote(se2.compose(best.T_a_b, se2.inverse(keyscan.T_local_base)), ratio)
+        self._votes = [*(other for other in self._votes if self._agree(vote, other, keyscan)), vote]
+        if len(self._votes) + min(vote.ratio for vote in self._votes) - 1.0 >= config.evidence:
+            self._fix(best.T_a_b, keyscan)
+        self._searched_m, self._next_search_m = keyscan.travel_m, keyscan.travel_m + config.first_m
+
+    def _agree(self, one: "_Vote", other: "_Vote", keyscan: MappedKeyscan) -> bool:
+        """Whether two alignments put the newest keyscan at one pose of the map."""
+        ends = (se2.compose(vote.T_map_odom, keyscan.T_local_base) for vote in (one, other))
+        gap = se2.between(*ends)
+        return bool(np.hypot(gap[0], gap[1]) <= AGREES_M and abs(gap[2]) <= AGREES_RAD)
+
+    def _fix(self, T_map_base: FloatArray, keyscan: MappedKeyscan) -> None:
+        self.fixes += 1
+        self._T_map_base = T_map_base
+        self._covariance = np.diag((FIRST_SIGMA_M**2, FIRST_SIGMA_M**2, FIRST_SIGMA_RAD**2))
+        self._checked_m = self._seen_m = keyscan.travel_m
+        self._quality = self._agreement(T_map_base, self._config.checked_m).explained
+
+    def _lose(self) -> None:
+        self.losses += self._T_map_base is not None
+        self._T_map_base, self._quality = None, 0.0
+        self._votes = []
+        if self._recent:
+            self._searched_m = self._recent[-1].travel_m
+            self._next_search_m = self._searched_m + self._config.first_m
+
+    def _publish(self, keyscan: MappedKeyscan) -> None:
+        if self._T_map_base is None:
+            self.estimate = None
+            return
+        T_map_odom = se2.compose(self._T_map_base, se2.inverse(keyscan.T_local_base))
+        self.estimate = MapEstimate(frozen(T_map_odom), frozen(self._covariance), self._quality)
+
+
+def _turn(theta: float) -> FloatArray:
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))

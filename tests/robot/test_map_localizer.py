@@ -1,0 +1,140 @@
+"""A robot in a finished map: found where it is, followed, lost when carried away, never placed in another building."""
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se2
+from fcslam.lidar.frozen_map import frozen_map
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.lidar.scan import point_scan
+from fcslam.lidar.submap import build_submap
+from fcslam.lidar.uniqueness import best_elsewhere, two_best
+from fcslam.localization import run_localization
+from fcslam.maps.fusion import fuse
+from fcslam.mission import MissionConfig
+from fcslam.records import Keyscan, KeyscanId
+from tests import small_fleet
+from tests.robot.kidnapping import put_down
+
+pytestmark = pytest.mark.slow
+
+RIGHT_M, RIGHT_RAD = 0.1, 0.03
+
+
+def map_of(robots):
+    """The true map of what these robots saw, in the coordinates of the building."""
+    keyscans, poses = [], []
+    for robot in robots:
+        for number, scan in enumerate(robot.scans()):
+            if number % 3 == 0:
+                keyscans.append(Keyscan(KeyscanId(robot.name, number), scan.stamp, scan.ranges_m))
+                poses.append(robot.T_building_base[number])
+    return fuse(keyscans, np.array(poses), {robot.name: robot.lasers for robot in robots}, OccupancyConfig())
+
+
+class Recorded:
+    """A recording of scans in memory."""
+
+    def __init__(self, name, scans):
+        self.name, self._scans = name, list(scans)
+
+    def records(self):
+        return iter(self._scans)
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    return small_fleet.draw(3)
+
+
+@pytest.fixture(scope="module")
+def building(fleet):
+    """The map that two of the three robots made."""
+    return map_of(fleet.robots[:2])
+
+
+def errors(poses, robot):
+    """Distance (m) and turn (rad) of the believed poses from the truth."""
+    believed = poses.believed()
+    off = se2.between(small_fleet.truth_at(robot, believed.stamps), believed.T_map_base)
+    return np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])
+
+
+def localized(scans, occupancy, name="robot", **options):
+    return run_localization(Recorded(name, scans), occupancy, MissionConfig(), **options)
+
+
+def test_a_robot_is_found_without_an_initial_pose(fleet, building):
+    robot = fleet.robots[2]
+    run = localized(robot.scans(), building)
+    poses = run.localized["robot"]
+    distance_m, turn_rad = errors(poses, robot)
+    assert run.metrics["fixes"].value == 1
+    assert run.metrics["losses"].value == 0
+    assert run.metrics["first_fix_after"].value < 15.0
+    assert poses.is_localized.mean() > 0.5
+    assert distance_m.max() < RIGHT_M
+    assert turn_rad.max() < RIGHT_RAD
+    assert poses.is_localized[-1]
+    assert (poses.sigma[poses.is_localized] > 0.0).all()
+    assert ((poses.quality > 0.5) == poses.is_localized).all()
+
+
+def test_no_pose_in_the_map_of_another_building(fleet):
+    elsewhere = map_of(small_fleet.draw(1, seed=7).robots)
+    run = localized(fleet.robots[2].scans(), elsewhere)
+    assert run.metrics["fixes"].value == 0
+    assert not run.localized["robot"].is_localized.any()
+    assert len(run.trajectories["robot"].stamps) == 0
+
+
+def test_an_initial_pose_is_used_if_the_walls_confirm_it(fleet, building):
+    robot = fleet.robots[2]
+    start = robot.T_building_base[0]
+    near = localized(robot.scans(), building, initial=start + np.array((0.4, -0.3, 0.1)))
+    distance_m, _ = errors(near.localized["robot"], robot)
+    assert near.metrics["first_fix_after"].value < 4.0
+    assert distance_m.max() < RIGHT_M
+    far = localized(robot.scans(), building, initial=start + np.array((3.0, 2.0, 1.5)))
+    distance_m, _ = errors(far.localized["robot"], robot)
+    assert distance_m.max() < RIGHT_M
+
+
+def test_a_robot_that_is_carried_away_is_found_again_and_never_wrong(fleet, building):
+    carried, there = fleet.robots[2], fleet.robots[0]
+    before = list(carried.scans())[:80]
+    scans = before + put_down(before[-1], list(there.scans()))
+    truth = np.concatenate((carried.T_building_base[:80], there.T_building_base))
+    run = localized(scans, building)
+    poses = run.localized["robot"]
+    off = se2.between(truth, poses.T_map_base)
+    wrong = poses.is_localized & (np.hypot(off[:, 0], off[:, 1]) > 0.5)
+    assert run.metrics["losses"].value == 1
+    assert wrong.sum() <= 5  # scans until the robot notices
+    assert poses.is_localized[-1]
+
+
+def test_the_best_alignment_is_the_one_that_nothing_elsewhere_beats(fleet):
+    robot = fleet.robots[0]
+    scans, poses = list(robot.scans())[::3], robot.T_building_base[::3]
+    whole, part = (
+        build_submap(
+            [
+                (point_scan(s.ranges_m, s.laser), se2.between(poses[0], T))
+                for s, T in zip(scans[:n], poses[:n], strict=True)
+            ]
+        )
+        for n in (len(scans), 12)
+    )
+    best, rival = two_best(whole, part)
+    assert np.allclose(best.T_a_b, 0.0, atol=0.03)
+    other = best_elsewhere(whole, part, best.T_a_b)
+    assert rival is not None
+    assert other is not None
+    assert rival.score_m < best.score_m
+    assert other.score_m == pytest.approx(rival.score_m, rel=0.2)
+
+
+def test_frozen_map_of_a_mission_matches_the_scans(fleet, building):
+    frozen = frozen_map(building, "building")
+    assert len(frozen.surface) > 300
