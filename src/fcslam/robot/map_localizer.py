@@ -65,6 +65,12 @@ class MapLocalizationConfig(Settings):
     overlap: float = Field(
         default=0.25, ge=0, le=1, description="least share of the walls in known area; below it, nothing is compared"
     )
+    doubted: float = Field(
+        default=0.80,
+        ge=0,
+        le=1,
+        description="with a smaller share of the walls in the map, the pose is compared with the best one elsewhere",
+    )
     lost_explained: float = Field(
         default=0.60, ge=0, le=1, description="a robot that is lost sees a smaller share of its walls in the map"
     )
@@ -199,8 +205,24 @@ class MapLocalizer:
             self._seen_m, self._quality = keyscan.travel_m, found.explained
             if found.explained < config.lost_explained and found.violation > config.lost_violation:
                 self._lose()
+            elif found.explained < config.doubted:
+                self._contest(self._T_map_base, keyscan)
         elif keyscan.travel_m > self._seen_m + config.unseen_m:
             self._lose()
+
+    def _contest(self, T_map_base: FloatArray, keyscan: MappedKeyscan) -> None:
+        """Give up a doubtful pose if the walls fit clearly better elsewhere."""
+        from fcslam.lidar.uniqueness import align_map, best_elsewhere
+
+        submap = self._submap(self._config.checked_m)
+        rival = best_elsewhere(self._map, submap, T_map_base)
+        if rival is None or rival.violation > self._config.violation:
+            return
+        here = align_map(self._map, submap, T_map_base)
+        ratio = rival.score_m / max(LEAST_RIVAL_M, here.score_m)
+        if ratio >= self._config.ratio:
+            self._lose()
+            self._vote(rival.T_a_b, ratio, keyscan)
 
     def _agreement(self, T_map_base: FloatArray, reach_m: float) -> Agreement:
         return agreement(self._submap(reach_m), self._map, T_map_base)
@@ -234,11 +256,19 @@ class MapLocalizer:
         ratio = best.score_m / (LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m))
         if ratio < config.ratio or best.violation > config.violation:
             return
-        vote = _Vote(se2.compose(best.T_a_b, se2.inverse(keyscan.T_local_base)), ratio)
+        self._vote(best.T_a_b, ratio, keyscan)
+
+    def _vote(self, T_map_base: FloatArray, ratio: float, keyscan: MappedKeyscan) -> None:
+        """Count the best alignment of a stretch; with enough evidence it fixes the pose."""
+        vote = _Vote(se2.compose(T_map_base, se2.inverse(keyscan.T_local_base)), ratio)
         self._votes = [*(other for other in self._votes if self._agree(vote, other, keyscan)), vote]
-        if len(self._votes) + min(vote.ratio for vote in self._votes) - 1.0 >= config.evidence:
-            self._fix(best.T_a_b, keyscan)
-        self._searched_m, self._next_search_m = keyscan.travel_m, keyscan.travel_m + config.first_m
+        if len(self._votes) + min(vote.ratio for vote in self._votes) - 1.0 >= self._config.evidence:
+            self._fix(T_map_base, keyscan)
+        self._begin_stretch(keyscan.travel_m)
+
+    def _begin_stretch(self, travel_m: float) -> None:
+        """What was seen before is not searched for again."""
+        self._searched_m, self._next_search_m = travel_m, travel_m + self._config.first_m
 
     def _agree(self, one: "_Vote", other: "_Vote", keyscan: MappedKeyscan) -> bool:
         """Whether two alignments put the newest keyscan at one pose of the map."""
@@ -258,8 +288,7 @@ class MapLocalizer:
         self._T_map_base, self._quality = None, 0.0
         self._votes = []
         if self._recent:
-            self._searched_m = self._recent[-1].travel_m
-            self._next_search_m = self._searched_m + self._config.first_m
+            self._begin_stretch(self._recent[-1].travel_m)
 
     def _publish(self, keyscan: MappedKeyscan) -> None:
         if self._T_map_base is None:

@@ -1,0 +1,220 @@
+"""Localisation in a finished map: found after how far, how exactly, and never in the wrong place.
+
+    FCSLAM_DATA=/path/to/data python benchmarks/localization.py [--keep rows.jsonl]
+
+**Parts**: the last part of a log in the map of the parts before it, by the map files of the run folder alone. Errors
+are those of the believed poses by the reference relations.
+
+**Wean Hall**: each of five runs in the map that the other four made. The corridors repeat themselves. Reference: the
+map of all five runs, moved onto that map by a robot that is in both.
+
+**Other buildings**: the first 60 m of each log in the maps of the next three. Any fix is wrong.
+
+**Carried away**: a simulated robot is put down at least 10 m away and turned by at least 30 degrees; its wheels never
+notice. The map is that of three other robots. After each fix the robot must be within 0.5 m of the truth; "believed
+wrongly" counts the metres that it drove from then on until it noticed that it is elsewhere.
+
+Without FCSLAM_DATA only the last part runs. Seeds below 100 chose the settings.
+"""
+
+import itertools
+import os
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+from relocalisation import Drive, kidnap
+from strangers import CORRECTED, RAW
+from wean_hall import LOGS as WEAN_HALL
+
+import fcslam
+from fcslam import sources
+from fcslam.errors import SourceError
+from fcslam.evaluation.fleet.relations import RelationsQuestion, evaluate_relations
+from fcslam.geometry import se2
+from fcslam.localization import read_map
+from fcslam.metrics.trajectory import align
+from fcslam.records import FloatArray, LaserScan, SensorRecord
+from fcslam.runs import LocalizedPoses, Run
+from fcslam.simulation.options import Building
+from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+from fcslam.sources.faults import Faults
+
+WRONG_M = 0.5
+STRANGER_M, STRANGER_MAPS = 60.0, 3
+BUILDINGS, SEEDS, PATH_M = ("default", "office"), tuple(range(101, 117)), 60.0
+MAPPING = (0, 3, 4)
+"""Robots of a fleet of five that make the map."""
+
+FOUND = {"scans": ",.0f", "localised": ".3f", "fixed after, m": ".1f", "fixes": ".0f", "losses": ".0f"}
+PARTS = {"log": "", **FOUND, "relations, m": ".4f", "deg": ".3f", "largest, m": ".3f", "CPU, s": ".1f",
+         "of a core at 10 Hz": ".4f"}  # fmt: skip
+WEAN = {"run": "", **FOUND, "driven, m": ".1f", "off, median, m": ".3f", "largest, m": ".3f", "wrong": ".0f"}
+OTHERS = {"log": "", "map": "", "scans": ",.0f", "fixes": ".0f", "CPU, s": ".1f"}
+CARRIED = {"building": "", "seed": "", "fixed before": "", "noticed after, m": ".1f", "found": "",
+           "found after, m": ".1f", "off, m": ".3f", "believed wrongly, m": ".1f", "wrong fixes": ".0f"}  # fmt: skip
+
+
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("--keep", type=Path, help="file that keeps finished rows; the same one resumes")
+    parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of the robots that are carried away")
+    chosen = parser.parse_args()
+    kept, report = common.Kept(chosen.keep), common.Report(__file__, __doc__, chosen)
+    with tempfile.TemporaryDirectory() as place:
+        work = Path(place)
+        if os.environ.get("FCSLAM_DATA"):
+            logs = [*RAW, *CORRECTED]
+            folder = common.recordings(*common.slam_benchmark_files(), *WEAN_HALL, *logs)
+            parts = [kept.rows(("part", log), lambda log=log: [part(folder, log, work)])[0] for log in common.SPLITS]
+            report.table("Parts", PARTS, parts)
+            report.table("Wean Hall", WEAN, kept.rows(("wean",), lambda: wean_hall(folder, work)))
+            report.table("Other buildings", OTHERS, kept.rows(("others",), lambda: strangers(folder, logs, work)))
+        cases = itertools.product(BUILDINGS, chosen.seeds)
+        carried = [
+            row for case in cases for row in kept.rows(("carried", *case), lambda case=case: carried_away(*case))
+        ]
+        report.table("Carried away: summary", {"": "", "value": ".2f"}, summary(carried))
+        report.table("Carried away", CARRIED, carried)
+    report.write()
+
+
+class Head:
+    """The first metres of a recording."""
+
+    def __init__(self, source: sources.Source, length_m: float) -> None:
+        self.name, self._source, self._length_m = source.name, source, length_m
+
+    def records(self) -> Iterator[SensorRecord]:
+        before, driven_m = None, 0.0
+        for record in self._source.records():
+            if isinstance(record, LaserScan):
+                here = np.array(record.T_odom_base[:2])
+                driven_m += 0.0 if before is None else float(np.hypot(*(here - before)))
+                before = here
+            if driven_m > self._length_m:
+                return
+            yield record
+
+
+class Scans:
+    """Scans in memory as a recording."""
+
+    faults = Faults({})
+
+    def __init__(self, name: str, scans: Sequence[LaserScan]) -> None:
+        self.name, self._scans = name, scans
+
+    def records(self) -> Iterator[SensorRecord]:
+        return iter(self._scans)
+
+
+def found(run: Run) -> tuple[float, ...]:
+    names = ("scans", "localized_share", "first_fix_after", "fixes", "losses")
+    return tuple(run.metrics[name].value for name in names)
+
+
+def localized(source: Any, place: Path | Any) -> tuple[Run, float]:
+    """The run of a localisation, and its CPU time."""
+    from fcslam.localization import run_localization
+    from fcslam.mission import MissionConfig
+
+    occupancy = read_map(place) if isinstance(place, Path) else place
+    began = time.process_time()
+    return run_localization(source, occupancy, MissionConfig()), time.process_time() - began
+
+
+def part(folder: Path, log: str, work: Path) -> tuple:
+    """The last part of a log in the map of the others."""
+    parts = sources.split(sources.open_source(common.log_path(folder, log)), common.SPLITS[log])
+    fcslam.map_recordings(parts[:-1], output=work / log)
+    run, cpu_s = localized(parts[-1], work / log)
+    run.save(work / f"{log}-localized")
+    reference = common.relations_path(folder, log)
+    errors = evaluate_relations(work / f"{log}-localized", reference, RelationsQuestion())
+    scans = run.metrics["scans"].value
+    means = errors.translation.mean, errors.rotation.mean, errors.translation.maximum
+    return (log, *found(run), *means, cpu_s, 10.0 * cpu_s / scans)
+
+
+def wean_hall(folder: Path, work: Path) -> Iterable[tuple]:
+    paths = {Path(log).name.split(".")[0]: folder / log for log in WEAN_HALL}
+    together = fcslam.map_recordings(paths)
+    for name, path in paths.items():
+        others = fcslam.map_recordings({n: p for n, p in paths.items() if n != name}, output=work / f"without-{name}")
+        run, _ = localized(sources.open_source(path), work / f"without-{name}")
+        common_robot = next(n for n in paths if n != name)
+        T_map_all = align(*(r.trajectories[common_robot].T_map_base for r in (others, together)))
+        truth = together.trajectories[name]
+        moved = se2.compose(T_map_all, truth.T_map_base[np.searchsorted(truth.stamps, run.trajectories[name].stamps)])
+        off = np.hypot(*(moved - run.trajectories[name].T_map_base)[:, :2].T)
+        largest = off.max(initial=0.0)
+        yield name, *found(run), truth.path_length_m, float(np.median(off)), largest, int((off > WRONG_M).sum())
+
+
+def strangers(folder: Path, logs: Sequence[str], work: Path) -> Iterable[tuple]:
+    maps: dict[str, Any] = {}
+    for number, log in enumerate(logs):
+        fcslam.map_recordings(folder / log, output=work / f"stranger-{number}")
+        maps[log] = read_map(work / f"stranger-{number}")
+    for number, log in enumerate(logs):
+        for other in [logs[(number + k) % len(logs)] for k in range(1, STRANGER_MAPS + 1)]:
+            try:
+                run, cpu_s = localized(Head(sources.open_source(folder / log), STRANGER_M), maps[other])
+                yield log, other, run.metrics["scans"].value, run.metrics["fixes"].value, cpu_s
+            except SourceError as error:
+                print(error, flush=True)
+
+
+def carried_away(building: str, seed: int) -> Iterable[tuple]:
+    settings = SimulationSettings(building=Building(building), robots=5, path_length_m=PATH_M, camera=None)
+    robots = simulate_fleet(settings, seed).robots
+    drives = [Drive(robot.name, list(robot.scans()), robot.T_building_base) for robot in robots]
+    drive, moment = kidnap(drives[1], drives[2], np.random.default_rng(seed))
+    if not moment:
+        return
+    run = fcslam.map_recordings([Scans(drives[k].name, drives[k].scans) for k in MAPPING])
+    first = run.trajectories[drives[0].name]
+    T_building_map = align(drives[0].truth(first.stamps), first.T_map_base)
+    poses = localized(Scans(drive.name, drive.scans), run.maps[first.map_index])[0].localized[drive.name]
+    yield building, seed, *verdict(poses, drive, moment, T_building_map)
+
+
+def verdict(poses: LocalizedPoses, drive: Drive, moment: int, T_building_map: FloatArray) -> tuple:
+    """What the robot believed before and after it was carried away with scan ``moment``."""
+    known = poses.is_localized
+    off_m = np.hypot(*(se2.compose(T_building_map, poses.T_map_base) - drive.truth(poses.stamps))[:, :2].T)
+    step_m = np.append(0.0, np.hypot(*np.diff(drive.T_building_base[:, :2], axis=0).T))
+    step_m[moment] = 0.0
+    driven_m = np.cumsum(step_m)
+    fixed = np.flatnonzero(known & ~np.append(False, known[:-1]))
+    wrong_fixes = int((off_m[fixed] > WRONG_M).sum())
+    since = np.arange(len(known)) >= moment
+    silent = np.flatnonzero(since & ~known)
+    noticed_m = driven_m[silent[0]] - driven_m[moment] if known[moment - 1] and len(silent) else np.nan
+    right = np.flatnonzero(since & known & (off_m <= WRONG_M))
+    found_m = driven_m[right[0]] - driven_m[moment] if len(right) else np.nan
+    off = float(np.median(off_m[right])) if len(right) else np.nan
+    wrongly = float(step_m[since & known & (off_m > WRONG_M)].sum())
+    before = "yes" if known[:moment].any() else "no"
+    return before, noticed_m, "yes" if len(right) else "no", found_m, off, wrongly, wrong_fixes
+
+
+def summary(rows: Sequence[tuple]) -> Iterator[tuple[str, float]]:
+    some = [dict(zip(CARRIED, row, strict=True)) for row in rows]
+    yield "carried away", len(some)
+    yield "localised before", sum(row["fixed before"] == "yes" for row in some)
+    yield "found again", sum(row["found"] == "yes" for row in some)
+    yield "wrong fixes", sum(row["wrong fixes"] for row in some)
+    for name in ("noticed after, m", "found after, m", "off, m", "believed wrongly, m"):
+        values = np.array([row[name] for row in some], dtype=np.float64)
+        yield f"{name}: median", float(np.nanmedian(values))
+        yield f"{name}: largest", float(np.nanmax(values))
+
+
+if __name__ == "__main__":
+    main()
