@@ -10,6 +10,10 @@ GL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
 HAS_GL := $(BIN)/python -c "from fcslam.simulation.engine import gl_context; gl_context(16, 16).free()" 2>/dev/null
 AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire::http::Timeout=20 -o Acquire::Retries=1
+# A real ROS as the peer of tests, in an environment of its own: rclpy from PyPI, rospy and roscore from Debian.
+ROS_VENV := .venv-ros
+RCLPY := ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-sensor-msgs==5.5.1 ros-nav-msgs==5.5.1
+ROSPY := python3-rospy python3-roslaunch python3-rosmaster python3-sensor-msgs python3-nav-msgs python3-tf2-msgs
 # torch's build for processors is a tenth of the size of the one that PyPI has.
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
@@ -19,7 +23,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system test-attack check bench bench-quick docs proto
+.PHONY: help install gl learning demo test test-fast test-system test-attack ros-test check bench bench-quick docs proto
 .DEFAULT_GOAL := help
 
 help:
@@ -28,6 +32,7 @@ help:
 	@echo "make test-fast    the same without the slow tests"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
+	@echo "make ros-test     install a real ROS 2 and ROS 1 as peers of the tests of live robots, if permitted"
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
@@ -79,6 +84,14 @@ test-system: $(INSTALLED)
 
 test-attack: $(INSTALLED)
 	@$(PYTEST) -m attack -rs
+
+# Never fails: without ROS the tests of live robots are skipped.
+ros-test: $(INSTALLED)
+	@$(PIP) -e ".[$(EXTRAS),ros2]"
+	@$(PYTHON) -m venv $(ROS_VENV)
+	@$(ROS_VENV)/bin/python -m pip install -qq --disable-pip-version-check $(RCLPY) || echo "No rclpy for this Python."
+	@$(AS_ROOT) true 2>/dev/null && { $(APT_GET) update; $(APT_GET) install --no-install-recommends $(ROSPY); } >/dev/null || \
+	    echo "No roscore. To have it: sudo apt-get install $(ROSPY)"
 
 check: $(INSTALLED)
 	@$(BIN)/ruff check .

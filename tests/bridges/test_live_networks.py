@@ -1,0 +1,192 @@
+"""`fcslam robot` and `fcslam record` against real rclpy and a real roscore: the map of a live robot is that of its bag.
+
+`make ros-test` installs what this needs. Other environments skip it.
+"""
+
+import importlib.util
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fcslam.bridges.ros1 import DEBIAN
+from fcslam.sources import write_bag
+from tests import small_fleet
+
+ROOT = Path(__file__).parents[2]
+RCLPY = Path(os.environ.get("FCSLAM_RCLPY", ROOT / ".venv-ros" / "bin" / "python"))
+"""A Python with rclpy."""
+HERE = Path(__file__).parent
+SPEED = 4.0
+LONGEST_S = 180.0
+
+needs_rclpy = pytest.mark.skipif(
+    not RCLPY.exists() or importlib.util.find_spec("cyclonedds") is None, reason="no rclpy or cyclonedds: make ros-test"
+)
+needs_roscore = pytest.mark.skipif(
+    not Path("/usr/bin/roscore").exists() or not Path(DEBIAN, "rospy").exists(), reason="no rospy: make ros-test"
+)
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return list(small_fleet.draw(1, path_length_m=8.0).robots[0].scans())
+
+
+@pytest.fixture(scope="module")
+def folder(scans, tmp_path_factory):
+    """The scans as a file for the players, and the run of the same scans as a bag."""
+    folder = tmp_path_factory.mktemp("live")
+    laser = scans[0].laser
+    np.savez(
+        folder / "scans.npz",
+        stamps=[scan.stamp for scan in scans],
+        ranges=[np.where(scan.ranges_m >= laser.max_range_m, np.inf, scan.ranges_m) for scan in scans],
+        odometry=[scan.T_odom_base for scan in scans],
+        laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
+        mounting_x=laser.T_base_laser[0],
+    )
+    write_bag(folder / "bag.mcap", scans)
+    ended(fcslam("map", f"robot1={folder / 'bag.mcap'}", "-o", folder / "expected", "-q"))
+    return folder
+
+
+def fcslam(*arguments, **environment):
+    return subprocess.Popen(
+        [sys.executable, "-m", "fcslam.cli", *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": str(ROOT / "src"), **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process):
+    """What the command wrote."""
+    try:
+        out, error = process.communicate(timeout=LONGEST_S)
+    finally:
+        process.kill()
+    assert process.returncode == 0, out + error
+    return out + error
+
+
+def play(python, script, folder, **environment):
+    """The drive as its player saw it."""
+    command = [python, HERE / script, folder / "scans.npz", "/robot1", str(SPEED)]
+    done = subprocess.run(
+        list(map(str, command)), env={**os.environ, **environment}, capture_output=True, text=True, timeout=LONGEST_S,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def poses(run):
+    return np.loadtxt(run / "trajectories" / "robot1.tum")
+
+
+def ros2(domain):
+    return {
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
+    }
+
+
+def mounting(scans):
+    return "--laser-pose=" + ",".join(map(str, scans[0].laser.T_base_laser))
+
+
+@pytest.fixture
+def roscore():
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        port = probe.getsockname()[1]
+    environment = {"ROS_MASTER_URI": f"http://localhost:{port}", "ROS_HOSTNAME": "localhost"}
+    process = subprocess.Popen(
+        ["/usr/bin/roscore", "-p", str(port)],
+        env={**os.environ, **environment, "PYTHONPATH": ""},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    time.sleep(4.0)
+    yield environment
+    process.send_signal(signal.SIGINT)
+    process.wait(10.0)
+
+
+def check_drive(played, scans, output, folder):
+    assert played["played"] == played["posed"] == len(scans)
+    assert played["frame"] == "map"
+    assert played["values"] == [-1, 0, 100]
+    assert played["path"] > 5
+    expected = poses(folder / "expected")
+    assert np.abs(poses(output) - expected).max() < 1e-3
+    assert (output / "map.pgm").read_bytes() == (folder / "expected" / "map.pgm").read_bytes()
+
+
+@needs_rclpy
+def test_a_robot_of_ros_2(folder, scans, tmp_path):
+    environment = ros2(41)
+    robot = fcslam("robot", "ros2:/robot1", mounting(scans), "-o", tmp_path / "run", **environment)
+    played = play(RCLPY, "rclpy_player.py", folder, **environment)
+    ended(robot)
+    check_drive(played, scans, tmp_path / "run", folder)
+
+
+@needs_rclpy
+def test_a_recording_of_ros_2(folder, scans, tmp_path):
+    environment = ros2(42)
+    recorder = fcslam("record", "ros2:/robot1", "-o", tmp_path / "robot1.mcap", **environment)
+    play(RCLPY, "rclpy_player.py", folder, **environment)
+    recorder.send_signal(signal.SIGINT)
+    assert f"{len(scans)} of /robot1/scan" in ended(recorder)
+    ended(fcslam("map", tmp_path / "robot1.mcap", mounting(scans), "-o", tmp_path / "run", "-q"))
+    assert np.abs(poses(tmp_path / "run") - poses(folder / "expected")).max() < 1e-3
+
+
+@needs_rclpy
+def test_a_robot_that_nobody_knows_on_ros_2():
+    process = fcslam("robot", "ros2:/nobody", "--ros-parameters", HERE / "hurry.yaml", **ros2(43))
+    _, error = process.communicate(timeout=LONGEST_S)
+    assert process.returncode == 2
+    assert "no laser scans (sensor_msgs/LaserScan) in /nobody" in error
+    assert "Traceback" not in error
+
+
+@needs_roscore
+def test_a_robot_of_ros_1(folder, scans, tmp_path, roscore):
+    robot = fcslam("robot", "ros1:/robot1", mounting(scans), "-o", tmp_path / "run", **roscore)
+    played = play(sys.executable, "rospy_player.py", folder, **roscore)
+    ended(robot)
+    assert played["transforms"] > 0
+    check_drive(played, scans, tmp_path / "run", folder)
+
+
+@needs_roscore
+def test_a_recording_of_ros_1(folder, scans, tmp_path, roscore):
+    recorder = fcslam("record", "ros1:/robot1", "-o", tmp_path / "robot1.bag", **roscore)
+    play(sys.executable, "rospy_player.py", folder, **roscore)
+    recorder.send_signal(signal.SIGINT)
+    assert f"{len(scans)} of /robot1/scan" in ended(recorder)
+    ended(fcslam("map", tmp_path / "robot1.bag", mounting(scans), "-o", tmp_path / "run", "-q"))
+    assert np.abs(poses(tmp_path / "run") - poses(folder / "expected")).max() < 1e-3
+
+
+@needs_roscore
+def test_a_missing_roscore_is_one_line():
+    process = fcslam("robot", "ros1:/robot1", ROS_MASTER_URI="http://localhost:9")
+    _, error = process.communicate(timeout=LONGEST_S)
+    assert process.returncode == 2
+    assert error.splitlines()[-1] == (
+        "fcslam: no roscore answers at http://localhost:9; start roscore, or set ROS_MASTER_URI"
+    )
