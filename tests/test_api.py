@@ -159,8 +159,8 @@ def test_settings_come_from_a_model_a_mapping_or_a_file_and_arguments_replace_th
     path = tmp_path / "mission.yaml"
     path.write_text("seed: 7\n")
     for config in (fcslam.MissionConfig(seed=7), {"seed": 7}, path, str(path)):
-        assert api._settings(config, None, None) == fcslam.MissionConfig(seed=7)
-        changed = api._settings(config, 8, False)
+        assert api.settings_of(config, None, None) == fcslam.MissionConfig(seed=7)
+        changed = api.settings_of(config, 8, False)
         assert (changed.seed, changed.fleet.join_maps) == (8, False)
 
 

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
-from fcslam.cloud.report import Track, run_of, traffic_metrics
+from fcslam.cloud.report import Track, keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.sessions import check_robot, robot_of, session_name
 from fcslam.cloud.settings import FleetConfig
 from fcslam.config import Settings, dump
@@ -121,13 +121,16 @@ class MissionCloud:
         """The result of all packets so far.
 
         Args:
-            tracks: the scans of every session that sent packets; gives the order of the sessions.
+            tracks: the scans of the sessions, in their order. Other sessions come first, with their keyscans alone.
             scans: number of scans.
             recorded_s: length of the recordings together, seconds.
         """
+        result = self._cloud.finalize()
+        unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
+        tracks = unknown | dict(tracks)
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
-        return run_of(self._cloud.finalize(), tracks, metrics, dump(self.config), self.config.map)
+        return run_of(result, tracks, metrics, dump(self.config), self.config.map)
 
 
 def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:

@@ -12,7 +12,7 @@ from rich.console import Console
 from fcslam.cli import main
 from fcslam.cli.progress import ProgressDisplay
 from fcslam.cli.robot import _watch
-from fcslam.robot.agent import AgentProgress
+from fcslam.live.records import RobotStatus
 from fcslam.robot.outbox import WaitingPackets
 from fcslam.runs import read_tum
 from fcslam.sources import write_carmen
@@ -124,6 +124,6 @@ def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begin
     with ProgressDisplay(console) as display:
         watch = _watch(display, console, 100)
         for times_lost, quality in [(0, 0.0), (1, 0.0), (1, 0.5), (1, 0.0), (2, 0.0)]:
-            watch(AgentProgress(9, 9, WaitingPackets(0, 0), 9, 9, 0, 0, 0, 0.0, quality, times_lost, None, False, ()))
+            watch(RobotStatus(9, 9, WaitingPackets(0, 0), 9, 9, 0, 0, 0, 0.0, quality, times_lost, None, False, ()))
     said = [line.split(":")[0] for line in console.file.getvalue().splitlines()]
     assert said == ["connected", "lost", "relocalised in map 0, quality 0.50", "not relocalised", "lost"]

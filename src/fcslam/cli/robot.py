@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.robot.agent import Agent, AgentProgress
+    from fcslam.live.records import RobotStatus
+    from fcslam.live.robot import Robot
     from fcslam.robot.frontend import RobotConfig
-    from fcslam.robot.outbox import Outbox
     from fcslam.sources import Survey
 
 
@@ -154,7 +154,8 @@ def robot(
     from fcslam.cli.live import map_live
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import InputError
-    from fcslam.robot.agent import PlaybackPace
+    from fcslam.live.playback import PlaybackPace, play
+    from fcslam.live.robot import Playback, Robot
     from fcslam.sources import BagOptions
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
@@ -169,7 +170,7 @@ def robot(
     server, state = _required(server, state)
     keep_private()
     pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
-    settings = mission_config(config).robot
+    settings = mission_config(config)
     argument = source if name is None else f"{name}={source}"
     recording = open_recording(argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
     _check_name(recording.name)
@@ -177,20 +178,24 @@ def robot(
     survey = recording.survey()
     console = notices(quiet)
     print_notes(console, survey.notes)
-    with _agent(recording.name, settings, server, state, token, ca, own, outbox_mb, budget_kbps) as (agent, outbox):
-        known = outbox.begin(_fingerprint(recording.name, survey, settings, budget_kbps), resume)
+    fingerprint = _fingerprint(recording.name, survey, settings.robot, budget_kbps)
+    live = Robot(
+        recording.name, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
+        outbox_mb=outbox_mb, config=settings, own_map=False, playback=Playback(fingerprint, resume),
+    )  # fmt: skip
+    with closing(live):
         try:
             with compiled(console), _interruptible(), ProgressDisplay(console) as display:
-                agent.run(recording.records(), known, pace, _watch(display, console, survey.scan_count))
+                play(live, recording.records(), pace, _watch(display, console, survey.scan_count))
         except KeyboardInterrupt:
-            left = outbox.waiting
+            left = live.status().waiting
             print_line(
                 console,
                 f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume",
             )
             raise
-        print_faults(console, {recording.name: recording.faults.plus(Fault.ODOMETRY_JUMP, agent.odometry_jumps)})
-        _report(agent, state, server)
+        print_faults(console, {recording.name: recording.faults.plus(Fault.ODOMETRY_JUMP, live.odometry_jumps)})
+        _report(live, state, server)
 
 
 def _required(server: str | None, state: Path | None) -> tuple[str, Path]:
@@ -202,47 +207,6 @@ def _required(server: str | None, state: Path | None) -> tuple[str, Path]:
             "a recording needs --server and --state; `fcslam map` maps it without, and ros2:/NAMESPACE is a live robot"
         )
     return server, state
-
-
-@contextmanager
-def _agent(
-    name: str,
-    settings: "RobotConfig",
-    server: str,
-    state: Path,
-    token: str | None,
-    ca: Path | None,
-    own: tuple[Path, Path] | None,
-    outbox_mb: float,
-    budget_kbps: float | None,
-) -> "Iterator[tuple[Agent, Outbox]]":
-    """The robot and its outbox, which is in the state folder."""
-    import numpy as np
-
-    from fcslam.errors import StateError
-    from fcslam.robot.agent import Agent
-    from fcslam.robot.beside import backend_process
-    from fcslam.robot.budget import Budget
-    from fcslam.robot.frontend import RobotFrontend
-    from fcslam.robot.outbox import Outbox
-    from fcslam.robot.warmup import warm_up_tracking
-    from fcslam.wire.http_transport import HttpTransport
-
-    try:
-        state.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StateError(f"{state}: cannot be made ({error.strerror}); give another --state") from error
-    warm_up_tracking(settings)
-    # Not the mission's seed: robots must not retry at the same moments.
-    rng = np.random.default_rng()
-    budget = None if budget_kbps is None else Budget(1e3 * budget_kbps)
-    with (
-        backend_process(name, settings) as backend,
-        closing(Outbox(state / "outbox.sqlite", name, int(outbox_mb * 1e6))) as outbox,
-        closing(HttpTransport(server, name, outbox.agent, token, ca, own)) as transport,
-    ):
-        frontend = RobotFrontend(name, settings, backend)
-        yield Agent(frontend, outbox, transport, state, rng, time.monotonic, time.sleep, budget), outbox
 
 
 def _speed(text: str) -> float | None:
@@ -323,13 +287,13 @@ def _interruptible() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[AgentProgress], None]":
+def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[RobotStatus], None]":
     """Show the progress of ``total`` scans, and print each change of the connection and of the robot's localisation."""
     trouble: str | None = "connecting"
     notices_before: tuple[str, ...] = ()
     localization, times_lost = "mapping", 0
 
-    def watch(now: "AgentProgress") -> None:
+    def watch(now: "RobotStatus") -> None:
         nonlocal trouble, notices_before, localization, times_lost
         lines = [now.trouble or "connected"] * (now.trouble != trouble)
         if (now.localization, now.times_lost) != (localization, times_lost):
@@ -343,7 +307,7 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
     return watch
 
 
-def _localisation(now: "AgentProgress", times_lost_before: int) -> str:
+def _localisation(now: "RobotStatus", times_lost_before: int) -> str:
     """What a robot that was lost knows about its place; ``times_lost_before``: its count at the last such line."""
     if now.quality > 0.0:
         return f"relocalised in map {now.map_index}, quality {now.quality:.2f}"
@@ -352,7 +316,7 @@ def _localisation(now: "AgentProgress", times_lost_before: int) -> str:
     return "not relocalised: no other closure supports the estimated place"
 
 
-def _details(now: "AgentProgress", is_complete: bool) -> str:
+def _details(now: "RobotStatus", is_complete: bool) -> str:
     """The state of robot, connection, packets and map, the most important first: a narrow terminal cuts the end."""
     stage = "catching up" if now.catching_up else "sending" if is_complete else str(now.localization)
     details = [stage, "offline" if now.trouble else "online", f"{now.waiting.packets} waiting"]
@@ -367,10 +331,10 @@ def _details(now: "AgentProgress", is_complete: bool) -> str:
     return ", ".join([*details, f"{now.keyscans} keyscans"])
 
 
-def _report(agent: "Agent", state: Path, server: str) -> None:
+def _report(robot: "Robot", state: Path, server: str) -> None:
     from fcslam.runs import write_tum
 
-    now = agent.progress()
+    now = robot.status()
     console = answers()
     print_line(
         console,
@@ -384,7 +348,7 @@ def _report(agent: "Agent", state: Path, server: str) -> None:
     if now.times_lost:
         lost = f"lost {now.times_lost} times" if now.times_lost > 1 else "lost once"
         print_line(console, f"{lost}; {_localisation(now, now.times_lost)}")
-    trajectory = agent.trajectory()
-    if trajectory is not None:
-        write_tum(state / "trajectory.tum", *trajectory)
+    if now.map_index is not None:
+        trajectory = robot.trajectory()
+        write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.T_map_base)
         print_line(console, f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")

@@ -20,7 +20,7 @@ from fcslam.records import Correction, FloatArray, frozen
 from fcslam.runs import Run
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Packet
-from fcslam.wire.packets import measure
+from fcslam.wire.packets import SizedPacket, decode, measure
 
 Answer = TypeVar("Answer")
 Correct = Callable[[int, Correction], None]
@@ -31,19 +31,22 @@ class OwnMap:
     """Gets all packets of one robot, in their order, and corrects its poses. Any thread may call."""
 
     def __init__(self, robot: str, config: MissionConfig, executor: Executor, correct: Correct) -> None:
-        """``executor`` has one worker."""
+        """Start a map in the only worker of ``executor``."""
         self._robot, self._config, self._executor, self._correct = robot, config, executor, correct
         self.failure: str | None = None
         """Why the map stopped growing; None if it grows."""
         self._applying: deque[Future[list[tuple[int, Correction]]]] = deque()
         executor.submit(_open, robot, config).result()
 
+    def restore(self, packets: Sequence[bytes]) -> None:
+        """Apply the packets of earlier sessions, encoded, before those of this one; later."""
+        if packets:
+            self._await(self._submit(_restore, packets))
+
     def put(self, packets: Sequence[Packet]) -> None:
         """Apply the next packets, later."""
         if packets and self.failure is None:
-            applied = self._submit(_apply, packets)
-            self._applying.append(applied)
-            applied.add_done_callback(self._take)
+            self._await(self._submit(_apply, packets))
 
     @property
     def backlog(self) -> int:
@@ -88,6 +91,10 @@ class OwnMap:
             failed.set_exception(error)
             return failed
 
+    def _await(self, applied: Future[list[tuple[int, Correction]]]) -> None:
+        self._applying.append(applied)
+        applied.add_done_callback(self._take)
+
     def _take(self, done: Future[list[tuple[int, Correction]]]) -> None:
         if done.cancelled():
             return
@@ -113,6 +120,12 @@ _clouds: dict[str, MissionCloud] = {}
 
 def _open(robot: str, config: MissionConfig) -> None:
     _clouds[robot] = MissionCloud(config)
+
+
+def _restore(robot: str, earlier: Sequence[bytes]) -> list[tuple[int, Correction]]:
+    for data in earlier:
+        _clouds[robot].apply(SizedPacket(decode(data), len(data)))
+    return []
 
 
 def _apply(robot: str, packets: Sequence[Packet]) -> list[tuple[int, Correction]]:

@@ -10,6 +10,7 @@ from fcslam.lidar.frontend import motion_information
 from fcslam.lidar.odometry import OdometryConfig
 from fcslam.lidar.tracker import TrackedScan
 from fcslam.records import FloatArray, frozen
+from fcslam.robot.outbox import WaitingPackets
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +72,55 @@ class RobotPose:
         return frozen(se2.compose(self.T_map_base, se2.inverse(self.T_odom_base)))
 
 
+class LocalizationState(StrEnum):
+    """Whether a robot knows its pose in its map."""
+
+    MAPPING = "mapping"
+    """It was never lost."""
+    LOST = "lost"
+    """It maps in a new session, whose transform to the map and to its earlier sessions is not known yet."""
+    RELOCALISED = "relocalised"
+    """It was lost, and its new session is joined to the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStatus:
+    """What a robot has done so far."""
+
+    scans: int
+    keyscans: int
+    waiting: WaitingPackets
+    """Packets that the server has not confirmed."""
+    confirmed: int
+    """Packets that the server has confirmed."""
+    sent_bytes: int
+    left_out: int
+    """Places that are not sent, because the state folder or the budget has no room for them."""
+    refused: int
+    """Packets that the server will never store."""
+    map_index: int | None
+    """Index of the robot's map; None before the first correction."""
+    correction_age_s: float | None
+    quality: float
+    """Quality of the newest correction, in [0, 1]: how well other sessions support the robot's place in the map."""
+    times_lost: int
+    """Number of times the robot was lost since it started."""
+    trouble: str | None
+    """Why packets do not arrive; None if they do, or if there is no server."""
+    catching_up: bool
+    """Whether a resumed recording has not yet reached the point of interruption."""
+    notices: tuple[str, ...]
+    """Messages about packets of another mission, refused packets, the last detector update, a failed back end, and
+    jumps of the odometry, if there were any."""
+
+    @property
+    def localization(self) -> LocalizationState:
+        """Whether the robot knows its pose."""
+        if not self.times_lost:
+            return LocalizationState.MAPPING
+        return LocalizationState.RELOCALISED if self.quality > 0.0 else LocalizationState.LOST
+
+
 class EventKind(StrEnum):
     """What can happen to a live robot besides its scans."""
 
@@ -82,6 +132,10 @@ class EventKind(StrEnum):
     """The robot's map got another index: it joined another map, or maps were renumbered."""
     CORRECTED = "corrected"
     """A correction moved the robot in its map, as a loop closure does."""
+    OFFLINE = "offline"
+    """The server cannot be reached; packets wait in the state folder."""
+    ONLINE = "online"
+    """The server confirms packets, for the first time or again."""
     FAILED = "failed"
     """A part of the robot stopped working; it goes on without."""
 

@@ -10,9 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
+from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,23 +23,50 @@ from numpy.typing import ArrayLike
 from fcslam.api import StrPath, settings_of
 from fcslam.cloud.sessions import session_name
 from fcslam.driving import track_of
-from fcslam.errors import InputError
+from fcslam.errors import InputError, StateError
 from fcslam.geometry import se2
 from fcslam.live.inputs import Lasers, checked_lasers, checked_robot, checked_scan
 from fcslam.live.own_map import OwnMap
-from fcslam.live.records import EventKind, RobotEvent, RobotPose
+from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
 from fcslam.mission import MissionConfig
-from fcslam.records import Correction, FloatArray, LaserScan, SensorRecord, frozen
+from fcslam.records import Correction, FloatArray, Keyscan, LaserScan, SensorRecord, frozen
 from fcslam.robot.beside import Beside, worker_process
+from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.localization import Localizer
+from fcslam.robot.outbox import Outbox, WaitingPackets
+from fcslam.robot.sender import CONNECTING
+from fcslam.robot.uplink import Uplink
 from fcslam.robot.warmup import warm_up_tracking
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.map_files import OccupancyMap
-from fcslam.wire.messages import Packet
+from fcslam.wire.http_transport import BatchTransport, HttpTransport
+from fcslam.wire.messages import Hello, Packet
 
 JUMP_M, JUMP_RAD = 0.01, 0.005
 """Corrections that move the robot by less are no event."""
+
+CLOSE_S = 5.0
+"""Time that a robot whose block ends without an error waits for the server."""
+QUIET = (EventKind.CORRECTED, EventKind.ONLINE, EventKind.JOINED, EventKind.RELOCALISED)
+"""Events that are logged as information; the others are warnings."""
+POLL_INTERVAL_S = 0.1
+"""Interval at which ``finish`` looks whether the server has everything."""
+LARGEST_BACKLOG = 200
+"""Largest number of inputs that wait for the back end, the map or the disk while a recording is played; a robot in real
+time never has as many."""
+
+
+class Playback(NamedTuple):
+    """A recording that is played to a robot."""
+
+    fingerprint: str
+    """Of the recording and the settings."""
+    resume: bool
+    """Whether the robot read it before and was interrupted; its packets come again."""
+
+
+LIVE = Playback("live", resume=False)
 
 _log = logging.getLogger(__name__)
 
@@ -63,24 +93,47 @@ class Robot:
         name: str,
         laser: Lasers | None = None,
         *,
+        server: str | BatchTransport | None = None,
+        state: StrPath | None = None,
+        token: str | None = None,
+        ca: StrPath | None = None,
+        certificate: tuple[StrPath, StrPath] | None = None,
+        budget_kbps: float | None = None,
+        outbox_mb: float = 256.0,
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
+        own_map: bool = True,
+        playback: Playback | None = None,
         on_event: Callable[[RobotEvent], None] | None = None,
         executor: Executor | None = None,
         clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         """Start the robot; takes some seconds, after which the first scan is as quick as every other.
 
         Args:
             name: of the robot; letters, digits and ``. _ -``.
             laser: its LiDAR, or several by name. None: only ``add`` is used.
+            server: address of an `fcslam serve` with the robot's fleet, or a transport of your own. None: the robot
+                maps alone.
+            state: folder of this robot alone; a robot that starts again with it finds its place in its earlier map.
+                With a server it holds the packets that the server has not confirmed. None: nothing is kept.
+            token: the robot's bearer token.
+            ca: PEM file of the authority that signed the server's certificate. None: those of the system.
+            certificate: PEM files of the robot's certificate and key, which replace the token.
+            budget_kbps: limit of the uplink, kB per second by the stamps. None: everything is sent.
+            outbox_mb: limit of the packets that wait for the server, MB; above three quarters, places are left out.
             config: as in ``map_recordings``.
+            own_map: whether the robot has a map of its own; a robot with a server may do without.
+            playback: the recording that is played. None: live.
             on_event: called by ``add_scan``, ``add_image`` and ``add``, in their thread, before they return.
             executor: runs the back end and the map, in its only worker. None: a process of its own, which ends with the
                 robot.
-            clock: seconds of any origin, for the age of corrections.
+            clock: seconds of any origin, for the age of corrections and for retries.
+            sleep: sleeps for so many seconds while ``finish`` waits for the server.
 
         Raises:
-            InputError: the name, a laser or the configuration cannot be used, or the worker does not start.
+            InputError: the name, a laser, the configuration, the address, a file or the state folder cannot be used, or
+                the worker does not start.
         """
         self.name = checked_robot(name)
         self._lasers = checked_lasers(laser)
@@ -98,19 +151,37 @@ class Robot:
         self._is_finished = self._is_closed = False
         self._told: set[str] = set()
         """Failures that were told."""
-        self._own: dict[int, Localizer] = {}
-        """The robot's own corrections, by part: after being lost, the robot goes on in another part."""
-        self._owned = executor is None
-        self._executor = worker_process() if executor is None else executor
-        try:
-            self._map = OwnMap(name, self._config, self._executor, self._correct)
-            self._frontend = RobotFrontend(name, self._config.robot, Beside(name, self._config.robot, self._executor))
-        except BrokenExecutor as error:
-            raise InputError(
-                f"{name}: the process of the back end does not start; a script that makes a Robot needs "
-                '`if __name__ == "__main__":` around its own code'
-            ) from error
-        warm_up_tracking(self._config.robot)
+        self._localizers: tuple[dict[int, Localizer], dict[int, Localizer]] = {}, {}
+        """Corrections by part: those of the robot's own map, and those of the server. After being lost, the robot goes
+        on in another part."""
+        self._keyscans = self._part_base = 0
+        self._is_online: bool | None = None
+        """Whether the server can be reached; None before the first reply."""
+        self._sleep = sleep
+        with ExitStack() as stack:
+            if executor is None:
+                executor = worker_process()
+                stack.callback(executor.shutdown, cancel_futures=True)
+            folder = _state_folder(state, server is not None, stack)
+            outbox, transport = None, None if isinstance(server, str) else server
+            if folder is not None:
+                outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, int(1e6 * outbox_mb))))
+            if isinstance(server, str) and outbox is not None:
+                own = None if certificate is None else (Path(certificate[0]), Path(certificate[1]))
+                http = HttpTransport(server, name, outbox.agent, token, None if ca is None else Path(ca), own)
+                transport = stack.enter_context(closing(http))
+            known = 0 if outbox is None else outbox.begin(*(playback or LIVE))
+            self._start(executor, outbox if transport is None else None, own_map)
+            self._uplink: Uplink | None = None
+            if outbox is not None and folder is not None:
+                # Not the seed of the configuration: robots must not retry at the same moments.
+                self._uplink = Uplink(
+                    self._frontend, outbox, transport, folder, np.random.default_rng(), clock, self._correct_by_server,
+                    known, None if budget_kbps is None else Budget(1e3 * budget_kbps),
+                )  # fmt: skip
+                stack.callback(self._uplink.close)
+            warm_up_tracking(self._config.robot)
+            self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -155,8 +226,7 @@ class Robot:
         with self._lock:
             if isinstance(record, LaserScan):
                 return self._process(record)
-            self._require_unfinished()
-            self._take(self._frontend.process(record))
+            self._take(self._processed(record))
             return None
 
     @property
@@ -164,22 +234,52 @@ class Robot:
         """The pose of the newest scan; None before the first."""
         return self._pose
 
-    def map(self) -> OccupancyMap:
-        """The map that the robot is in, of all scans added so far, corrected by all loop closures.
+    def status(self) -> RobotStatus:
+        """What the robot has done so far."""
+        uplink, localizer = self._uplink, self._localizer(self._part)
+        failure = self._frontend.backend_failure
+        broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
+        jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
+        notices = tuple(filter(None, (*(uplink.notices if uplink else ()), broken, jumps)))
+        sent = (
+            (uplink.waiting, uplink.confirmed, uplink.sent_bytes, uplink.left_out, uplink.refused)
+            if uplink
+            else (WaitingPackets(0, 0), 0, 0, 0, 0)
+        )
+        return RobotStatus(
+            self._scans, self._keyscans, *sent, localizer.map_index, localizer.age_s, localizer.quality, self._part,
+            uplink.trouble if uplink else None, uplink is not None and uplink.is_catching_up, notices,
+        )  # fmt: skip
 
-        It takes tens of milliseconds to seconds, in the worker; other threads may add scans meanwhile.
+    @property
+    def odometry_jumps(self) -> int:
+        """Number of jumps of the odometry so far."""
+        return self._frontend.odometry.jumps
+
+    def map(self) -> OccupancyMap:
+        """The map that the robot is in, of all its scans so far, corrected by all loop closures.
+
+        It takes tens of milliseconds to seconds, in the worker; other threads may add scans meanwhile. With a server it
+        shows what this robot saw, in the frame of the fleet's map.
 
         Returns:
             The occupancy of each cell, shape (H, W), the side of a cell and the lower left corner in ``map``.
 
         Raises:
+            InputError: the robot has no map of its own.
             FcslamError: the worker has ended.
         """
+        own = self._require_own_map()
         self._catch_up()
-        return self._map.draw(session_name(self.name, self._part), np.zeros(3))
+        with self._lock:
+            part = self._part
+        return own.draw(self._session(part), self._T_map_own(part))
 
     def trajectory(self) -> RobotTrajectory:
-        """All scans since the robot was last lost, corrected by all loop closures so far; it waits for the worker.
+        """All scans since the robot was last lost; it waits for the worker.
+
+        With a map of its own, the poses are corrected by all loop closures so far. Without, all move with the server's
+        newest correction.
 
         Raises:
             FcslamError: the worker has ended.
@@ -190,26 +290,61 @@ class Robot:
             track = self._frontend.tracks[part]
             stamps, keyscans, offsets = track.stamps, track.keyscans, track.T_keyscan_base
             T_odom_keyscan = track.T_odom_keyscan
-        known = self._map.poses(session_name(self.name, part))
-        T_map_odom = (
-            np.zeros(3) if not len(known) else se2.compose(known[-1], se2.inverse(T_odom_keyscan[len(known) - 1]))
-        )
+        known = np.empty((0, 3)) if self._own is None else self._own.poses(self._session(part))
+        known = se2.compose(self._T_map_own(part), known)
+        # Keyscans that the map does not have yet go on from the last one that it has.
+        moved = self._localizer(part).T_map_base(np.zeros(3))
+        T_map_odom = np.zeros(3) if moved is None else moved
+        if len(known):
+            T_map_odom = se2.compose(known[-1], se2.inverse(T_odom_keyscan[len(known) - 1]))
         poses = np.concatenate((known, se2.compose(T_map_odom, T_odom_keyscan[len(known) :])))
         index = self._localizer(part).map_index
         T_map_base = se2.compose(poses[keyscans], offsets)
-        return RobotTrajectory(
-            session_name(self.name, part), 0 if index is None else index, frozen(stamps), frozen(T_map_base)
-        )
+        return RobotTrajectory(self._session(part), 0 if index is None else index, frozen(stamps), frozen(T_map_base))
 
-    def finish(self) -> None:
-        """End the recording: close the last loops. Nothing can be added after it."""
+    def finish(self, timeout_s: float | None = None, watch: Callable[[RobotStatus], None] | None = None) -> bool:
+        """End the recording: close the last loops, and wait until the server has everything. Nothing can be added
+        after it.
+
+        Args:
+            timeout_s: longest time to wait for the server, seconds; None: as long as it takes.
+            watch: called while it waits.
+
+        Returns:
+            Whether the server has everything; otherwise the rest waits in the state folder for the next start.
+
+        Raises:
+            CloudError: the server rejects the robot.
+            StateError: the state folder cannot be used.
+        """
         with self._lock:
             if not self._is_finished:
                 self._is_finished = True
                 self._take(self._frontend.finish())
+        until_s = math.inf if timeout_s is None else self._clock() + timeout_s
+        uplink = self._uplink
+        if uplink is None:
+            return True
+        while (uplink.unstored or uplink.waiting.packets) and self._clock() < until_s:
+            self._wait_once(watch)
+        self._raise_failure()
+        return not uplink.unstored and not uplink.waiting.packets
+
+    def wait_for_room(self, watch: Callable[[RobotStatus], None] | None = None) -> None:
+        """Wait until the back end, the map, the disk and the server have caught up enough to take more, for a program
+        that adds records faster than a robot.
+
+        Raises:
+            CloudError: the server rejects the robot.
+            StateError: the state folder cannot be used.
+        """
+        self._raise_failure()
+        while self._is_behind():
+            self._wait_once(watch)
 
     def save(self, folder: StrPath, force: bool = False) -> Run:
-        """Write a run folder, as ``fcslam map`` does; after ``finish`` it is the same as for a recording.
+        """Write a run folder of the robot's own map, as ``fcslam map`` does; after ``finish`` it is the same as for a
+        recording.
 
         Args:
             folder: the folder to make.
@@ -220,37 +355,86 @@ class Robot:
 
         Raises:
             OutputError: the folder cannot be written.
+            InputError: the robot has no map of its own, or no scan was added.
             FcslamError: the worker has ended.
         """
+        own = self._require_own_map()
         prepare_output(Path(folder), force)
         with self._lock:
             self._take(self._frontend.ready(wait=True))  # a run needs the keyscans of all its scans
-            tracks = {
-                session_name(self.name, part): track_of(track) for part, track in enumerate(self._frontend.tracks)
-            }
+            parts = enumerate(self._frontend.tracks)
+            tracks = {self._session(part): track_of(track) for part, track in parts if len(track)}
+        if not tracks:
+            raise InputError(f"{self.name}: no scan was added, so there is no map to save")
         stamps = np.concatenate([track.stamps for track in tracks.values()])
-        run = self._map.run(tracks, len(stamps), float(np.ptp(stamps)) if len(stamps) else 0.0)
+        run = own.run(tracks, len(stamps), float(np.ptp(stamps)))
         run.save(folder, force)
         return run
 
     def close(self) -> None:
-        """Finish, and end the worker. A second call does nothing."""
-        if self._is_closed:
-            return
-        self._is_closed = True
-        try:
-            self.finish()
-        finally:
-            if self._owned:
-                self._executor.shutdown(cancel_futures=True)
+        """End the worker and the connection at once. What the server does not have waits in the state folder.
+
+        A second call does nothing.
+        """
+        self._is_finished = True
+        self._stack.close()
 
     @property
     def _part(self) -> int:
         return len(self._frontend.tracks) - 1
 
-    def _require_unfinished(self) -> None:
-        if self._is_finished:
-            raise InputError(f"{self.name}: the robot is finished; make a new Robot to go on")
+    def _session(self, part: int) -> str:
+        return session_name(self.name, self._part_base + part)
+
+    def _start(self, executor: Executor, outbox: Outbox | None, own_map: bool) -> None:
+        """Start the back end and the robot's own map, which goes on from the earlier sessions in ``outbox``."""
+        robot = self._config.robot
+        self._part_base = 0 if outbox is None else outbox.first_epoch
+        try:
+            self._own = OwnMap(self.name, self._config, executor, self._correct) if own_map else None
+            self._frontend = RobotFrontend(self.name, robot, Beside(self.name, robot, executor))
+        except BrokenExecutor as error:
+            raise InputError(
+                f"{self.name}: the process of the back end does not start; a script that makes a Robot needs "
+                '`if __name__ == "__main__":` around its own code'
+            ) from error
+        if self._own is not None and outbox is not None:
+            self._own.restore(outbox.complete_sessions())
+
+    def _require_own_map(self) -> OwnMap:
+        if self._own is None:
+            raise InputError(f"{self.name}: the robot was made without a map of its own; give own_map=True")
+        return self._own
+
+    def _is_behind(self) -> bool:
+        """Whether a recording should wait."""
+        uplink, own = self._uplink, self._own
+        unstored, is_full = (0, False) if uplink is None else (uplink.unstored, uplink.is_full)
+        with self._lock:
+            behind = max(self._frontend.backlog, unstored, 0 if own is None else own.backlog) > LARGEST_BACKLOG
+            if behind:
+                self._take(self._frontend.ready())
+        return behind or is_full
+
+    def _wait_once(self, watch: Callable[[RobotStatus], None] | None) -> None:
+        self._raise_failure()
+        if watch is not None:
+            watch(self.status())
+        self._sleep(POLL_INTERVAL_S)
+
+    def _raise_failure(self) -> None:
+        if self._uplink is not None and self._uplink.failure is not None:
+            raise self._uplink.failure
+
+    def _T_map_own(self, part: int) -> FloatArray:
+        """Where the robot's own map lies in the map of its poses, shape (3,)."""
+        own, by_server = (localizers.get(part) for localizers in self._localizers)
+        if by_server is None or by_server.correction is None:
+            return np.zeros(3)
+        own_correction = None if own is None else own.correction
+        if own_correction is None:
+            return by_server.correction.T_map_odom
+        return se2.compose(by_server.correction.T_map_odom, se2.inverse(own_correction.T_map_odom))
 
     def _catch_up(self) -> None:
         """Wait, without keeping scans waiting, until the back end has handled everything so far."""
@@ -261,10 +445,16 @@ class Robot:
         with self._lock:
             self._take(self._frontend.ready())
 
+    def _processed(self, record: SensorRecord) -> list[Packet]:
+        if self._is_finished:
+            raise InputError(f"{self.name}: the robot is finished; make a new Robot to go on")
+        if self._uplink is not None:
+            self._uplink.before_record()
+        return self._frontend.process(record)
+
     def _process(self, scan: LaserScan) -> RobotPose:
         """Localize a scan, and tell what happened."""
-        self._require_unfinished()
-        self._take(self._frontend.process(scan))
+        self._take(self._processed(scan))
         self._newest_s = max(self._newest_s, scan.stamp)
         self._scans += 1
         pose = self._pose = self._pose_of(self._newest(), scan.T_odom_base)
@@ -273,14 +463,27 @@ class Robot:
 
     def _take(self, packets: list[Packet]) -> None:
         """Pass the next packets on."""
-        self._map.put(packets)
+        if not packets:
+            return
+        self._keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
+        if self._uplink is not None:
+            self._uplink.put(packets)
+        if self._own is not None:
+            self._own.put([_in_epoch(packet, self._part_base + packet.epoch) for packet in packets])
 
     def _correct(self, epoch: int, correction: Correction) -> None:
         """Take a correction of the robot's own map, in any thread."""
-        self._localizer(epoch).correct(correction)
+        part = epoch - self._part_base
+        self._localizers[0].setdefault(part, Localizer(self._clock)).correct(correction)
+
+    def _correct_by_server(self, part: int, correction: Correction) -> None:
+        """Take a correction of the server, in any thread."""
+        self._localizers[1].setdefault(part, Localizer(self._clock)).correct(correction)
 
     def _localizer(self, part: int) -> Localizer:
-        return self._own.setdefault(part, Localizer(self._clock))
+        """That of the server as soon as it has corrected this part of the start."""
+        own, by_server = self._localizers
+        return by_server.get(part) or own.setdefault(part, Localizer(self._clock))
 
     def _pose_of(self, newest: NewestScan, T_odom_base: FloatArray) -> RobotPose:
         localizer = self._localizer(self._part)
@@ -302,15 +505,34 @@ class Robot:
         if correction is not self._applied and correction is not None:
             self._tell_correction(self._applied, correction)
             self._applied = correction
-        for failure in (self._frontend.backend_failure, self._map.failure):
-            if failure is not None and failure not in self._told:
-                self._told.add(failure)
-                self._event(EventKind.FAILED, f"no loop closures from now on, as the back end failed: {failure}")
+        self._tell_connection()
+        broken = self._frontend.backend_failure, None if self._own is None else self._own.failure
+        for failure in filter(None, broken):
+            self._tell_failure(f"no loop closures from now on, as the back end failed: {failure}")
+
+    def _tell_connection(self) -> None:
+        if self._uplink is None:
+            return
+        if self._uplink.failure is not None:
+            self._tell_failure(f"nothing is sent or kept any more: {self._uplink.failure}")
+        trouble, was_online = self._uplink.trouble, self._is_online
+        if trouble is None and was_online is not True and self._uplink.confirmed:
+            self._is_online = True
+            self._event(EventKind.ONLINE, "the server confirms packets")
+        elif trouble not in (None, CONNECTING) and was_online is not False:
+            self._is_online = False
+            self._event(EventKind.OFFLINE, f"the robot goes on, and its packets wait: {trouble}")
+
+    def _tell_failure(self, text: str) -> None:
+        """Tell a failure once."""
+        if text not in self._told:
+            self._told.add(text)
+            self._event(EventKind.FAILED, text)
 
     def _tell_correction(self, before: Correction | None, now: Correction) -> None:
         if self._part > 0 and now.quality > 0.0 and (before is None or before.quality == 0.0):
             self._event(EventKind.RELOCALISED, f"relocalised in map {now.map_index}, quality {now.quality:.2f}")
-        elif before is not None and now.map_index != before.map_index:
+        elif (before is None and self._uplink is not None) or (before and now.map_index != before.map_index):
             self._event(EventKind.JOINED, f"now in map {now.map_index}")
         T_smooth_base = self._frontend.scan_poses.in_odom(self._newest().pose)
         T_map_before = np.zeros(3) if before is None else before.T_map_odom
@@ -320,7 +542,7 @@ class Robot:
             self._event(EventKind.CORRECTED, f"corrected by {distance_m:.3f} m and {turned_rad:.4f} rad")
 
     def _event(self, kind: EventKind, text: str) -> None:
-        level = logging.INFO if kind is EventKind.CORRECTED else logging.WARNING
+        level = logging.INFO if kind in QUIET else logging.WARNING
         _log.log(level, "%s: %s", self.name, text)
         if self._on_event is not None:
             self._on_event(RobotEvent(kind, self._newest_s, text))
@@ -329,3 +551,26 @@ class Robot:
         newest = self._frontend.newest
         assert newest is not None  # there is one after a scan
         return newest
+
+
+def _in_epoch(packet: Packet, epoch: int) -> Packet:
+    body = replace(packet.body, epoch=epoch) if isinstance(packet.body, Hello) else packet.body
+    return replace(packet, epoch=epoch, body=body)
+
+
+def _state_folder(given: StrPath | None, is_needed: bool, stack: ExitStack) -> Path | None:
+    """The state folder, made if it is not there; one that is removed with ``stack`` if none is given and needed.
+
+    Raises:
+        StateError: it cannot be made.
+    """
+    if given is None:
+        return Path(stack.enter_context(TemporaryDirectory(prefix="fcslam-"))) if is_needed else None
+    folder = Path(given)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StateError(
+            f"{folder}: cannot be made ({error.strerror}); give another folder: --state, in Python state="
+        ) from error
+    return folder

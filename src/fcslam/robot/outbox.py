@@ -127,6 +127,11 @@ class Outbox:
             return int(_one(connection, "SELECT count(*) FROM packets WHERE epoch >= ?", self._first)[0])
 
     @property
+    def first_epoch(self) -> int:
+        """Epoch of the first part of this start."""
+        return self._first
+
+    @property
     def is_synchronized(self) -> bool:
         """Whether the cloud has confirmed every session; packets of other sessions are not sent."""
         return not self._rows("SELECT 1 FROM sessions WHERE met = 0 LIMIT 1")
@@ -171,6 +176,15 @@ class Outbox:
                 _insert(connection, epoch, packet.sequence, digest, number, sent)
                 self.waiting = WaitingPackets(self.waiting.packets + 1, self.waiting.bytes + len(sent))
         return dropped
+
+    def complete_sessions(self) -> list[bytes]:
+        """The packets of all earlier starts of which no packet left this file, in the order of their sessions."""
+        question = (
+            "SELECT data FROM packets JOIN sessions USING (epoch) WHERE epoch < ? AND stored = 0 AND sequence NOT NULL "
+            "AND epoch NOT IN (SELECT epoch FROM packets WHERE data IS NULL AND sequence NOT NULL) "
+            "ORDER BY epoch, sequence"
+        )
+        return [bytes(data) for (data,) in self._rows(question, (self._first,))]
 
     def record_detector_update(self, record: int, file: DetectorFile) -> None:
         """Store that the front end applied a detector update before this record of the session."""

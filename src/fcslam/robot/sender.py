@@ -19,6 +19,8 @@ SEND_INTERVAL_S = 1.0
 ASK_AFTER_S = 5.0
 """A robot without waiting packets asks for its correction after this time, which also shows that it is alive."""
 REMOVED = "an administrator removed this session: the cloud stores its packets, but they have no effect"
+CONNECTING = "connecting"
+"""The trouble before the first reply."""
 FIRST_RETRY_S, LONGEST_RETRY_S = 0.5, 30.0
 
 
@@ -62,7 +64,7 @@ class Sender:
         self.confirmed = 0
         """Packets that the cloud has stored."""
         self.refusals = 0
-        self.trouble: str | None = "connecting"
+        self.trouble: str | None = CONNECTING
         """Why packets do not arrive; None if they do."""
         self.notice: str | None = None
         """Message about packets of earlier starts that belong to another mission; None if there were none."""

@@ -1,6 +1,7 @@
 """A robot maps the same whether its cloud is there, slow, or away, and comes back where it was."""
 
 import threading
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -9,14 +10,18 @@ import pytest
 from fcslam.errors import CloudError, StateError
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.geometry import se2
+from fcslam.live.playback import PlaybackPace, play
+from fcslam.live.records import EventKind, LocalizationState
+from fcslam.live.robot import Playback, Robot
 from fcslam.records import Channel, Place
-from fcslam.robot.agent import Agent, LocalizationState, PlaybackPace
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
+from fcslam.runs import Occupancy
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
 from tests.features.networks import tiny_network
+from tests.live.same_thread import SameThread
 from tests.robot.fake_cloud import FakeCloud, Network, content
 from tests.robot.kidnapping import kidnapping
 from tests.wire.examples import CORRECTION
@@ -48,17 +53,15 @@ class Clock:
 
 
 def drive(tmp_path, network, records, resume=False, watch=lambda _: None, limit=10**9, recording="r"):
-    outbox = Outbox(tmp_path / "outbox", "alice", limit)
     pause = threading.Event()
-    agent = Agent(
-        RobotFrontend("alice", RobotConfig()), outbox, network, tmp_path, np.random.default_rng(0),
-        Clock(), lambda _: pause.wait(0.001),
+    robot = Robot(
+        "alice", server=network, state=tmp_path, outbox_mb=1e-6 * limit, own_map=False,
+        playback=Playback(recording, resume), executor=SameThread(), clock=Clock(),
+        sleep=lambda _: pause.wait(0.001),
     )  # fmt: skip
-    try:
-        agent.run(records, outbox.begin(recording, resume), AS_FAST_AS_POSSIBLE, watch)
-    finally:
-        outbox.close()
-    return agent
+    with closing(robot):
+        play(robot, records, AS_FAST_AS_POSSIBLE, watch)
+        return robot
 
 
 def stop_after(records, count):
@@ -75,14 +78,15 @@ def contents(packets):
 @pytest.mark.slow
 def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     cloud = FakeCloud(correction=CORRECTION.version)
-    agent = drive(tmp_path, Network(cloud), scans)
+    robot = drive(tmp_path, Network(cloud), scans)
     assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
     assert list(cloud.stored) == [(0, k) for k in range(len(alone))]
-    now = agent.progress()
+    now = robot.status()
     assert (now.scans, now.waiting.packets, now.confirmed, now.trouble) == (len(scans), 0, len(alone), None)
     assert (now.map_index, now.left_out, now.refused, now.catching_up) == (CORRECTION.map_index, 0, 0, False)
     assert now.sent_bytes == sum(map(len, cloud.stored.values()))
-    stamps, poses = agent.trajectory()
+    path = robot.trajectory()
+    stamps, poses = path.stamps, path.T_map_base
     assert np.array_equal(stamps, [scan.stamp for scan in scans])
     assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
 
@@ -154,12 +158,12 @@ def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone
         if now.waiting.bytes >= limit:
             waits.append(now.scans)
 
-    agent = drive(tmp_path, Away(cloud), scans, watch=watch, limit=limit)
+    robot = drive(tmp_path, Away(cloud), scans, watch=watch, limit=limit)
     assert len(set(waits)) < len(waits), "the front end waited"
     places = [packet for packet in alone if isinstance(packet.body, Place)]
     sent = [decode(data).body for data in cloud.stored.values()]
     left_out = len(places) - sum(isinstance(body, Place) for body in sent)
-    assert 0 < left_out == agent.progress().left_out
+    assert 0 < left_out == robot.status().left_out
     assert len(sent) == len(alone) - left_out
     assert list(cloud.stored) == [(0, k) for k in range(len(sent))]
 
@@ -168,8 +172,8 @@ def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone
 def test_a_refused_packet_is_kept_with_its_reason(scans, alone, tmp_path):
     place = next(packet for packet in alone if isinstance(packet.body, Place))
     cloud = FakeCloud(unwanted={content(encode(place))})
-    agent = drive(tmp_path, Network(cloud), scans)
-    assert agent.progress().refused == 1
+    robot = drive(tmp_path, Network(cloud), scans)
+    assert robot.status().refused == 1
     assert content((tmp_path / "refused" / "000000.bin").read_bytes()) == content(encode(place))
     assert (tmp_path / "refused" / "000000.txt").read_text() == "unwanted\n"
     assert len(cloud.stored) == len(alone) - 1
@@ -182,7 +186,7 @@ def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
     (tmp_path / "refused").touch()
     with pytest.raises(StateError, match="refused: cannot store a refused packet"):
         drive(tmp_path, Network(cloud), scans)
-    outbox = Outbox(tmp_path / "outbox", "alice", 10**9)
+    outbox = Outbox(tmp_path / "outbox.sqlite", "alice", 10**9)
     assert content(outbox.packet(*next(iter(cloud.refused)))) == content(encode(place))
     outbox.close()
 
@@ -203,10 +207,10 @@ def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tm
 
     with pytest.raises(KeyboardInterrupt):
         drive(tmp_path, Network(cloud), stop_after(patient(scans), 70))
-    agent = drive(tmp_path, Network(cloud), scans, resume=True)
+    robot = drive(tmp_path, Network(cloud), scans, resume=True)
     hellos = [decode(data).body for data in cloud.stored.values() if isinstance(decode(data).body, Hello)]
     assert [hello.detector_versions[Channel.CAMERA] == "tiny-2" for hello in hellos] == [False, True]
-    assert agent.progress().notices == ("detector tiny-2 from now on",)
+    assert robot.status().notices == ("detector tiny-2 from now on",)
 
 
 @pytest.mark.slow
@@ -217,26 +221,25 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         drive(tmp_path, Network(cloud), stop_after(scans, len(scans) - 5))
     seen = []
-    agent = drive(tmp_path, Network(cloud), scans, resume=True, watch=lambda now: seen.append(now.localization))
+    robot = drive(tmp_path, Network(cloud), scans, resume=True, watch=lambda now: seen.append(now.localization))
     frontend = RobotFrontend("alice", RobotConfig())
     said = [packet for scan in scans for packet in frontend.process(scan)] + frontend.finish()
     assert {packet.epoch for packet in said} == {0, 1}
     assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(said)]
     assert list(cloud.stored) == [(packet.epoch, packet.sequence) for packet in said]
     assert list(dict.fromkeys(seen)) == [LocalizationState.MAPPING, LocalizationState.LOST]
-    assert agent.trajectory() is None
-    newest = agent.localizer
-    agent._localizer(0).correct(replace(CORRECTION, map_index=1))
-    agent._localizer(1).correct(replace(CORRECTION, quality=0.5))
-    now = agent.progress()
-    assert agent.localizer is newest
+    assert robot.status().map_index is None
+    robot._correct_by_server(0, replace(CORRECTION, map_index=1))
+    robot._correct_by_server(1, replace(CORRECTION, quality=0.5))
+    now = robot.status()
     assert (now.localization, now.quality, now.map_index, now.times_lost) == (LocalizationState.RELOCALISED, 0.5, 0, 1)
-    stamps, poses = agent.trajectory()
+    path = robot.trajectory()
+    stamps, poses = path.stamps, path.T_map_base
     assert np.array_equal(stamps, [scan.stamp for scan in scans if scan.stamp >= stamps[0]])
     assert stamps[0] > moment, "where it was before is known as of then only"
     assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
-    agent._localizer(0).correct(replace(CORRECTION, version=CORRECTION.version + 1))
-    assert np.array_equal(agent.trajectory()[0], stamps), "not even if it was called the same map then"
+    robot._correct_by_server(0, replace(CORRECTION, version=CORRECTION.version + 1))
+    assert np.array_equal(robot.trajectory().stamps, stamps), "not even if it was called the same map then"
 
 
 @pytest.mark.slow
@@ -266,3 +269,64 @@ def test_a_recording_is_played_by_its_own_clock():
     now += 10.0  # mapping took long: nothing is left out, the recording just comes late
     pace.wait(9.0)
     assert slept == [0.0, 0.5, 1.0, 0.0]
+
+
+def test_the_own_map_lies_where_the_server_puts_it(scans):
+    cloud = FakeCloud(correction=CORRECTION.version)
+    with Robot("alice", scans[0].laser, server=Network(cloud), executor=SameThread()) as robot:
+        for scan in scans:
+            pose = robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
+        before = robot.map()
+        assert robot.finish()
+        T_map_odom = CORRECTION.T_map_odom
+        path, drawn = robot.trajectory(), robot.map()
+    assert np.allclose(path.T_map_base[0], T_map_odom, atol=0.02)
+    assert path.map_index == CORRECTION.map_index
+    if pose.map_index is not None:  # the reply came before the end
+        assert np.allclose(pose.T_map_base, path.T_map_base[-1], atol=0.05)
+    assert drawn.origin_xy != before.origin_xy or pose.map_index is not None
+    column, row = np.floor((path.T_map_base[-1, :2] - drawn.origin_xy) / drawn.resolution_m).astype(int)
+    assert drawn.cells[row, column] == Occupancy.FREE, "where the robot stands"
+
+
+def test_a_server_that_is_away_is_told_once_and_what_waits_is_kept(scans, tmp_path):
+    events, back = [], threading.Event()
+
+    class Away(Network):
+        def _next(self):
+            self.requests += 1
+            return "none" if back.is_set() else "request lost"
+
+    network, pause = Away(FakeCloud()), threading.Event()
+    with Robot("alice", scans[0].laser, server=network, state=tmp_path, own_map=False, executor=SameThread(),
+               clock=Clock(), on_event=events.append) as robot:  # fmt: skip
+        for scan in scans[:20]:
+            robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
+            while not network.requests:
+                pause.wait(0.001)
+        assert not robot.finish(timeout_s=5.0)
+    assert [event.kind for event in events] == [EventKind.OFFLINE]
+    back.set()
+    with Robot("alice", state=tmp_path, server=network, own_map=False, executor=SameThread()) as robot:
+        robot.finish()
+    assert {epoch for epoch, _ in network.cloud.stored} == {0}
+
+
+def test_a_server_that_turns_the_robot_away_stops_no_scan(scans, tmp_path):
+    class Closed(Network):
+        def state(self):
+            raise CloudError("no token")
+
+    events, pause = [], threading.Event()
+    with Robot("alice", scans[0].laser, server=Closed(FakeCloud()), state=tmp_path, executor=SameThread(),
+               on_event=events.append) as robot:  # fmt: skip
+        while not robot._uplink.failure:
+            pause.wait(0.001)
+        for scan in scans[:10]:
+            assert robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base).is_localized
+        with pytest.raises(CloudError, match="no token"):
+            robot.finish()
+        robot.close()
+    assert [(event.kind, event.text) for event in events] == [
+        (EventKind.FAILED, "nothing is sent or kept any more: no token")
+    ]

@@ -1,0 +1,176 @@
+"""The way of a robot's packets to a cloud over an unreliable network: mapping never depends on the network.
+
+One thread encodes the packets and puts them into the outbox, which is on disk, and another one sends them. So neither a
+disk nor the network delays the pose of a scan.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.errors import StateError
+from fcslam.records import Correction
+from fcslam.robot.budget import Budget
+from fcslam.robot.detector_updates import DetectorUpdates
+from fcslam.robot.frontend import RobotFrontend
+from fcslam.robot.outbox import Outbox, WaitingPackets
+from fcslam.robot.sender import Sender
+from fcslam.wire.http_transport import BatchTransport
+from fcslam.wire.messages import Packet
+
+STOP_TIMEOUT_S = 2.0
+"""Time that a running request may take when the robot stops; its packets are sent again at the next start."""
+
+
+class Uplink:
+    """Stores the packets of one start of a robot, and sends them if there is a cloud."""
+
+    def __init__(
+        self, frontend: RobotFrontend, outbox: Outbox, transport: BatchTransport | None, folder: Path,
+        rng: np.random.Generator, clock: Callable[[], float], correct: Callable[[int, Correction], None], known: int,
+        budget: Budget | None = None,
+    ) -> None:  # fmt: skip
+        """Start both threads.
+
+        Args:
+            frontend: uses the detectors that the cloud announces.
+            outbox: begun.
+            transport: to the cloud; None: all packets stay in the outbox.
+            folder: holds refused packets and detectors.
+            rng: of the delays after failures.
+            clock: seconds.
+            correct: called in the sender's thread, with the part of this start and its correction.
+            known: number of packets that the outbox has from before an interruption, and that come again.
+            budget: None: every packet is sent.
+        """
+        self._outbox = outbox
+        self._refused = folder / "refused"
+        self._budget = budget
+        self._correct_part = correct
+        self._known = known
+        self._detector_updates = DetectorUpdates(folder / "detectors", outbox, frontend)
+        self._detector_updates.resume()
+        self._refused_files: int | None = None
+        """Number of files of refused packets; None until they are counted, as there may be many."""
+        self._put = self._crowded_out = self._records = 0
+        self._storing = ThreadPoolExecutor(1, "outbox")
+        self._unstored: deque[Future[None]] = deque()
+        """Packets on their way into the outbox."""
+        self._sender: Sender | None = None
+        self._stop = threading.Event()
+        if transport is not None:
+            self._sender = Sender(
+                outbox, transport, rng, clock, self._correct, self._detector_updates.store, self._keep_refused
+            )
+            self._thread = threading.Thread(target=self._sender.run, args=(self._stop,), name="sender", daemon=True)
+            self._thread.start()
+
+    def before_record(self) -> None:
+        """Give the front end the detector that is due before the next record."""
+        self._detector_updates.apply_due(self._records, self.is_catching_up)
+        self._records += 1
+
+    def put(self, packets: Sequence[Packet]) -> None:
+        """Store the next packets of the front end, later."""
+        if packets:
+            self._unstored.append(self._storing.submit(self._store, packets))
+
+    def close(self) -> None:
+        """Stop both threads; packets on their way into the outbox are stored, and wait there."""
+        self._stop.set()
+        self._storing.shutdown()
+        if self._sender is not None:
+            self._thread.join(STOP_TIMEOUT_S)
+
+    @property
+    def failure(self) -> Exception | None:
+        """What ended one of the threads: a cloud that rejects the robot, or an outbox that cannot be used."""
+        while self._unstored and self._unstored[0].done():
+            error = self._unstored[0].exception()
+            if isinstance(error, Exception):
+                return error
+            self._unstored.popleft()
+        return None if self._sender is None else self._sender.failure
+
+    @property
+    def unstored(self) -> int:
+        """Number of batches of packets on their way into the outbox; those of a failed outbox stay there."""
+        return len(self._unstored) if self.failure is None else 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether so many packets wait that a recording should wait, too."""
+        return self._sender is not None and self._outbox.is_full
+
+    @property
+    def is_catching_up(self) -> bool:
+        """Whether a resumed recording has not yet reached the point of interruption."""
+        return self._put < self._known
+
+    @property
+    def waiting(self) -> WaitingPackets:
+        """Packets that the cloud has not confirmed."""
+        return self._outbox.waiting if self._sender is not None else WaitingPackets(0, 0)
+
+    @property
+    def confirmed(self) -> int:
+        """Number of packets that the cloud has confirmed."""
+        return 0 if self._sender is None else self._sender.confirmed
+
+    @property
+    def sent_bytes(self) -> int:
+        """Bytes of packets, counted as often as they were sent."""
+        return 0 if self._sender is None else self._sender.sent_bytes
+
+    @property
+    def left_out(self) -> int:
+        """Places that are not sent, because the outbox or the budget has no room for them."""
+        return self._crowded_out + (0 if self._budget is None else self._budget.left_out)
+
+    @property
+    def refused(self) -> int:
+        """Packets that the cloud will never store."""
+        return 0 if self._sender is None else self._sender.refusals
+
+    @property
+    def trouble(self) -> str | None:
+        """Why packets do not arrive; None if they do, or if there is no cloud."""
+        return None if self._sender is None else self._sender.trouble
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """Messages about packets of another mission, refused packets, removed sessions and the last detector update."""
+        if self._sender is None:
+            return ()
+        sender = self._sender
+        found = sender.notice, sender.refused_notice, sender.removed_notice, self._detector_updates.notice
+        return tuple(filter(None, found))
+
+    def _store(self, packets: Sequence[Packet]) -> None:
+        chosen = packets if self._budget is None else self._budget.fit(packets)
+        if chosen:
+            self._crowded_out += self._outbox.put(chosen)
+            self._put += len(chosen)
+
+    def _correct(self, epoch: int, correction: Correction) -> None:
+        part = self._outbox.part(epoch)
+        if part is not None:
+            self._correct_part(part, correction)
+
+    def _keep_refused(self, data: bytes, reason: str) -> None:
+        try:
+            self._refused.mkdir(parents=True, exist_ok=True)
+            if self._refused_files is None:
+                self._refused_files = len(list(self._refused.glob("*.bin")))
+            stem = f"{self._refused_files:06d}"
+            (self._refused / f"{stem}.bin").write_bytes(data)
+            (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
+        except OSError as error:
+            raise StateError(
+                f"{self._refused}: cannot store a refused packet ({error}); free some space, then use --resume"
+            ) from error
+        self._refused_files += 1
