@@ -8,7 +8,7 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import certificates, config, demo, evaluate, extract, federate, live, serve, simulate, train
+from fcslam.cli import certificates, config, demo, evaluate, extract, federate, live, serve, simulate, tokens, train
 from fcslam.cli import convert as conversion
 from fcslam.cli import localize as localization
 from fcslam.cli import map as mapping
@@ -88,6 +88,7 @@ app.command(
 )(certificates.certificates)
 app.command("warm-up", epilog=examples("fcslam warm-up"))(warming.warm_up)
 app.add_typer(federate.app, name="federate")
+app.add_typer(tokens.app, name="tokens")
 app.add_typer(evaluate.app, name="evaluate")
 app.add_typer(config.app, name="config")
 

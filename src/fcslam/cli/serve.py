@@ -69,8 +69,8 @@ def serve(
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with _listen(host, port) as listening:
         authenticator = _authenticator(tokens, client_ca)
-        _reload_on_hangup(authenticator, tokens)
         state = _state(data, authenticator, _cloud_config(config))
+        _reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
@@ -115,7 +115,7 @@ def _authenticator(tokens: Path | None, client_ca: Path | None) -> "Authenticato
     return Authenticator(read_tokens(tokens))
 
 
-def _reload_on_hangup(authenticator: "Authenticator", tokens: Path | None) -> None:
+def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
     """Read the tokens again at SIGHUP; those of before stay if the file is bad."""
     import logging
     import signal
@@ -129,11 +129,12 @@ def _reload_on_hangup(authenticator: "Authenticator", tokens: Path | None) -> No
         if tokens is None:
             return
         try:
-            authenticator.replace(read_tokens(tokens))
+            changed = state.authenticator.replace(read_tokens(tokens))
         except FcslamError as error:
             log.error("%s; the tokens of before stay valid", error)
         else:
             log.warning("read the tokens of %s again", tokens)
+            state.audit.record("", "", "tokens read again", 200, {"changed": changed})
 
     signal.signal(signal.SIGHUP, reload)
 
@@ -141,6 +142,7 @@ def _reload_on_hangup(authenticator: "Authenticator", tokens: Path | None) -> No
 def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig") -> "ServiceState":
     import time
 
+    from fcslam.service.audit_log import AuditLog
     from fcslam.service.http.events import EventStream
     from fcslam.service.http.limits import RateLimit
     from fcslam.service.http.state import ServiceState
@@ -151,7 +153,8 @@ def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig") ->
     missions = Missions(
         data, config, time.monotonic, time.time, lambda folder: Supervisor(folder, time.monotonic, events.publish)
     )
-    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events)
+    audit = AuditLog(data / "audit.jsonl", time.time)
+    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit)
 
 
 def _cloud_config(file: Path | None) -> "CloudConfig":

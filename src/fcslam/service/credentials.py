@@ -8,25 +8,22 @@ robots/<name>.pem, .key a robot's certificate, instead of a token
 """
 
 import datetime
-import hashlib
 import ipaddress
-import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import yaml
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fcslam.errors import OutputError
-from fcslam.service.http.authentication import Role, TokenEntry, TokensFile, read_tokens
+from fcslam.service.http.authentication import Role, read_tokens
+from fcslam.service.token_file import TokenHolder, add_token
 from fcslam.storage.files import write_file
 
 AUTHORITY_DAYS, LEAF_DAYS = 3650, 397
 """Longest validity of a server certificate that clients accept."""
-TOKEN_BYTES = 32
 
 Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
@@ -114,15 +111,10 @@ def _host(host: str) -> x509.GeneralName:
 
 def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
     path = folder / "tokens.yaml"
-    entries = list(read_tokens(path)) if path.exists() else []
-    known = {entry.name for entry in entries}
+    known = {entry.name for entry in read_tokens(path)} if path.exists() else set()
     for name, role in names.items():
         if name not in known:
-            token = secrets.token_urlsafe(TOKEN_BYTES)
-            write_file(folder / "tokens" / name, f"{token}\n".encode(), private=True)
-            entries.append(TokenEntry(name=name, role=role, sha256=hashlib.sha256(token.encode()).hexdigest()))
-    content = TokensFile(tokens=tuple(entries)).model_dump(mode="json", exclude_none=True)
-    write_file(path, yaml.safe_dump(content, sort_keys=False).encode())
+            add_token(path, TokenHolder(name, role), folder / "tokens" / name)
 
 
 def _write_pair(stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:

@@ -262,6 +262,37 @@ def test_the_service_is_ready_when_the_worker_has_caught_up(desk, monkeypatch):
     assert desk.ask("GET", "/readyz").status_code == 503
 
 
+def test_the_audit_log_says_who_did_what(mapped):
+    mapped.ask("POST", f"{API}/removals", "boss", json={"robot": "b"})
+    mapped.ask("POST", f"{API}/removals", "eye", json={"robot": "a"})
+    mapped.ask("POST", f"{API}/edits/7/undo", "boss")
+    mapped.ask("GET", f"{API}/fleet", "eye")
+    mapped.ask("GET", f"{API}/missions/mission/export?x=1", "boss")
+    told = mapped.ask("GET", f"{API}/audit", "boss").json()
+    assert [(line["who"], line["action"], line["status"], line["content"]) for line in told] == [
+        ("boss", f"POST {API}/removals", 201, {"robot": "b", "epoch": None}),
+        ("eye", f"POST {API}/removals", 403, {}),
+        ("boss", f"POST {API}/edits/7/undo", 409, {}),
+        ("boss", f"GET {API}/missions/mission/export?x=1", 200, {}),
+    ]
+    assert {(line["address"], line["time"]) for line in told} == {("127.0.0.1", "2001-09-09T01:46:40Z")}
+    (newest,) = mapped.ask("GET", f"{API}/audit?limit=1", "boss").json()
+    assert newest["action"] == f"GET {API}/audit"
+
+
+def test_refused_logins_are_counted_in_few_lines(desk):
+    def refused():
+        lines = desk.ask("GET", f"{API}/audit", "boss").json()
+        return [line["content"]["count"] for line in lines if line["action"] == "refused logins"]
+
+    for _ in range(5):
+        desk.ask("GET", f"{API}/fleet", "stranger")
+    assert refused() == [1]
+    desk.now += 61.0
+    desk.ask("GET", f"{API}/fleet")
+    assert refused() == [1, 5]
+
+
 def test_missions_are_begun_opened_and_rest_as_they_were(mapped):
     assert mapped.ask("POST", f"{API}/missions", "boss", json={"name": "next"}).json() == {
         "open": "next",

@@ -10,12 +10,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 import fcslam
 from fcslam.service.http.decisions import decision_router
 from fcslam.service.http.event_stream import event_router
+from fcslam.service.http.limits import CONTENT
 from fcslam.service.http.missions import file_router, mission_router
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
-from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.http.robots import detector_router, robot_router
-from fcslam.service.http.state import ServiceState
+from fcslam.service.http.state import ACTOR, ServiceState
 from fcslam.service.http.viewers import fleet_router, map_router
 
 PREFIX = "/api/v1"
@@ -44,6 +44,7 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         yield
         state.closing = True
+        state.audit.flush()
         state.missions.close()
 
     app = Service(
@@ -59,20 +60,35 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
     app.include_router(operations_router(state))
     for router in more:
         app.include_router(router)
-    app.add_middleware(_RefusalCounter, measures=state.measures)
+    app.add_middleware(_Watch, state=state)
     return app
 
 
-class _RefusalCounter:
-    """Counts answers that refuse. Plain ASGI: a middleware of Starlette's own base runs a task for every request."""
+class _Watch:
+    """Counts answers that refuse, and writes the audit log.
 
-    def __init__(self, app: ASGIApp, measures: ServiceMetrics) -> None:
-        self._app, self._measures = app, measures
+    Plain ASGI: a middleware of Starlette's own base runs a task for every request.
+    """
+
+    def __init__(self, app: ASGIApp, state: ServiceState) -> None:
+        self._app, self._state = app, state
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def watched(message: Message) -> None:
-            if message["type"] == "http.response.start" and message["status"] >= 400:
-                self._measures.refuse(message["status"])
+            if message["type"] == "http.response.start":
+                self._note(scope, message["status"])
             await send(message)
 
         await self._app(scope, receive, watched)
+
+    def _note(self, scope: Scope, status: int) -> None:
+        address = (scope.get("client") or ("",))[0]
+        if status >= 400:
+            self._state.measures.refuse(status)
+        if status == 401:
+            self._state.audit.refuse_login(address)
+        known = scope.get("state", {})
+        if ACTOR in known:
+            asked = f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
+            action = f"{scope['method']} {scope['path']}{asked}"
+            self._state.audit.record(known[ACTOR], address, action, status, known.get(CONTENT, {}))

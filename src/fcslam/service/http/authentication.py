@@ -64,9 +64,11 @@ class Authenticator:
         self._tokens = tokens
         self._clock = clock
 
-    def replace(self, tokens: Sequence[TokenEntry]) -> None:
-        """Use these tokens from the next request on."""
+    def replace(self, tokens: Sequence[TokenEntry]) -> list[str]:
+        """Use these tokens from the next request on; returns the names whose token is new, gone or another one."""
+        changed = sorted({entry.name for entry in set(tokens) ^ set(self._tokens or ())})
         self._tokens = tokens
+        return changed
 
     @property
     def is_open(self) -> bool:

@@ -73,7 +73,7 @@ def decision_router(state: ServiceState) -> APIRouter:
         """Exclude closures from now on."""
         new = await read_json(request, NewVeto)
         veto = Veto(new.robot_i, new.robot_j, new.stamps)
-        return await run_in_threadpool(_edit, state, request.state.author, veto, (new.robot_i, new.robot_j))
+        return await run_in_threadpool(_edit, state, request.state.actor, veto, (new.robot_i, new.robot_j))
 
     @router.post("/removals", status_code=201, openapi_extra=json_body(NewRemoval), responses=refusals(400, 404, 413))
     async def remove(request: Request) -> EditSummary:
@@ -81,7 +81,7 @@ def decision_router(state: ServiceState) -> APIRouter:
         new = await read_json(request, NewRemoval)
         check_robot(new.robot)
         removal = Removal(new.robot, new.epoch)
-        return await run_in_threadpool(_edit, state, request.state.author, removal, (new.robot,))
+        return await run_in_threadpool(_edit, state, request.state.actor, removal, (new.robot,))
 
     @router.get("/edits")
     def get_edits() -> list[EditSummary]:
@@ -92,7 +92,7 @@ def decision_router(state: ServiceState) -> APIRouter:
     @router.post("/edits/{number}/undo", status_code=201, responses=refusals(400, 404, 409))
     async def undo(request: Request, number: EditNumber) -> EditSummary:
         """Undo a veto or a removal. A removed session comes back when the worker has applied all packets again."""
-        return await run_in_threadpool(_edit, state, request.state.author, Undo(number), ())
+        return await run_in_threadpool(_edit, state, request.state.actor, Undo(number), ())
 
     @router.post(
         "/detectors",

@@ -17,6 +17,9 @@ REQUEST_BYTES = 16.0 * 2**10
 """Cost of a request besides its bytes, in bytes."""
 LONGEST_JSON_BYTES = 64 * 2**10
 
+CONTENT = "content"
+"""What the state of a request names its body, for the audit log."""
+
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
@@ -60,10 +63,12 @@ async def read_json(request: Request, model: type[_Model]) -> _Model:
     """
     body = await read_body(request, LONGEST_JSON_BYTES)
     try:
-        return model.model_validate_json(body)
+        read = model.model_validate_json(body)
     except ValidationError as error:
         found = error.errors(include_url=False, include_context=False, include_input=False)
         raise RequestValidationError([{**one, "loc": ("body", *one["loc"])} for one in found]) from error
+    setattr(request.state, CONTENT, read.model_dump())
+    return read
 
 
 def json_body(model: type[BaseModel]) -> dict[str, Any]:

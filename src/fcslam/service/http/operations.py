@@ -1,10 +1,13 @@
 """Routes for operators: health, readiness and metrics."""
 
-from fastapi import APIRouter, HTTPException
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import JSONResponse, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from fcslam.errors import StoreError
+from fcslam.service.audit_log import AuditEntry
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.problems import problem
 from fcslam.service.http.responses import Health, Readiness, Unready, content, refusals
@@ -44,6 +47,11 @@ def operations_router(state: ServiceState) -> APIRouter:
         if backlog > LARGEST_BACKLOG:
             return problem(503, f"the worker is catching up: {backlog} packets have no effect yet", backlog=backlog)
         return Readiness(backlog=backlog)
+
+    @router.get("/api/v1/audit", dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503))
+    def get_audit(limit: Annotated[int, Query(ge=1, le=10_000)] = 100) -> list[AuditEntry]:
+        """The newest lines of the audit log: who did what, and how many logins were refused."""
+        return state.audit.newest(limit)
 
     @router.get(
         "/metrics",

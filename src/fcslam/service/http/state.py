@@ -1,12 +1,14 @@
 """State shared by all routes of the HTTP service."""
 
 import asyncio
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from fastapi import Depends, HTTPException, Request, Security
 from fastapi.params import Depends as Dependency
 from fastapi.security import HTTPBearer
 
+from fcslam.service.audit_log import AuditLog
 from fcslam.service.detectors import DetectorStore
 from fcslam.service.http.authentication import Authenticator, Role
 from fcslam.service.http.events import EventStream
@@ -16,6 +18,8 @@ from fcslam.service.missions import Missions, OpenMission
 
 ANYBODY = "anybody"
 """The author of what is done without authentication."""
+ACTOR = "actor"
+"""What the state of a request names whoever asks for what only administrators may do."""
 _BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
 
 
@@ -27,6 +31,7 @@ class ServiceState:
     authenticator: Authenticator
     rate: RateLimit
     events: EventStream
+    audit: AuditLog
     measures: ServiceMetrics = field(default_factory=ServiceMetrics)
     closing: bool = False
     """Whether the service is stopping and takes no new requests."""
@@ -53,7 +58,7 @@ class ServiceState:
             if self.closing:
                 raise HTTPException(503, "the service is stopping; try again")
             if self.authenticator.is_open:
-                request.state.author = ANYBODY
+                self._note(request, ANYBODY, roles)
                 return
             tls = request.scope.get("extensions", {}).get("tls", {})
             who = self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
@@ -62,13 +67,19 @@ class ServiceState:
                 raise HTTPException(
                     401, "no known token and no robot's certificate; send Authorization: Bearer TOKEN", headers
                 )
+            self._note(request, who.name, roles)
             if who.role not in roles:
                 needed = " or ".join(roles)
                 raise HTTPException(403, f"'{who.name}' is a {who.role}; this is for a {needed}")
-            request.state.author = who.name
             robot = request.path_params.get("robot")
             if who.role is Role.ROBOT and robot not in (None, who.name):
                 raise HTTPException(403, f"robot '{who.name}' does not speak for robot '{robot}'")
 
         # the second one tells OpenAPI of tokens, and does nothing else
         return [Depends(check)] if self.authenticator.is_open else [Depends(check), Security(_BEARER)]
+
+    @staticmethod
+    def _note(request: Request, name: str, roles: Sequence[Role]) -> None:
+        """Tell the handler and the audit log who asks for what only administrators may do."""
+        if set(roles) == {Role.ADMIN}:
+            setattr(request.state, ACTOR, name)

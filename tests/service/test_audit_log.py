@@ -1,0 +1,49 @@
+"""The audit log: appended to, never changed, and no way to fill the disk."""
+
+import json
+import os
+
+import pytest
+
+from fcslam.service.audit_log import AuditLog
+
+
+@pytest.fixture
+def log(tmp_path):
+    return AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
+
+
+def test_lines_are_appended_and_private(log, tmp_path):
+    assert log.newest(10) == []
+    for number in range(3):
+        log.record("boss", "::1", "POST /x", 201, {"number": number})
+    path = tmp_path / "audit.jsonl"
+    assert [json.loads(line)["content"]["number"] for line in path.read_text().splitlines()] == [0, 1, 2]
+    assert path.stat().st_mode & 0o077 == 0
+    assert [entry.content["number"] for entry in log.newest(2)] == [1, 2]
+    assert log.newest(1)[0].time == "1970-01-01T00:00:00Z"
+
+
+def test_of_a_long_log_the_end_is_read(log):
+    for number in range(3000):
+        log.record("boss", "::1", "POST /x", 201, {"number": number, "long": "x" * 500})
+    newest = log.newest(10_000)
+    assert newest[-1].content["number"] == 2999
+    assert 1000 < len(newest) < 3000
+
+
+def test_what_cannot_be_written_is_said_and_stops_nothing(tmp_path, caplog):
+    log = AuditLog(tmp_path / "missing" / "audit.jsonl", lambda: 0.0)
+    log.record("boss", "::1", "POST /x", 201, {})
+    (line,) = caplog.messages
+    assert "cannot be written" in line
+    assert "POST /x" in line
+
+
+def test_refused_logins_left_over_are_written_at_the_end(log):
+    for _ in range(4):
+        log.refuse_login("::1")
+    log.flush()
+    log.flush()
+    assert [entry.content["count"] for entry in log.newest(10)] == [1, 3]
+    assert os.listdir(log._path.parent) == ["audit.jsonl"]
