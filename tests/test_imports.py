@@ -65,6 +65,8 @@ HEAVY = [
     "numba",
     "scipy",
     "rosbags",
+    "cyclonedds",
+    "rospy",
 ]
 
 

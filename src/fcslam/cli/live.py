@@ -1,5 +1,6 @@
 """A live robot on a ROS network, for `fcslam robot` and `fcslam record`."""
 
+import sys
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
@@ -19,36 +20,42 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.bridges.parameters import NodeParameters
-    from fcslam.mission import MissionConfig
+    from fcslam.live.robot import Robot
     from fcslam.sources import BagOptions
 
 _SCANS_PER_LINE = 600
 """A line of progress is printed each time that many scans have come."""
 
 
+SERVER_PATIENCE_S = 60.0
+"""Longest wait for the server at the end of a drive."""
+SWITCH_INTERVAL_S = 0.001
+"""Time after which a thread that publishes yields to the one that maps; Python's own is 5 ms."""
+
+
 def map_live(
     address: str,
     name: str | None,
-    config: "MissionConfig",
+    start: "Callable[..., Robot]",
     options: "BagOptions",
     domain: int | None,
     parameters: "NodeParameters",
     output: Path | None,
     console: "Console",
 ) -> None:
-    """Map the robot at ``address`` until it is stopped, and write the run to ``output``.
+    """Map the robot at ``address`` until it is stopped, and write the run to ``output``; ``start`` makes the robot.
 
     Raises:
-        InputError: the network, its topics or the output cannot be used.
+        InputError: the network, its topics, the server or the output cannot be used.
     """
     from fcslam.bridges.addresses import open_network, parse_address
     from fcslam.bridges.node import RobotNode, await_sensors
-    from fcslam.live.robot import Robot
     from fcslam.runs import prepare_output
 
     place = parse_address(address)
     output = new_folder(RUNS) if output is None else output
     prepare_output(output, force=False)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
 
     def notify(line: str) -> None:
         print_line(console, line)
@@ -56,7 +63,7 @@ def map_live(
     with (
         closing(open_network(place, domain)) as network,
         compiled(console),
-        Robot(name or place.robot, config=config, on_event=lambda event: notify(event.text)) as robot,
+        start(name or place.robot, on_event=lambda event: notify(event.text)) as robot,
     ):
         topics = await_sensors(network, place.namespace, options, parameters.topic_timeout)
         for note in topics.notes:
@@ -69,7 +76,8 @@ def map_live(
         if not node.scans:
             notify("no scan was mapped; nothing is written")
             return
-        robot.finish()
+        if not robot.finish(SERVER_PATIENCE_S):
+            notify("the server does not have everything; the rest is sent at the next start with the same --state")
         node.publish_map()
         run = robot.save(output)
         print_faults(console, {robot.name: node.sensors.audit.faults()})

@@ -4,6 +4,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -120,7 +121,7 @@ def robot(
     ] = None,
     output: Annotated[
         Path | None,
-        output_option("Run folder of a live robot that maps alone.", RUNS),
+        output_option("Run folder of a live robot, with its own map.", RUNS),
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
@@ -153,28 +154,29 @@ def robot(
     from fcslam.bridges.addresses import is_address
     from fcslam.cli.live import map_live
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.errors import InputError
     from fcslam.live.playback import PlaybackPace, play
     from fcslam.live.robot import Playback, Robot
     from fcslam.sources import BagOptions
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
+    keep_private()
+    settings = mission_config(config)
+    token, own = _token(token_file), _own_certificate(certificate, key)
     if is_address(source):
-        if server is not None:
-            raise InputError("a live robot maps alone so far; leave out --server")
+        start = partial(
+            Robot, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
+            outbox_mb=outbox_mb, config=settings,
+        )  # fmt: skip
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose) or BagOptions()
         parameters = node_parameters(ros_parameters, use_sim_time)
-        map_live(source, name, mission_config(config), options, domain, parameters, output, notices(quiet))
+        map_live(source, name, start, options, domain, parameters, output, notices(quiet))
         return
     server, state = _required(server, state)
-    keep_private()
     pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
-    settings = mission_config(config)
     argument = source if name is None else f"{name}={source}"
     recording = open_recording(argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
     _check_name(recording.name)
-    token, own = _token(token_file), _own_certificate(certificate, key)
     survey = recording.survey()
     console = notices(quiet)
     print_notes(console, survey.notes)
