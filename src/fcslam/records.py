@@ -275,6 +275,8 @@ class ReasonCode(StrEnum):
     RIVAL_PLACES = "rival_has_more_places"
     OUTSIDE_CLUSTER = "outside_dominant_cluster"
     CONTRADICTS_JOINT_GRAPH = "contradicts_joint_graph"
+    PATHS_CONTRADICT = "paths_contradict"
+    SEPARATED = "robot_contradicted"
     VETOED = "vetoed"
     UNUSED = "not_needed_by_rigid_fusion"
 
@@ -301,6 +303,8 @@ _REASON_TEXT = {
     ReasonCode.RIVAL_PLACES: "closures from {value} separate places agree, but others from {limit} contradict them",
     ReasonCode.OUTSIDE_CLUSTER: "outside the dominant cluster",
     ReasonCode.CONTRADICTS_JOINT_GRAPH: "contradicts the joint graph",
+    ReasonCode.PATHS_CONTRADICT: "the paths of the two robots contradict: mean chi-square {value}, {limit} allowed",
+    ReasonCode.SEPARATED: "the robot has a map of its own: the paths of {value} others contradict its path",
     ReasonCode.VETOED: "vetoed by hand",
     ReasonCode.UNUSED: "not needed by the rigid fusion",
 }

@@ -1,6 +1,7 @@
 """Decisions about closures: which are accepted, which maps they join, and what is revoked when evidence turns."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import astuple
 
 import numpy as np
 
@@ -47,6 +48,8 @@ class ClosureDecisions:
         self._changes: tuple[Change, ...] = ()
         self._contested = False
         """Whether evidence has turned against a join."""
+        self._apart: dict[frozenset[str], Reason] = {}
+        """Pairs of sessions that the last re-evaluation keeps apart, because paths contradict each other."""
         self._postponed_until = 0
         """Number of closures below which a contested join is not re-evaluated."""
 
@@ -113,8 +116,15 @@ class ClosureDecisions:
 
     def reevaluate(self) -> Fusion:
         """Decide every closure again from all evidence: revoke outvoted ones, separate maps that only they joined."""
-        fusion = reevaluate(self._graph, self.closures, self._config.consistency, self._comparison.uniqueness)
+        fusion = reevaluate(
+            self._graph,
+            self.closures,
+            self._config.consistency,
+            self._config.contradiction,
+            self._comparison.uniqueness,
+        )
         self.maps = [list(sessions) for sessions in fusion.maps]
+        self._apart = dict(fusion.apart)
         self._contested, self._postponed_until = False, int(CONTESTED_GROWTH * len(self.closures))
         self.version += 1
         return fusion
@@ -128,6 +138,7 @@ class ClosureDecisions:
             "version": self.version,
             "changes": [(kind_of(change), edit_json(change)) for change in self._changes],
             "contested": self._contested,
+            "apart": [(sorted(pair), astuple(reason)) for pair, reason in self._apart.items()],
             "postponed_until": self._postponed_until,
         }
 
@@ -139,6 +150,7 @@ class ClosureDecisions:
         changes = (read_edit(*change) for change in state["changes"])
         self._changes = tuple(change for change in changes if isinstance(change, Veto | Removal))
         self._contested, self._postponed_until = state["contested"], state["postponed_until"]
+        self._apart = {frozenset(pair): Reason(ReasonCode(code), *details) for pair, (code, *details) in state["apart"]}
 
     def _is_vetoed(self, entry: ClosureEntry) -> bool:
         """Whether a veto excludes the closure, or one of its sessions is removed."""
@@ -173,6 +185,11 @@ class ClosureDecisions:
         if decision.shortfall is not None:
             _explain(entries, decision.shortfall.under(CONSISTENCY))
             return
+        apart = None if joined else self._kept_apart(a, b)
+        if apart is not None:
+            self._contested = True
+            _explain(entries, apart)
+            return
         members = [entries[k] for k in decision.members]
         if not joined:
             self._join(members, a, b)
@@ -183,6 +200,11 @@ class ClosureDecisions:
         _explain(entries, Reason(ReasonCode.OUTSIDE_CLUSTER))
         if fresh:
             self._optimize()
+
+    def _kept_apart(self, a: str, b: str) -> Reason | None:
+        """Why the maps of two sessions must not be joined, if paths contradict each other."""
+        pairs = (frozenset((x, y)) for x in self.map_of(a) for y in self.map_of(b))
+        return next((self._apart[pair] for pair in pairs if pair in self._apart), None)
 
     def _examine(self, sessions: tuple[str, str], a: Trajectory, b: Trajectory, members: Closures) -> Uniqueness | None:
         """Compare the maps of two sessions if their cluster is new or has grown much."""
@@ -212,6 +234,7 @@ class ClosureDecisions:
 
     def _optimize(self) -> None:
         self._graph.optimize()
+        self._contested |= self._graph.is_strained(self._config.contradiction)
         self.version += 1
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
+from fcslam.graph.contradiction import strained_pairs
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph
@@ -114,10 +115,16 @@ class JointGraph:
 
     def optimize(self) -> None:
         """Quick solve (Levenberg-Marquardt with a Cauchy loss on closures)."""
-        kept = np.ones(len(self.graph.edges), dtype=bool)
-        kept[list(self._left_out)] = False
         start = self._poses[: len(self.graph)]
-        self.take(optimize(self.graph, start, loss=Loss.CAUCHY, kept=kept, factors=self._factors).poses)
+        self.take(optimize(self.graph, start, loss=Loss.CAUCHY, kept=self._kept(), factors=self._factors).poses)
+
+    def is_strained(self, limit: float) -> bool:
+        """Whether the mean chi-square of the closures between two robots is over the limit: they may contradict."""
+        owner = np.zeros(len(self.graph), np.int64)
+        for number, variables in enumerate(self._variables.values()):
+            owner[variables] = number
+        poses = self._poses[: len(self.graph)]
+        return bool(strained_pairs(self.graph, owner, poses, self._kept(), limit))
 
     def take(self, poses: FloatArray) -> None:
         """Replace the estimate by a solution, shape (N, 3)."""
@@ -175,6 +182,12 @@ class JointGraph:
             path = state["paths"][robot]
             self._variables[robot] = path["variables"].tolist()
             self._chains[robot], self._step_covariance[robot] = list(path["chain"]), list(path["steps"])
+
+    def _kept(self) -> NDArray[np.bool_]:
+        """Edges that count, shape (E,)."""
+        kept = np.ones(len(self.graph.edges), dtype=bool)
+        kept[list(self._left_out)] = False
+        return kept
 
     def _add_variable(self, pose: FloatArray) -> int:
         variable = self.graph.add_variable(pose)

@@ -1,6 +1,6 @@
 """Re-evaluation: decide every closure from all evidence, independent of earlier decisions."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.joining import CONSISTENCY, ExamineSessions
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
+from fcslam.cloud.sessions import robot_of
 from fcslam.graph.consistency import Closures, ConsistencySettings
 from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
@@ -18,7 +19,11 @@ CONTRADICTS = Reason(ReasonCode.CONTRADICTS_JOINT_GRAPH)
 
 
 def reevaluate(
-    graph: JointGraph, closures: ClosureLog, settings: ConsistencySettings, examine: ExamineSessions
+    graph: JointGraph,
+    closures: ClosureLog,
+    settings: ConsistencySettings,
+    contradiction: float,
+    examine: ExamineSessions,
 ) -> Fusion:
     """Solve the joint graph from all evidence; update the poses of the graph and the status of every entry.
 
@@ -31,21 +36,22 @@ def reevaluate(
     def examine_pair(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> Uniqueness | None:
         return examine((robots[a], robots[b]), path_a, path_b, members)
 
-    solution = solve_jointly(_evidence(graph, entries), settings, examine=examine_pair)
+    solution = solve_jointly(_evidence(graph, entries), settings, examine=examine_pair, contradiction=contradiction)
     graph.take(solution.poses)
     reasons = _reasons(solution, robots)
     maps = dict(zip(robots, solution.maps, strict=True))
     for entry in entries:
         assert entry.edge is not None
         pair = frozenset((entry.closure.i.robot, entry.closure.j.robot))
-        apart = len({maps[robot] for robot in pair}) > 1
-        contradiction = reasons.get(pair, CONTRADICTS) if apart else CONTRADICTS
-        _decide(entry, bool(solution.weights[entry.edge] > INLIER_WEIGHT), contradiction)
+        divided = len({maps[robot] for robot in pair}) > 1
+        refuted = reasons.get(pair, CONTRADICTS) if divided else CONTRADICTS
+        _decide(entry, bool(solution.weights[entry.edge] > INLIER_WEIGHT), refuted)
         graph.count(entry.edge, holds=entry.closure.status is ClosureStatus.ACCEPTED)
     members = [[robot for robot in robots if maps[robot] == number] for number in sorted(set(solution.maps))]
     T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
     T_local_base = dict(zip(robots, solution.own, strict=True))
-    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in closures))
+    apart = _named(solution.apart, robots)
+    return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in closures), apart)
 
 
 def _enter(graph: JointGraph, entries: Iterable[ClosureEntry]) -> None:
@@ -63,7 +69,10 @@ def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
         informative[entry.edge] = entry.closure.informative
         independent[entry.edge] = entry.independent
         vetoed[entry.edge] = entry.vetoed
-    return JointEvidence(graph.graph, tuple(graph.robots().values()), informative, independent, vetoed)
+    sessions = graph.robots()
+    senders = [robot_of(session) for session in sessions]
+    numbers = tuple(map(senders.index, senders))
+    return JointEvidence(graph.graph, tuple(sessions.values()), informative, independent, vetoed, numbers)
 
 
 def _decide(entry: ClosureEntry, holds: bool, contradiction: Reason) -> None:
@@ -82,8 +91,13 @@ def _decide(entry: ClosureEntry, holds: bool, contradiction: Reason) -> None:
 
 def _reasons(solution: JointSolution, robots: list[str]) -> dict[frozenset[str], Reason]:
     """By pair of robots, why their closures do not join their maps."""
-    return {
+    short = {
         frozenset((robots[link.a], robots[link.b])): link.decision.shortfall.under(CONSISTENCY)
         for link in solution.links
         if link.decision.shortfall is not None
     }
+    return short | _named(solution.apart, robots)
+
+
+def _named(pairs: Mapping[tuple[int, int], Reason], robots: list[str]) -> dict[frozenset[str], Reason]:
+    return {frozenset((robots[a], robots[b])): reason for (a, b), reason in pairs.items()}

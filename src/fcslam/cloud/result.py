@@ -1,7 +1,7 @@
 """The result of a fleet: all closures decided, all robots placed in maps."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.records import ClosureStatus, Correction, FloatArray, Keyscan, LaserModel, LoopClosure, frozen
+from fcslam.records import ClosureStatus, Correction, FloatArray, Keyscan, LaserModel, LoopClosure, Reason, frozen
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +61,8 @@ class Fusion:
     """Every robot's keyscans in its own map, shape (N, 3)."""
     closures: tuple[LoopClosure, ...]
     """In the order in which they were found, decided."""
+    apart: Mapping[frozenset[str], Reason] = field(default_factory=dict)
+    """Pairs of robots that must not share a map, because paths contradict each other."""
 
 
 def map_indices(maps: Sequence[Sequence[str]]) -> dict[str, int]:

@@ -49,6 +49,13 @@ class FleetConfig(Settings):
         gt=1,
         description="number of submaps in the cache, 0.2 MB each; others are rebuilt from their keyscans",
     )
+    contradiction: float = Field(
+        default=0.3,
+        gt=0,
+        description="mean chi-square of the closures between two robots, solved without the others, above which the "
+        "paths of the two contradict each other; it is about 0.05 between robots that measure correctly, because the "
+        "stated noise of closures is a bound",
+    )
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
     consistency: ConsistencySettings = Field(

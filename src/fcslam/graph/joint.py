@@ -5,7 +5,7 @@ the robots' frames are unknown. Pairwise consistency finds these transforms; gra
 closure.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -21,6 +21,8 @@ from fcslam.graph.cluster import (
     relative_frame,
 )
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
+from fcslam.graph.contradiction import Contradictions, contradictions, leaving
+from fcslam.graph.contradiction import confirmed as confirmed_pairs
 from fcslam.graph.evidence import Uniqueness, shortfall
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
@@ -28,7 +30,7 @@ from fcslam.graph.optimizer import GncSettings, Solution, optimize_gnc, refine_i
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import robot_trajectory, solve_single_robot
 from fcslam.graph.trajectory import Trajectory
-from fcslam.records import FloatArray, frozen
+from fcslam.records import FloatArray, Reason, ReasonCode, frozen
 
 ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures], Uniqueness | None]
 """Compares the transform that closures give between the maps of two robots with the best transform elsewhere. It takes
@@ -52,6 +54,9 @@ class JointEvidence:
     Only such closures are evidence for this transform."""
     excluded: NDArray[np.bool_]
     """Per edge, shape (E,): closures that are known to be false, as by a veto."""
+    senders: tuple[int, ...] | None = None
+    """Who sent each robot's packets: the sessions of one sender count as one where robots contradict each other. None:
+    each robot is its own sender."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +94,8 @@ class JointSolution:
     """One for every two robots with independent closures between them."""
     own: tuple[FloatArray, ...]
     """Poses of each robot from its own measurements alone, shape (N_k, 3); the first stays where the graph has it."""
+    apart: Mapping[tuple[int, int], Reason]
+    """Pairs of robots a < b that closures would join, and that stay apart because paths contradict each other."""
 
 
 def not_examined(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> None:
@@ -100,17 +107,19 @@ def solve_jointly(
     consistency: ConsistencySettings,
     gnc: GncSettings | None = None,
     examine: ExaminePair = not_examined,
+    contradiction: float = np.inf,
 ) -> JointSolution:
     """Find poses, maps and inlier closures from the evidence alone; no earlier estimate plays a part.
 
-    A link is dropped, and the rest solved again, if a third of its cluster turns out as outliers in the joint solution
-    or if the remaining members would not be enough to join two maps.
+    A link is dropped, and the rest solved again, if a third of its cluster turns out as outliers in the joint solution,
+    if the remaining members would not be enough to join two maps, or if one of its robots contradicts others.
 
     Args:
         evidence: graph of N variables and E edges, with the role of every edge.
         consistency: when closures are consistent, and what a cluster needs.
         gnc: settings of graduated non-convexity.
         examine: called for two robots where only the amount of evidence is open.
+        contradiction: mean chi-square of the closures between two robots above which they contradict each other.
 
     Returns:
         Poses (N, 3), weights (E,), and the maps.
@@ -123,6 +132,8 @@ def solve_jointly(
     # 2. Find the dominant cluster of closures between every two robots (PCM).
     links = _find_links(evidence, paths, consistency, examine)
     joining = [link for link in links if link.decision.dominant]
+    apart: dict[tuple[int, int], Reason] = {}
+    senders = evidence.senders or range(len(own))
     while True:
         # 3. Merge the robots' frames along the strongest links.
         frames, maps = _merge_frames(len(own), joining)
@@ -140,9 +151,15 @@ def solve_jointly(
         confirmed = [
             link for link in joining if _is_confirmed(link, paths, solution, evidence.informative, consistency)
         ]
+        # 7. Robots that contradict others get maps of their own.
+        found = contradictions(
+            evidence.graph, _owners(evidence)[0], solution.poses, solution.weights, within_maps, contradiction, gnc
+        )
+        apart |= _separations(confirmed_pairs(found, senders, contradiction), joining, senders, contradiction)
+        confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         if len(confirmed) == len(joining):
             own_poses: tuple[FloatArray, ...] = tuple(frozen(path.poses) for path in paths)
-            return JointSolution(solution.poses, solution.weights, tuple(maps), tuple(links), own_poses)
+            return JointSolution(solution.poses, solution.weights, tuple(maps), tuple(links), own_poses, apart)
         joining = confirmed
 
 
@@ -348,6 +365,25 @@ def _is_confirmed(
         rival_places=0,
     )
     return 3 * len(members) > 2 * len(link.members) and shortfall(remaining, settings) is None
+
+
+def _separations(
+    found: Contradictions, joining: Sequence[Link], senders: Sequence[int], limit: float
+) -> dict[tuple[int, int], Reason]:
+    """Pairs of robots that must not share a map any more: those that contradict each other, and links of robots that
+    leave to robots that stay. If that keeps all links, robots that leave keep none."""
+    apart = {
+        pair: Reason(ReasonCode.PATHS_CONTRADICT, mean, limit, "fleet.contradiction") for pair, mean in found.items()
+    }
+    left = leaving(found, senders)
+    alone = {
+        (link.a, link.b): Reason(ReasonCode.SEPARATED, max(left.get(link.a, 0), left.get(link.b, 0)))
+        for link in joining
+        if left.keys() & {link.a, link.b}
+    }
+    crossing = {pair: reason for pair, reason in alone.items() if len(left.keys() & set(pair)) == 1}
+    dropped = crossing or not {(link.a, link.b) for link in joining}.isdisjoint(apart)
+    return (crossing if dropped else alone) | apart
 
 
 def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
