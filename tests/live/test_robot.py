@@ -173,6 +173,37 @@ def test_invalid_ranges_are_no_points(robot, scans):
     assert np.allclose(pose.T_map_base, clean.scan_poses.T_odom_base()[-1], atol=0.05)
 
 
+def test_without_odometry_scan_matching_alone_gives_the_motion(scans):
+    events = []
+    with fcslam.Robot("anna", scans[0].laser, executor=SameThread(), on_event=events.append) as blind:
+        poses = [blind.add_scan(scan.ranges_m, scan.stamp) for scan in scans]
+        with pytest.raises(InputError, match="some scans have odometry and some have not"):
+            blind.add_scan(scans[-1].ranges_m, scans[-1].stamp, scans[-1].T_odom_base)
+    frontend = RobotFrontend("anna", fcslam.MissionConfig().robot)
+    for scan in scans:
+        frontend.process(scan)
+    assert np.allclose([pose.T_map_base for pose in poses], frontend.scan_poses.T_odom_base(), atol=0.06)
+    assert all(pose.T_odom_base is pose.T_map_odom is None for pose in poses)
+    assert not [event for event in events if event.kind is not fcslam.EventKind.CORRECTED]
+
+
+def test_odometry_that_stops_is_refused(robot, scans):
+    drive(robot, scans[:2])
+    with pytest.raises(InputError, match="some scans have odometry and some have not"):
+        robot.add_scan(scans[2].ranges_m, scans[2].stamp)
+
+
+def test_a_bare_corridor_is_told_once_to_a_robot_without_odometry():
+    laser = fcslam.LaserModel(360, -math.pi, math.radians(1.0), 12.0)
+    distances = 1.0 / np.maximum(np.abs(np.sin(laser.angles_rad())), 1e-9)
+    rng, events = np.random.default_rng(1), []
+    with fcslam.Robot("anna", laser, executor=SameThread(), on_event=events.append) as robot:
+        poses = [robot.add_scan(distances + rng.normal(0.0, 0.01, 360), stamp) for stamp in np.arange(0.0, 3.0, 0.1)]
+    assert [event.kind for event in events] == [fcslam.EventKind.UNDETERMINED]
+    assert not any(pose.is_determined for pose in poses)
+    assert poses[-1].covariance[0, 0] > 3.0 * poses[-1].covariance[1, 1]
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [

@@ -224,7 +224,7 @@ def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: Odome
     Args:
         motion: pose of the later keyscan in the earlier one, shape (3,), metres and radians.
         tracked: the later keyscan.
-        odometry: error of the odometry, used if the scan was not matched.
+        odometry: error of the odometry, used if the scan was not matched or there is no odometry.
 
     Returns:
         Information in the tangent space at ``motion`` (x, y, theta of the later keyscan), shape (3, 3).
@@ -235,7 +235,7 @@ def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: Odome
     sigma_m = ODOMETRY_SIGMA_M + ODOMETRY_SIGMA_PER_TRAVEL * moved
     sigma_rad = ODOMETRY_SIGMA_RAD + ODOMETRY_SIGMA_PER_TURN * turned
     prior = np.diag((sigma_m**-2, sigma_m**-2, sigma_rad**-2))
-    if not tracked.information.any():  # odometry alone, and the wheels may have slipped
+    if not odometry.is_measured or not tracked.information.any():  # no wheels, or they may have slipped
         prior = odometry_error(moved, turned, odometry).information
     covariance = np.linalg.inv(POINT_INFORMATION_SHARE * turn.T @ tracked.information @ turn + prior)
     floor_m, floor_rad = least_sigmas(moved, turned)

@@ -26,6 +26,9 @@ class OdometryConfig(Settings):
     """Error of the wheel odometry since the last match, as the sum of a constant, a share of the travel and a share of
     the turn. The defaults trust it little: wheels may slip by a third of the way."""
 
+    is_measured: bool = Field(
+        default=True, description="whether wheels measure the motion; false: it is predicted from the motion before"
+    )
     position_m: float = Field(default=0.02, gt=0, description="standard deviation of the position, constant part [m]")
     position_per_travel: float = Field(
         default=0.3, ge=0, description="standard deviation of the position per metre of travel [m/m]"

@@ -179,8 +179,10 @@ def self_violation(scans: Sequence[tuple[PointScan, FloatArray]]) -> float:
     of ``Agreement.violation``.
 
     Args:
-        scans: as for ``build_submap``.
+        scans: as for ``build_submap``; a single one does not contradict itself.
     """
+    if len(scans) < 2:
+        return 0.0
     even, odd = build_submap(scans[::2]), build_submap(scans[1::2])
     here = np.zeros(3)  # not se2.IDENTITY: a read-only array would compile the code once more
     return max(agreement(even, odd, here).violation, agreement(odd, even, here).violation)

@@ -239,7 +239,7 @@ class ScanTracker:
             return match, innovation
         other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, config.matching)
         other_innovation = se2.between(T_local_guess, other.T_field_base)
-        is_fixed = is_doubtful or _weakest_sigma_m(other) < SEARCH_SIGMA_M
+        is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
         if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:
             return other, other_innovation
         return match, innovation
@@ -255,11 +255,14 @@ def _learn_usual(usual: float, likelihood: float) -> float:
 def _is_good(match: ScanMatch) -> bool:
     """Whether a match is clear enough to judge odometry by it."""
     explains = match.explained >= GOOD_SHARE * match.known and match.known >= GOOD_KNOWN
-    return explains and _weakest_sigma_m(match) <= GOOD_SIGMA_M
+    return explains and weakest_sigma_m(match.information) <= GOOD_SIGMA_M
 
 
-def _weakest_sigma_m(match: ScanMatch) -> float:
-    """Standard deviation of the position by the scan's points, in the direction that they fix least, metres."""
-    (xx, xy), (_, yy) = match.information[:2, :2].tolist()
+def weakest_sigma_m(information: FloatArray) -> float:
+    """Standard deviation of the position by a scan's points, in the direction that they fix least, metres.
+
+    ``information`` is over (x, y) and theta, shape (3, 3); infinity if there is none.
+    """
+    (xx, xy), (_, yy) = information[:2, :2].tolist()
     weakest = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)  # the lesser eigenvalue
     return weakest**-0.5 if weakest > 0.0 else math.inf

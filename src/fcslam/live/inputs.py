@@ -56,20 +56,17 @@ def checked_lasers(lasers: Lasers | None) -> dict[str, LaserModel]:
     return named
 
 
-def checked_scan(
-    ranges_m: ArrayLike, stamp: float, odometry: ArrayLike, laser: LaserModel, newest_s: float
-) -> LaserScan:
+def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, laser: LaserModel) -> LaserScan:
     """A scan as a record; negative ranges are made invalid.
 
     Args:
         ranges_m: shape (beam_count,).
-        stamp: seconds.
-        odometry: shape (3,).
+        stamp: checked, seconds.
+        T_odom_base: checked, shape (3,).
         laser: the laser.
-        newest_s: the largest stamp so far.
 
     Raises:
-        InputError: a shape is wrong, stamp or odometry are not finite, or the clock went back.
+        InputError: the ranges are no numbers, or not as many as the laser has beams.
     """
     try:
         ranges = np.array(ranges_m, np.float32)
@@ -81,7 +78,7 @@ def checked_scan(
         )
     ranges[ranges < 0.0] = np.nan
     ranges.setflags(write=False)
-    return LaserScan(checked_stamp(stamp, newest_s), ranges, laser, checked_odometry(odometry))
+    return LaserScan(stamp, ranges, laser, T_odom_base)
 
 
 def checked_stamp(stamp: float, newest_s: float) -> float:
@@ -111,5 +108,5 @@ def checked_odometry(odometry: ArrayLike) -> FloatArray:
     except (TypeError, ValueError) as error:
         raise InputError(f"odometry: not a pose ({error}); give (x, y, theta)") from error
     if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise InputError(f"odometry: {odometry!r} is not a pose; give (x, y, theta) in metres and radians, or None")
+        raise InputError(f"odometry: {odometry!r} is not a pose; give (x, y, theta) in metres and radians")
     return pose

@@ -8,7 +8,7 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import motion_information
 from fcslam.lidar.odometry import OdometryConfig
-from fcslam.lidar.tracker import TrackedScan
+from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.outbox import WaitingPackets
 
@@ -51,6 +51,15 @@ class RobotPose:
     def theta(self) -> float:
         """Radians, in [-pi, pi)."""
         return float(self.T_map_base[2])
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the scan fixes the position in every direction.
+
+        Where it does not, as in a bare corridor, the odometry gives the motion along it; without odometry nothing does.
+        A robot that stands still keeps its pose: True.
+        """
+        return self._tracked.scan is None or weakest_sigma_m(self._tracked.information) <= SEARCH_SIGMA_M
 
     @property
     def covariance(self) -> FloatArray:
@@ -132,6 +141,9 @@ class EventKind(StrEnum):
     """The robot's map got another index: it joined another map, or maps were renumbered."""
     CORRECTED = "corrected"
     """A correction moved the robot in its map, as a loop closure does."""
+    UNDETERMINED = "undetermined"
+    """The robot has no odometry, and for a second its scans have not fixed its position in every direction: along a
+    bare corridor, or among few walls, it may move unseen."""
     OFFLINE = "offline"
     """The server cannot be reached; packets wait in the state folder."""
     ONLINE = "online"

@@ -25,7 +25,7 @@ from fcslam.cloud.sessions import session_name
 from fcslam.driving import track_of
 from fcslam.errors import InputError, StateError
 from fcslam.geometry import se2
-from fcslam.live.inputs import Lasers, checked_lasers, checked_robot, checked_scan
+from fcslam.live.inputs import Lasers, checked_lasers, checked_odometry, checked_robot, checked_scan, checked_stamp
 from fcslam.live.own_map import OwnMap
 from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
 from fcslam.mission import MissionConfig
@@ -34,6 +34,7 @@ from fcslam.robot.beside import Beside, worker_process
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.localization import Localizer
+from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
 from fcslam.robot.outbox import Outbox, WaitingPackets
 from fcslam.robot.sender import CONNECTING
 from fcslam.robot.uplink import Uplink
@@ -46,6 +47,8 @@ from fcslam.wire.messages import Hello, Packet
 JUMP_M, JUMP_RAD = 0.01, 0.005
 """Corrections that move the robot by less are no event."""
 
+UNDETERMINED_S = 1.0
+"""Scans without odometry that leave a direction open for longer are told."""
 CLOSE_S = 5.0
 """Time that a robot whose block ends without an error waits for the server."""
 QUIET = (EventKind.CORRECTED, EventKind.ONLINE, EventKind.JOINED, EventKind.RELOCALISED)
@@ -144,6 +147,10 @@ class Robot:
         self._newest_s = -math.inf
         self._scans = 0
         self._pose: RobotPose | None = None
+        self._prediction: MotionPrediction | None = None
+        """Stands in for the odometry; None if there is odometry."""
+        self._determined_s = -math.inf
+        """Stamp of the newest scan that fixed the position; infinity once it was told that none does."""
         self._newest_part = 0
         """The part that the newest pose is of."""
         self._applied: Correction | None = None
@@ -191,7 +198,9 @@ class Robot:
     ) -> None:
         self.close()
 
-    def add_scan(self, ranges_m: ArrayLike, stamp: float, odometry: ArrayLike, laser: str = "") -> RobotPose:
+    def add_scan(
+        self, ranges_m: ArrayLike, stamp: float, odometry: ArrayLike | None = None, laser: str = ""
+    ) -> RobotPose:
         """Localize the next scan.
 
         Args:
@@ -199,7 +208,8 @@ class Robot:
                 return.
             stamp: seconds. It may step back by 2 s at most, as clocks of several sensors disagree.
             odometry: pose (x, y, theta) of ``base`` by wheel odometry at the stamp, metres and radians; its origin does
-                not matter.
+                not matter. None for all scans: there is no odometry, and scan matching alone gives the motion; an event
+                says where the scans do not determine it.
             laser: which one, if there are several.
 
         Returns:
@@ -212,8 +222,9 @@ class Robot:
         if laser not in self._lasers:
             raise InputError(f"laser {laser!r} is not known; known: {', '.join(map(repr, self._lasers)) or 'none'}")
         with self._lock:
-            scan = checked_scan(ranges_m, stamp, odometry, self._lasers[laser], self._newest_s)
-            return self._process(scan)
+            stamp = checked_stamp(stamp, self._newest_s)
+            T_odom_base = self._odometry(stamp, odometry)
+            return self._process(checked_scan(ranges_m, stamp, T_odom_base, self._lasers[laser]))
 
     def add(self, record: SensorRecord) -> RobotPose | None:
         """Add the next record of any sensor, as a recording yields them; returns the pose of a scan.
@@ -452,12 +463,33 @@ class Robot:
             self._uplink.before_record()
         return self._frontend.process(record)
 
+    def _odometry(self, stamp: float, given: ArrayLike | None) -> FloatArray:
+        """The given odometry, or its prediction; the first scan decides whether there is any."""
+        if not self._scans and given is None and self._prediction is None:
+            self._prediction = MotionPrediction()
+            self._config = self._config.model_copy(update={"robot": without_odometry(self._config.robot)})
+            self._frontend.replace_settings(self._config.robot)
+        if given is None and self._prediction is not None:
+            return self._prediction.predict(stamp)
+        if given is None or self._prediction is not None:
+            raise InputError(
+                f"{self.name}: some scans have odometry and some have not; give it with every scan or with none"
+            )
+        return checked_odometry(given)
+
     def _process(self, scan: LaserScan) -> RobotPose:
         """Localize a scan, and tell what happened."""
         self._take(self._processed(scan))
         self._newest_s = max(self._newest_s, scan.stamp)
         self._scans += 1
-        pose = self._pose = self._pose_of(self._newest(), scan.T_odom_base)
+        newest = self._newest()
+        T_smooth_base = self._frontend.scan_poses.in_odom(newest.pose)
+        if self._prediction is not None:
+            is_matched = newest.tracked.information.any() and not newest.is_deferred
+            self._prediction.observe(scan.stamp, T_smooth_base if is_matched else None)
+        pose = self._pose = self._pose_of(newest, T_smooth_base, scan.T_odom_base)
+        if self._prediction is not None:
+            self._tell_undetermined(pose)
         self._tell()
         return pose
 
@@ -485,13 +517,13 @@ class Robot:
         own, by_server = self._localizers
         return by_server.get(part) or own.setdefault(part, Localizer(self._clock))
 
-    def _pose_of(self, newest: NewestScan, T_odom_base: FloatArray) -> RobotPose:
+    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray) -> RobotPose:
         localizer = self._localizer(self._part)
-        T_smooth_base = self._frontend.scan_poses.in_odom(newest.pose)
         corrected = localizer.T_map_base(T_smooth_base)
         is_found = self._part == 0 or localizer.quality > 0.0
         return RobotPose(
-            newest.pose.stamp, frozen(T_smooth_base if corrected is None else corrected), T_odom_base, newest.quality,
+            newest.pose.stamp, frozen(T_smooth_base if corrected is None else corrected),
+            T_odom_base if self._prediction is None else None, newest.quality,
             is_found and not newest.is_deferred, localizer.map_index, newest.pose.T_keyscan_base, newest.tracked,
             self._config.robot.lidar.tracker.odometry,
         )  # fmt: skip
@@ -509,6 +541,17 @@ class Robot:
         broken = self._frontend.backend_failure, None if self._own is None else self._own.failure
         for failure in filter(None, broken):
             self._tell_failure(f"no loop closures from now on, as the back end failed: {failure}")
+
+    def _tell_undetermined(self, pose: RobotPose) -> None:
+        if pose.is_determined or self._scans == 1:
+            self._determined_s = pose.stamp
+        elif pose.stamp > self._determined_s + UNDETERMINED_S:
+            self._determined_s = math.inf
+            self._event(
+                EventKind.UNDETERMINED,
+                "the scans do not fix the position in every direction, and there is no odometry: the robot may move "
+                "unseen",
+            )
 
     def _tell_connection(self) -> None:
         if self._uplink is None:

@@ -112,6 +112,11 @@ class RobotFrontend:
         """Pose of the first doubtful scan in the local frame, as it was matched, shape (3,)."""
         self._begin()
 
+    def replace_settings(self, config: RobotConfig) -> None:
+        """Localize with other settings, before the first scan; those of the back end stay."""
+        self._config = config
+        self._lidar = LidarFrontend(self.robot, config.lidar)
+
     @property
     def scan_poses(self) -> ScanTrack:
         """Poses of the scans of the present session."""
