@@ -275,3 +275,14 @@ def test_another_thread_may_ask_meanwhile(scans):
         assert len(robot.trajectory().stamps) == len(scans)
         assert robot.map().cells.size > 1
     assert drawn
+
+
+def test_closures_join_places_that_are_near_each_other(robot, scans):
+    drive(robot, scans)
+    end_s = scans[-1].stamp
+    drive(robot, [replace(scan, stamp=2.0 * end_s - scan.stamp) for scan in scans[::-1]])
+    robot.finish()
+    ends = robot.closures()
+    assert ends.shape[1:] == (2, 2)
+    assert len(ends)
+    assert np.hypot(*(ends[:, 0] - ends[:, 1]).T).max() < 5.0

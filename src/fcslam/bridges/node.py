@@ -20,7 +20,7 @@ from fcslam.bridges.sensors import LiveSensors, Notify
 from fcslam.bridges.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
 from fcslam.bridges.transform_stream import TransformStream
 from fcslam.errors import FcslamError, NetworkError
-from fcslam.records import LaserScan, SensorRecord
+from fcslam.records import FloatArray, LaserScan, SensorRecord
 from fcslam.runs import RobotTrajectory
 from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, SCAN, MessageCodec
@@ -55,6 +55,9 @@ class LiveRobot(Protocol):
 
     def trajectory(self) -> RobotTrajectory:
         """The poses of all scans now."""
+
+    def closures(self) -> FloatArray:
+        """Both ends of each closure, shape (N, 2, 2), metres in ``map``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +175,7 @@ class RobotNode:
         self._stop.set()
 
     def publish_map(self) -> None:
-        """Publish the map and the path as they are now, if there is a scan.
+        """Publish the map, the path and the closures as they are now, if there is a scan.
 
         Raises:
             FcslamError: the map is gone.
@@ -183,6 +186,7 @@ class RobotNode:
         if self._outputs.map(stamp_ns, self._robot.map()):
             trajectory = self._robot.trajectory()
             self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
+            self._outputs.closures(stamp_ns, self._robot.closures())
 
     def _next(self) -> _Message | None:
         try:

@@ -16,7 +16,7 @@ from fcslam.errors import FcslamError
 from fcslam.geometry import se2
 from fcslam.maps.fusion import fuse
 from fcslam.mission import MissionCloud, MissionConfig
-from fcslam.records import Correction, FloatArray, frozen
+from fcslam.records import ClosureStatus, Correction, FloatArray, frozen
 from fcslam.runs import Run
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.messages import Packet
@@ -74,6 +74,14 @@ class OwnMap:
             FcslamError: the worker has ended.
         """
         return self._answer(self._submit(_poses, session))
+
+    def closures(self, session: str, T_map_own: FloatArray) -> FloatArray:
+        """Both ends of each accepted closure in the map that a session is in, shape (N, 2, 2), metres in ``map``.
+
+        Raises:
+            FcslamError: the worker has ended.
+        """
+        return self._answer(self._submit(_closures, session, T_map_own))
 
     def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
         """The result of all packets so far; arguments as in ``MissionCloud.run``.
@@ -146,6 +154,18 @@ def _draw(robot: str, session: str, T_map_own: FloatArray) -> OccupancyMap:
         if mapped.map_index == index
     ]
     return fuse_members(members, cloud.config.map)
+
+
+def _closures(robot: str, session: str, T_map_own: FloatArray) -> FloatArray:
+    result = _clouds[robot].fleet.estimate()
+    robots = {mapped.robot: mapped for mapped in result.robots}
+    index = robots[session].map_index if session in robots else None
+    poses = {name: mapped.T_map_base for name, mapped in robots.items() if mapped.map_index == index}
+    accepted = (
+        c for c in result.closures if c.status is ClosureStatus.ACCEPTED and {c.i.robot, c.j.robot} <= poses.keys()
+    )
+    ends = [[poses[end.robot][end.number] for end in (closure.i, closure.j)] for closure in accepted]
+    return se2.compose(T_map_own, np.array(ends).reshape(-1, 2, 3))[..., :2]
 
 
 def _poses(robot: str, session: str) -> FloatArray:

@@ -286,6 +286,18 @@ class Robot:
             part = self._part
         return own.draw(self._session(part), self._T_map_own(part))
 
+    def closures(self) -> FloatArray:
+        """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``.
+
+        Raises:
+            InputError: the robot has no map of its own.
+            FcslamError: the worker has ended.
+        """
+        own = self._require_own_map()
+        with self._lock:
+            part = self._part
+        return own.closures(self._session(part), self._T_map_own(part))
+
     def trajectory(self) -> RobotTrajectory:
         """All scans since the robot was last lost; it waits for the worker.
 
