@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import fcslam
+from fcslam.bridges import node as node_module
 from fcslam.bridges.network import Endpoint, Quality
-from fcslam.bridges.node import EMPTY, FINISH, RobotNode, await_sensors
+from fcslam.bridges.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
 from fcslam.bridges.parameters import NodeParameters
 from fcslam.errors import NetworkError
+from fcslam.runs.map_files import parse_map
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from tests import small_fleet
@@ -127,3 +129,60 @@ def test_peers_that_get_nothing_are_told_once(network, robot):
 def test_missing_topics_end_the_wait():
     with pytest.raises(NetworkError, match="nobody publishes anything"):
         await_sensors(MemoryNetwork(), "/robot1", BagOptions(), 0.0, 0.0)
+
+
+def save(network, name):
+    network.say(f"/robot1/{SAVE_MAP}", STRING, CODEC.make(STRING, data=name))
+
+
+def test_a_map_is_saved_for_map_server(network, robot, scans, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = []
+    node = start(network, robot, said.append)
+    plays(network, scans)
+    run_until(node, len(scans))
+    save(network, "office")
+    saved = parse_map("office", *((tmp_path / f"office.{kind}").read_bytes() for kind in ("pgm", "yaml")))
+    assert np.array_equal(saved.cells, robot.map().cells)
+    assert f"map saved: {tmp_path / 'office.yaml'}" in said
+
+
+@pytest.mark.parametrize("name", ["../office", "/etc/office", "a b", ".hidden"])
+def test_nobody_on_the_network_chooses_a_folder(network, robot, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    said = []
+    start(network, robot, said.append)
+    save(network, name)
+    assert list(tmp_path.iterdir()) == []
+    assert "is no name; give letters" in said[0]
+
+
+def test_an_initial_pose_is_refused_with_the_reason(network, robot):
+    said = []
+    start(network, robot, said.append)
+    for _ in range(2):
+        network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))
+    assert said == ["an initial pose is ignored: the robot maps, and its first scan is the origin of the map"]
+
+
+def test_silence_is_told_once_and_the_robot_goes_on(network, robot, scans, monkeypatch):
+    monkeypatch.setattr(node_module, "_SILENCE_S", 0.3)
+    said = []
+    node = start(network, robot, said.append)
+    plays(network, scans[:10])
+    later = threading.Timer(1.5, plays, (network, scans[10:20]))
+    later.start()
+    run_until(node, 20)
+    later.join()
+    assert len(said) == 2
+    assert said[0].startswith("no scan for")
+    assert said[1].startswith("scans arrive again after")
+    assert robot.status().scans == 20
+
+
+def test_messages_that_come_too_fast_are_counted(network, robot, scans, monkeypatch):
+    monkeypatch.setattr(node_module, "_LONGEST_INBOX", 5)
+    said = []
+    start(network, robot, said.append)
+    plays(network, scans[:10])
+    assert said == ["messages come faster than this computer can map; some are lost"]

@@ -20,7 +20,7 @@ from fcslam.bridges.sensors import LiveSensors, Notify
 from fcslam.bridges.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
 from fcslam.bridges.transform_stream import TransformStream
 from fcslam.errors import FcslamError, NetworkError
-from fcslam.records import FloatArray, LaserScan, SensorRecord
+from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.runs import RobotTrajectory
 from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, SCAN, MessageCodec
@@ -273,16 +273,18 @@ class RobotNode:
         return deliver
 
     def _save_map(self, payload: bytes) -> None:
-        """Write the files of map_server; the message is their path, without suffix."""
+        """Write the files of map_server to this process's folder; the message is their name."""
         try:
-            path = Path(self._codec.decode(payload, STRING).data or self._robot.name)
+            name = self._codec.decode(payload, STRING).data or self._robot.name
+            if not NAME.fullmatch(name):  # anybody on the network may send it
+                raise ValueError(f"{name!r} is no name; give letters, digits and . _ -, without a folder")
             occupancy = self._robot.map()
-            write_file(path.with_name(f"{path.name}.pgm"), pgm_bytes(occupancy))
-            write_file(path.with_name(f"{path.name}.yaml"), map_yaml(occupancy, f"{path.name}.pgm"))
+            write_file(Path(f"{name}.pgm"), pgm_bytes(occupancy))
+            write_file(Path(f"{name}.yaml"), map_yaml(occupancy, f"{name}.pgm"))
         except (ValueError, OSError, FcslamError) as error:
             self._notify(f"the map cannot be saved: {error}")
         else:
-            self._notify(f"map saved: {path}.pgm, {path}.yaml")
+            self._notify(f"map saved: {Path(f'{name}.yaml').absolute()}")
 
     def _refuse_pose(self, _: bytes) -> None:
         self._tell_once("an initial pose is ignored: the robot maps, and its first scan is the origin of the map")

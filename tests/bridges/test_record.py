@@ -1,0 +1,75 @@
+"""A recording of a network in memory is read as a bag; what is missing on a computer is said in one line."""
+
+import sys
+import threading
+
+import pytest
+
+from fcslam.bridges.node import await_sensors
+from fcslam.bridges.record import record
+from fcslam.bridges.ros1 import INSTALL as INSTALL_ROS1
+from fcslam.bridges.ros1 import Ros1Network
+from fcslam.bridges.ros2 import INSTALL as INSTALL_ROS2
+from fcslam.bridges.ros2 import Ros2Network
+from fcslam.cli import main
+from fcslam.errors import NetworkError
+from fcslam.sources import BagOptions, open_source
+from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
+from tests.bridges.memory_network import MemoryNetwork, offered
+from tests.bridges.ros_messages import odometry, scan, transform
+
+RANGES = [5.0] * 180
+
+
+def test_a_recording_is_a_bag(tmp_path):
+    network = MemoryNetwork([offered("/scan", SCAN), offered("/odom", ODOMETRY), offered("/tf_static", TRANSFORMS)])
+    topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
+    stop, said = threading.Event(), []
+    output = tmp_path / "day.mcap"
+    thread = threading.Thread(target=lambda: said.append(record(network, topics, output, stop, said.append)))
+    thread.start()
+    while "/clock" not in network.subscribed:
+        stop.wait(0.01)
+    network.say("/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser"))
+    for stamp in range(1, 9):
+        network.say("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0)))
+        network.say("/scan", SCAN, scan(stamp, RANGES))
+    stop.set()
+    thread.join(10.0)
+    assert said == [{"/tf_static": 1, "/odom": 8, "/scan": 8}]
+    survey = open_source(output).survey()
+    assert (survey.scan_count, survey.path_length_m) == (8, 7.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["day.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("network", "module", "remedy"),
+    [
+        (lambda: Ros2Network(0, {}), "cyclonedds", INSTALL_ROS2),
+        (Ros1Network, "rosgraph", INSTALL_ROS1),
+    ],
+)
+def test_a_missing_middleware_is_told_with_the_command_that_installs_it(network, module, remedy, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with pytest.raises(NetworkError, match="install it: ") as caught:
+        network()
+    assert str(caught.value).endswith(remedy)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["record", "robot.bag", "-o", "day.mcap"], "robot.bag: is no address of a live robot"),
+        (["record", "ros2:/a", "-o", "day.bag"], "a recording of ros2 is a .mcap file"),
+        (["record", "ros2:/a", "-o", "nowhere/day.mcap"], "there is no folder nowhere"),
+        (["robot", "ros2:a b"], "'a b' is no namespace"),
+        (["robot", "ros2:/a", "--domain", "999"], "'999' is no domain of ROS 2"),
+        (["robot", "log.clf"], "a recording needs --server and --state"),
+    ],
+)
+def test_wrong_arguments_are_one_line(words, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
