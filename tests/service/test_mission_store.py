@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from fcslam.cloud.replies import NEWS_M, NEWS_RAD, SessionCorrection
 from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Channel, Correction, Edit, Removal, Undo, Veto, frozen
-from fcslam.service.mission_store import MissionStore, StoredPacket, check_mission
+from fcslam.service.mission_store import EDITS, FACTS, PACKETS, MissionStore, StoredPacket, check_mission
+from fcslam.storage.seals import seal
 from fcslam.wire.messages import PacketKind
 
 NUMBERS = st.tuples(st.sampled_from(["a", "b"]), st.integers(0, 2), st.integers(0, 12))
@@ -215,7 +216,7 @@ def test_packets_are_stored_while_an_export_is_written(store, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(
-    "harm", ["text", "trigger", "view", "version", "torn", "kind", "channel", "none", "config", "edit", "undo"]
+    "harm", ["text", "trigger", "view", "version", "torn", "kind", "channel", "none", "config", "edit", "undo", "seal"]
 )
 def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
     path = tmp_path / "out.sqlite"
@@ -228,17 +229,26 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
         path.write_bytes(content[: len(content) // 2])
     else:
         connection = sqlite3.connect(path)
-        connection.execute({
+        connection.create_function("seal", -1, seal)
+        changes = {"kind": {"kind": "rumour"}, "channel": {"channel": "smell"}, "none": {"kind": None}}
+        rows = {
+            "edit": (EDITS, (1, "boss", 0.0, "removal", '{"robot": 1}')),
+            "undo": (EDITS, (1, "boss", 0.0, "undo", '{"number": 1}')),
+            "config": (FACTS, ("config", '{"seed": "x"}')),
+        }
+        statements = {
             "trigger": "CREATE TRIGGER t AFTER INSERT ON edits BEGIN DELETE FROM packets; END",
             "view": "CREATE VIEW v AS SELECT 1",
             "version": "PRAGMA user_version=99",
-            "kind": "UPDATE packets SET kind = 'rumour' WHERE sequence = 3",
-            "channel": "UPDATE packets SET channel = 'smell' WHERE sequence = 3",
-            "none": "UPDATE packets SET kind = NULL WHERE sequence = 3",
-            "edit": "INSERT INTO edits VALUES (1, 'boss', 0.0, 'removal', '{\"robot\": 1}')",
-            "undo": "INSERT INTO edits VALUES (1, 'boss', 0.0, 'undo', '{\"number\": 1}')",
-            "config": "INSERT INTO facts VALUES ('config', '{\"seed\": \"x\"}')",
-        }[harm])  # fmt: skip
+            "seal": "UPDATE packets SET time = 1.0 WHERE sequence = 3",
+        }
+        if harm in changes:
+            PACKETS.update(connection, changes[harm], "sequence = 3", {})
+        elif harm in rows:
+            table, row = rows[harm]
+            table.insert(connection, row)
+        else:
+            connection.execute(statements[harm])
         connection.commit()
         connection.close()
     with pytest.raises(StoreError):

@@ -19,7 +19,7 @@ from fcslam.runs import open_run
 from fcslam.service import worker as worker_module
 from fcslam.service.crash_log import MOST_CRASHES
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import CONFIG, MissionStore, StoredPacket
+from fcslam.service.mission_store import MissionStore, StoredPacket
 from fcslam.service.worker import AT_ONCE, SNAPSHOT_EVERY_S, Worker
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
@@ -51,7 +51,7 @@ class Cloud:
         path.mkdir()
         self.store = MissionStore(self.folder.store)
         if config:
-            self.store.remember(CONFIG, config.model_dump_json())
+            self.store.configure(config)
         self.now, self.told = 0.0, []
         self.restart()
 

@@ -16,7 +16,8 @@ from fcslam.cloud.replies import SessionCorrection, is_news
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Correction, Edit, Undo, frozen
-from fcslam.storage.database import Database, check_file, translate_errors
+from fcslam.storage.database import Database, SealedTable, check_file, translate_errors
+from fcslam.storage.recovery import fault
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import Label
@@ -26,18 +27,21 @@ APPLIED = "applied"
 CONFIG = "config"
 """A fact: the mission's configuration."""
 
-_VERSION = 5
+CONFIG_COPY = "config copy"
+"""A fact: the same again, because nothing else can tell it."""
+
+VERSION = 6
 """Version of the schema and of the packets."""
 _AT_ONCE = 10_000
 """Packets that are read at once."""
 _COLUMNS = "robot, epoch, sequence, time, kind, channel, data, refusal"
 
-_SCHEMA = """
+SCHEMA = """
 CREATE TABLE packets (
     arrival INTEGER PRIMARY KEY,
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, sequence INTEGER NOT NULL,
     received REAL NOT NULL, time REAL NOT NULL, kind TEXT, channel TEXT,
-    refusal TEXT, data BLOB NOT NULL,
+    refusal TEXT, data BLOB NOT NULL, seal BLOB NOT NULL,
     UNIQUE (robot, epoch, sequence)
 ) STRICT;
 CREATE INDEX refusals ON packets (robot, epoch, sequence) WHERE refusal IS NOT NULL;
@@ -45,16 +49,26 @@ CREATE INDEX hellos ON packets (robot, epoch, sequence) WHERE kind = 'hello';
 CREATE TABLE corrections (
     robot TEXT NOT NULL, epoch INTEGER NOT NULL, version INTEGER NOT NULL UNIQUE, time REAL NOT NULL,
     map_index INTEGER NOT NULL, x REAL NOT NULL, y REAL NOT NULL, theta REAL NOT NULL, quality REAL NOT NULL,
+    seal BLOB NOT NULL,
     PRIMARY KEY (robot, epoch)
 ) STRICT;
 CREATE TABLE edits (
-    number INTEGER PRIMARY KEY, author TEXT NOT NULL, time REAL NOT NULL, kind TEXT NOT NULL, content TEXT NOT NULL
+    number INTEGER PRIMARY KEY, author TEXT NOT NULL, time REAL NOT NULL, kind TEXT NOT NULL, content TEXT NOT NULL,
+    seal BLOB NOT NULL
 ) STRICT;
 CREATE TABLE finalizations (
-    number INTEGER PRIMARY KEY, arrivals INTEGER NOT NULL, edits INTEGER NOT NULL, run TEXT, failure TEXT
+    number INTEGER PRIMARY KEY, arrivals INTEGER NOT NULL, edits INTEGER NOT NULL, run TEXT, failure TEXT,
+    seal BLOB NOT NULL
 ) STRICT;
-CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT
+CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL, seal BLOB NOT NULL) STRICT
 """
+PACKETS = SealedTable(
+    "packets", "arrival", "robot", "epoch", "sequence", "received", "time", "kind", "channel", "refusal", "data"
+)
+CORRECTIONS = SealedTable("corrections", "robot", "epoch", "version", "time", "map_index", "x", "y", "theta", "quality")
+EDITS = SealedTable("edits", "number", "author", "time", "kind", "content")
+FINALIZATIONS = SealedTable("finalizations", "number", "arrivals", "edits", "run", "failure")
+FACTS = SealedTable("facts", "name", "value")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +124,7 @@ class MissionStore:
         Raises:
             StoreError: the file is no mission of this version, or cannot be used.
         """
-        self._database = Database(path, _SCHEMA, _VERSION)
+        self._database = Database(path, SCHEMA, VERSION)
 
     def close(self) -> None:
         """Close the file."""
@@ -163,9 +177,10 @@ class MissionStore:
 
     def refuse(self, robot: str, epoch: int, sequence: int, reason: str) -> None:
         """Note that a packet does not fit what its robot sent before."""
-        statement = "UPDATE packets SET refusal = ? WHERE robot = ? AND epoch = ? AND sequence = ?"
+        where = "robot = :robot AND epoch = :epoch AND sequence = :sequence"
+        number = {"robot": robot, "epoch": epoch, "sequence": sequence}
         with self._database.transaction() as database:
-            database.execute(statement, (reason, robot, epoch, sequence))
+            PACKETS.update(database, {"refusal": reason}, where, number)
 
     def refusals(self, robot: str) -> list[tuple[int, int, str]]:
         """Epoch, number and reason of every refused packet of a robot."""
@@ -216,9 +231,8 @@ class MissionStore:
         with self._database.transaction() as database:
             if isinstance(content, Undo):
                 check_undo(_edits(database.execute, 0), content.number)
-            columns, row = "author, time, kind, content", (author, time_s, kind_of(content), edit_json(content))
-            number = database.execute(f"INSERT INTO edits ({columns}) VALUES (?, ?, ?, ?)", row).lastrowid
-        assert number is not None
+            number = _next(database, "edits", "number")
+            EDITS.insert(database, (number, author, float(time_s), kind_of(content), edit_json(content)))
         return Edit(number, author, time_s, content)
 
     def edits(self, after: int = 0) -> list[Edit]:
@@ -228,11 +242,10 @@ class MissionStore:
     def ask_to_finalize(self) -> int:
         """Request the result of all packets that arrived; returns the number of the request."""
         with self._database.transaction() as database:
-            database.execute(
-                "INSERT INTO finalizations (arrivals, edits)"
-                " SELECT (SELECT ifnull(max(arrival), 0) FROM packets), (SELECT count(*) FROM edits)"
-            )
-            return int(database.execute("SELECT last_insert_rowid()").fetchone()[0])
+            number = _next(database, "finalizations", "number")
+            arrivals, edits = _next(database, "packets", "arrival") - 1, _next(database, "edits", "number") - 1
+            FINALIZATIONS.insert(database, (number, arrivals, edits, None, None))
+            return number
 
     def finalizations(self) -> list[Finalization]:
         """All requests, the oldest first."""
@@ -248,17 +261,22 @@ class MissionStore:
     def answer(self, number: int, run: str | None, failure: str | None = None) -> None:
         """Store the outcome of a request."""
         with self._database.transaction() as database:
-            database.execute("UPDATE finalizations SET run = ?, failure = ? WHERE number = ?", (run, failure, number))
+            FINALIZATIONS.update(database, {"run": run, "failure": failure}, "number = :number", {"number": number})
 
     def fact(self, name: str) -> str | None:
         """A stored fact about the mission; None if there is none."""
         value: str | None = self._database.value("SELECT value FROM facts WHERE name = ?", (name,))
         return value
 
-    def remember(self, name: str, value: str) -> None:
-        """Store or replace a fact."""
+    def configure(self, config: CloudConfig) -> CloudConfig:
+        """Store the mission's configuration, if it has none yet; returns the one that it has."""
+        text = config.model_dump_json()
         with self._database.transaction() as database:
-            _remember(database, name, value)
+            stored = database.execute("SELECT value FROM facts WHERE name = ?", (CONFIG,)).fetchone()
+            if stored is None:
+                _remember(database, CONFIG, text)
+                _remember(database, CONFIG_COPY, text)
+        return config if stored is None else CloudConfig.model_validate_json(stored[0])
 
     def traffic(self) -> Ledger:
         """Traffic of accepted packets by label, and of refused ones."""
@@ -306,14 +324,17 @@ def check_mission(path: Path) -> None:
     Raises:
         StoreError: it is not what ``MissionStore.export`` writes.
     """
-    check_file(path, _SCHEMA, _VERSION)
+    check_file(path, SCHEMA, VERSION)
+    found = fault(path, SCHEMA, VERSION)
+    if found is not None:
+        raise StoreError(f"{path}: {found}")
     with (
         translate_errors(path),
-        closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found,
+        closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as opened,
     ):
-        labels = found.execute("SELECT DISTINCT kind, channel, refusal IS NULL FROM packets").fetchall()
-        facts = dict(found.execute("SELECT name, value FROM facts").fetchall())
-        edits = found.execute("SELECT number, author, time, kind, content FROM edits ORDER BY number").fetchall()
+        labels = opened.execute("SELECT DISTINCT kind, channel, refusal IS NULL FROM packets").fetchall()
+        facts = dict(opened.execute("SELECT name, value FROM facts").fetchall())
+        edits = opened.execute("SELECT number, author, time, kind, content FROM edits ORDER BY number").fetchall()
     try:
         _check_edits(edits)
         for kind, channel, counts in labels:
@@ -347,33 +368,35 @@ def _check_edits(rows: Sequence[tuple[int, str, float, str, str]]) -> None:
 
 
 def _remember(database: sqlite3.Connection, name: str, value: str) -> None:
-    database.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, value))
+    FACTS.insert(database, (name, value), replaces=True)
+
+
+def _next(database: sqlite3.Connection, table: str, column: str) -> int:
+    """The number after the last one of a table."""
+    return int(database.execute(f"SELECT ifnull(max({column}), 0) + 1 FROM {table}").fetchone()[0])
 
 
 def _put(database: sqlite3.Connection, packets: Sequence[StoredPacket], received_s: float) -> tuple[int, int | None]:
     """How many packets are new, and the index of the first conflicting packet, where it stops."""
-    conflict, new = None, 0
+    conflict, new, arrival = None, 0, _next(database, "packets", "arrival")
     for index, packet in enumerate(packets):
-        if _insert(database, packet, received_s):
+        known = _data(database, packet)
+        if known is None:
+            number = (packet.robot, packet.epoch, packet.sequence)
+            times, label = (float(received_s), float(packet.time)), (packet.kind, packet.channel)
+            PACKETS.insert(database, (arrival + new, *number, *times, *label, packet.refusal, packet.data))
             new += 1
-        elif not _is_there(database, packet):
+        elif known != packet.data:
             conflict = index
             break
     return new, conflict
 
 
-def _insert(database: sqlite3.Connection, packet: StoredPacket, received_s: float) -> bool:
-    columns = "robot, epoch, sequence, received, time, kind, channel, refusal, data"
-    number = (packet.robot, packet.epoch, packet.sequence)
-    row = (*number, received_s, packet.time, packet.kind, packet.channel, packet.refusal, packet.data)
-    statement = f"INSERT INTO packets ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING"
-    return database.execute(statement, row).rowcount > 0
-
-
-def _is_there(database: sqlite3.Connection, packet: StoredPacket) -> bool:
+def _data(database: sqlite3.Connection, packet: StoredPacket) -> bytes | None:
+    """The stored packet of the same number; None if there is none."""
     statement = "SELECT data FROM packets WHERE robot = ? AND epoch = ? AND sequence = ?"
-    (data,) = database.execute(statement, (packet.robot, packet.epoch, packet.sequence)).fetchone()
-    return bool(data == packet.data)
+    row = database.execute(statement, (packet.robot, packet.epoch, packet.sequence)).fetchone()
+    return None if row is None else bytes(row[0])
 
 
 def _packet(
@@ -397,9 +420,7 @@ def _read_correction(
 def _write_correction(database: sqlite3.Connection, news: SessionCorrection) -> None:
     """Replace the session's correction; its version is the mission's next one."""
     correction = news.correction
-    row = (news.robot, news.epoch, news.time, correction.map_index, *correction.T_map_odom.tolist(), correction.quality)
-    database.execute(
-        "INSERT OR REPLACE INTO corrections"
-        " SELECT ?1, ?2, ifnull(max(version) + 1, 0), ?3, ?4, ?5, ?6, ?7, ?8 FROM corrections",
-        row,
-    )
+    (version,) = database.execute("SELECT ifnull(max(version) + 1, 0) FROM corrections").fetchone()
+    pose, quality = correction.T_map_odom.tolist(), float(correction.quality)
+    row = (news.robot, news.epoch, version, float(news.time), correction.map_index, *pose, quality)
+    CORRECTIONS.insert(database, row, replaces=True)

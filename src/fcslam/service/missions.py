@@ -1,18 +1,20 @@
 """The missions of one service, of which one is open."""
 
 import fcntl
+import logging
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import ServiceError
+from fcslam.errors import ServiceError, StoreError
 from fcslam.records import Change, Edit, Undo
 from fcslam.service.detectors import STAGING, DetectorStore
 from fcslam.service.intake import Intake
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.mission_store import CONFIG, MissionStore
+from fcslam.service.mission_recovery import recover_mission
+from fcslam.service.mission_store import MissionStore
 from fcslam.service.supervisor import RunningWorker
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing, write_file
@@ -22,6 +24,8 @@ FIRST = "mission"
 """Name of a new service's first mission."""
 IMPORT, EXPORT = ".import", ".export"
 """Prefixes of temporary folders of imported and exported missions."""
+
+_log = logging.getLogger(__name__)
 
 Launch = Callable[[MissionFolder], RunningWorker]
 """Starts the worker of a mission."""
@@ -34,12 +38,15 @@ class OpenMission:
         self, folder: MissionFolder, config: CloudConfig, clock: Callable[[], float],
         wall_clock: Callable[[], float], launch: Launch, detectors: DetectorStore,
     ) -> None:  # fmt: skip
+        """Check and open the mission's file; ``config`` is that of a new mission.
+
+        Raises:
+            StoreError: the file cannot be used, or what determines the map is lost.
+        """
         self.folder = folder
+        _check_file(folder)
         self.store = MissionStore(folder.store)
-        stored = self.store.fact(CONFIG)
-        if stored is None:
-            self.store.remember(CONFIG, config.model_dump_json())
-        limits = (config if stored is None else CloudConfig.model_validate_json(stored)).fleet.claims
+        limits = self.store.configure(config).fleet.claims
         self.intake = Intake(self.store, clock, wall_clock, detectors.announced, limits)
         self.worker = launch(folder)
         self._wall_clock = wall_clock
@@ -59,6 +66,25 @@ class OpenMission:
         """Stop the worker, then close the store."""
         self.worker.stop()
         self.store.close()
+
+
+def _check_file(folder: MissionFolder) -> None:
+    """Recover a damaged file; refuse a mission whose file is gone.
+
+    Raises:
+        StoreError: it is gone, or what determines the map is lost.
+    """
+    has_begun = folder.worker_lock.exists()
+    if has_begun and not folder.store.exists():
+        raise StoreError(
+            f"{folder.store}: the mission's file is gone; put a copy in its place, or move {folder.path} away to begin "
+            "a new mission"
+        )
+    if not has_begun and folder.store.exists() and not folder.store.stat().st_size:
+        folder.store.unlink()  # the service was killed while it created the file
+    told = recover_mission(folder.store)
+    if told is not None:
+        _log.error("%s", told)
 
 
 class Missions:

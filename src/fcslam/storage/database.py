@@ -4,13 +4,14 @@ import os
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from fcslam.errors import StoreError
+from fcslam.storage.seals import PAGE_BYTES, seal, seal_pages, seals_file
 
 BUSY_S = 30.0
 """How long a writer waits for another process to finish."""
@@ -53,6 +54,7 @@ class Database:
         self._lock, self._reading_lock, self._sharing_lock = threading.Lock(), threading.Lock(), threading.Lock()
         self._waiting: deque[_Waiting] = deque()
         with translate_errors(path):
+            seals_file(path).unlink(missing_ok=True)  # they are of a file that nobody writes
             if exclusive:
                 pragmas = ("locking_mode=EXCLUSIVE", "journal_mode=WAL", "synchronous=NORMAL")
                 self._connection = self._reading = _connected(path, *pragmas, timeout_s=0.0)
@@ -63,17 +65,19 @@ class Database:
                 # A commit takes as long as the disk does. A second connection lets readers see the state before it.
                 self._reading = _connected(path, "query_only=ON")
         with self.transaction() as connection:
-            if not _shape(connection)[1]:
+            if not shape(connection)[1]:
                 _make(connection, schema, version)
-            if _shape(connection) != _expected(schema, version):
+            if shape(connection) != expected_shape(schema, version):
                 raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, and seal its pages if no other process has it open."""
         with self._lock:
             self._connection.close()
         with self._reading_lock:
             self._reading.close()
+        with suppress(OSError):  # the seals of the rows are still there
+            seal_pages(self._path)
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
@@ -150,6 +154,34 @@ class Database:
                 staging.unlink(missing_ok=True)
 
 
+class SealedTable:
+    """A table whose last column is the seal of its rows (``storage.seals``)."""
+
+    def __init__(self, name: str, *columns: str) -> None:
+        """``columns``: all but the seal, in their order."""
+        self._name, self._columns = name, columns
+        marks = ", ".join(f"?{number}" for number in range(1, len(columns) + 1))
+        self._values = f"{name} VALUES ({marks}, seal('{name}', {marks}))"
+
+    def insert(self, connection: sqlite3.Connection, row: Sequence[object], *, replaces: bool = False) -> None:
+        """Insert a row; ``replaces``: in place of one with the same key.
+
+        Values of REAL columns must be floats: the seal is of the value as it is read again.
+        """
+        connection.execute(f"INSERT {'OR REPLACE ' if replaces else ''}INTO {self._values}", row)
+
+    def update(
+        self, connection: sqlite3.Connection, changes: Mapping[str, object], where: str, values: Mapping[str, object]
+    ) -> None:
+        """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
+        assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
+        sealed = ", ".join(f":new_{column}" if column in changes else column for column in self._columns)
+        connection.execute(
+            f"UPDATE {self._name} SET {assignments}, seal = seal('{self._name}', {sealed}) WHERE {where}",
+            {**values, **{f"new_{column}": value for column, value in changes.items()}},
+        )
+
+
 def check_file(path: Path, schema: str, version: int) -> None:
     """Refuse a file of unknown origin that ``Database`` did not create; it is not changed and none of its code runs.
 
@@ -161,7 +193,7 @@ def check_file(path: Path, schema: str, version: int) -> None:
         closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found,
     ):
         found.execute("PRAGMA trusted_schema=OFF")
-        if _shape(found) != _expected(schema, version):
+        if shape(found) != expected_shape(schema, version):
             raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
         if found.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
             raise StoreError(f"{path}: broken")
@@ -170,8 +202,9 @@ def check_file(path: Path, schema: str, version: int) -> None:
 def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> sqlite3.Connection:
     # Transactions begin where this module says so.
     connection = sqlite3.connect(path, timeout=timeout_s, isolation_level=None, check_same_thread=False)
-    for pragma in ("trusted_schema=OFF", *pragmas):
+    for pragma in ("trusted_schema=OFF", f"page_size={PAGE_BYTES}", *pragmas):
         connection.execute(f"PRAGMA {pragma}")
+    connection.create_function("seal", -1, seal, deterministic=True)
     return connection
 
 
@@ -181,16 +214,17 @@ def _make(connection: sqlite3.Connection, schema: str, version: int) -> None:
     connection.execute(f"PRAGMA user_version={version}")
 
 
-def _shape(connection: sqlite3.Connection) -> tuple[int, list[tuple[Any, ...]]]:
+def shape(connection: sqlite3.Connection) -> tuple[int, list[tuple[Any, ...]]]:
     """Version and schema."""
     parts = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema ORDER BY type, name").fetchall()
     return connection.execute("PRAGMA user_version").fetchone()[0], parts
 
 
-def _expected(schema: str, version: int) -> tuple[int, list[tuple[Any, ...]]]:
+def expected_shape(schema: str, version: int) -> tuple[int, list[tuple[Any, ...]]]:
+    """The ``shape`` of a new file."""
     with closing(sqlite3.connect(":memory:")) as connection:
         _make(connection, schema, version)
-        return _shape(connection)
+        return shape(connection)
 
 
 @contextmanager
