@@ -36,10 +36,10 @@ from fcslam.errors import (
 
 if TYPE_CHECKING:
     from fcslam.api import localize, map_recordings
-    from fcslam.live.records import EventKind, RobotEvent, RobotPose
+    from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.mission import MissionConfig, Progress
-    from fcslam.records import Channel, ClosureStatus, LaserModel, Veto
+    from fcslam.records import CameraModel, Channel, ClosureStatus, LaserModel, Transform, Veto
     from fcslam.runs import (
         ClosureRow,
         LocalizedPoses,
@@ -57,6 +57,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BagOptions",
+    "CameraModel",
     "Channel",
     "ClosureRow",
     "ClosureStatus",
@@ -84,6 +85,7 @@ __all__ = [
     "Robot",
     "RobotEvent",
     "RobotPose",
+    "RobotStatus",
     "RobotTrajectory",
     "Run",
     "ServiceError",
@@ -92,6 +94,7 @@ __all__ = [
     "StateError",
     "StoreError",
     "TrainingError",
+    "Transform",
     "UnavailableError",
     "Veto",
     "__version__",
@@ -102,6 +105,7 @@ __all__ = [
 
 _LAZY: Final = {
     "BagOptions": "fcslam.sources",
+    "CameraModel": "fcslam.records",
     "Channel": "fcslam.records",
     "ClosureRow": "fcslam.runs",
     "ClosureStatus": "fcslam.records",
@@ -117,8 +121,10 @@ _LAZY: Final = {
     "Robot": "fcslam.live.robot",
     "RobotEvent": "fcslam.live.records",
     "RobotPose": "fcslam.live.records",
+    "RobotStatus": "fcslam.live.records",
     "RobotTrajectory": "fcslam.runs",
     "Run": "fcslam.runs",
+    "Transform": "fcslam.records",
     "Veto": "fcslam.records",
     "localize": "fcslam.api",
     "map_recordings": "fcslam.api",

@@ -17,6 +17,8 @@ from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.robot.kidnapping import drives, kidnapping
 
+CAMERA = fcslam.CameraModel(64, 48, 60.0, 60.0, 31.5, 23.5, fcslam.Transform((0.1, 0.0, 0.4), (-0.5, 0.5, -0.5, 0.5)))
+
 
 @pytest.fixture(scope="module")
 def scans():
@@ -286,3 +288,43 @@ def test_closures_join_places_that_are_near_each_other(robot, scans):
     assert ends.shape[1:] == (2, 2)
     assert len(ends)
     assert np.hypot(*(ends[:, 0] - ends[:, 1]).T).max() < 5.0
+
+
+def test_images_are_grey_or_rgb_and_of_the_camera(scans):
+    with fcslam.Robot("anna", scans[0].laser, camera=CAMERA, executor=SameThread()) as robot:
+        drive(robot, scans[:2])
+        robot.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
+        robot.add_image(np.zeros((48, 64, 3), np.uint8), scans[1].stamp, scans[1].T_odom_base)
+        for wrong in (np.zeros((48, 63), np.uint8), np.zeros((48, 64)), np.zeros((48, 64, 4), np.uint8), "no image"):
+            with pytest.raises(InputError, match="but the camera gives"):
+                robot.add_image(wrong, scans[1].stamp)
+    with pytest.raises(InputError, match="finished"):
+        robot.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
+
+
+def test_an_image_without_a_camera_is_one_line(robot, scans):
+    with pytest.raises(InputError, match="the robot has no camera"):
+        robot.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"fx": 0.0}, "a focal length above 0"),
+        ({"T_base_camera": fcslam.Transform((0, 0, 0), (0, 0, 0, 2))}, "no unit"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_one_line(change, reason):
+    with pytest.raises(InputError, match=reason):
+        fcslam.Robot("anna", camera=replace(CAMERA, **change), executor=SameThread())
+
+
+def test_two_lasers_are_told_apart_by_name(scans):
+    rear = replace(scans[0].laser, T_base_laser=(-0.2, 0.0, math.pi))
+    with fcslam.Robot("anna", {"front": scans[0].laser, "rear": rear}, executor=SameThread()) as robot:
+        for scan in scans[:10]:
+            robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base, laser="front")
+            robot.add_scan(np.full(180, np.inf), scan.stamp, scan.T_odom_base, laser="rear")
+        with pytest.raises(InputError, match="laser '' is not known; known: 'front', 'rear'"):
+            robot.add_scan(scans[0].ranges_m, scans[9].stamp, scans[9].T_odom_base)
+        assert len(robot.trajectory().stamps) == 20

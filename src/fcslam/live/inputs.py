@@ -9,10 +9,13 @@ from numpy.typing import ArrayLike
 from fcslam.cloud.sessions import check_robot
 from fcslam.errors import InputError, PacketError
 from fcslam.geometry.beams import is_field_of_view
-from fcslam.records import FloatArray, LaserModel, LaserScan, frozen
+from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, LaserScan, frozen
 from fcslam.runs import check_names
 from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.wire.checks import check_name
+
+JPEG_QUALITY = 95
+"""Of images that are given as arrays."""
 
 Lasers = LaserModel | Mapping[str, LaserModel]
 
@@ -79,6 +82,49 @@ def checked_scan(ranges_m: ArrayLike, stamp: float, T_odom_base: FloatArray, las
     ranges[ranges < 0.0] = np.nan
     ranges.setflags(write=False)
     return LaserScan(stamp, ranges, laser, T_odom_base)
+
+
+def checked_camera(camera: CameraModel | None) -> CameraModel | None:
+    """The camera.
+
+    Raises:
+        InputError: it cannot be one.
+    """
+    if camera is None:
+        return None
+    translation_m, rotation = camera.T_base_camera
+    numbers = camera.fx, camera.fy, camera.cx, camera.cy, *translation_m, *rotation
+    is_unit = math.isclose(math.hypot(*rotation), 1.0, abs_tol=1e-3)
+    if not all(map(math.isfinite, numbers)) or min(camera.fx, camera.fy, camera.width, camera.height) <= 0:
+        raise InputError(f"camera: {camera} needs finite numbers, and a size and a focal length above 0 pixels")
+    if not is_unit:
+        raise InputError(f"camera: the rotation {rotation} of T_base_camera is no unit quaternion (x, y, z, w)")
+    return camera
+
+
+def checked_image(image: ArrayLike, stamp: float, T_odom_base: FloatArray | None, camera: CameraModel) -> CameraImage:
+    """An image as a record, encoded as JPEG: grey values are enough for keypoints.
+
+    Args:
+        image: shape (height, width), or (height, width, 3) in the order red, green, blue; uint8.
+        stamp: checked, seconds.
+        T_odom_base: checked, shape (3,); None: unknown.
+        camera: the camera.
+
+    Raises:
+        InputError: the image has another type, or another shape than those of the camera.
+    """
+    import cv2
+
+    pixels = np.asarray(image)
+    size = camera.height, camera.width
+    if pixels.dtype != np.uint8 or pixels.shape not in (size, (*size, 3)):
+        raise InputError(
+            f"image: shape {pixels.shape} of {pixels.dtype}, but the camera gives {size} or {(*size, 3)} of uint8"
+        )
+    grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    _, encoded = cv2.imencode(".jpg", grey, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
+    return CameraImage(stamp, encoded.tobytes(), camera, T_odom_base)
 
 
 def checked_stamp(stamp: float, newest_s: float) -> float:

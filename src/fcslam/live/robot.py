@@ -25,11 +25,20 @@ from fcslam.cloud.sessions import session_name
 from fcslam.driving import track_of
 from fcslam.errors import InputError, StateError
 from fcslam.geometry import se2
-from fcslam.live.inputs import Lasers, checked_lasers, checked_odometry, checked_robot, checked_scan, checked_stamp
+from fcslam.live.inputs import (
+    Lasers,
+    checked_camera,
+    checked_image,
+    checked_lasers,
+    checked_odometry,
+    checked_robot,
+    checked_scan,
+    checked_stamp,
+)
 from fcslam.live.own_map import OwnMap
 from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
 from fcslam.mission import MissionConfig
-from fcslam.records import Correction, FloatArray, Keyscan, LaserScan, SensorRecord, frozen
+from fcslam.records import CameraModel, Correction, FloatArray, Keyscan, LaserScan, SensorRecord, frozen
 from fcslam.robot.beside import Beside, worker_process
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
@@ -96,6 +105,7 @@ class Robot:
         name: str,
         laser: Lasers | None = None,
         *,
+        camera: CameraModel | None = None,
         server: str | BatchTransport | None = None,
         state: StrPath | None = None,
         token: str | None = None,
@@ -116,6 +126,7 @@ class Robot:
         Args:
             name: of the robot; letters, digits and ``. _ -``.
             laser: its LiDAR, or several by name. None: only ``add`` is used.
+            camera: its camera, if it has one.
             server: address of an `fcslam serve` with the robot's fleet, or a transport of your own. None: the robot
                 maps alone.
             state: folder of this robot alone; a robot that starts again with it finds its place in its earlier map.
@@ -140,6 +151,7 @@ class Robot:
         """
         self.name = checked_robot(name)
         self._lasers = checked_lasers(laser)
+        self._camera = checked_camera(camera)
         self._config = settings_of(config)
         self._on_event = on_event
         self._clock = clock
@@ -225,6 +237,26 @@ class Robot:
             stamp = checked_stamp(stamp, self._newest_s)
             T_odom_base = self._odometry(stamp, odometry)
             return self._process(checked_scan(ranges_m, stamp, T_odom_base, self._lasers[laser]))
+
+    def add_image(self, image: ArrayLike, stamp: float, odometry: ArrayLike | None = None) -> None:
+        """Add the next image of the camera, by which places are recognised. It never leaves the robot.
+
+        Args:
+            image: undistorted, shape (height, width), or (height, width, 3) in the order red, green, blue; uint8.
+            stamp: seconds, as in ``add_scan``.
+            odometry: as in ``add_scan``, at the stamp of the image. None: the robot is taken to be where the last scan
+                was made.
+
+        Raises:
+            InputError: the robot has no camera, the image does not fit it, the clock went back by more than 2 s, a
+                number cannot be used, or the robot is finished. The image is ignored.
+        """
+        if self._camera is None:
+            raise InputError(f"{self.name}: the robot has no camera; give camera=fcslam.CameraModel(...)")
+        with self._lock:
+            stamp = checked_stamp(stamp, self._newest_s)
+            T_odom_base = None if odometry is None or self._prediction is not None else checked_odometry(odometry)
+            self.add(checked_image(image, stamp, T_odom_base, self._camera))
 
     def add(self, record: SensorRecord) -> RobotPose | None:
         """Add the next record of any sensor, as a recording yields them; returns the pose of a scan.

@@ -1,0 +1,63 @@
+"""The programs of docs/howto-python.md and of examples/ run as they are printed."""
+
+import re
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import fcslam
+from tests import small_fleet
+from tests.live.test_robot import CAMERA
+from tests.robot.http_cloud import serving
+
+ROOT = Path(__file__).parents[2]
+
+
+def programs():
+    text = (ROOT / "docs" / "howto-python.md").read_text(encoding="utf-8")
+    return [textwrap.dedent(block) for block in re.findall(r"\n\n((?: {4}.*\n|\n)+)", text)]
+
+
+@pytest.fixture
+def my_robot(monkeypatch):
+    """The reader's own module."""
+    recorded = list(small_fleet.draw(1, path_length_m=3.0).robots[0].scans())
+    module = ModuleType("my_robot")
+    module.laser = recorded[0].laser
+    module.rear_laser = fcslam.LaserModel(*module.laser.beams, 12.0, (-0.2, 0.0, 0.0))
+    module.camera = CAMERA
+    module.scans = lambda: [(scan.ranges_m, scan.stamp, scan.T_odom_base) for scan in recorded]
+    module.rear_scans = module.scans
+    module.images = lambda: [np.zeros((48, 64, 3), np.uint8)] * len(recorded)
+    monkeypatch.setitem(sys.modules, "my_robot", module)
+    return module
+
+
+@pytest.mark.slow
+def test_the_programs_of_the_page_run(my_robot, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with serving() as cloud, fcslam.Robot("before", my_robot.laser) as my_robot.robot:
+        my_robot.server = cloud.url
+        for scan in my_robot.scans():
+            my_robot.robot.add_scan(*scan)
+        assert len(programs()) == 6
+        for number, program in enumerate(programs()):
+            exec(compile(program, f"program {number}", "exec"), {"__name__": "__main__"})
+        assert cloud.cloud.stored
+    assert capsys.readouterr().out.count("True") == len(my_robot.scans())
+    assert fcslam.open_run("runs/anna").maps
+
+
+@pytest.mark.slow
+def test_the_example_maps_a_yard(tmp_path):
+    command = [sys.executable, ROOT / "examples" / "live_robot.py", tmp_path / "run"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env={"PYTHONPATH": f"{ROOT / 'src'}"})
+    assert done.stdout.startswith("at (0.00, 0.00) m, 0.00 rad\n")
+    assert done.stderr == ""
+    run = fcslam.open_run(tmp_path / "run")
+    assert run.trajectories["anna"].path_length_m == pytest.approx(40.0, rel=0.05)
