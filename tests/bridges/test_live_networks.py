@@ -11,8 +11,10 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 
@@ -45,18 +47,22 @@ def scans():
 def folder(scans, tmp_path_factory):
     """The scans as a file for the players, and the run of the same scans as a bag."""
     folder = tmp_path_factory.mktemp("live")
+    for_player(folder / "scans.npz", scans)
+    write_bag(folder / "bag.mcap", scans)
+    ended(fcslam("map", f"robot1={folder / 'bag.mcap'}", "-o", folder / "expected", "-q"))
+    return folder
+
+
+def for_player(path, scans):
     laser = scans[0].laser
     np.savez(
-        folder / "scans.npz",
+        path,
         stamps=[scan.stamp for scan in scans],
         ranges=[np.where(scan.ranges_m >= laser.max_range_m, np.inf, scan.ranges_m) for scan in scans],
         odometry=[scan.T_odom_base for scan in scans],
         laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
         mounting_x=laser.T_base_laser[0],
     )
-    write_bag(folder / "bag.mcap", scans)
-    ended(fcslam("map", f"robot1={folder / 'bag.mcap'}", "-o", folder / "expected", "-q"))
-    return folder
 
 
 def fcslam(*arguments, **environment):
@@ -79,9 +85,9 @@ def ended(process):
     return out + error
 
 
-def play(python, script, folder, **environment):
+def play(python, script, folder, namespace="/robot1", **environment):
     """The drive as its player saw it."""
-    command = [python, HERE / script, folder / "scans.npz", "/robot1", str(SPEED)]
+    command = [python, HERE / script, folder / "scans.npz", namespace, str(SPEED)]
     done = subprocess.run(
         list(map(str, command)), env={**os.environ, **environment}, capture_output=True, text=True, timeout=LONGEST_S,
         check=False,
@@ -161,6 +167,44 @@ def test_a_robot_that_nobody_knows_on_ros_2():
     assert process.returncode == 2
     assert "no laser scans (sensor_msgs/LaserScan) in /nobody" in error
     assert "Traceback" not in error
+
+
+@needs_rclpy
+def test_three_robots_of_ros_2_share_one_map(drawn, tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        port = probe.getsockname()[1]
+    server = fcslam("serve", "--data", tmp_path / "missions", "--port", port)
+    environment = ros2(44)
+    robots, players = [], []
+    for robot in drawn.robots:
+        scans, folder = list(robot.scans()), tmp_path / robot.name
+        folder.mkdir()
+        for_player(folder / "scans.npz", scans)
+        robots.append(fcslam(
+            "robot", f"ros2:/{robot.name}", mounting(scans), "-o", folder / "run",
+            "--server", f"http://127.0.0.1:{port}", "--state", folder / "state", **environment,
+        ))  # fmt: skip
+        players.append((RCLPY, "rclpy_player.py", folder, f"/{robot.name}"))
+    with ThreadPoolExecutor() as pool:
+        drives = list(pool.map(lambda player: play(*player, **environment), players))
+    for robot in robots:
+        ended(robot)
+    assert all(drive["posed"] == drive["played"] for drive in drives)
+    end = time.monotonic() + LONGEST_S
+    while len(maps := maps_of(port)) != 1 and time.monotonic() < end:
+        time.sleep(1.0)
+    server.send_signal(signal.SIGINT)
+    server.communicate(timeout=LONGEST_S)
+    assert maps == {0: {"robot_1", "robot_2", "robot_3"}}
+
+
+def maps_of(port):
+    """The robots of each map of a service."""
+    maps = {}
+    for robot in httpx.get(f"http://127.0.0.1:{port}/api/v1/robots").json():
+        maps.setdefault(robot["map"], set()).add(robot["robot"])
+    return maps
 
 
 @needs_roscore
