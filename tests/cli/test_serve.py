@@ -1,5 +1,6 @@
 """`fcslam serve` and `fcslam certificates`: what is refused at once, and a real service behind TLS."""
 
+import json
 import os
 import re
 import signal
@@ -177,6 +178,67 @@ def test_killed_at_any_moment_a_service_loses_nothing_and_finds_the_same(tmp_pat
     assert all(path.stat().st_mode & 0o077 == 0 for path in tmp_path.glob("data*/**/*"))
     assert runs[0].map_files == runs[1].map_files
     assert [str(c) for c in runs[0].closures] == [str(c) for c in runs[1].closures]
+
+
+MAPPED = ("pose_graph.g2o", "closures.csv", "robots.csv", "*.pgm", "*.yaml", "*.png", "trajectories/*", "local/*")
+
+
+def mapped(folder):
+    """The files of a run folder, without those about its traffic."""
+    return {str(path.relative_to(folder)): path.read_bytes() for name in MAPPED for path in folder.glob(name)}
+
+
+@pytest.mark.attack
+@pytest.mark.system
+@pytest.mark.parametrize("session", [{}, {"epoch": 0}], ids=["robot", "session"])
+def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets, session):
+    """The worker is killed in between; the robot goes on sending."""
+    honest = [packet for packet in packets if packet.robot != "robot_2"]
+    service = Service(tmp_path / "data")
+    with httpx.Client(base_url=service.url, timeout=300.0) as client:
+
+        def play(sent):
+            for robot in dict.fromkeys(packet.robot for packet in sent):
+                send(client, robot, [packet for packet in sent if packet.robot == robot])
+
+        def finalized():
+            return mapped(Path(client.post(f"{API}/finalize").json()["run"]))
+
+        def robots():
+            return {robot for one in client.get(f"{API}/maps").json() for robot in one["robots"]}
+
+        def until(condition):
+            end = time.monotonic() + 60.0
+            while not condition():
+                assert time.monotonic() < end
+                time.sleep(0.1)
+
+        expected = {}
+        for name, sent in (("without", honest), ("with", packets)):
+            client.post(f"{API}/missions", json={"name": name}).raise_for_status()
+            play(sent)
+            expected[name] = finalized()
+        assert expected["with"] != expected["without"]
+        client.post(f"{API}/missions", json={"name": "edited"}).raise_for_status()
+        cut = 2 * len(packets) // 3
+        play(packets[:cut])
+        finalized()
+        until(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
+        removed = client.post(f"{API}/removals", json={"robot": "robot_2", **session}).json()
+        until(lambda: robots() == {"robot_1", "robot_3"})
+        os.kill(children(service.process.pid)[0], signal.SIGKILL)
+        play(packets[cut:])
+        assert finalized() == expected["without"]
+        assert robots() == {"robot_1", "robot_3"}
+        assert client.post(f"{API}/edits/{removed['number']}/undo").status_code == 201
+        assert finalized() == expected["with"]
+        until(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
+        until(lambda: client.get("/readyz").json() == {"status": "ready", "backlog": 0})
+        audited = [json.loads(line)["action"] for line in (tmp_path / "data" / "audit.jsonl").read_text().splitlines()]
+        assert audited[-4:] == [
+            f"POST {API}/removals", f"POST {API}/finalize", f"POST {API}/edits/1/undo", f"POST {API}/finalize"
+        ]  # fmt: skip
+    service.stop()
 
 
 @pytest.mark.system

@@ -2,6 +2,7 @@
 
 import fcntl
 import gc
+import json
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from fcslam.service import worker as worker_module
 from fcslam.service.crash_log import MOST_CRASHES
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import MissionStore, StoredPacket
+from fcslam.service.supervisor import PROGRESS
 from fcslam.service.worker import AT_ONCE, SNAPSHOT_EVERY_S, Worker
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
@@ -416,6 +418,12 @@ def test_a_packet_refused_while_it_waits_is_not_applied_after_a_restart(cloud):
     assert [packet.sequence for packet in applied] == [packets[-2].sequence]
 
 
+def told(process, event):
+    """Read until a worker says this; how far it has come may be said before."""
+    while (said := json.loads(process.stdout.readline())["event"]) != event:
+        assert said == PROGRESS
+
+
 @pytest.mark.slow
 def test_a_worker_waits_until_the_one_before_is_gone(cloud):
     command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
@@ -426,8 +434,8 @@ def test_a_worker_waits_until_the_one_before_is_gone(cloud):
             time.sleep(3.0)
             assert cloud.store.applied() == 0
             fcntl.flock(before, fcntl.LOCK_UN)
-            assert b"ready" in process.stdout.readline()
-            assert b"live" in process.stdout.readline()
+            told(process, "ready")
+            told(process, "live")
             process.stdin.close()
             assert process.wait(60) == 0
 
@@ -439,7 +447,7 @@ def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cl
         process.terminate()
         assert process.wait(60) == -signal.SIGTERM
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert b"ready" in process.stdout.readline()
+        told(process, "ready")
         process.terminate()
         process.stdin.close()
         assert process.wait(60) == 0
