@@ -157,6 +157,7 @@ class Worker:
             self._start_over()
         self._fleet.edit(now)
         self._published, self._reported = -1, min(self._reported, max(self._applied, self._resumed_at) - 1)
+        self._publish_at = self._clock()  # who edits the map waits for it
         return True
 
     def _start_over(self) -> None:
