@@ -148,7 +148,7 @@ class Worker:
         return max(due_s, 0.0)
 
     def _take_edits(self) -> bool:
-        edits = self._store.edits(len(self._edits))
+        edits = self._store.edits(self._newest_edit)
         if not edits:
             return False
         before, now = in_force(self._edits), in_force([*self._edits, *edits])
@@ -159,6 +159,11 @@ class Worker:
         self._published, self._reported = -1, min(self._reported, max(self._applied, self._resumed_at) - 1)
         self._publish_at = self._clock()  # who edits the map waits for it
         return True
+
+    @property
+    def _newest_edit(self) -> int:
+        """Number of the last edit that was read; a repaired mission may lack some before it."""
+        return self._edits[-1].number if self._edits else 0
 
     def _start_over(self) -> None:
         """Apply all packets again, as a worker without a snapshot does: a removed session comes back."""
@@ -225,7 +230,7 @@ class Worker:
             "fleet": self._fleet.state(),
             "log": self._log.state(),
             "arrivals": self._arrivals,
-            "edits": len(self._edits),
+            "edits": self._newest_edit,
             "hash": self._read_hash.hex(),
             "times": [(*session, time_s) for session, time_s in self._times.items()],
         }
@@ -246,8 +251,8 @@ class Worker:
             read_hash = b""
             for data in self._store.contents(state["arrivals"]):
                 read_hash = _chained(read_hash, data)
-            edits = self._store.edits()
-            if read_hash.hex() != state["hash"] or state["edits"] > len(edits):
+            edits = [edit for edit in self._store.edits() if edit.number <= state["edits"]]
+            if read_hash.hex() != state["hash"] or state["edits"] > (edits[-1].number if edits else 0):
                 raise InputError(f"{self._folder.snapshot}: is of other packets")
             fleet = Fleet.restored(self._config.fleet, self._config.seed, state["fleet"], self._read)
             log = PacketLog.restored(state["log"])
@@ -255,7 +260,7 @@ class Worker:
             _log.warning("%s; the worker applies all packets again", str(error) or type(error).__name__)
             return
         self._fleet, self._log = fleet, log
-        self._arrivals, self._edits, self._read_hash = state["arrivals"], edits[: state["edits"]], read_hash
+        self._arrivals, self._edits, self._read_hash = state["arrivals"], edits, read_hash
         self._times = {(robot, epoch): time_s for robot, epoch, time_s in state["times"]}
 
     def _fits(self) -> str:
@@ -299,7 +304,7 @@ class Worker:
     def _finalize(self) -> bool:
         """Answer the oldest request whose packets and edits have all taken effect."""
         for asked in self._store.finalizations():
-            if asked.run or asked.failure or asked.arrivals > self._arrivals or asked.edits > len(self._edits):
+            if asked.run or asked.failure or asked.arrivals > self._arrivals or asked.edits > self._newest_edit:
                 continue
             self._answer(asked)
             return True
