@@ -8,7 +8,20 @@ import click
 import typer
 
 import fcslam
-from fcslam.cli import certificates, config, demo, evaluate, extract, federate, live, serve, simulate, tokens, train
+from fcslam.cli import (
+    certificates,
+    config,
+    demo,
+    evaluate,
+    extract,
+    federate,
+    info,
+    live,
+    serve,
+    simulate,
+    tokens,
+    train,
+)
 from fcslam.cli import convert as conversion
 from fcslam.cli import localize as localization
 from fcslam.cli import map as mapping
@@ -44,6 +57,7 @@ app.command(
         "fcslam localize today.bag --map office.yaml --initial-pose 2,3.5,1.57",
     ),
 )(localization.localize)
+app.command("info", epilog=examples("fcslam info robot1.bag", "fcslam info robot1.mcap --json"))(info.info)
 app.command(
     "convert",
     epilog=examples(

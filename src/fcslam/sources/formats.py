@@ -76,15 +76,25 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
             are given for a recording that is not a bag.
     """
     path = Path(path)
+    kind = format_of(path)
+    if options is not None and not kind.takes_options:
+        raise SourceError(
+            f"{path}: a {kind.name} has neither topics nor tf; options of bags (--scan-topic, --odom-topic, "
+            "--camera-topic, --laser-pose) go with ROS bags only, leave them out"
+        )
+    return kind.open(path, name or robot_name(path), options)
+
+
+def format_of(path: Path) -> Format:
+    """The format of the recording at ``path``, by its content.
+
+    Raises:
+        SourceError: as ``open_source``.
+    """
     content = b"" if path.is_dir() else head(path)
     for kind in FORMATS:
         if kind.recognises(path, content):
-            if options is not None and not kind.takes_options:
-                raise SourceError(
-                    f"{path}: a {kind.name} has neither topics nor tf; options of bags (--scan-topic, --odom-topic, "
-                    "--camera-topic, --laser-pose) go with ROS bags only, leave them out"
-                )
-            return kind.open(path, name or robot_name(path), options)
+            return kind
     *others, last = (kind.name for kind in FORMATS)
     known = f"{', '.join(others)} or {last}"
     if path.is_dir():

@@ -1,0 +1,83 @@
+"""`fcslam info`: what is in a recording."""
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.cli.output import answers, print_line
+from fcslam.cli.recordings import CameraTopic, LaserPose, OdomTopic, ScanTopic, bag_options
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from fcslam.sources.inspection import Inspection, LaserContents
+
+GAPS_SHOWN = 3
+
+
+def info(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording in any known format.")],
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    scan_topic: ScanTopic = None,
+    odom_topic: OdomTopic = None,
+    camera_topic: CameraTopic = None,
+    laser_pose: LaserPose = None,
+) -> None:
+    """Say what is in a recording, and whether it can be mapped; if not, why."""
+    from fcslam.sources.inspection import inspect
+
+    found = inspect(recording, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
+    console = answers()
+    if as_json:
+        print_line(console, json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
+        return
+    for line in _lines(found):
+        print_line(console, line)
+
+
+def _lines(found: "Inspection") -> "Iterator[str]":
+    yield f"{found.path}: {found.format}"
+    if found.bag is not None:
+        yield "topics:"
+        for topic in found.bag.topics:
+            rate = "" if topic.rate_hz is None else f", {topic.rate_hz:.1f} Hz"
+            frame = found.bag.laser_frames.get(topic.name)
+            seen_from = "" if frame is None else f", frame {frame}"
+            yield f"  {topic.name}: {topic.type}, {topic.messages} messages{rate}{seen_from}"
+        if found.bag.transforms:
+            yield f"transforms: {', '.join(f'{parent} -> {child}' for parent, child in found.bag.transforms)}"
+    if found.problem is not None:
+        yield f"cannot be mapped: {found.problem}"
+        return
+    yield f"{found.scans} scans in {found.duration_s:.1f} s, path of {found.path_length_m:.1f} m by odometry"
+    for number, laser in enumerate(found.lasers):
+        yield f"laser {number}: {_laser(laser)}"
+    if found.camera is not None:
+        camera = found.camera
+        yield f"camera: {found.images} images of {camera.width} x {camera.height} pixels"
+    if found.gaps:
+        longest = sorted(found.gaps, key=lambda gap: -gap.length_s)[:GAPS_SHOWN]
+        shown = ", ".join(f"{gap.length_s:.1f} s after {gap.after_s:.1f} s" for gap in longest)
+        yield f"gaps without scans: {len(found.gaps)}; the longest: {shown}"
+    if found.steps_back:
+        yield f"stamps that step back: {found.steps_back}, by up to {found.largest_step_back_s:.3f} s"
+    if found.faults:
+        yield f"faults: {found.faults}"
+    yield from found.notes
+    yield "can be mapped"
+
+
+def _laser(laser: "LaserContents") -> str:
+    model, (x, y, theta) = laser.model, laser.model.T_base_laser
+    first_deg = math.degrees(model.angle_min_rad)
+    last_deg = first_deg + math.degrees(model.beams.span_rad)
+    rate = "" if laser.rate_hz is None else f" at {laser.rate_hz:.1f} Hz"
+    return (
+        f"{laser.scans} scans{rate}, {model.beam_count} beams from {first_deg:.1f} to {last_deg:.1f} degrees, "
+        f"range up to {model.max_range_m:g} m, mounted at x {x:g} m, y {y:g} m, {math.degrees(theta):.1f} degrees"
+    )

@@ -1,0 +1,121 @@
+"""What is in a recording of any format, and whether it can be mapped."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fcslam.errors import SourceError
+from fcslam.geometry.beams import is_same_laser
+from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry
+from fcslam.sources.bags.contents import BagContents, bag_contents
+from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.rosbag import RosBag
+from fcslam.sources.formats import format_of, open_source
+from fcslam.sources.source import Source
+
+GAP_S, GAP_INTERVALS = 1.0, 5.0
+"""A longer time without a scan, in seconds and in usual intervals between scans, is a gap."""
+
+
+@dataclass(frozen=True, slots=True)
+class LaserContents:
+    """One laser of a recording."""
+
+    model: LaserModel
+    scans: int
+    rate_hz: float | None
+    """Usual, by the stamps; None without time between scans."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A time without a scan."""
+
+    after_s: float
+    """Time from the first scan to the last one before it, seconds."""
+    length_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """What is in a recording."""
+
+    path: Path
+    format: str
+    bag: BagContents | None
+    """None for other formats."""
+    scans: int = 0
+    duration_s: float = 0.0
+    path_length_m: float = 0.0
+    """By odometry."""
+    lasers: tuple[LaserContents, ...] = ()
+    odometry: int = 0
+    """Readings of the odometry besides those that the scans carry."""
+    camera: CameraModel | None = None
+    images: int = 0
+    gaps: tuple[Gap, ...] = ()
+    steps_back: int = 0
+    """Stamps of scans that are before the stamp of the scan before."""
+    largest_step_back_s: float = 0.0
+    faults: str = ""
+    """What was wrong with it and is tolerated, one line; empty without faults."""
+    notes: tuple[str, ...] = ()
+    """Choices that were made, such as topics."""
+    problem: str | None = None
+    """Why it cannot be mapped, one line; None if it can."""
+
+
+def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
+    """Read a recording once or twice and say what is in it.
+
+    Raises:
+        SourceError: it is no recording of a known format, or cannot be read at all.
+    """
+    source = open_source(path, options)
+    name = format_of(path).name
+    bag = bag_contents(path) if isinstance(source, RosBag) else None
+    try:
+        return _inspected(source, path, name, bag)
+    except SourceError as error:
+        return Inspection(path, name, bag, problem=str(error))
+
+
+def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -> Inspection:
+    survey = source.survey()
+    stamps: list[float] = []
+    by_laser: list[tuple[LaserModel, list[float]]] = [(laser, []) for laser in survey.lasers]
+    odometry = images = 0
+    for record in source.records():
+        match record:
+            case LaserScan():
+                stamps.append(record.stamp)
+                for laser, own in by_laser:
+                    if is_same_laser(record.laser, laser):
+                        own.append(record.stamp)
+                        break
+            case Odometry():
+                odometry += 1
+            case CameraImage():
+                images += 1
+    steps_s = np.diff(np.array(stamps))
+    back_s = -steps_s[steps_s < 0.0]
+    return Inspection(
+        path, name, bag, len(stamps), survey.duration_s, survey.path_length_m,
+        tuple(LaserContents(laser, len(own), _rate_hz(own)) for laser, own in by_laser),
+        odometry, survey.camera, images, _gaps(stamps), len(back_s), float(back_s.max(initial=0.0)),
+        str(source.faults) if source.faults else "", survey.notes,
+    )  # fmt: skip
+
+
+def _rate_hz(stamps: list[float]) -> float | None:
+    steps_s = np.diff(np.sort(stamps))
+    usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
+    return 1.0 / usual_s if usual_s > 0.0 else None
+
+
+def _gaps(stamps: list[float]) -> tuple[Gap, ...]:
+    ordered = np.sort(stamps)
+    steps_s = np.diff(ordered)
+    limit_s = max(GAP_S, GAP_INTERVALS * float(np.median(steps_s))) if len(steps_s) else np.inf
+    return tuple(Gap(float(ordered[k] - ordered[0]), float(steps_s[k])) for k in np.flatnonzero(steps_s > limit_s))

@@ -1,0 +1,80 @@
+"""What `fcslam info` finds in recordings of each format, mappable or not."""
+
+import pytest
+
+from fcslam.errors import SourceError
+from fcslam.sources import BagOptions, write_recording
+from fcslam.sources.inspection import inspect
+from tests.sources import camera_records, carmen_text
+from tests.sources.bag_messages import BEAMS, LASER_POSE, drive, mounted, odom, save, scan, text
+
+
+def without_tf(said):
+    return [message for message in said if not message.topic.startswith("/tf")]
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_a_bag_names_its_topics_rates_and_frames(tmp_path, suffix):
+    said = [*drive(40), text(101.0)]
+    found = inspect(save(tmp_path / f"run{suffix}", said))
+    assert found.format == "ROS bag"
+    assert found.problem is None
+    topics = {topic.name: topic for topic in found.bag.topics}
+    assert sorted(topics) == ["/chatter", "/odom", "/scan", "/tf_static"]
+    assert topics["/scan"].type == "sensor_msgs/LaserScan"
+    assert (topics["/scan"].messages, topics["/chatter"].rate_hz) == (40, None)
+    assert topics["/scan"].rate_hz == pytest.approx(5.0)
+    assert topics["/odom"].rate_hz == pytest.approx(10.0, rel=0.02)
+    assert found.bag.transforms == (("base_link", "laser"),)
+    assert found.bag.laser_frames == {"/scan": "laser"}
+    (laser,) = found.lasers
+    assert (laser.scans, laser.model.beam_count) == (40, BEAMS)
+    assert laser.model.T_base_laser == pytest.approx(LASER_POSE)
+    assert laser.rate_hz == pytest.approx(5.0)
+    assert (found.scans, found.steps_back, found.gaps, found.camera) == (40, 0, (), None)
+    assert found.duration_s == pytest.approx(7.8)
+
+
+def test_a_bag_that_cannot_be_mapped_is_shown_with_the_reason(tmp_path):
+    path = save(tmp_path / "run.bag", without_tf(drive(40)))
+    found = inspect(path)
+    assert "it does not say where the laser of /scan sits" in found.problem
+    assert {topic.name for topic in found.bag.topics} == {"/odom", "/scan"}
+    assert found.scans == 0
+    assert inspect(path, BagOptions(laser_poses=((0.0, 0.0, 0.0),))).problem is None
+    lonely = inspect(save(tmp_path / "lonely.bag", [mounted(), odom(100.0, (0.0, 0.0, 0.0))]))
+    assert "no laser scans" in lonely.problem
+
+
+def test_gaps_and_steps_back_are_counted(tmp_path):
+    early = [message for message in drive(60) if not 104.0 < message.bag_time < 107.0 or message.topic != "/scan"]
+    late = scan(111.9, bag_time=112.0), scan(111.5, bag_time=112.1)
+    found = inspect(save(tmp_path / "run.bag", [*early, *late, odom(112.2, (0.0, 0.0, 0.0))]))
+    (gap,) = found.gaps
+    assert gap.length_s == pytest.approx(3.2, abs=0.3)
+    assert gap.after_s == pytest.approx(3.8, abs=0.3)
+    assert found.steps_back == 1
+    assert found.largest_step_back_s == pytest.approx(0.4)
+    assert "steps back in time kept: 1" in found.faults
+
+
+def test_a_carmen_log_has_no_topics(tmp_path):
+    path = carmen_text.save(tmp_path / "run.clf", carmen_text.drive(30))
+    found = inspect(path)
+    assert (found.format, found.bag, found.scans, found.problem) == ("CARMEN log", None, 30, None)
+    assert found.path_length_m > 0.0
+
+
+def test_a_recording_folder_shows_its_camera(tmp_path):
+    write_recording(tmp_path / "run", (camera_records.LASER,), camera_records.CAMERA, camera_records.drive(20))
+    found = inspect(tmp_path / "run")
+    assert (found.format, found.scans, found.images, found.odometry) == ("recording folder", 20, 20, 20)
+    assert found.camera == camera_records.CAMERA
+
+
+def test_what_is_no_recording_is_refused(tmp_path):
+    (tmp_path / "letter.txt").write_text("dear reader\n")
+    with pytest.raises(SourceError, match="no recording of a known format"):
+        inspect(tmp_path / "letter.txt")
+    with pytest.raises(SourceError):
+        inspect(tmp_path / "nowhere.bag")
