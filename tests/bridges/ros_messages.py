@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, ODOMETRY, SCAN, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
 CODEC = MessageCodec(ros1=False)
@@ -37,6 +37,23 @@ def odometry(stamp, pose, frame="odom", child="base_link"):
 
 def transform(stamp, parent, child, pose=LASER_POSE):
     return CODEC.transforms(header(stamp, parent), child, in_space(np.array(pose)))
+
+
+def image(stamp, width=8, height=6):
+    data = np.zeros(width * height, np.uint8)
+    return CODEC.make(
+        IMAGE, header=header(stamp, "camera"), height=height, width=width, encoding="mono8", is_bigendian=0, step=width,
+        data=data,
+    )  # fmt: skip
+
+
+def camera_info(stamp, width=8, height=6):
+    region = CODEC.make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    K = np.array((5.0, 0, 4.0, 0, 5.0, 3.0, 0, 0, 1.0))
+    return CODEC.make(
+        CAMERA_INFO, header=header(stamp, "camera"), height=height, width=width, distortion_model="plumb_bob",
+        d=np.zeros(5), k=K, r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=region,
+    )  # fmt: skip
 
 
 def encoded(kind, message):

@@ -6,8 +6,10 @@ import pytest
 from fcslam.bridges.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, LiveSensors
 from fcslam.bridges.topics import SensorTopics
 from fcslam.errors import NetworkError
+from fcslam.records import CameraImage
 from fcslam.sources import BagOptions
-from tests.bridges.ros_messages import KINDS, LASER_POSE, encoded, odometry, scan, transform
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE
+from tests.bridges.ros_messages import KINDS, LASER_POSE, camera_info, encoded, image, odometry, scan, transform
 
 RANGES = np.full(180, 5.0)
 
@@ -15,15 +17,16 @@ RANGES = np.full(180, 5.0)
 class Robot:
     """Feeds messages to sensors and keeps what comes out."""
 
-    def __init__(self, odometry="/odom", **options):
+    def __init__(self, odometry="/odom", kinds=KINDS, camera=None, info=None, **options):
         self.said = []
-        topics = SensorTopics(KINDS, ("/scan",), odometry, ("/tf", "/tf_static"))
+        self.kinds = kinds
+        topics = SensorTopics(kinds, ("/scan",), odometry, ("/tf", "/tf_static"), camera, info)
         self.sensors = LiveSensors(topics, "", BagOptions(**options), False, self.said.append)
         self.records = []
         self.now_s = 0.0
 
     def hears(self, topic, message):
-        payload = message if isinstance(message, bytes) else encoded(KINDS[topic], message)
+        payload = message if isinstance(message, bytes) else encoded(self.kinds[topic], message)
         self.records += self.sensors.add(topic, payload, self.now_s, 1)
         return self
 
@@ -143,3 +146,29 @@ def test_a_tilted_laser_is_refused():
     robot.hears("/tf_static", lying)
     with pytest.raises(NetworkError, match="tilted by 90 degrees"):
         robot.drives(np.arange(1.0, 9.0))
+
+
+def test_tf_is_not_decoded_once_the_mounting_is_known(robot):
+    robot.drives(np.arange(1.0, 7.0))
+    robot.hears("/tf", b"no message")
+    assert robot.said == []
+
+
+@pytest.fixture
+def camera_robot():
+    """A robot with a camera of raw images that is ready."""
+    robot = Robot(kinds={**KINDS, "/image": IMAGE, "/camera_info": CAMERA_INFO}, camera="/image", info="/camera_info")
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/tf_static", transform(0.0, "base_link", "camera", (0.1, 0.0, 0.0)))
+    robot.hears("/camera_info", camera_info(0.0))
+    return robot.drives(np.arange(1.0, 7.0))
+
+
+def test_raw_images_become_records_at_a_rate_that_is_enough(camera_robot):
+    for step in range(10):
+        camera_robot.now_s = 0.1 * step
+        camera_robot.hears("/image", image(6.0))
+    images = [record for record in camera_robot.records if isinstance(record, CameraImage)]
+    assert len(images) == 3
+    assert images[0].T_odom_base == pytest.approx([6.0, 0.0, 0.0])
+    assert images[0].camera.T_base_camera.translation_m == pytest.approx((0.1, 0.0, 0.0))

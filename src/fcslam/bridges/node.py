@@ -35,6 +35,7 @@ SAVE_MAP, FINISH, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "initialpos
 _LONGEST_INBOX = 20_000
 """Most messages that wait to be read; beyond, newer ones are lost."""
 _POLL_S = 0.1
+_SETTLES_FOR_ODOMETRY = 4
 _SILENCE_S = 2.0
 """A pause of the scans that is longer is told."""
 _DEPTHS = {SCAN: 100, COMPRESSED_IMAGE: 10, IMAGE: 10, CAMERA_INFO: 1}
@@ -72,13 +73,16 @@ def await_sensors(
 ) -> SensorTopics:
     """The topics of the robot's sensors, once they are there; ``settle_s`` later, so that all of them are.
 
+    Odometry may also come from tf, which is there early on most robots. So its topic is given more time to appear.
+
     Raises:
         NetworkError: a topic is missing, or of another type.
     """
     end_s = time.monotonic() + timeout_s
     while True:
         try:
-            choose_sensor_topics(network.endpoints(), namespace, options)
+            if choose_sensor_topics(network.endpoints(), namespace, options).odometry is None:
+                time.sleep(_SETTLES_FOR_ODOMETRY * settle_s)
             time.sleep(settle_s)
             return choose_sensor_topics(network.endpoints(), namespace, options)
         except NetworkError:

@@ -49,16 +49,17 @@ class Ros2Network:
             raise NetworkError(
                 f"DDS domain {domain} cannot be joined ({error}); check the network and CYCLONEDDS_URI"
             ) from error
-        self._alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
+        alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
         self._any = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
         self._waitset = core.WaitSet(self._participant)
-        self._builtin = [
+        readers = [
             (publishes, builtin.BuiltinDataReader(self._participant, topic))
             for publishes, topic in (
                 (True, builtin.BuiltinTopicDcpsPublication),
                 (False, builtin.BuiltinTopicDcpsSubscription),
             )
         ]
+        self._builtin = [(*known, core.ReadCondition(known[1], alive)) for known in readers]
         self._readers: tuple[tuple[Any, Deliver], ...] = ()
         self._topics: dict[tuple[str, str], Any] = {}
         self._closed = threading.Event()
@@ -67,12 +68,10 @@ class Ros2Network:
 
     def endpoints(self) -> Sequence[Endpoint]:
         """As in RosNetwork."""
-        from cyclonedds.core import ReadCondition
-
         own = self._participant.guid
         found = []
-        for publishes, reader in self._builtin:
-            for sample in reader.read(_ENDPOINTS_READ, ReadCondition(reader, self._alive)):
+        for publishes, reader, alive in self._builtin:
+            for sample in reader.read(_ENDPOINTS_READ, alive):
                 topic, kind = _TOPIC.fullmatch(sample.topic_name or ""), _TYPE.fullmatch(sample.type_name or "")
                 if topic and kind:
                     quality = _quality_of(sample.qos)

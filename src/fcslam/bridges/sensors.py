@@ -6,12 +6,22 @@ for the odometry at its stamp. If that does not come, it gets the nearest pose w
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from math import inf
 
 from fcslam.bridges.topics import SensorTopics
 from fcslam.errors import NetworkError
 from fcslam.records import Beams, SensorRecord
 from fcslam.sources.bags.camera import Calibration, calibration_of, image_of
-from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN, MessageCodec
+from fcslam.sources.bags.codec import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    ODOMETRY,
+    OLD_TRANSFORMS,
+    SCAN,
+    TRANSFORMS,
+    MessageCodec,
+)
 from fcslam.sources.bags.merging import ScanMerger
 from fcslam.sources.bags.messages import (
     BeamsError,
@@ -43,6 +53,8 @@ PATIENCE_S = 5.0
 """Time that a live robot waits for the first odometry, for the mounting of a laser and for a calibration."""
 ODOMETRY_PATIENCE_S = 1.0
 """Time that a scan waits for its odometry."""
+RAW_IMAGE_PERIOD_S = 0.4
+"""Least time between two raw images that are read; places are a metre apart, and an image takes 10 ms to encode."""
 STEPS_BACK_FOR_RESTART = 3
 """Number of scans in a row that are far back in time until the clock is taken to have stepped back."""
 _LONGEST_WAIT = 10_000
@@ -78,6 +90,7 @@ class LiveSensors:
         self._counts: Counter[str] = Counter()
         self._began: float | None = None
         self._misplaced = 0
+        self._next_image_s = -inf
         self._waiting_since: float | None = None
         self._beams: list[Beams] = []
         """Usual beams of each laser, once they are known."""
@@ -100,6 +113,8 @@ class LiveSensors:
             NetworkError: the robot cannot be mapped: a mounting or the odometry is missing.
         """
         self._counts[topic] += 1
+        if self._is_needless(self._topics.kinds[topic], now_s):
+            return
         try:
             items = self._decoded(topic, payload, received_ns)
         except BeamsError as error:
@@ -152,6 +167,15 @@ class LiveSensors:
                 yield from self._recorded(paired, entry)
         for number, entry in self._pairing.flush():
             yield from self._recorded(number, entry)
+
+    def _is_needless(self, kind: str, now_s: float) -> bool:
+        """Whether a message need not be decoded, which would cost more time than all scans."""
+        if kind == IMAGE:
+            if now_s < self._next_image_s:
+                return True
+            self._next_image_s = now_s + RAW_IMAGE_PERIOD_S
+        # Once the mountings are known, tf has nothing but the odometry.
+        return self._rig is not None and self._topics.odometry is not None and kind in (TRANSFORMS, OLD_TRANSFORMS)
 
     def _begin(self) -> None:
         """Begin to read scans; those before have no part in it."""

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.bridges.parameters import NodeParameters
+    from fcslam.live.records import RobotEvent
     from fcslam.live.robot import Robot
     from fcslam.sources import BagOptions
 
@@ -50,6 +51,7 @@ def map_live(
     """
     from fcslam.bridges.addresses import open_network, parse_address
     from fcslam.bridges.node import RobotNode, await_sensors
+    from fcslam.live.records import EventKind
     from fcslam.runs import prepare_output
 
     place = parse_address(address)
@@ -60,10 +62,14 @@ def map_live(
     def notify(line: str) -> None:
         print_line(console, line)
 
+    def tell(event: "RobotEvent") -> None:
+        if event.kind is not EventKind.CORRECTED:  # there are many
+            notify(event.text)
+
     with (
         closing(open_network(place, domain)) as network,
         compiled(console),
-        start(name or place.robot, on_event=lambda event: notify(event.text)) as robot,
+        start(name or place.robot, on_event=tell) as robot,
     ):
         topics = await_sensors(network, place.namespace, options, parameters.topic_timeout)
         for note in topics.notes:
