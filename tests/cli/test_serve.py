@@ -289,5 +289,8 @@ def test_tokens_are_read_again_at_sighup(credentials, tmp_path):
         assert hang_up(yaml.safe_dump({"tokens": ended})) == 401
         assert hang_up(yaml.safe_dump({"tokens": entries})) == 200
         assert hang_up(yaml.safe_dump({"tokens": others})) == 401
+        lines = [json.loads(line) for line in (tmp_path / "data" / "audit.jsonl").read_text().splitlines()]
+        read = [line["content"]["changed"] for line in lines if line["action"] == "tokens read again"]
+        assert read == [[], ["boss"], ["boss"], ["boss"]]
     finally:
         service.kill()
