@@ -17,10 +17,10 @@ RANGES = np.full(180, 5.0)
 class Robot:
     """Feeds messages to sensors and keeps what comes out."""
 
-    def __init__(self, odometry="/odom", kinds=KINDS, camera=None, info=None, **options):
+    def __init__(self, odometry="/odom", kinds=KINDS, camera=None, info=None, scans=("/scan",), **options):
         self.said = []
         self.kinds = kinds
-        topics = SensorTopics(kinds, ("/scan",), odometry, ("/tf", "/tf_static"), camera, info)
+        topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info)
         self.sensors = LiveSensors(topics, "", BagOptions(**options), False, self.said.append)
         self.records = []
         self.now_s = 0.0
@@ -137,6 +137,32 @@ def test_silence_of_the_odometry_is_told():
 def test_silence_of_a_laser_is_told(robot):
     with pytest.raises(NetworkError, match="/scan: no scan that can be read arrived within 5 s"):
         robot.waits(PATIENCE_S + 1.0)
+
+
+def two_lasers(**options):
+    robot = Robot(kinds={**KINDS, "/rear": KINDS["/scan"]}, scans=("/scan", "/rear"), **options)
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/tf_static", transform(0.0, "base_link", "rear", (-0.3, 0.0, 3.0)))
+    return robot
+
+
+def test_the_scans_of_two_lasers_come_in_the_order_of_their_stamps():
+    robot = two_lasers()
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0)))
+        robot.hears("/rear", scan(stamp - 0.25, RANGES, "rear"))
+        robot.hears("/scan", scan(stamp - 0.5, RANGES))
+    assert robot.stamps == sorted(robot.stamps)
+    assert len(robot.records) >= 14
+    assert [record.laser.T_base_laser[0] for record in robot.records[:2]] == pytest.approx([LASER_POSE[0], -0.3])
+
+
+def test_two_lasers_of_one_frame_are_refused():
+    robot = two_lasers()
+    for stamp in np.arange(1.0, 9.0):
+        robot.hears("/scan", scan(stamp, RANGES)).hears("/rear", scan(stamp, RANGES))
+    with pytest.raises(NetworkError, match="the scans of /scan and /rear have one frame"):
+        robot.hears("/odom", odometry(1.0, (0.0, 0.0, 0.0)))
 
 
 def test_a_tilted_laser_is_refused():

@@ -274,6 +274,12 @@ class LiveSensors:
     def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
         if self._options.laser_poses:
             return [Mounting(pose, upside_down=False, tilt_rad=0.0) for pose in self._options.laser_poses]
+        frames = [scan.frame for scan in first]
+        if len(set(frames)) < len(frames):
+            raise NetworkError(
+                f"the scans of {' and '.join(self._topics.scans)} have one frame, so tf cannot say where each laser "
+                "sits; say it by --laser-pose X,Y,THETA for each"
+            )
         mountings = []
         for topic, scan in zip(self._topics.scans, first, strict=True):
             try:
