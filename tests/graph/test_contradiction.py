@@ -5,7 +5,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
-from fcslam.graph.contradiction import confirmed, leaving
+from fcslam.graph.contradiction import contradictions, leaving
 from fcslam.graph.joint import JointEvidence, solve_jointly
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.records import ReasonCode
@@ -30,7 +30,14 @@ LIMIT = 0.3
     ids=["none", "one against three", "two", "two and a third", "one robot twice", "two against two"],
 )
 def test_who_leaves(pairs, senders, left):
-    assert leaving(dict.fromkeys(pairs, 1.0), senders) == left
+    found = dict.fromkeys(pairs, 1.0)
+    assert leaving(found, found, senders) == left
+
+
+@pytest.mark.parametrize(("third", "left"), [(0.25, {1: 1}), (0.04, {0: 1, 1: 1})], ids=["clearly", "hardly"])
+def test_of_two_that_contradict_the_one_leaves_that_fits_a_third_worse(third, left):
+    contradicting = {(0, 1): 0.7}
+    assert leaving(contradicting, {**contradicting, (0, 2): 0.02, (1, 2): third}, (0, 1, 2)) == left
 
 
 @pytest.mark.parametrize(
@@ -44,7 +51,7 @@ def test_who_leaves(pairs, senders, left):
     ids=["one pair", "one clear pair", "two robots against one", "two sessions of one robot"],
 )
 def test_a_slight_contradiction_counts_if_a_third_robot_confirms_it(found, kept):
-    assert list(confirmed(found, (0, 1, 2, 2), LIMIT)) == kept
+    assert list(contradictions(found, (0, 1, 2, 2), LIMIT)) == kept
 
 
 def world(*scales: float, senders=None) -> JointEvidence:

@@ -6,7 +6,7 @@ two robots agree on tell: those of true paths are far below the closures' stated
 place, and those of contradicting paths reach it everywhere.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,16 @@ _KEPT = 0.5
 _UNCONFIRMED = 2.0
 """Two robots that only each other contradict, nobody else either of them, need this many times the limit."""
 
-Contradictions = Mapping[tuple[int, int], float]
-"""Mean chi-square of the closures between two robots a < b whose paths contradict each other."""
+_CLEARLY_WORSE = 3.0
+"""Of two robots that contradict each other, the one that fits the others so many times worse is wrong."""
+
+Strains = Mapping[tuple[int, int], float]
+"""Mean chi-square of the closures between two robots a < b."""
 
 
 def strained_pairs(
     graph: PoseGraph, owner: NDArray[np.int64], poses: FloatArray, kept: NDArray[np.bool_], limit: float
-) -> Contradictions:
+) -> Strains:
     """Pairs of robots that poses strain: the mean chi-square of the closures between them is over the limit.
 
     A necessary condition of a contradiction: the two alone could only fit better.
@@ -47,7 +50,7 @@ def strained_pairs(
     return {(int(a), int(b)): float(mean) for (a, b), mean in zip(pairs.T, means, strict=True) if mean > limit}
 
 
-def contradictions(
+def strains(
     graph: PoseGraph,
     owner: NDArray[np.int64],
     poses: FloatArray,
@@ -55,8 +58,8 @@ def contradictions(
     within: NDArray[np.bool_],
     limit: float,
     gnc: GncSettings | None = None,
-) -> Contradictions:
-    """Pairs of robots that contradict each other, whatever the other robots measure.
+) -> Strains:
+    """How well every two robots fit together, whatever the other robots measure; nothing if all fit.
 
     Args:
         graph: N variables and E edges.
@@ -64,15 +67,17 @@ def contradictions(
         poses: a joint solution, shape (N, 3), metres and radians.
         weights: its weights, shape (E,).
         within: edges that may count, shape (E,).
-        limit: largest mean chi-square of the closures between two robots, solved without the others.
+        limit: largest mean chi-square in the joint solution at which two robots fit; then they fit alone as well.
         gnc: threshold of inliers.
+
+    Returns:
+        Mean chi-square of the closures between any two robots, solved without the others.
     """
-    found = {}
-    for a, b in strained_pairs(graph, owner, poses, weights > _KEPT, limit):
-        mean = _pair_strain(graph, owner, (a, b), poses, weights, within, gnc)
-        if mean > limit:
-            found[a, b] = mean
-    return found
+    kept = weights > _KEPT
+    if not strained_pairs(graph, owner, poses, kept, limit):
+        return {}
+    every = strained_pairs(graph, owner, poses, kept, 0.0)
+    return {pair: _pair_strain(graph, owner, pair, poses, weights, within, gnc) for pair in every}
 
 
 def _pair_strain(
@@ -100,41 +105,56 @@ def _pair_strain(
     return float(chi2.mean()) if len(chi2) else 0.0
 
 
-def confirmed(found: Contradictions, senders: Sequence[int], limit: float) -> Contradictions:
-    """The contradictions that others confirm, because they contradict one of the two robots as well, or that are clear.
+def contradictions(found: Strains, senders: Sequence[int], limit: float) -> Strains:
+    """The pairs of robots that contradict each other.
+
+    Their mean chi-square is over the limit, and a third robot contradicts one of them as well, or it is over twice the
+    limit.
 
     Args:
-        found: contradicting pairs.
-        senders: as for ``leaving``.
-        limit: largest mean chi-square of a pair that does not contradict.
+        found: all pairs.
+        senders: who sent each robot's packets; robots of one sender, its sessions, count as one.
+        limit: largest mean chi-square of two robots that fit.
     """
-    against = {robot: len(set(others)) for robot, others in _by_robot(set(found), senders)}
+    over = {pair: mean for pair, mean in found.items() if mean > limit}
+    against = _against(over, senders)
     return {
-        (a, b): mean for (a, b), mean in found.items() if mean > _UNCONFIRMED * limit or max(against[a], against[b]) > 1
+        (a, b): mean for (a, b), mean in over.items() if mean > _UNCONFIRMED * limit or max(against[a], against[b]) > 1
     }
 
 
-def leaving(found: Contradictions, senders: Sequence[int]) -> dict[int, int]:
+def leaving(contradicting: Strains, found: Strains, senders: Sequence[int]) -> dict[int, int]:
     """Which robots leave the maps of those that they contradict, and how many others contradict each.
 
-    The robot that most others contradict leaves first, until no two that stay contradict each other. Those that equally
-    many contradict leave together: with nobody else to ask, it is open which of two is wrong.
+    The robot that most others contradict leaves first, until no two that stay contradict each other. Of those that
+    equally many contradict, the one leaves that fits the others clearly worse. If none does, it is open which of them
+    is wrong, and all leave.
 
     Args:
-        found: contradicting pairs.
-        senders: who sent each robot's packets; robots of one sender, its sessions, count as one.
+        contradicting: pairs that contradict each other.
+        found: all pairs.
+        senders: as for ``contradictions``.
     """
     left: dict[int, int] = {}
-    open_pairs = set(found)
-    while open_pairs:
-        against = {robot: len(set(others)) for robot, others in _by_robot(open_pairs, senders)}
+    pairs = contradicting
+    while pairs:
+        against = _against(pairs, senders)
         most = max(against.values())
-        left |= {robot: count for robot, count in against.items() if count == most}
-        open_pairs = {pair for pair in open_pairs if not left.keys() & set(pair)}
+        equal = {robot for robot, count in against.items() if count == most}
+        misfit = dict.fromkeys(equal, 0.0)
+        for pair, mean in found.items():
+            for robot in equal.intersection(pair) if len(equal.intersection(pair)) == 1 else ():
+                misfit[robot] = max(misfit[robot], mean)
+        worst = max(misfit.values())
+        left |= {robot: most for robot in equal if _CLEARLY_WORSE * misfit[robot] >= worst}
+        pairs = {pair: mean for pair, mean in pairs.items() if left.keys().isdisjoint(pair)}
     return left
 
 
-def _by_robot(pairs: set[tuple[int, int]], senders: Sequence[int]) -> Iterator[tuple[int, list[int]]]:
-    """Every robot of a pair, and the senders of those that contradict it."""
-    for robot in sorted({robot for pair in pairs for robot in pair}):
-        yield robot, [senders[b if a == robot else a] for a, b in pairs if robot in (a, b)]
+def _against(pairs: Strains, senders: Sequence[int]) -> dict[int, int]:
+    """How many senders contradict each robot."""
+    others: dict[int, set[int]] = {}
+    for a, b in pairs:
+        others.setdefault(a, set()).add(senders[b])
+        others.setdefault(b, set()).add(senders[a])
+    return {robot: len(others[robot]) for robot in sorted(others)}

@@ -21,8 +21,7 @@ from fcslam.graph.cluster import (
     relative_frame,
 )
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
-from fcslam.graph.contradiction import Contradictions, contradictions, leaving
-from fcslam.graph.contradiction import confirmed as confirmed_pairs
+from fcslam.graph.contradiction import Strains, contradictions, leaving, strains
 from fcslam.graph.evidence import Uniqueness, shortfall
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
@@ -152,10 +151,10 @@ def solve_jointly(
             link for link in joining if _is_confirmed(link, paths, solution, evidence.informative, consistency)
         ]
         # 7. Robots that contradict others get maps of their own.
-        found = contradictions(
+        found = strains(
             evidence.graph, _owners(evidence)[0], solution.poses, solution.weights, within_maps, contradiction, gnc
         )
-        apart |= _separations(confirmed_pairs(found, senders, contradiction), joining, senders, contradiction)
+        apart |= _separations(found, joining, senders, contradiction)
         confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         if len(confirmed) == len(joining):
             own_poses: tuple[FloatArray, ...] = tuple(frozen(path.poses) for path in paths)
@@ -368,14 +367,16 @@ def _is_confirmed(
 
 
 def _separations(
-    found: Contradictions, joining: Sequence[Link], senders: Sequence[int], limit: float
+    found: Strains, joining: Sequence[Link], senders: Sequence[int], limit: float
 ) -> dict[tuple[int, int], Reason]:
     """Pairs of robots that must not share a map any more: those that contradict each other, and links of robots that
     leave to robots that stay. If that keeps all links, robots that leave keep none."""
+    contradicting = contradictions(found, senders, limit)
     apart = {
-        pair: Reason(ReasonCode.PATHS_CONTRADICT, mean, limit, "fleet.contradiction") for pair, mean in found.items()
+        pair: Reason(ReasonCode.PATHS_CONTRADICT, mean, limit, "fleet.contradiction")
+        for pair, mean in contradicting.items()
     }
-    left = leaving(found, senders)
+    left = leaving(contradicting, found, senders)
     alone = {
         (link.a, link.b): Reason(ReasonCode.SEPARATED, max(left.get(link.a, 0), left.get(link.b, 0)))
         for link in joining

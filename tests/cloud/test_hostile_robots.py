@@ -1,0 +1,91 @@
+"""A robot that copies another one's packets and deforms them: it bends nobody's map, and closures.csv tells why."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.cloud.cloud import Cloud
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.packet_log import PacketNumber
+from fcslam.cloud.settings import FleetConfig
+from fcslam.records import ClosureStatus, Constraint, Keyscan, KeyscanId, Place, ReasonCode, frozen
+from fcslam.wire.packets import decode, encode
+from tests import small_fleet
+from tests.small_fleet import fingerprint, in_order, map_of
+
+pytestmark = [pytest.mark.slow, pytest.mark.attack]
+
+PRECISE = frozen(np.diag((1e6, 1e6, 2.5e7)))
+"""The best precision that the cloud does not refuse: 1 mm, 0.2 mrad."""
+
+
+def scaled(packets, name, scale):
+    """What a robot called ``name`` sends that copies another one's packets, all lengths scaled."""
+
+    def changed(body):
+        match body:
+            case Keyscan():
+                ranges_m = frozen(body.ranges_m * scale, np.float32)
+                return replace(body, id=KeyscanId(name, body.id.number), ranges_m=ranges_m)
+            case Constraint():
+                T_i_j = frozen(body.T_i_j * (scale, scale, 1.0))
+                return replace(body, robot=name, T_i_j=T_i_j, information=PRECISE)
+            case Place():
+                keypoints = frozen(body.keypoints * scale, np.float32)
+                return replace(body, id=KeyscanId(name, body.id.number), keypoints=keypoints)
+            case _:
+                return replace(body, robot=name)
+
+    return [replace(packet, robot=name, body=changed(packet.body)) for packet in packets]
+
+
+def fed(packets):
+    cloud = Cloud(FleetConfig(), 0)
+    for packet in packets:
+        cloud.apply(packet)
+    return cloud
+
+
+@pytest.fixture(scope="module")
+def honest():
+    """Three robots on ways through one building."""
+    robots = small_fleet.draw(3, 30.0, seed=2).robots
+    return in_order(decode(encode(packet)) for robot in robots for packet in small_fleet.sent_by(robot))
+
+
+@pytest.fixture(scope="module")
+def packets(honest):
+    copied = [packet for packet in honest if packet.robot == "robot_2"]
+    return in_order([*honest, *scaled(copied, "evil", 1.02)])
+
+
+@pytest.fixture(scope="module")
+def attacked(packets):
+    return fed(packets)
+
+
+def between(result, *, evil):
+    """Decided closures between two robots, with the evil one or without."""
+    found = [c for c in result.closures if c.i.robot != c.j.robot and c.status is not ClosureStatus.CANDIDATE]
+    return [closure for closure in found if ("evil" in (closure.i.robot, closure.j.robot)) is evil]
+
+
+def test_a_scaled_copy_gets_a_map_of_its_own(honest, attacked):
+    alone, found = fed(honest).finalize(), attacked.finalize()
+    assert map_of(alone) == {"robot_1": 0, "robot_2": 0, "robot_3": 0}
+    assert map_of(found) == map_of(alone) | {"evil": 1}
+    now, then = ({robot.robot: robot.T_map_base for robot in result.robots} for result in (found, alone))
+    for name in then:
+        assert np.abs(now[name] - then[name])[:, :2].max() < 0.05
+    kept = [sum(c.status is ClosureStatus.ACCEPTED for c in between(r, evil=False)) for r in (found, alone)]
+    assert kept[0] > 0.9 * kept[1]
+    reasons = {closure.reason.code for closure in between(found, evil=True)}
+    assert ReasonCode.PATHS_CONTRADICT in reasons
+    assert reasons <= {ReasonCode.PATHS_CONTRADICT, ReasonCode.SEPARATED}
+
+
+def test_a_restored_fleet_keeps_robots_apart(packets, attacked):
+    stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in packets}
+    restored = Fleet.restored(FleetConfig(), 0, attacked.fleet.state(), stored.__getitem__)
+    assert fingerprint(restored.conclude()) == fingerprint(attacked.fleet.conclude())
