@@ -105,6 +105,12 @@ def test_poses_do_not_wait_for_the_worker(scans):
         assert len(robot.trajectory().stamps) == len(scans)
 
 
+def test_without_a_scan_there_is_nothing_to_save(robot, tmp_path):
+    with pytest.raises(InputError, match="no scan was added"):
+        robot.save(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_run_can_be_saved_before_the_end(robot, scans, tmp_path):
     drive(robot, scans[:30])
     run = robot.save(tmp_path / "run")

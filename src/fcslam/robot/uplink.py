@@ -60,6 +60,7 @@ class Uplink:
         self._storing = ThreadPoolExecutor(1, "outbox")
         self._unstored: deque[Future[None]] = deque()
         """Packets on their way into the outbox."""
+        self._unstored_lock = threading.Lock()
         self._sender: Sender | None = None
         self._stop = threading.Event()
         if transport is not None:
@@ -89,11 +90,12 @@ class Uplink:
     @property
     def failure(self) -> Exception | None:
         """What ended one of the threads: a cloud that rejects the robot, or an outbox that cannot be used."""
-        while self._unstored and self._unstored[0].done():
-            error = self._unstored[0].exception()
-            if isinstance(error, Exception):
-                return error
-            self._unstored.popleft()
+        with self._unstored_lock:
+            while self._unstored and self._unstored[0].done():
+                error = self._unstored[0].exception()
+                if isinstance(error, Exception):
+                    return error
+                self._unstored.popleft()
         return None if self._sender is None else self._sender.failure
 
     @property
