@@ -169,33 +169,38 @@ def test_a_robot_that_nobody_knows_on_ros_2():
     assert "Traceback" not in error
 
 
-@needs_rclpy
-def test_three_robots_of_ros_2_share_one_map(drawn, tmp_path):
+@pytest.fixture
+def port(tmp_path):
+    """The port of a service."""
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
-    server = fcslam("serve", "--data", tmp_path / "missions", "--port", port)
+    with fcslam("serve", "--data", tmp_path / "missions", "--port", port) as server:
+        yield port
+        server.kill()
+
+
+@needs_rclpy
+def test_three_robots_of_ros_2_share_one_map(drawn, tmp_path, port):
     environment = ros2(44)
     robots, players = [], []
     for robot in drawn.robots:
         scans, folder = list(robot.scans()), tmp_path / robot.name
         folder.mkdir()
         for_player(folder / "scans.npz", scans)
-        robots.append(fcslam(
-            "robot", f"ros2:/{robot.name}", mounting(scans), "-o", folder / "run",
-            "--server", f"http://127.0.0.1:{port}", "--state", folder / "state", **environment,
-        ))  # fmt: skip
+        words = ["robot", f"ros2:/{robot.name}", mounting(scans), "-o", folder / "run", "--state", folder / "state"]
+        robots.append(fcslam(*words, "--server", f"http://127.0.0.1:{port}", **environment))
         players.append((RCLPY, "rclpy_player.py", folder, f"/{robot.name}"))
-    with ThreadPoolExecutor() as pool:
-        drives = list(pool.map(lambda player: play(*player, **environment), players))
-    for robot in robots:
-        ended(robot)
+    try:
+        with ThreadPoolExecutor() as pool:
+            drives = list(pool.map(lambda player: play(*player, **environment), players))
+    finally:
+        for robot in robots:
+            ended(robot)
     assert all(drive["posed"] == drive["played"] for drive in drives)
     end = time.monotonic() + LONGEST_S
     while len(maps := maps_of(port)) != 1 and time.monotonic() < end:
         time.sleep(1.0)
-    server.send_signal(signal.SIGINT)
-    server.communicate(timeout=LONGEST_S)
     assert maps == {0: {"robot_1", "robot_2", "robot_3"}}
 
 
