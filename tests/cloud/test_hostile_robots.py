@@ -78,8 +78,9 @@ def test_a_scaled_copy_gets_a_map_of_its_own(honest, attacked):
     now, then = ({robot.robot: robot.T_map_base for robot in result.robots} for result in (found, alone))
     for name in then:
         assert np.abs(now[name] - then[name])[:, :2].max() < 0.05
-    kept = [sum(c.status is ClosureStatus.ACCEPTED for c in between(r, evil=False)) for r in (found, alone)]
-    assert kept[0] > 0.9 * kept[1]
+    honest_closures = between(found, evil=False)
+    assert ClosureStatus.REVOKED not in {closure.status for closure in honest_closures}
+    assert sum(closure.status is ClosureStatus.ACCEPTED for closure in honest_closures) > 50
     reasons = {closure.reason.code for closure in between(found, evil=True)}
     assert ReasonCode.PATHS_CONTRADICT in reasons
     assert reasons <= {ReasonCode.PATHS_CONTRADICT, ReasonCode.SEPARATED}
