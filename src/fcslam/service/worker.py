@@ -41,7 +41,7 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump
-from fcslam.errors import InputError, PacketError
+from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.processes import obey_parent
 from fcslam.records import Edit, Removal
 from fcslam.runs import Metric, Run
@@ -68,7 +68,7 @@ LIVE_NICENESS = 10
 REPORT_EVERY_S = 0.1
 """Corrections are not stored more often than this: packets that come in wait until they are on the disk."""
 PAUSE_S = 30.0
-"""After the live run folder could not be written."""
+"""After something could not be written."""
 SNAPSHOT_SHARE = 0.05
 """Of the worker's time, for its snapshots: the next worker repeats no more than this part's inverse."""
 SNAPSHOT_EVERY_S = 5.0
@@ -123,6 +123,7 @@ class Worker:
         self._publishing: _Publishing | None = None
         self._resume()
         self._reported, self._report_at = self._resumed_at, -math.inf
+        self._finalize_at = -math.inf
         self._written, self._write_at = self._applied, clock() + SNAPSHOT_EVERY_S
         tell(PROGRESS, self._applied)
 
@@ -201,7 +202,12 @@ class Worker:
         now = self._clock()
         if self._reported >= self._applied or now < self._report_at:
             return False
-        self._store.progress(self._applied, self._corrections())
+        try:
+            self._store.progress(self._applied, self._corrections())
+        except StoreError as error:  # the fleet in memory is worth more than a new worker
+            _log.error("corrections are stored later: %s", error)
+            self._report_at = now + PAUSE_S
+            return False
         self._reported, self._report_at = self._applied, now + REPORT_EVERY_S
         return True
 
@@ -303,10 +309,16 @@ class Worker:
 
     def _finalize(self) -> bool:
         """Answer the oldest request whose packets and edits have all taken effect."""
+        if self._clock() < self._finalize_at:
+            return False
         for asked in self._store.finalizations():
             if asked.run or asked.failure or asked.arrivals > self._arrivals or asked.edits > self._newest_edit:
                 continue
-            self._answer(asked)
+            try:
+                self._answer(asked)
+            except StoreError as error:  # the disk may be freed
+                _log.error("the request for result %d stays: %s", asked.number, error)
+                self._finalize_at = self._clock() + PAUSE_S
             return True
         return False
 

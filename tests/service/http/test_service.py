@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fcslam.errors import ServiceError
+from fcslam.errors import ServiceError, StoreError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.records import Channel, Correction, Keyscan
 from fcslam.runs import open_run
@@ -202,6 +202,24 @@ def test_a_result_is_a_run_folder(mapped):
     run = open_run(Path(answer["run"]))
     assert sum(len(t.stamps) for t in run.trajectories.values()) == 2 * len(POSES)
     assert mapped.ask("POST", f"{API}/finalize", "boss").json()["number"] == answer["number"] + 1
+
+
+def test_a_full_disk_is_507_and_the_result_comes_when_there_is_room(mapped, monkeypatch):
+    def full(*_, **__):
+        raise StoreError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("fcslam.service.http.decisions.LEAST_FREE_BYTES", 2**62)
+        patched.setattr("fcslam.runs.Run.save", full)
+        patched.setattr("fcslam.service.mission_store.MissionStore.answer", full)
+        patched.setattr("fcslam.service.mission_store.MissionStore.progress", full)
+        response = mapped.ask("POST", f"{API}/finalize", "boss")
+        assert response.status_code == 507
+        assert "free" in response.json()["error"]
+    mapped.state.mission.worker.ring()
+    asked = mapped.state.mission.store.finalizations()[-1]
+    assert asked.run
+    assert len(open_run(mapped.state.mission.folder.run(asked.run)).trajectories) == 2
 
 
 def test_a_veto_parts_what_only_it_held_together(mapped):

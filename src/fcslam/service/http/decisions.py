@@ -1,6 +1,7 @@
 """Decisions about the open mission: results, vetoes, detectors."""
 
 import asyncio
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Annotated
@@ -22,6 +23,8 @@ from fcslam.service.http.state import ServiceState
 from fcslam.wire.limits import MAXIMUM_EPOCH
 
 LOOK_EVERY_S = 0.1
+LEAST_FREE_BYTES = 8 * 2**20
+"""A disk with less is full: neither a result nor why there is none can be written reliably."""
 
 EditNumber = Annotated[int, Path(ge=1, le=2**31 - 1)]
 SessionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
@@ -65,6 +68,11 @@ def decision_router(state: ServiceState) -> APIRouter:
                 raise HTTPException(500, asked.failure)
             if asked.run:
                 return Finalized(number=number, run=str(mission.folder.run(asked.run).resolve()))
+            free = shutil.disk_usage(mission.folder.path).free
+            if free < LEAST_FREE_BYTES:
+                raise HTTPException(
+                    507, f"{free} bytes are free on the disk; free some, and the worker writes result {number} by itself"
+                )
             await asyncio.sleep(LOOK_EVERY_S)
         raise HTTPException(503, "the mission was closed; the result will be there when it is open again")
 
