@@ -87,10 +87,10 @@ def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_c
 
     import uvicorn
 
-    from fcslam.service.http.protocol import GuardedProtocol, allow_many_connections
+    from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 
     allow_many_connections()
-    return uvicorn.Server(
+    return GuardedServer(
         uvicorn.Config(
             app,
             http=GuardedProtocol,

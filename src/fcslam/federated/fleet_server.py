@@ -28,6 +28,7 @@ from fcslam.federated.fleet_grid import FleetGrid
 from fcslam.federated.identity import RefusedRequestError, RobotAuthenticator
 from fcslam.federated.replies import printable_line
 from fcslam.federated.tls import Certificates
+from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 
 NEXT_PATH: Final = "/fleet/next"
 ALIVE_PATH: Final = "/fleet/alive"
@@ -77,7 +78,9 @@ class FleetApp:
             f"{REPLY_PATH}{{number:int}}": self._reply,
         }
         routes = [Route(path, self._guarded(handler), methods=["POST"]) for path, handler in operations.items()]
-        return Starlette(routes=routes, exception_handlers={404: self._unknown, 405: self._unknown})
+        app = Starlette(routes=routes, exception_handlers={404: self._unknown, 405: self._unknown})
+        app.router.redirect_slashes = False  # a redirect repeats whatever Host the request names
+        return app
 
     def _guarded(
         self, handler: Callable[[Request, str], Awaitable[Response]]
@@ -178,11 +181,11 @@ def listening(app: FleetApp, listener: socket.socket, certificates: Certificates
         listener: bound socket.
         certificates: of this machine; None for no encryption.
     """
-    server = uvicorn.Server(
+    server = GuardedServer(
         uvicorn.Config(
             app.asgi(),
             loop="asyncio",
-            http="h11",
+            http=GuardedProtocol,
             ssl_certfile=None if certificates is None else certificates.certificate,
             ssl_keyfile=None if certificates is None else certificates.key,
             log_level="critical",

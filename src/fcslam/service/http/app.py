@@ -52,6 +52,7 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
         version=fcslam.__version__,
         docs_url="/docs" if docs else None,
         redoc_url=None,
+        redirect_slashes=False,  # a redirect repeats whatever Host the request names
         lifespan=lifespan,
     )
     add_handlers(app)

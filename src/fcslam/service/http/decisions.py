@@ -71,7 +71,8 @@ def decision_router(state: ServiceState) -> APIRouter:
             free = shutil.disk_usage(mission.folder.path).free
             if free < LEAST_FREE_BYTES:
                 raise HTTPException(
-                    507, f"{free} bytes are free on the disk; free some, and the worker writes result {number} by itself"
+                    507,
+                    f"{free} bytes are free on the disk; free some, and the worker writes result {number} by itself",
                 )
             await asyncio.sleep(LOOK_EVERY_S)
         raise HTTPException(503, "the mission was closed; the result will be there when it is open again")

@@ -7,6 +7,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.routing import Match
 
@@ -45,6 +46,7 @@ def add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(FcslamError, _on_fcslam_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
+    app.add_exception_handler(ClientDisconnect, _on_disconnect)
     app.add_exception_handler(Exception, _on_anything_else)
 
 
@@ -76,6 +78,11 @@ def _on_validation_error(_: Request, error: Exception) -> JSONResponse:
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
     return problem(400, f"{where}: {first['msg']}")
+
+
+def _on_disconnect(_: Request, _error: Exception) -> JSONResponse:
+    """The client left within its request: no fault of the service, and nobody reads the response."""
+    return problem(400, "the body ends before its end")
 
 
 def _on_anything_else(_: Request, error: Exception) -> JSONResponse:

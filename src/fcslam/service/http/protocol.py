@@ -2,10 +2,13 @@
 
 import asyncio
 import resource
+import socket
 import ssl
 from collections import Counter
+from functools import partial
 from typing import Any
 
+import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -15,6 +18,8 @@ IDLE_S = 10.0
 """Time for the header of a request, from the connection or the response before."""
 BODY_S = 60.0
 """Time for a request with its body."""
+HANDSHAKE_S = 10.0
+"""Time for a TLS handshake."""
 _LOOK_EVERY_S = 2.0
 _FILES = 16_384
 """Files that may be open at a time, if the system allows it: connections whose TLS handshake is not done count, too."""
@@ -26,6 +31,22 @@ def allow_many_connections() -> None:
     most = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+
+
+class GuardedServer(uvicorn.Server):
+    """uvicorn's server with a limit for TLS handshakes, which come before a protocol; theirs is a minute."""
+
+    def run(self, sockets: list[socket.socket] | None = None) -> None:
+        """Serve until the server is told to stop."""
+        with asyncio.Runner(loop_factory=self._loop) as runner:
+            runner.run(self.serve(sockets=sockets))
+
+    def _loop(self) -> asyncio.AbstractEventLoop:
+        loop = (self.config.get_loop_factory() or asyncio.new_event_loop)()
+        if self.config.is_ssl:
+            limited = partial(loop.create_server, ssl_handshake_timeout=HANDSHAKE_S)
+            loop.create_server = limited  # type: ignore[method-assign]
+        return loop
 
 
 class GuardedProtocol(H11Protocol):

@@ -1,6 +1,7 @@
 """State shared by all routes of the HTTP service."""
 
 import asyncio
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -15,7 +16,10 @@ from fcslam.service.http.events import EventStream
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission
+from fcslam.service.token_buckets import TokenBuckets
 
+UNKNOWN_PER_S, UNKNOWN_BURST = 50.0, 1000.0
+"""Requests without a known token that are answered 401, on average and at once; further ones are hung up on."""
 ANYBODY = "anybody"
 """The author of what is done without authentication."""
 ACTOR = "actor"
@@ -33,6 +37,8 @@ class ServiceState:
     events: EventStream
     audit: AuditLog
     measures: ServiceMetrics = field(default_factory=ServiceMetrics)
+    unknown: TokenBuckets = field(default_factory=lambda: TokenBuckets(time.monotonic, UNKNOWN_PER_S, UNKNOWN_BURST))
+    """Requests of those who have no known token, all together; requests with one never wait for them."""
     closing: bool = False
     """Whether the service is stopping and takes no new requests."""
     changing: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -63,6 +69,10 @@ class ServiceState:
             tls = request.scope.get("extensions", {}).get("tls", {})
             who = self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
             if who is None:
+                wait_s = self.unknown.wait_s("", 1.0)
+                if wait_s > 0.0:
+                    later = {"Retry-After": str(int(wait_s) + 1), "Connection": "close"}
+                    raise HTTPException(429, "too many requests without a known token", later)
                 headers = {"WWW-Authenticate": "Bearer"}
                 raise HTTPException(
                     401, "no known token and no robot's certificate; send Authorization: Bearer TOKEN", headers
