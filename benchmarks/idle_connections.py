@@ -2,10 +2,10 @@
 
     python benchmarks/idle_connections.py [--idle 2000] [--robots 20] [--seconds 60]
 
-`fcslam serve` runs on this machine without TLS. Robots ask for their news once a second, as live robots with nothing to
-send do, each over a connection of its own, first alone and then while another process holds idle connections and opens a
-new one for each that the service closes. A request that finds its connection closed is sent again, as a robot does; its
-time counts from the first attempt.
+`fcslam serve` runs on this machine without TLS. Robots ask for their news once a second, as live robots with nothing
+to send do, each over a connection of its own: first alone, then while another process holds idle connections and opens
+a new one for each that the service closes. A request that finds its connection closed is sent again, as a robot does;
+its time counts from the first attempt.
 """
 
 import asyncio

@@ -2,6 +2,7 @@
 
 import logging
 import socket
+import ssl
 import threading
 import time
 from datetime import UTC, datetime
@@ -73,7 +74,7 @@ def test_a_tls_handshake_that_does_not_come_is_hung_up_on(tmp_path, monkeypatch)
         with socket.create_connection(listening.getsockname(), timeout=30.0) as connection:
             assert connection.recv(1) == b"", "asyncio's own limit is a minute"
         url = f"https://127.0.0.1:{listening.getsockname()[1]}"
-        assert httpx.get(url, verify=str(tmp_path / "ca.pem")).status_code == 204
+        assert httpx.get(url, verify=ssl.create_default_context(cafile=tmp_path / "ca.pem")).status_code == 204
     finally:
         server.should_exit = True
         thread.join()
