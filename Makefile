@@ -36,7 +36,7 @@ help:
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
-	@echo "make install      create .venv; EXTRAS=dev,train,federated,sim,foxglove adds packages"
+	@echo "make install      create .venv; EXTRAS=dev,train,federated,sim adds packages"
 	@echo "make learning     install torch and Flower, for training the detector, if they are available"
 	@echo "make gl           install the GL library of the simulated cameras, if permitted"
 	@echo "make docs         write docs/settings.md, the reference of all settings"
