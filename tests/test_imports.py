@@ -38,6 +38,7 @@ ROOMS = [
     "federated",
     "simulation",
     "driving",
+    "mission_file",
     "mission",
     "localization",
     "api",

@@ -11,6 +11,7 @@ from fcslam.config import load, parse
 from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
 from fcslam.mission import MissionConfig, Watch, run_mission
+from fcslam.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
 from fcslam.runs import OccupancyMap, Run, prepare_output
 from fcslam.sources import BagOptions, Source
@@ -37,6 +38,7 @@ def map_recordings(
     progress: Watch | None = None,
     force: bool = False,
     processes: int = 1,
+    onto: StrPath | None = None,
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
@@ -58,6 +60,9 @@ def map_recordings(
         progress: called every 50 scans, and before the maps are fused, with the state of the mission.
         force: replace a run that is at ``output``.
         processes: number of robots that are mapped at a time, each in a process of its own; it does not change the run.
+        onto: mission file, or run folder with one, of an earlier mission that goes on. The run is that of all
+            recordings at once; the earlier ones are not needed. Without ``config`` the mission keeps its settings of
+            the cloud.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -65,9 +70,11 @@ def map_recordings(
     """
     if output is not None:
         prepare_output(Path(output), force)
-    settings = settings_of(config, seed, join_maps)
+    earlier = None if onto is None else read_mission(Path(onto))
+    settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
     robots = split_recordings(_opened(recordings, bag_options), split)
-    run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes), side_by_side(processes))
+    drive = side_by_side(processes)
+    run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes), drive, earlier)
     if output is not None:
         run.save(output, force)
     return run
@@ -117,6 +124,13 @@ def localize(
     if output is not None:
         run.save(output, force)
     return run
+
+
+def continued_config(earlier: SavedMission | None) -> MissionConfig:
+    """The default configuration, with the cloud's settings of an earlier mission if there is one."""
+    if earlier is None:
+        return MissionConfig()
+    return MissionConfig(seed=earlier.config.seed, fleet=earlier.config.fleet, map=earlier.config.map)
 
 
 def split_recordings(recordings: list[Source], parts: int) -> list[Source]:

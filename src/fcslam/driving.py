@@ -7,13 +7,14 @@ import pickle
 import queue
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from multiprocessing.process import BaseProcess
 from typing import Any, Final
 
 from fcslam.cloud.report import Track
+from fcslam.cloud.sessions import session_name
 from fcslam.errors import FcslamError
 from fcslam.processes import obey_parent, start_method
 from fcslam.records import Keyscan, LaserScan
@@ -21,7 +22,7 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
 from fcslam.sources import Source
 from fcslam.sources.faults import Fault, Faults
-from fcslam.wire.packets import SizedPacket, measure
+from fcslam.wire.packets import SizedPacket, decode, measure, readdress
 
 SCANS_PER_LEG: Final = 50
 _POLL_S: Final = 1.0
@@ -36,8 +37,8 @@ class Leg:
     packets: tuple[SizedPacket, ...]
     stamps: tuple[float, ...]
     """Of the scans, seconds."""
-    tracks: tuple[Track, ...] = ()
-    """All scans by session; empty before the last leg."""
+    tracks: Mapping[str, Track] = field(default_factory=dict)
+    """All scans, by the name of the session; empty before the last leg."""
     faults: Faults | None = None
     """What was wrong with the recording; None before the last leg."""
 
@@ -102,7 +103,22 @@ def _legs(source: Source, config: RobotConfig) -> Iterator[Leg]:
             packets, stamps = [], []
     packets += map(measure, robot.finish())
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
-    yield Leg(robot.robot, tuple(packets), tuple(stamps), tuple(map(track_of, robot.tracks)), faults)
+    tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}
+    yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults)
+
+
+def continued(legs: Iterator[Leg], first_epoch: int) -> Iterator[Leg]:
+    """The legs of a robot that had so many sessions before."""
+    for leg in legs:
+        packets = tuple(_readdressed(sized, first_epoch) for sized in leg.packets)
+        names = (session_name(leg.robot, first_epoch + epoch) for epoch in range(len(leg.tracks)))
+        yield replace(leg, packets=packets, tracks=dict(zip(names, leg.tracks.values(), strict=True)))
+
+
+def _readdressed(sized: SizedPacket, first_epoch: int) -> SizedPacket:
+    packet = sized.packet
+    data = readdress(sized.data, first_epoch + packet.epoch, packet.sequence)
+    return SizedPacket(decode(data), data)
 
 
 def track_of(poses: ScanTrack) -> Track:

@@ -4,22 +4,26 @@ sources -> robot (LiDAR SLAM, features) -> packets -> cloud (places -> graph -> 
 """
 
 import heapq
+import itertools
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pydantic import Field
 
 from fcslam.cloud.cloud import Cloud
+from fcslam.cloud.edits import in_force
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.report import Track, keyscan_track, run_of, traffic_metrics
-from fcslam.cloud.sessions import check_robot, robot_of, session_name
-from fcslam.cloud.settings import FleetConfig
+from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of
+from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.config import Settings, dump
-from fcslam.driving import Drive, Leg, one_by_one
+from fcslam.driving import Drive, Leg, continued, one_by_one
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.metrics.jumps import JumpLimits
-from fcslam.records import Veto
+from fcslam.mission_file import EMPTY, SavedMission, mission_bytes
+from fcslam.records import Edit, Veto
 from fcslam.robot.frontend import RobotConfig
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
@@ -28,6 +32,9 @@ from fcslam.wire.checks import check_name
 from fcslam.wire.ledger import Counter
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import SizedPacket, measure
+
+AUTHOR = "fcslam map"
+"""The author of vetoes that are given with the recordings."""
 
 
 class MissionConfig(Settings):
@@ -64,39 +71,53 @@ def run_mission(
     watch: Watch = lambda _: None,
     vetoes: Sequence[Veto] = (),
     drive: Drive = one_by_one,
+    onto: SavedMission | None = None,
 ) -> Run:
-    """Map recordings together, one robot each, without the closures of ``vetoes``; ``drive`` runs the robots.
+    """Map recordings together, one robot each.
+
+    Args:
+        sources: the recordings.
+        config: all settings.
+        watch: called with the progress.
+        vetoes: closures that must not count.
+        drive: runs the robots.
+        onto: an earlier mission that goes on; its packets take effect again, and the result is that of all recordings
+            at once. A robot of it that has a recording again begins a new session.
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
         ConfigError: a veto names a robot that is not there.
         OutputError: a robot's name cannot be a file name.
     """
+    onto = onto or EMPTY
     _check_robots(sources)
-    _check_vetoes(vetoes, [source.name for source in sources])
-    cloud = MissionCloud(config)
-    cloud.fleet.edit(vetoes)
-    meter = _Meter(watch, cloud.fleet, [source.name for source in sources])
+    _check_vetoes(vetoes, [*onto.packets, *(source.name for source in sources)])
+    cloud = MissionCloud(config, onto, vetoes)
+    meter = _Meter(watch, cloud.fleet, [*onto.packets, *(source.name for source in sources)])
     with drive(sources, config.robot) as robots:
-        streams = [_packets(legs, meter) for legs in robots]
+        new = [continued(legs, onto.epochs(source.name)) for legs, source in zip(robots, sources, strict=True)]
+        streams = [_packets(legs, meter) for legs in (*onto.legs(), *new)]
         for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
             cloud.apply(sent)
     meter.report(fusing=True)
-    tracks = {
-        session_name(robot, epoch): track
-        for robot, sessions in meter.tracks.items()
-        for epoch, track in enumerate(sessions)
-    }
-    return cloud.run(tracks, meter.scans, meter.recorded_s)
+    return cloud.run(meter.tracks, meter.scans, meter.recorded_s)
 
 
 class MissionCloud:
     """The cloud of a mission within one process; it counts what is sent."""
 
-    def __init__(self, config: MissionConfig) -> None:
+    def __init__(self, config: MissionConfig, onto: SavedMission = EMPTY, vetoes: Sequence[Veto] = ()) -> None:
+        """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
         self.config = config
         self._cloud = Cloud(config.fleet, config.seed)
         self._traffic = Counter()
+        self._packets: list[SizedPacket] = []
+        self._refused = onto.refused
+        numbers = itertools.count(len(onto.edits) + 1)
+        self._edits = (*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in vetoes))
+        self._cloud.fleet.edit(in_force(self._edits))
+        for packet in onto.refused:
+            self._cloud.refuse(packet.robot, packet.epoch, packet.sequence)
 
     @property
     def fleet(self) -> Fleet:
@@ -113,6 +134,7 @@ class MissionCloud:
             replies = self._cloud.apply(sent.packet)
         except PacketError as error:
             raise FcslamError(f"{sent.packet.robot}: the cloud refused a packet: {error}") from error
+        self._packets.append(sent)
         for packet in (sent, *map(measure, replies)):
             self._traffic.accept(packet.label, packet.size)
         return replies
@@ -127,10 +149,13 @@ class MissionCloud:
         """
         result = self._cloud.finalize()
         unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
-        tracks = unknown | dict(tracks)
+        mapped = {robot.robot for robot in result.robots}
+        tracks = unknown | {name: track for name, track in tracks.items() if name in mapped}
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
-        return run_of(result, tracks, metrics, dump(self.config), self.config.map)
+        settings = CloudConfig(seed=self.config.seed, fleet=self.config.fleet, map=self.config.map)
+        mission = mission_bytes(settings, self._edits, self._packets, self._refused, tracks)
+        return replace(run_of(result, tracks, metrics, dump(self.config), self.config.map), mission=mission)
 
 
 def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
@@ -149,8 +174,14 @@ class _Meter:
         self._span: dict[str, tuple[float, float]] = {}
         self._faults: dict[str, Faults] = {}
         self.scans = self.keyscans = 0
-        self.tracks: dict[str, Sequence[Track]] = dict.fromkeys(robots, ())
+        self._tracks: dict[str, dict[str, Track]] = {robot: {} for robot in robots}
         """By robot and session, of the robots that are done."""
+
+    @property
+    def tracks(self) -> dict[str, Track]:
+        """The scans of the robots that are done, by session; robots and their sessions in order."""
+        by_robot = (sorted(robot.items(), key=lambda item: robot_and_epoch(item[0])) for robot in self._tracks.values())
+        return dict(itertools.chain.from_iterable(by_robot))
 
     @property
     def recorded_s(self) -> float:
@@ -167,7 +198,7 @@ class _Meter:
         if leg.faults is None:
             self.report()
         else:
-            self.tracks[leg.robot] = leg.tracks
+            self._tracks[leg.robot] |= leg.tracks
             self._faults[leg.robot] = leg.faults
 
     def report(self, fusing: bool = False) -> None:

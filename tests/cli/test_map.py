@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 
-from fcslam import api
 from fcslam.cli import main
 from fcslam.cli import map as mapping
 from fcslam.config import dump
@@ -22,8 +21,8 @@ from tests.small_fleet import truth_at
 from tests.sources.carmen_text import drive, flaser, odom, pose_at, save
 
 RUN_FILES = {
-    "closures.csv", "config.yaml", "local", "map.pgm", "map.png", "map.yaml", "metrics.json", "pose_graph.g2o",
-    "robots.csv", "trajectories",
+    "closures.csv", "config.yaml", "local", "map.pgm", "map.png", "map.yaml", "metrics.json", "mission.fcslam",
+    "pose_graph.g2o", "robots.csv", "trajectories",
 }  # fmt: skip
 
 
@@ -420,6 +419,6 @@ def test_a_disk_that_is_full_is_one_line(tmp_path, log, monkeypatch, capsys):
 
 
 def test_the_command_refuses_before_the_long_work(tmp_path, log, monkeypatch, capsys):
-    monkeypatch.setattr(api, "run_mission", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr("fcslam.mission.run_mission", lambda *_: pytest.fail("worked"))
     refused(capsys, tmp_path, log, tmp_path / "none.log", "--output", tmp_path / "run")
     refused(capsys, tmp_path, log, "--output", log / "run")

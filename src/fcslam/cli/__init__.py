@@ -48,6 +48,7 @@ app.command(
         "fcslam map robot1.clf.gz robot2.clf.gz",
         "fcslam map anna=run1.bag ben=run2.mcap -o runs/building",
         "fcslam map building.clf.gz --split 3 --quiet",
+        "fcslam map today.bag --onto runs/building -o runs/building-2",
     ),
 )(mapping.map_recordings)
 app.command(

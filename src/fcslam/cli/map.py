@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.mission import MissionConfig, Progress
+    from fcslam.mission_file import SavedMission
     from fcslam.records import Veto
     from fcslam.runs import Run
     from fcslam.sources import Source
@@ -47,6 +48,13 @@ def map_recordings(
     split: Annotated[
         int, typer.Option(min=1, help="Split the one LOG into this number of robots with equal scan counts.")
     ] = 1,
+    onto: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MISSION",
+            help="Run folder or mission file of an earlier mission to continue; its recordings are not needed.",
+        ),
+    ] = None,
     no_fuse: NoFuse = False,
     fusion: Fusion = None,
     veto: Annotated[
@@ -67,16 +75,18 @@ def map_recordings(
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
     with _without_collection():
-        from fcslam.api import split_recordings
+        from fcslam.api import continued_config, split_recordings
+        from fcslam.mission_file import read_mission
         from fcslam.runs import prepare_output, read_vetoes
 
         output = output or new_folder(RUNS)
         prepare_output(output, force)
-        settings = mission_config(config, seed, no_fuse, fusion)
+        earlier = None if onto is None else read_mission(onto)
+        settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier))
         vetoes = read_vetoes(veto) if veto else ()
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
         sources = split_recordings(open_recordings(logs, options), split)
-    map_sources(sources, settings, output, notices(quiet), force, vetoes)
+    map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier)
 
 
 def map_sources(
@@ -86,14 +96,16 @@ def map_sources(
     console: "Console",
     force: bool = False,
     vetoes: "Sequence[Veto]" = (),
+    earlier: "SavedMission | None" = None,
 ) -> "Run":
     """Run the mission, write the run folder and print a summary; progress and notices go to ``console``.
 
     A run that appeared at ``output`` meanwhile is replaced only with ``force``.
     """
     with _without_collection():
-        from fcslam import api
         from fcslam.cli.progress import ProgressDisplay
+        from fcslam.driving import side_by_side
+        from fcslam.mission import run_mission
 
         surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
         gc.freeze()
@@ -102,8 +114,9 @@ def map_sources(
     began = time.perf_counter()
     with compiled(console), ProgressDisplay(console) as display:
         faults: dict[str, Faults] = {}
-        progress = _watch(display, sum(survey.scan_count for survey in surveys), faults)
-        run = api.map_recordings(sources, config=settings, vetoes=vetoes, progress=progress, processes=cores())
+        known = 0 if earlier is None else sum(len(track.stamps) for track in earlier.tracks.values())
+        progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
+        run = run_mission(sources, settings, progress, vetoes, side_by_side(cores()), earlier)
         display.start("writing")
         run.save(output, force)
     print_faults(console, faults)

@@ -31,9 +31,13 @@ Fusion = Annotated[
 
 
 def mission_config(
-    file: Path | None, seed: int | None = None, no_fuse: bool = False, fusion: FusionStrategy | None = None
+    file: Path | None,
+    seed: int | None = None,
+    no_fuse: bool = False,
+    fusion: FusionStrategy | None = None,
+    default: "MissionConfig | None" = None,
 ) -> "MissionConfig":
-    """The configuration in ``file``, or the default one, with the changes of the command line.
+    """The configuration in ``file``, or else the default one, with the changes of the command line.
 
     Raises:
         ConfigError: the file cannot be read or is invalid, or ``fusion`` is given together with ``no_fuse``.
@@ -42,7 +46,7 @@ def mission_config(
     from fcslam.errors import ConfigError
     from fcslam.mission import MissionConfig
 
-    config = MissionConfig() if file is None else load(MissionConfig, file)
+    config = (default or MissionConfig()) if file is None else load(MissionConfig, file)
     if seed is not None:
         config = config.model_copy(update={"seed": seed})
     if no_fuse and fusion is not None:

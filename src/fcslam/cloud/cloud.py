@@ -6,7 +6,7 @@ from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import ReplyState, SessionCorrection, is_news, replies
 from fcslam.cloud.result import FleetResult
-from fcslam.cloud.sessions import in_session
+from fcslam.cloud.sessions import in_session, session_name
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
 from fcslam.records import Place
@@ -56,6 +56,10 @@ class Cloud:
         if refusal is not None:
             raise refusal
         return self._replies(packet, number.session)
+
+    def refuse(self, robot: str, epoch: int, sequence: int) -> None:
+        """A packet that was refused where it was received; later packets are applied without it."""
+        self._log.refuse(PacketNumber(session_name(robot, epoch), sequence))
 
     def finalize(self) -> FleetResult:
         """The result of all packets so far; it depends on their set alone."""

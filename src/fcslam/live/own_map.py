@@ -132,7 +132,7 @@ def _open(robot: str, config: MissionConfig) -> None:
 
 def _restore(robot: str, earlier: Sequence[bytes]) -> list[tuple[int, Correction]]:
     for data in earlier:
-        _clouds[robot].apply(SizedPacket(decode(data), len(data)))
+        _clouds[robot].apply(SizedPacket(decode(data), data))
     return []
 
 

@@ -6,6 +6,7 @@
     pose_graph.g2o             the optimised pose graph
     metrics.json               [{name, value, unit}]
     config.yaml                the complete configuration of the run
+    mission.fcslam             packets, edits and configuration of the mission, with which it can go on
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
     localization/<robot>.csv   instead of local: of a robot that was localised in a finished map, pose, standard
                                deviations and quality at every laser scan
@@ -41,7 +42,7 @@ from fcslam.runs.trajectories import read_tum, write_tum
 from fcslam.storage.files import replacing_folder
 
 TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
-LOCALIZATION = "localization"
+LOCALIZATION, MISSION = "localization", "mission.fcslam"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 
 _SAFE_NAME = re.compile(r"\w[\w.+-]*")
@@ -72,6 +73,8 @@ class Run:
     """File name to content: map.pgm, map.yaml, map.png, map_1.pgm ..."""
     local_maps: Mapping[str, LocalMap] = field(default_factory=dict)
     """By robot: every robot's own map. Live results of the service have none, and their folder has no ``local``."""
+    mission: bytes = b""
+    """The mission file: packets and edits, with which the mission can go on. Live results of the service have none."""
     localized: Mapping[str, LocalizedPoses] = field(default_factory=dict)
     """By robot: poses in a finished map; ``fcslam.localize`` makes them."""
 
@@ -168,6 +171,7 @@ def open_run(folder: str | os.PathLike[str]) -> Run:
             pose_graph_g2o=(path / POSE_GRAPH).read_text(encoding="utf-8"),
             map_files={file.name: file.read_bytes() for file in sorted(path.glob("map*.*"))},
             local_maps=_read_local_maps(path / LOCAL, maps),
+            mission=(path / MISSION).read_bytes() if (path / MISSION).exists() else b"",
             localized={file.stem: read_localized(file) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
     except (OSError, ValueError, csv.Error) as error:
@@ -195,6 +199,8 @@ def _write(run: Run, folder: Path) -> None:
         (folder / LOCALIZATION).mkdir()
     for poses in run.localized.values():
         write_localized(folder / LOCALIZATION / f"{poses.robot}.csv", poses)
+    if run.mission:
+        (folder / MISSION).write_bytes(run.mission)
     write_robots(folder / ROBOTS, run.trajectories.values())
     write_closures(folder / CLOSURES, run.closures)
     (folder / METRICS).write_text(metrics_json(run.metrics.values()), encoding="utf-8")

@@ -15,6 +15,7 @@ from fcslam.service.mission_store import (
     FINALIZATIONS,
     PACKETS,
     SCHEMA,
+    TRACKS,
     VERSION,
 )
 from fcslam.storage.database import Database, translate_errors
@@ -77,6 +78,7 @@ def recover_mission(path: Path) -> str | None:
                     (CORRECTIONS, _newest(damage.rows["corrections"])),
                     (EDITS, edits.values()),
                     (FINALIZATIONS, _numbered(damage.rows["finalizations"]).values()),
+                    (TRACKS, {row[:2]: row for row in damage.rows["tracks"]}.values()),
                     (FACTS, facts.items()),
                 ):
                     for row in rows:

@@ -5,14 +5,18 @@ Packets are numbered by **arrival**. The order in which they take effect follows
 """
 
 import sqlite3
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from fcslam.cloud.edits import check_undo, edit_json, kind_of, read_edit
 from fcslam.cloud.replies import SessionCorrection, is_news
+from fcslam.cloud.report import Track
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Correction, Edit, Undo, frozen
@@ -32,6 +36,8 @@ CONFIG_COPY = "config copy"
 
 VERSION = 6
 """Version of the schema and of the packets."""
+LARGEST_TRACK = 1 << 28
+"""Largest size of one column of a session's scans, bytes."""
 _AT_ONCE = 10_000
 """Packets that are read at once."""
 _COLUMNS = "robot, epoch, sequence, time, kind, channel, data, refusal"
@@ -60,6 +66,11 @@ CREATE TABLE finalizations (
     number INTEGER PRIMARY KEY, arrivals INTEGER NOT NULL, edits INTEGER NOT NULL, run TEXT, failure TEXT,
     seal BLOB NOT NULL
 ) STRICT;
+CREATE TABLE tracks (
+    robot TEXT NOT NULL, epoch INTEGER NOT NULL, stamps BLOB NOT NULL, keyscans BLOB NOT NULL, offsets BLOB NOT NULL,
+    seal BLOB NOT NULL,
+    PRIMARY KEY (robot, epoch)
+) STRICT;
 CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL, seal BLOB NOT NULL) STRICT
 """
 PACKETS = SealedTable(
@@ -68,6 +79,7 @@ PACKETS = SealedTable(
 CORRECTIONS = SealedTable("corrections", "robot", "epoch", "version", "time", "map_index", "x", "y", "theta", "quality")
 EDITS = SealedTable("edits", "number", "author", "time", "kind", "content")
 FINALIZATIONS = SealedTable("finalizations", "number", "arrivals", "edits", "run", "failure")
+TRACKS = SealedTable("tracks", "robot", "epoch", "stamps", "keyscans", "offsets")
 FACTS = SealedTable("facts", "name", "value")
 
 
@@ -278,6 +290,22 @@ class MissionStore:
                 _remember(database, CONFIG_COPY, text)
         return config if stored is None else CloudConfig.model_validate_json(stored[0])
 
+    def put_track(self, robot: str, epoch: int, track: Track) -> None:
+        """Store the scans of a session, which a robot keeps to itself; known to the robot's own machine only."""
+        arrays = track.stamps.astype("<f8"), track.keyscans.astype("<i8"), track.T_keyscan_base.astype("<f8")
+        row = (robot, epoch, *(zlib.compress(array.tobytes()) for array in arrays))
+        with self._database.transaction() as database:
+            TRACKS.insert(database, row)
+
+    def tracks(self) -> dict[tuple[str, int], Track]:
+        """The scans of every session whose scans are known, by robot and epoch.
+
+        Raises:
+            StoreError: they are broken.
+        """
+        rows = self._database.rows("SELECT robot, epoch, stamps, keyscans, offsets FROM tracks", ())
+        return {(robot, epoch): _read_track(f"{robot}, epoch {epoch}", *blobs) for robot, epoch, *blobs in rows}
+
     def traffic(self) -> Ledger:
         """Traffic of accepted packets by label, and of refused ones."""
         columns, groups = "robot, kind, channel, refusal IS NULL", "robot, kind, channel, refusal IS NULL"
@@ -397,6 +425,33 @@ def _data(database: sqlite3.Connection, packet: StoredPacket) -> bytes | None:
     statement = "SELECT data FROM packets WHERE robot = ? AND epoch = ? AND sequence = ?"
     row = database.execute(statement, (packet.robot, packet.epoch, packet.sequence)).fetchone()
     return None if row is None else bytes(row[0])
+
+
+def _read_track(name: str, *blobs: bytes) -> Track:
+    try:
+        stamps, keyscans, offsets = (_inflated(blob) for blob in blobs)
+        track = Track(
+            frozen(np.frombuffer(stamps, "<f8")),
+            np.frombuffer(keyscans, "<i8"),
+            frozen(np.frombuffer(offsets, "<f8").reshape(-1, 3)),
+        )
+        if not len(track.stamps) == len(track.keyscans) == len(track.T_keyscan_base):
+            raise ValueError("its columns have different lengths")
+        if not (np.isfinite(track.stamps).all() and np.isfinite(track.T_keyscan_base).all()):
+            raise ValueError("a number is not finite")
+        if len(track.keyscans) and (track.keyscans.min() < 0):
+            raise ValueError("a keyscan has a negative number")
+    except (ValueError, zlib.error) as error:
+        raise StoreError(f"the scans of {name} are broken ({error})") from error
+    return track
+
+
+def _inflated(blob: bytes) -> bytes:
+    inflate = zlib.decompressobj()
+    content = inflate.decompress(blob, LARGEST_TRACK)
+    if inflate.unconsumed_tail:
+        raise ValueError(f"more than {LARGEST_TRACK >> 20} MiB")
+    return content
 
 
 def _packet(

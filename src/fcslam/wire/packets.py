@@ -54,11 +54,15 @@ def encode(packet: Packet) -> bytes:
 
 
 class SizedPacket(NamedTuple):
-    """A packet as its receiver reads it, and its size."""
+    """A packet as its receiver reads it, and as it is sent."""
 
     packet: Packet
-    size: int
-    """Bytes."""
+    data: bytes
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return len(self.data)
 
     @property
     def label(self) -> Label:
@@ -69,14 +73,14 @@ class SizedPacket(NamedTuple):
 
 
 def measure(packet: Packet) -> SizedPacket:
-    """What a receiver reads and a network carries: the same as ``encode`` and ``decode``, but nothing is decoded.
+    """What a receiver reads and a network carries: as by ``encode`` and ``decode``, but nothing is decoded.
 
     Raises:
         PacketError: as ``encode``.
     """
-    size = len(encode(packet))
+    data = encode(packet)
     _, codec = CODEC_OF_TYPE[type(packet.body)]
-    return SizedPacket(replace(packet, body=codec.round(packet.body)), size)
+    return SizedPacket(replace(packet, body=codec.round(packet.body)), data)
 
 
 def decode(data: bytes) -> Packet:

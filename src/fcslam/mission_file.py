@@ -1,0 +1,131 @@
+"""The mission file: packets, edits and configuration of a mission in one file. The service exports the same format.
+
+A mission that goes on needs no recording of earlier robots: their packets take effect again.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from fcslam.cloud.report import Track
+from fcslam.cloud.sessions import robot_and_epoch, session_name
+from fcslam.cloud.settings import CloudConfig
+from fcslam.driving import Leg
+from fcslam.errors import PacketError, SourceError, StoreError
+from fcslam.records import Edit
+from fcslam.runs.folder import MISSION
+from fcslam.service.mission_store import CONFIG, MissionStore, StoredPacket, check_mission
+from fcslam.sources.faults import Faults
+from fcslam.wire.packets import SizedPacket, decode
+
+_AT_ONCE: Final = 1000
+"""Packets that are read at once."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedMission:
+    """The content of a mission file."""
+
+    config: CloudConfig
+    edits: tuple[Edit, ...]
+    packets: Mapping[str, tuple[SizedPacket, ...]]
+    """By robot, in the order of their times; without refused ones."""
+    refused: tuple[StoredPacket, ...]
+    """Packets without effect; their numbers are used up."""
+    tracks: Mapping[str, Track]
+    """The scans of each session whose scans are known, by its name."""
+
+    def epochs(self, robot: str) -> int:
+        """How many sessions the robot had, counted with those without a packet."""
+        return 1 + max((sized.packet.epoch for sized in self.packets.get(robot, ())), default=-1)
+
+    def legs(self) -> list[Iterator[Leg]]:
+        """What each robot did, as ``driving`` gives it for recordings."""
+        return [iter((self._leg(robot, packets),)) for robot, packets in self.packets.items()]
+
+    def _leg(self, robot: str, packets: tuple[SizedPacket, ...]) -> Leg:
+        tracks = {name: track for name, track in self.tracks.items() if robot_and_epoch(name)[0] == robot}
+        stamps = tuple(stamp for track in tracks.values() for stamp in track.stamps.tolist())
+        return Leg(robot, packets, stamps, tracks, Faults({}))
+
+
+EMPTY: Final = SavedMission(CloudConfig(), (), {}, (), {})
+"""A mission before its first packet."""
+
+
+def read_mission(path: Path) -> SavedMission:
+    """Read a mission file; it is not changed.
+
+    Raises:
+        SourceError: there is none, it is damaged or of another version, or a packet in it cannot be read.
+    """
+    if path.is_dir():
+        path /= MISSION
+    if not path.is_file():
+        raise SourceError(f"{path}: no mission file; `fcslam map` writes one into each run folder")
+    try:
+        check_mission(path)
+        with TemporaryDirectory() as place:  # opening it for reading would leave files beside it
+            copy = Path(place) / MISSION
+            copy.write_bytes(path.read_bytes())
+            with closing(MissionStore(copy)) as store:
+                return _read(store)
+    except PacketError as error:
+        raise SourceError(f"{path}: {error}") from error
+    except StoreError as error:
+        raise SourceError(str(error)) from error
+
+
+def mission_bytes(
+    config: CloudConfig,
+    edits: Sequence[Edit],
+    packets: Sequence[SizedPacket],
+    refused: Sequence[StoredPacket],
+    tracks: Mapping[str, Track],
+) -> bytes:
+    """The mission file of a mission.
+
+    Args:
+        config: settings of the cloud.
+        edits: all edits, in their order.
+        packets: the packets in the order in which they took effect.
+        refused: packets without effect.
+        tracks: the scans of each session, by its name.
+    """
+    with TemporaryDirectory() as place:
+        with closing(MissionStore(Path(place) / "mission.sqlite")) as store:
+            store.configure(config)
+            store.put([*map(_stored, packets), *refused], 0.0)
+            for edit in edits:
+                store.edit(edit.content, edit.author, edit.time_s)
+            for name, track in tracks.items():
+                store.put_track(*robot_and_epoch(name), track)
+            store.export(Path(place) / MISSION)
+        return (Path(place) / MISSION).read_bytes()
+
+
+def _stored(sized: SizedPacket) -> StoredPacket:
+    packet, label = sized.packet, sized.label
+    return StoredPacket(packet.robot, packet.epoch, packet.sequence, packet.time, label.kind, label.channel, sized.data)
+
+
+def _read(store: MissionStore) -> SavedMission:
+    packets: dict[str, list[SizedPacket]] = {}
+    refused, last = [], 0
+    while arrived := store.arrivals(last, _AT_ONCE):
+        for arrival, stored in arrived:
+            last = arrival
+            if stored.refusal is None:
+                packets.setdefault(stored.robot, []).append(SizedPacket(decode(stored.data), stored.data))
+            else:
+                refused.append(stored)
+    return SavedMission(
+        config=CloudConfig.model_validate_json(store.fact(CONFIG) or "{}"),
+        edits=tuple(store.edits()),
+        packets={robot: tuple(sorted(sent, key=lambda sized: sized.packet.order)) for robot, sent in packets.items()},
+        refused=tuple(refused),
+        tracks={session_name(robot, epoch): track for (robot, epoch), track in store.tracks().items()},
+    )
