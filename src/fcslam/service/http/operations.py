@@ -48,7 +48,7 @@ def operations_router(state: ServiceState) -> APIRouter:
             return problem(503, f"the worker is catching up: {backlog} packets have no effect yet", backlog=backlog)
         return Readiness(backlog=backlog)
 
-    @router.get("/api/v1/audit", dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503))
+    @router.get("/api/v1/audit", dependencies=state.require(Role.ADMIN), responses=refusals(400, 401, 403, 503))
     def get_audit(limit: Annotated[int, Query(ge=1, le=10_000)] = 100) -> list[AuditEntry]:
         """The newest lines of the audit log: who did what, and how many logins were refused."""
         return state.audit.newest(limit)
