@@ -313,3 +313,24 @@ def test_a_killed_robot_has_all_that_it_put(path):
         assert (first, last + 1) == (0, outbox.waiting.packets)
         assert last >= most
         outbox.close()
+
+
+@pytest.mark.parametrize("at", [20, 30, 2000, 5000, 9000])
+def test_a_damaged_byte_in_a_closed_outbox_is_mended_and_more_is_told(path, at):
+    outbox = Outbox(path, "alice", LIMIT)
+    outbox.begin("r", resume=False)
+    outbox.synchronize({})
+    outbox.put([said(k, KEYSCAN) for k in range(30)])
+    outbox.close()
+    content = bytearray(path.read_bytes())
+    content[at] ^= 0x41
+    path.write_bytes(content)
+    outbox = Outbox(path, "alice", LIMIT)
+    assert len(drain(outbox)) == 30
+    outbox.close()
+    assert (path.parent / "damaged" / "1" / path.name).read_bytes() == content
+    content = bytearray(path.read_bytes())
+    content[at : at + 2] = bytes((content[at] ^ 1, content[at + 1] ^ 1))
+    path.write_bytes(content)
+    with pytest.raises(StateError, match="damaged"):
+        Outbox(path, "alice", LIMIT)

@@ -7,6 +7,7 @@ with the digests it checks that a recording that is read again produces the same
 """
 
 import hashlib
+import logging
 import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,10 +18,13 @@ from typing import Any, NamedTuple
 from fcslam.errors import StateError, StoreError
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.storage.database import Database
+from fcslam.storage.recovery import mend_pages
 from fcslam.wire.batches import LENGTH
 from fcslam.wire.limits import MAXIMUM_EPOCH
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, readdress
+
+_log = logging.getLogger(__name__)
 
 PLACES_SHARE = 0.75
 """Share of the outbox up to which places are accepted; the rest is for packets that the map cannot do without."""
@@ -84,6 +88,7 @@ class Outbox:
         self._first = -1
         """Epoch of the first part of this start."""
         with self._state_errors():
+            self._mend()
             self._database = Database(path, _SCHEMA, _VERSION, exclusive=True)
         try:
             self.agent = self._agent_of(robot)
@@ -94,6 +99,14 @@ class Outbox:
         except StateError:
             self.close()
             raise
+
+    def _mend(self) -> None:
+        try:
+            kept = mend_pages(self._path)
+        except StoreError as error:
+            raise StateError(f"{error}; give another --state, or a copy of this one") from error
+        if kept is not None:
+            _log.warning("%s: a damaged byte is mended; the file as it was found is in %s", self._path, kept)
 
     def close(self) -> None:
         """Close the file; waiting packets stay in it."""

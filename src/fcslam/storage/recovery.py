@@ -88,6 +88,28 @@ def find_damage(path: Path, schema: str, version: int) -> Damage | None:
         return None
 
 
+def mend_pages(path: Path) -> Path | None:
+    """Mend single damaged bytes in a database that was closed; one that was not, or does not exist, is not checked.
+
+    Returns:
+        Folder of the damaged file; None if nothing is damaged.
+
+    Raises:
+        StoreError: there is more damage than that, and nothing was changed; or the disk is full.
+    """
+    if not path.exists() or _log_of(path).exists():
+        return None
+    with translate_errors(path), contents(path) as content:
+        seals = PageSeals.read(seals_file(path))
+        pages = [] if seals is None else seals.damaged(content)
+        if seals is None or not pages:
+            return None
+        mended = [seals.repaired(page, content) for page in pages]
+        if not all(mended):
+            raise StoreError(f"{path}: page {_numbers(pages)} is damaged")
+        return _mended(path, pages, [page for page in mended if page]).kept
+
+
 def fault(path: Path, schema: str, version: int) -> str | None:
     """What is wrong with a database by its header, log, trees and rows; None if nothing is, or if it is of another
     version.
