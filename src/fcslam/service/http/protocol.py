@@ -12,7 +12,7 @@ import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-MOST_CONNECTIONS = 512
+MOST_CONNECTIONS = 4096
 """Connections without a request in progress; of more, one of the address that has most is closed."""
 IDLE_S = 10.0
 """Time for the header of a request, from the connection or the response before."""
