@@ -24,6 +24,7 @@ SYMBOL = re.compile(r"`(\w+)`(?:(?:,| and) `(\w+)`)? in `([\w/]+\.py)`")
 INLINE_COMMAND = re.compile(r"`(fcslam [^`\n]+)`")
 COMMAND_LINE = re.compile(r"^(?: {4})?(fcslam .+)$", re.MULTILINE)
 TARGET = re.compile(r"(?:^|`| {4})make ([a-z-]+)", re.MULTILINE)
+TEST = re.compile(r"`(test_\w+)`")
 SETTING = re.compile(r"`((?:robot|fleet|map)\.[a-z][\w.]*)`")
 
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -125,6 +126,23 @@ def test_every_setting_exists(page):
     files = {"map.png", "map.pgm", "map.yaml"}
     named = set(SETTING.findall(page.read_text(encoding="utf-8"))) - files
     assert [key for key in sorted(named) if not is_setting(key)] == []
+
+
+def defined_tests() -> set[str]:
+    files = sorted((ROOT / "tests").rglob("test_*.py"))
+    return {name for file in files for name in re.findall(r"^def (test_\w+)\(", file.read_text("utf-8"), re.MULTILINE)}
+
+
+@pages
+def test_every_test_exists(page):
+    assert set(TEST.findall(page.read_text(encoding="utf-8"))) - defined_tests() == set()
+
+
+def test_each_line_of_the_threat_model_names_a_test():
+    text = (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
+    rows = [row for row in re.findall(r"^\|.*\|$", text, re.MULTILINE) if not row.endswith(("| test |", "---|"))]
+    assert len(rows) > 20
+    assert [row for row in rows if not TEST.search(row)] == []
 
 
 def test_readme_is_short_and_starts_with_the_two_commands():
