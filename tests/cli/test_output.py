@@ -57,8 +57,9 @@ def test_the_last_lines_say_why_maps_are_apart_and_name_every_picture(tmp_path, 
     assert main(["map", *logs, "-o", str(tmp_path / "run"), "--quiet"]) == 0
     lines = capsys.readouterr().out.splitlines()
     after = lines[lines.index("2 maps") + 1 :]
-    assert len(after) == 3
     assert "no two of their places look alike" in after[0] or after[0].startswith("map 0 (a) and map 1 (b): ")
-    assert after[1:] == [f"map: {tmp_path / 'run' / name}" for name in ("map.png", "map_1.png")]
+    pictures = sorted((tmp_path / "run").glob("*.png"))  # a map of few keyscans gets none
+    assert pictures
+    assert after[1:] == [f"map: {path}" for path in pictures]
     assert main(["map", *logs, "-o", str(tmp_path / "alone"), "--quiet", "--no-fuse"]) == 0
     assert "2 maps: one for each robot" in capsys.readouterr().out
