@@ -23,7 +23,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system test-attack ros-test check bench bench-quick docs proto
+.PHONY: help install gl learning demo test test-fast test-system test-attack ros-test check bench bench-quick docs proto lock sbom audit
 .DEFAULT_GOAL := help
 
 help:
@@ -39,6 +39,9 @@ help:
 	@echo "make install      create .venv; EXTRAS=dev,train,federated,sim adds packages"
 	@echo "make learning     install torch and Flower, for training the detector, if they are available"
 	@echo "make gl           install the GL library of the simulated cameras, if permitted"
+	@echo "make lock         write requirements.txt: what a service and a robot install, with hashes"
+	@echo "make sbom         write sbom.json, the software bill of materials of requirements.txt (CycloneDX)"
+	@echo "make audit        look for known vulnerabilities of requirements.txt; needs the Internet"
 	@echo "make docs         write docs/settings.md, the reference of all settings"
 	@echo "make proto        generate the Python code of the wire format"
 
@@ -106,6 +109,17 @@ bench-quick: $(INSTALLED)
 
 docs: $(INSTALLED)
 	@$(BIN)/python tools/settings_reference.py
+
+# constraints.txt says the versions; this adds the hashes.
+lock: $(INSTALLED)
+	@$(BIN)/uv pip compile -q pyproject.toml --constraint constraints.txt --generate-hashes --no-annotate --no-header \
+	    --python-version 3.11 --python-platform x86_64-manylinux_2_28 --only-binary :all: -o requirements.txt
+
+sbom: $(INSTALLED)
+	@$(BIN)/python tools/sbom.py >sbom.json
+
+audit: $(INSTALLED)
+	@$(BIN)/python tools/audit.py
 
 proto: $(INSTALLED)
 	@cd src && ../$(BIN)/python -m grpc_tools.protoc --proto_path=. --python_out=. --pyi_out=. fcslam/wire/*.proto
