@@ -5,6 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed-$(EXTRAS)
 DEMO ?= demo
+SECONDS ?= 60
 # What draws the pictures of simulated cameras where there is no display and no graphics card.
 GL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
 HAS_GL := $(BIN)/python -c "from fcslam.simulation.engine import gl_context; gl_context(16, 16).free()" 2>/dev/null
@@ -23,7 +24,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system test-attack ros-test check bench bench-quick docs proto lock sbom audit
+.PHONY: help install gl learning demo test test-fast test-system test-attack ros-test check bench bench-quick docs proto fuzz lock sbom audit
 .DEFAULT_GOAL := help
 
 help:
@@ -33,6 +34,7 @@ help:
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
 	@echo "make ros-test     install a real ROS 2 and ROS 1 as peers of the tests of live robots, if permitted"
+	@echo "make fuzz         broken packets for SECONDS=60: each is read or refused with a reason"
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
@@ -95,6 +97,10 @@ ros-test: $(INSTALLED)
 	@$(ROS_VENV)/bin/python -m pip install -qq --disable-pip-version-check $(RCLPY) || echo "No rclpy for this Python."
 	@$(AS_ROOT) true 2>/dev/null && { $(APT_GET) update; $(APT_GET) install --no-install-recommends $(ROSPY); } >/dev/null || \
 	    echo "No roscore. To have it: sudo apt-get install $(ROSPY)"
+
+fuzz: $(INSTALLED)
+	@folder=$$(mktemp -d) && trap 'rm -r "$$folder"' EXIT && \
+	    $(BIN)/python benchmarks/fuzz.py --seconds $(SECONDS) --results "$$folder"
 
 check: $(INSTALLED)
 	@$(BIN)/ruff check .

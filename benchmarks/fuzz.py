@@ -1,14 +1,17 @@
 """A million broken packets: every one is read or refused with a reason, nothing crashes, hangs or piles up memory.
 
     python benchmarks/fuzz.py --packets 1000000
+    python benchmarks/fuzz.py --seconds 60 --results FOLDER
 
 Packets of every kind, the golden ones and random ones up to the limits, are broken in every way below. What is read
 must survive being written and read once more. Anything but a packet or a PacketError fails the script, and so do a
-thousand packets that take longer than two minutes. Memory is the resident set, after the first tenth and the largest
-later.
+thousand packets that take longer than two minutes. With `--seconds`, the script ends after that time and draws a new
+seed in each run. It prints the seed, and `--seed` repeats the packets. Memory is the resident set, after the first
+100,000 packets at most and the largest later.
 """
 
 import faulthandler
+import math
 import random
 import resource
 import sys
@@ -57,15 +60,20 @@ REASONS = {"reason": "", "packets": ","}
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--packets", type=int, default=1_000_000, help="how many")
-    parser.add_argument("--seed", type=int, default=0, help="of the one random generator")
+    parser.add_argument("--seconds", type=float, help="end after so long")
+    parser.add_argument("--seed", type=int, help="of the one random generator (0; with --seconds, a new one)")
     chosen = parser.parse_args()
+    if chosen.seed is None:
+        chosen.seed = 0 if chosen.seconds is None else random.SystemRandom().getrandbits(32)
+    print("seed", chosen.seed, flush=True)
     report = common.Report(__file__, __doc__, chosen)
     began = time.perf_counter()
-    outcome = fuzz(chosen.packets, chosen.seed)
+    outcome = fuzz(chosen.packets, chosen.seed, math.inf if chosen.seconds is None else chosen.seconds)
     wall_s = time.perf_counter() - began
+    packets = sum(tally.packets for tally in outcome.tallies.values())
     report.say(
-        f"{chosen.packets:,} packets in {wall_s:.0f} s, {chosen.packets / wall_s:,.0f} a second; resident set "
-        f"{outcome.early_mb:.0f} MB after the first tenth, {outcome.late_mb:.0f} MB at the end. "
+        f"{packets:,} packets in {wall_s:.0f} s, {packets / wall_s:,.0f} a second; resident set "
+        f"{outcome.early_mb:.0f} MB at the beginning, {outcome.late_mb:.0f} MB at the end. "
         f"Crashed: {sum(tally.crashed for tally in outcome.tallies.values())}."
     )
     report.table("Ways to break a packet", COLUMNS, [tally.row(name) for name, tally in outcome.tallies.items()])
@@ -102,13 +110,16 @@ class Outcome:
     late_mb: float = 0.0
 
 
-def fuzz(count: int, seed: int) -> Outcome:
-    """Break and read ``count`` packets."""
+def fuzz(count: int, seed: int, longest_s: float) -> Outcome:
+    """Break and read ``count`` packets, or as many as ``longest_s`` allows."""
+    began = time.perf_counter()
     rng, outcome = random.Random(seed), Outcome()
     corpus = list(packets_of_every_kind(rng))
     names = list(BREAKERS)
     for k in range(count):
         if k % CHUNK == 0:
+            if time.perf_counter() - began > longest_s:
+                break
             faulthandler.dump_traceback_later(LONGEST_S, exit=True)
             note_memory(outcome, k, count)
         name = names[k % len(names)]
@@ -145,7 +156,7 @@ def receive(data: bytes, outcome: Outcome, name: str) -> None:
 def note_memory(outcome: Outcome, done: int, count: int) -> None:
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     resident_mb = pages * resource.getpagesize() / 1e6
-    if done <= count // 10:
+    if done <= min(count // 10, 100_000):
         outcome.early_mb = resident_mb
     outcome.late_mb = max(outcome.late_mb, resident_mb)
 
