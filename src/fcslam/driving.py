@@ -109,6 +109,9 @@ def _legs(source: Source, config: RobotConfig) -> Iterator[Leg]:
 
 def continued(legs: Iterator[Leg], first_epoch: int) -> Iterator[Leg]:
     """The legs of a robot that had so many sessions before."""
+    if first_epoch == 0:
+        yield from legs
+        return
     for leg in legs:
         packets = tuple(_readdressed(sized, first_epoch) for sized in leg.packets)
         names = (session_name(leg.robot, first_epoch + epoch) for epoch in range(len(leg.tracks)))
