@@ -33,8 +33,8 @@ help:
 	@echo "make test-fast    the same without the slow tests"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
+	@echo "make fuzz         broken packets, files, requests and messages; SECONDS=60 of each kind"
 	@echo "make ros-test     install a real ROS 2 and ROS 1 as peers of the tests of live robots, if permitted"
-	@echo "make fuzz         broken packets for SECONDS=60: each is read or refused with a reason"
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
@@ -100,7 +100,7 @@ ros-test: $(INSTALLED)
 
 fuzz: $(INSTALLED)
 	@folder=$$(mktemp -d) && trap 'rm -r "$$folder"' EXIT && \
-	    $(BIN)/python benchmarks/fuzz.py --seconds $(SECONDS) --results "$$folder"
+	    $(ONE_THREAD) $(BIN)/python benchmarks/fuzz.py --seconds $(SECONDS) --results "$$folder"
 
 check: $(INSTALLED)
 	@$(BIN)/ruff check .

@@ -1,340 +1,228 @@
-"""A million broken packets: every one is read or refused with a reason, nothing crashes, hangs or piles up memory.
+"""Broken packets, imports, recordings, requests, federated messages, settings, maps: read, or refused in words.
 
-    python benchmarks/fuzz.py --packets 1000000
-    python benchmarks/fuzz.py --seconds 60 --results FOLDER
+    python benchmarks/fuzz.py --seconds 60
 
-Packets of every kind, the golden ones and random ones up to the limits, are broken in every way below. What is read
-must survive being written and read once more. Anything but a packet or a PacketError fails the script, and so do a
-thousand packets that take longer than two minutes. With `--seconds`, the script ends after that time and draws a new
-seed in each run. It prints the seed, and `--seed` repeats the packets. Memory is the resident set, after the first
-100,000 packets at most and the largest later.
+A target takes valid inputs, breaks them at random, and reads them in a process of its own. A finding is any exception
+but a refusal in words, an input that takes more than 20 s, more than 1 GB of memory beyond that of valid inputs, a file
+written outside the target's folder, or a process that dies. Each finding is printed with the command that repeats it.
+Without --seed, every run draws another one.
 """
 
 import faulthandler
-import math
+import json
+import mmap
+import os
 import random
 import resource
+import secrets
+import struct
+import subprocess
 import sys
+import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import common
-import numpy as np
-from google.protobuf.message import DecodeError, Message
 
-from fcslam.errors import PacketError
-from fcslam.records import (
-    Beams,
-    Channel,
-    Constraint,
-    ConstraintKind,
-    Correction,
-    DetectorFile,
-    Keyscan,
-    KeyscanId,
-    LaserModel,
-    Place,
-)
-from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS
-from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
-from fcslam.wire.packets import decode, encode, read_label
-from fcslam.wire.quantisation import dequantise
-
-GOLDEN = common.REPOSITORY / "tests" / "wire" / "golden"
-LONGEST_S = 120
-CHUNK = 1000
-SIZES = {1: 100, 3: 100, 10: 50, 30: 20, 100: 5, 300: 1, MAXIMUM_KEYPOINTS: 1}
-"""Of packets, and how often one is taken: the larger the rarer."""
-INTERESTING = (0, 1, 2, 3, 127, 128, 255, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
-FLOATS = (0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), float("-inf"), 5e-324, 1e-30, 3.2, 1e6, 1.1e6, 1e30, 1e308)
-COLUMNS = {"broken by": "", "packets": ",", "read": ",", "refused": ",", "crashed": ",", "mean, us": ".0f",
-           "slowest, ms": ".1f"}  # fmt: skip
-REASONS = {"reason": "", "packets": ","}
-
-
-def main() -> None:
-    parser = common.options(__doc__)
-    parser.add_argument("--packets", type=int, default=1_000_000, help="how many")
-    parser.add_argument("--seconds", type=float, help="end after so long")
-    parser.add_argument("--seed", type=int, help="of the one random generator (0; with --seconds, a new one)")
-    chosen = parser.parse_args()
-    if chosen.seed is None:
-        chosen.seed = 0 if chosen.seconds is None else random.SystemRandom().getrandbits(32)
-    print("seed", chosen.seed, flush=True)
-    report = common.Report(__file__, __doc__, chosen)
-    began = time.perf_counter()
-    outcome = fuzz(chosen.packets, chosen.seed, math.inf if chosen.seconds is None else chosen.seconds)
-    wall_s = time.perf_counter() - began
-    packets = sum(tally.packets for tally in outcome.tallies.values())
-    report.say(
-        f"{packets:,} packets in {wall_s:.0f} s, {packets / wall_s:,.0f} a second; resident set "
-        f"{outcome.early_mb:.0f} MB at the beginning, {outcome.late_mb:.0f} MB at the end. "
-        f"Crashed: {sum(tally.crashed for tally in outcome.tallies.values())}."
-    )
-    report.table("Ways to break a packet", COLUMNS, [tally.row(name) for name, tally in outcome.tallies.items()])
-    report.table("The most frequent reasons", REASONS, outcome.reasons.most_common(25))
-    report.write()
-    if outcome.crashes:
-        sys.exit("\n".join(outcome.crashes[:20]))
-
-
-@dataclass
-class Tally:
-    """What came of the packets that were broken in one way."""
-
-    packets: int = 0
-    read: int = 0
-    crashed: int = 0
-    seconds: float = 0.0
-    slowest_s: float = 0.0
-
-    def row(self, name: str) -> tuple:
-        refused = self.packets - self.read - self.crashed
-        mean_us = 1e6 * self.seconds / max(self.packets, 1)
-        return name, self.packets, self.read, refused, self.crashed, mean_us, 1e3 * self.slowest_s
+TARGETS = ("packets", "imports", "recordings", "http", "federated", "configuration", "maps")
+LONGEST_S = 20.0
+MOST_BYTES = 10**9
+GRACE_S = 120.0
+"""For the start of a target: it makes its valid inputs and compiles."""
+WARM_UP = 20
+"""Inputs after which memory and files count."""
+MOST_FINDINGS = 20
+COLUMNS = {
+    "target": "", "inputs": ",", "read": ",", "refused": ",", "findings": ",", "slowest, ms": ".0f",
+    "memory grew, MB": ".0f",
+}  # fmt: skip
+WRITES = {"os.mkdir": 0, "os.remove": 0, "os.rmdir": 0, "os.chmod": 0, "os.rename": 1, "os.link": 1, "os.symlink": 1}
+"""Events of Python that change what is on disk, and which of their arguments is the changed path. The last argument is
+the folder that the path is relative to, or -1."""
 
 
 @dataclass
 class Outcome:
-    """What came of all of them."""
+    """What came of the inputs of a target."""
 
-    tallies: dict[str, Tally] = field(default_factory=lambda: {name: Tally() for name in BREAKERS})
-    reasons: Counter = field(default_factory=Counter)
-    crashes: list[str] = field(default_factory=list)
-    early_mb: float = 0.0
-    late_mb: float = 0.0
+    target: str
+    inputs: int = 0
+    read: int = 0
+    slowest_s: float = 0.0
+    grew_bytes: int = 0
+    findings: list[str] = field(default_factory=list)
 
 
-def fuzz(count: int, seed: int, longest_s: float) -> Outcome:
-    """Break and read ``count`` packets, or as many as ``longest_s`` allows."""
-    began = time.perf_counter()
-    rng, outcome = random.Random(seed), Outcome()
-    corpus = list(packets_of_every_kind(rng))
-    names = list(BREAKERS)
-    for k in range(count):
-        if k % CHUNK == 0:
-            if time.perf_counter() - began > longest_s:
-                break
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each target")
+    parser.add_argument("--jobs", type=int, default=2, help="targets at once")
+    parser.add_argument("--targets", nargs="+", default=TARGETS, choices=TARGETS, help="all by default")
+    parser.add_argument("--seed", type=int, default=secrets.randbelow(2**32), help="of the random generator")
+    parser.add_argument("--input", type=int, help="repeat this input of one target, with the seed of the finding")
+    parser.add_argument("--inside", type=Path, help="run one target in this folder; for this script itself")
+    chosen = parser.parse_args()
+    if chosen.input is not None:
+        repeat(chosen.targets[0], chosen.seed, chosen.input)
+        return
+    if chosen.inside is not None:
+        run_inside(chosen.targets[0], chosen.seed, chosen.seconds, chosen.inside)
+        return
+    print(f"seed {chosen.seed}", flush=True)
+    report = common.Report(__file__, __doc__, chosen)
+    with ThreadPoolExecutor(chosen.jobs) as pool:
+        outcomes = list(
+            pool.map(lambda target: outcome_of(target, chosen.seed, chosen.seconds), runnable(chosen.targets))
+        )
+    report.say(f"Seed {chosen.seed}, {chosen.seconds:.0f} s of each target, {chosen.jobs} at a time.")
+    report.table("Targets", COLUMNS, map(row, outcomes))
+    report.write()
+    findings = [f"{each.target}: {finding}" for each in outcomes for finding in each.findings]
+    if findings:
+        sys.exit("\n".join(findings))
+    print(f"{sum(each.inputs for each in outcomes):,} inputs, 0 findings")
+
+
+def runnable(targets: Sequence[str]) -> list[str]:
+    """The targets whose packages are installed."""
+    has_learning = find_spec("torch") is not None and find_spec("flwr") is not None
+    if not has_learning and "federated" in targets:
+        print("federated: left out, needs fcslam[federated]")
+    return [target for target in targets if target != "federated" or has_learning]
+
+
+def row(outcome: Outcome) -> tuple:
+    refused = max(0, outcome.inputs - outcome.read - len(outcome.findings))
+    return (
+        outcome.target, outcome.inputs, outcome.read, refused, len(outcome.findings), 1e3 * outcome.slowest_s,
+        outcome.grew_bytes / 1e6,
+    )  # fmt: skip
+
+
+def outcome_of(target: str, seed: int, seconds: float) -> Outcome:
+    """Run a target in a process of its own, which it may end or fill."""
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        counter = Path(folder) / "counter"
+        counter.write_bytes(bytes(8))
+        command = [sys.executable, __file__, "--targets", target, "--seed", str(seed), "--seconds", str(seconds)]
+        try:
+            ended = subprocess.run(
+                [*command, "--inside", folder], capture_output=True, text=True, errors="replace", check=False,
+                timeout=seconds + LONGEST_S + GRACE_S,
+            )  # fmt: skip
+            fate, words = f"the process ended with {ended.returncode}", ended.stderr[-3000:]
+        except subprocess.TimeoutExpired as late:
+            fate, words = f"the process did not end after {late.timeout:.0f} s", ""
+        written = Path(folder) / "outcome.json"
+        if written.exists():
+            return Outcome(**json.loads(written.read_text(encoding="utf-8")))
+        (number,) = struct.unpack("q", counter.read_bytes())
+    return Outcome(target, number + 1, findings=[f"{fate}\n{words}\n{how_to_repeat(target, seed, number)}"])
+
+
+def how_to_repeat(target: str, seed: int, number: int) -> str:
+    return f"repeat with: python benchmarks/fuzz.py --targets {target} --seed {seed} --input {number}"
+
+
+def opened(target: str) -> Any:
+    """The target: a function of a folder, which gives a context."""
+    if str(common.REPOSITORY) not in sys.path:
+        sys.path.insert(0, str(common.REPOSITORY))
+    from tests.fuzz.targets import TARGETS as ALL
+
+    return ALL[target]
+
+
+def generator(target: str, seed: int, number: int) -> random.Random:
+    """Each input has its own, so that one can be repeated alone."""
+    return random.Random(f"{seed} {target} {number}")
+
+
+def repeat(target: str, seed: int, number: int) -> None:
+    """Run one input alone and let its exception through."""
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, opened(target)(Path(folder)) as attempt:
+        faulthandler.dump_traceback_later(LONGEST_S, exit=True)
+        print("read" if attempt(generator(target, seed, number)) else "refused")
+        faulthandler.cancel_dump_traceback_later()
+
+
+def run_inside(target: str, seed: int, seconds: float, folder: Path) -> None:
+    """Run a target and write what came of it into the folder; the process may die on the way."""
+    outcome = Outcome(target)
+    (place := folder / "work").mkdir()
+    with (folder / "counter").open("r+b") as file:
+        counter = mmap.mmap(file.fileno(), 8)
+    with opened(target)(place) as attempt:
+        fuzz(attempt, outcome, seed, seconds, folder, counter)
+    (folder / "outcome.json").write_text(json.dumps(asdict(outcome)), encoding="utf-8")
+
+
+def fuzz(attempt: Any, outcome: Outcome, seed: int, seconds: float, folder: Path, counter: mmap.mmap) -> None:
+    outside: list[str] = []
+    until, armed, early_bytes = time.monotonic() + seconds, 0.0, 0
+    while (now := time.monotonic()) < until and len(outcome.findings) < MOST_FINDINGS:
+        if now > armed + 1.0:  # arming starts a thread, which takes longer than reading a packet
             faulthandler.dump_traceback_later(LONGEST_S, exit=True)
-            note_memory(outcome, k, count)
-        name = names[k % len(names)]
-        receive(BREAKERS[name](rng, corpus), outcome, name)
-    note_memory(outcome, count, count)
+            armed = now
+        if outcome.inputs == WARM_UP:
+            early_bytes = resident_bytes()
+            watch_files(folder, outside)
+            limit_memory()
+        counter[:] = struct.pack("q", outcome.inputs)
+        trouble = None
+        try:
+            outcome.read += attempt(generator(outcome.target, seed, outcome.inputs))
+        except Exception as error:  # what is looked for
+            trouble = f"{type(error).__name__}: {str(error)[:500]}"
+        if outside:
+            trouble = f"written outside: {outside.pop()}"
+            outside.clear()
+        outcome.slowest_s = max(outcome.slowest_s, time.monotonic() - now)
+        if outcome.inputs > WARM_UP and outcome.inputs % 100 == 0:
+            outcome.grew_bytes = max(outcome.grew_bytes, resident_bytes() - early_bytes)
+            if outcome.grew_bytes > MOST_BYTES:
+                trouble = f"{outcome.grew_bytes / 1e6:.0f} MB more than at the start"
+        if trouble is not None:
+            outcome.findings.append(f"{trouble}\n{how_to_repeat(outcome.target, seed, outcome.inputs)}")
+        outcome.inputs += 1
     faulthandler.cancel_dump_traceback_later()
-    return outcome
 
 
-def receive(data: bytes, outcome: Outcome, name: str) -> None:
-    tally = outcome.tallies[name]
-    began = time.perf_counter()
-    try:
-        packet = decode(data)
-        # What is read can be sent on and says the same.
-        again = encode(packet)
-        if encode(decode(again)) != again or read_label(data).robot != packet.robot:
-            raise AssertionError("read, and not the same when written and read again")
-        tally.read += 1
-    except PacketError as error:
-        outcome.reasons["".join("#" if letter.isdigit() else letter for letter in str(error))[:70]] += 1
-        if not 0 < len(str(error)) < 400:
-            tally.crashed += 1
-            outcome.crashes.append(f"{name}: a reason of {len(str(error))} characters: {data[:200].hex()}")
-    except Exception as error:  # any other error is what is looked for
-        tally.crashed += 1
-        outcome.crashes.append(f"{name}: {error!r}: {data[:2000].hex()}")
-    elapsed = time.perf_counter() - began
-    tally.packets += 1
-    tally.seconds += elapsed
-    tally.slowest_s = max(tally.slowest_s, elapsed)
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * resource.getpagesize()
 
 
-def note_memory(outcome: Outcome, done: int, count: int) -> None:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    resident_mb = pages * resource.getpagesize() / 1e6
-    if done <= min(count // 10, 100_000):
-        outcome.early_mb = resident_mb
-    outcome.late_mb = max(outcome.late_mb, resident_mb)
+def limit_memory() -> None:
+    """More than the limit at once is a MemoryError, whether it is used or not."""
+    mapped = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + 2 * MOST_BYTES, resource.RLIM_INFINITY))
 
 
-def packets_of_every_kind(rng: random.Random) -> Iterator[bytes]:
-    """The golden packets several times, and random valid ones from small to the limits."""
-    for path in sorted(GOLDEN.glob("*.bin")):
-        yield from [path.read_bytes()] * 100
-    numbers = np.random.default_rng(rng.getrandbits(64))
-    for size, copies in SIZES.items():
-        for body in bodies(numbers, size):
-            yield from [encode(Packet("alice", 7, rng.getrandbits(40), 2e9, body))] * copies
+def watch_files(folder: Path, outside: list[str]) -> None:
+    """Note every file that this process writes outside the folder. Python cannot take this back."""
+    inside, root = os.path.realpath(folder), os.getcwd()
 
+    def note(event: str, arguments: tuple) -> None:
+        if event == "open":
+            path, mode, flags = arguments
+            writes = bool((flags or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)) or bool(set(mode or "") & set("wax+"))
+        elif event in WRITES:
+            path, writes = arguments[WRITES[event]], arguments[-1] == -1  # else tempfile, which clears its own folder
+        else:
+            return
+        if not writes or isinstance(path, int):
+            return
+        absolute = os.path.normpath(os.path.join(root, os.fsdecode(path)))
+        # Compiled code is cached beside its source.
+        if not absolute.startswith((inside, "/dev/", "/proc/")) and "__pycache__" not in absolute:
+            outside.append(f"{event} {absolute}")
 
-def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
-    laser = LaserModel(min(size, MAXIMUM_BEAMS), -3.0, 0.001, 30.0, (0.1, 0.0, 0.2))
-    yield Hello("alice", 7, (laser,), {Channel.LIDAR: "birdseye-brief-1", Channel.CAMERA: "light-1"})
-    walk = np.abs(np.cumsum(rng.integers(-40, 41, 2 * size)))[: min(2 * size, MAXIMUM_BEAMS)]
-    yield Keyscan(KeyscanId("alice", size), 1e9, dequantise((walk % 65536).astype(np.uint16)))
-    yield Keyscan(KeyscanId("alice", size), 1e9, dequantise(rng.integers(0, 65536, size).astype(np.uint16)))
-    beams = Beams(size, -3.0, 0.0009)
-    yield Keyscan(KeyscanId("alice", size), 1e9, dequantise(np.full(size, 500, np.uint16)), laser=1, beams=beams)
-    spread = rng.normal(size=(3, 3))
-    information = spread @ spread.T + np.eye(3)
-    motion = rng.uniform(-3.0, 3.0, 3)
-    yield Constraint("alice", size, size + 1, ConstraintKind.ODOMETRY, motion, (information + information.T) / 2.0)
-    for channel in Channel:
-        shape = (size, KEYPOINT_AXES[channel])
-        keypoints = rng.uniform(-12.0, 12.0, shape).astype(np.float32)
-        common_bits = rng.integers(0, 256, 32, np.uint8)
-        codes = common_bits ^ (rng.integers(0, 256, (size, 32), np.uint8) & rng.integers(0, 256, (size, 32), np.uint8))
-        yield Place(KeyscanId("alice", size), channel, "light-1", size, size + 9, keypoints, codes)
-    yield Correction("alice", size, 0, motion)
-    yield Acknowledgement("alice", 7, size)
-    yield DetectorUpdate("alice", DetectorFile(Channel.CAMERA, "light-2", 1, size, rng.bytes(32)))
-
-
-def flip(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data = bytearray(rng.choice(corpus))
-    for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
-        bit = rng.randrange(8 * len(data))
-        data[bit // 8] ^= 1 << bit % 8
-    return bytes(data)
-
-
-def edit(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data = rng.choice(corpus)
-    for _ in range(rng.choice((1, 1, 2, 4))):
-        at = rng.randrange(min(len(data), 200) + 1) if rng.random() < 0.7 else rng.randrange(len(data) + 1)
-        data = data[:at] + rng.randbytes(rng.randrange(4)) + data[at + rng.randrange(4) :]
-    return data
-
-
-def cut(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data = rng.choice(corpus)
-    return data[: rng.randrange(len(data))]
-
-
-def splice(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data, other = rng.choice(corpus), rng.choice(corpus)
-    return data[: rng.randrange(len(data) + 1)] + other[rng.randrange(len(other) + 1) :]
-
-
-def swap_fields(rng: random.Random, corpus: list[bytes]) -> bytes:
-    """A field of a packet, at any depth, becomes another value, that of another packet, absent, or is there twice."""
-    message, other = pb.Packet.FromString(rng.choice(corpus)), pb.Packet.FromString(rng.choice(corpus))
-    for _ in range(rng.choice((1, 1, 2, 3))):
-        part = rng.choice(list(parts(message)))
-        fields = part.DESCRIPTOR.fields
-        chosen = rng.choice(fields)
-        donors = [each for each in parts(other) if each.DESCRIPTOR is part.DESCRIPTOR]
-        if rng.random() < 0.2:
-            part.ClearField(chosen.name)
-        elif donors and rng.random() < 0.5:
-            part.ClearField(chosen.name)
-            part.MergeFrom(only(donors[0], chosen.name))
-        elif not chosen.message_type:
-            set_field(rng, part, chosen)
-    data = message.SerializeToString()
-    return data + other.SerializeToString() if rng.random() < 0.05 else data
-
-
-def parts(message: Message) -> Iterator[Message]:
-    """The message and every message in it."""
-    yield message
-    for each, value in message.ListFields():
-        if each.message_type:
-            for inner in value if each.is_repeated else (value,):
-                yield from parts(inner)
-
-
-def only(message: Message, name: str) -> Message:
-    """A message with nothing but this field."""
-    result = type(message)()
-    for each, value in message.ListFields():
-        if each.name == name:
-            if each.is_repeated:
-                getattr(result, name).extend(value)
-            elif each.message_type:
-                getattr(result, name).CopyFrom(value)
-            else:
-                setattr(result, name, value)
-    return result
-
-
-def set_field(rng: random.Random, part: Message, chosen: Any) -> None:
-    kinds = type(chosen)
-    value: Any
-    if chosen.type in (kinds.TYPE_DOUBLE, kinds.TYPE_FLOAT):
-        value = rng.choice(FLOATS)
-    elif chosen.type == kinds.TYPE_STRING:
-        value = rng.choice(("", "alice", "bob", "a" * 65, "../x", "\u00e9", "a\n"))
-    elif chosen.type == kinds.TYPE_BYTES:
-        value = rng.randbytes(rng.choice((0, 1, 2, 31, 32, 33, 300, 5000)))
-    elif chosen.type == kinds.TYPE_UINT64:
-        value = rng.choice(INTERESTING)
-    else:
-        value = rng.choice(INTERESTING) % (2**31 if chosen.type == kinds.TYPE_ENUM else 2**32)
-    if chosen.is_repeated:
-        getattr(part, chosen.name).extend([value] * rng.choice((1, 1, 6, 100)))
-    else:
-        setattr(part, chosen.name, value)
-
-
-def foreign_fields(rng: random.Random, corpus: list[bytes]) -> bytes:
-    """Fields that the schema does not know, groups, and messages in messages down to great depths."""
-    data = rng.choice(corpus)
-    added = varint(rng.getrandbits(rng.choice((4, 8, 32))) << 3 | rng.randrange(8)) + varint(rng.choice(INTERESTING))
-    if rng.random() < 0.3:
-        for _ in range(rng.choice((3, 99, 101, 500))):
-            added = b"\x52" + varint(len(added)) + added
-    at = rng.choice((0, len(data)))
-    return data[:at] + added + rng.randbytes(rng.randrange(3)) + data[at:]
-
-
-def varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 127:
-        out.append(value & 127 | 128)
-        value >>= 7
-    return bytes([*out, value])
-
-
-def bomb(rng: random.Random, corpus: list[bytes]) -> bytes:
-    """A stream of bytes that stands for as much as possible: constant, periodic or random, up to the limits."""
-    message = pb.Packet.FromString(rng.choice(corpus))
-    body = getattr(message, message.WhichOneof("body"))
-    length = rng.choice((0, 1, 2, 10, 1000, 12288, 12289, 65536))
-    unit = rng.randbytes(rng.choice((1, 2, 7)))
-    stream = rng.choice((unit * length, rng.randbytes(length)))[:length]
-    for each in body.DESCRIPTOR.fields:
-        if each.type == each.TYPE_BYTES and rng.random() < 0.8:
-            setattr(body, each.name, stream)
-        elif "count" in each.name and rng.random() < 0.5:
-            setattr(body, each.name, rng.choice(INTERESTING) % 2**32)
-    return message.SerializeToString()
-
-
-def noise(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data = rng.randbytes(rng.choice((0, 1, 5, 30, 300, 98304, 98305)) if rng.random() < 0.02 else rng.randrange(60))
-    try:
-        pb.Packet.FromString(data)
-    except DecodeError:
-        return data if rng.random() < 0.5 else rng.choice(corpus)[: rng.randrange(30)] + data
-    return data
-
-
-Breaker = Callable[[random.Random, list[bytes]], bytes]
-BREAKERS: dict[str, Breaker] = {
-    "bits flipped": flip,
-    "bytes edited": edit,
-    "cut off": cut,
-    "spliced": splice,
-    "fields swapped": swap_fields,
-    "foreign fields": foreign_fields,
-    "bombs": bomb,
-    "noise": noise,
-}
+    sys.addaudithook(note)
 
 
 if __name__ == "__main__":

@@ -3,12 +3,15 @@
 import difflib
 import math
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from fcslam.errors import ConfigError
+
+LONGEST_QUOTE: Final = 300
+"""Longer texts from a file are cut in messages."""
 
 
 class Settings(BaseModel):
@@ -27,11 +30,11 @@ def load(kind: type[SettingsType], path: Path) -> SettingsType:
         ConfigError: the file cannot be read, is not a mapping, or has an unknown key or a wrong value.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = parse_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML ({_one_line(error)})") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from error
     if content is None:
         content = {}
     if not isinstance(content, dict):
@@ -49,10 +52,12 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
         return kind.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+        key = one_line(".".join(str(part) for part in first["loc"]))
         if first["type"] == "extra_forbidden":
             raise ConfigError(f"{where}: unknown key '{key}'{_nearest(kind, first['loc'])}") from error
-        raise ConfigError(f"{where}: {key}: {first['msg']} (given: {first['input']!r})") from error
+        raise ConfigError(
+            f"{where}: {key}: {one_line(first['msg'])} (given: {one_line(repr(first['input']))})"
+        ) from error
 
 
 def dump(settings: Settings) -> str:
@@ -90,5 +95,19 @@ def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:
     return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(model.model_fields)}"
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def parse_yaml(text: str) -> Any:
+    """Content of YAML text of unknown origin.
+
+    Raises:
+        ValueError: it is not valid YAML; the message is one line.
+    """
+    try:
+        return yaml.safe_load(text)
+    except Exception as error:  # beside its own errors, those of its constructors: recursion, dates, numbers, ...
+        raise ValueError(f"not valid YAML ({one_line(str(error))})") from error
+
+
+def one_line(text: str) -> str:
+    """The text on one line of at most ``LONGEST_QUOTE`` characters, for a message that quotes a file."""
+    line = " ".join(text.split())
+    return line if len(line) <= LONGEST_QUOTE else f"{line[: LONGEST_QUOTE - 3]}..."

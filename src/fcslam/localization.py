@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import yaml
 
-from fcslam.config import dump
+from fcslam.config import dump, one_line, parse_yaml
 from fcslam.errors import EvaluationError, SourceError
 from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
@@ -51,15 +50,15 @@ def read_map(path: Path) -> OccupancyMap:
     description = path / MAP_YAML if path.is_dir() else path
     try:
         text = _content(description).decode("utf-8")
-        image = yaml.safe_load(text)["image"]
+        image = parse_yaml(text)["image"]
         if not isinstance(image, str) or Path(image).name != image:
-            raise SourceError(f"{description}: the image {image!r} must be a file beside the description")
+            raise SourceError(f"{description}: the image {one_line(repr(image))} must be a file beside the description")
         return parse_map(str(description), _content(description.parent / image), text)
     except OSError as error:
         raise SourceError(
-            f"{error.filename}: no map can be read ({error.strerror}); give a run folder or a map.yaml"
+            f"{one_line(str(error.filename))}: no map can be read ({error.strerror}); give a run folder or a map.yaml"
         ) from error
-    except (yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{description}: names no image; give a run folder or the YAML file of a map") from error
     except EvaluationError as error:
         raise SourceError(str(error)) from error

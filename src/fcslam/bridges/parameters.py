@@ -3,10 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import Field
 
-from fcslam.config import Settings, parse
+from fcslam.config import Settings, one_line, parse, parse_yaml
 from fcslam.errors import ConfigError
 
 _PARAMETERS = "ros__parameters"
@@ -37,9 +36,9 @@ def load_parameters(path: Path | None) -> NodeParameters:
     if path is None:
         return NodeParameters()
     try:
-        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read ({' '.join(str(error).split())})") from error
+        content: Any = parse_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read ({one_line(str(error))})") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: has no parameters; write `fcslam: {{ros__parameters: {{...}}}}`")
     nodes = [node[_PARAMETERS] for node in content.values() if isinstance(node, dict) and _PARAMETERS in node]

@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from fcslam.config import one_line, parse_yaml
 from fcslam.errors import EvaluationError
 from fcslam.records import frozen
 
@@ -90,7 +91,7 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
     try:
         return _parsed(pgm, description)
     except ValueError as error:
-        raise EvaluationError(f"{name} is broken: {error}") from error
+        raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
 
 
 def _parsed(pgm: bytes, description: str) -> OccupancyMap:
@@ -112,12 +113,10 @@ def _parsed(pgm: bytes, description: str) -> OccupancyMap:
 def _described(description: str) -> tuple[float, tuple[float, float], float, float]:
     """Resolution, origin, threshold of occupied cells, threshold of free cells."""
     try:
-        content: Any = yaml.safe_load(description)
+        content: Any = parse_yaml(description)
         resolution_m, occupied, free = (float(content[key]) for key in ("resolution", "occupied_thresh", "free_thresh"))
         x, y, theta = map(float, content["origin"])
         plain = not content.get("negate", 0) and content.get("mode", "trinary") == "trinary" and theta == 0.0
-    except yaml.YAMLError as error:
-        raise ValueError(f"the description is not valid YAML ({' '.join(str(error).split())})") from error
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError("the description lacks resolution, origin, occupied_thresh or free_thresh") from error
     if not (0.0 < resolution_m < math.inf and math.isfinite(x) and math.isfinite(y) and 0.0 <= free <= occupied <= 1.0):

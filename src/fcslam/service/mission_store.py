@@ -18,6 +18,7 @@ from fcslam.cloud.edits import check_undo, edit_json, kind_of, read_edit
 from fcslam.cloud.replies import SessionCorrection, is_news
 from fcslam.cloud.report import Track
 from fcslam.cloud.settings import CloudConfig
+from fcslam.config import one_line
 from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Correction, Edit, Undo, frozen
 from fcslam.storage.database import Database, SealedTable, check_file, translate_errors
@@ -371,7 +372,7 @@ def check_mission(path: Path) -> None:
         CloudConfig.model_validate_json(facts.get(CONFIG, "{}"))
         int(facts.get(APPLIED, "0"))
     except (ValueError, EditError) as error:
-        raise StoreError(f"{path}: {' '.join(str(error).split())}") from error
+        raise StoreError(f"{path}: {one_line(str(error))}") from error
 
 
 def _edits(query: Callable[[str, tuple[int]], Iterable[Any]], after: int) -> list[Edit]:

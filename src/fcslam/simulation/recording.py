@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 import fcslam
-from fcslam.config import dump
+from fcslam.config import dump, parse_yaml
 from fcslam.errors import OutputError
 from fcslam.records import GroundTruth, RecordedItem
 from fcslam.simulation.simulated_fleet import SimulatedRobot, SimulationSettings
@@ -78,8 +78,8 @@ def _writer(robot: SimulatedRobot, folder: Path, resume: bool) -> RecordingWrite
 
 def _check_same(path: Path, wanted: dict[str, Any]) -> None:
     try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        found = parse_yaml(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise OutputError(f"{path}: cannot be read, so nothing can go on here; choose another place") from error
     if found != wanted:
         raise OutputError(f"{path}: {_difference(found, wanted)}; give what was given before, or choose another place")

@@ -232,5 +232,7 @@ def translate_errors(path: Path) -> Iterator[None]:
     """Raise errors of the disk and of SQLite as a ``StoreError`` of one line."""
     try:
         yield
+    except UnicodeDecodeError as error:  # in the names of tables, which SQLite does not check
+        raise StoreError(f"{path}: broken") from error
     except (OSError, sqlite3.DatabaseError) as error:
         raise StoreError(f"{path}: cannot be read or written ({error}); is the disk full?") from error

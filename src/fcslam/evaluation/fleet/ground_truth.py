@@ -9,8 +9,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
+from fcslam.config import parse_yaml
 from fcslam.errors import EvaluationError
 from fcslam.evaluation.fleet.relations import pose_table
 from fcslam.metrics.grid import LabelledGrid
@@ -78,7 +78,7 @@ def read_grid(path: Path) -> LabelledGrid:
         EvaluationError: one of the two files is missing or invalid.
     """
     try:
-        meta = yaml.safe_load(path.read_text(encoding="utf-8"))
+        meta = parse_yaml(path.read_text(encoding="utf-8"))
         pixels = cv2.imdecode(np.fromfile(path.parent / meta["image"], dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
         if pixels is None:
             raise ValueError(f"{meta['image']} is no image")
@@ -86,7 +86,7 @@ def read_grid(path: Path) -> LabelledGrid:
         occupied_over, free_under = float(meta["occupied_thresh"]), float(meta["free_thresh"])
         if not (resolution_m > 0.0 and origin.shape == (3,) and np.isfinite(origin).all()):
             raise ValueError("resolution or origin is wrong")
-    except (OSError, ValueError, TypeError, KeyError, cv2.error, yaml.YAMLError) as error:
+    except (OSError, ValueError, TypeError, KeyError, cv2.error) as error:
         raise EvaluationError(f"{path}: not a map of ROS map_server ({error!r})") from error
     occupancy = (pixels if meta.get("negate") else 255 - pixels)[::-1] / 255.0
     return LabelledGrid(occupancy > occupied_over, occupancy < free_under, resolution_m, frozen(origin))
