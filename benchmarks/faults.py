@@ -8,12 +8,19 @@ answers, cuts them in the middle, delays them, lets them arrive twice and in ano
 for what is five minutes of the recording. Processes are killed (SIGKILL) at random instants and started again; the
 server's disk is full for a while; the robots' clocks are minutes apart.
 
+The scenario "killed, a real log" needs recordings and runs only when `--scenarios` names it. It maps one log of
+the SLAM benchmark, cut into robots, over a network that cuts, doubles and delays requests, and kills server, worker and
+robots twelve times in each round; a robot that is done is not killed. Each round has the next seed. For 100 kills:
+
+    FCSLAM_DATA=/path/to/data python benchmarks/faults.py --scenarios "killed, a real log" --rounds 10 --keep FILE
+
 After each scenario the result is asked for and compared with what `fcslam map` makes of the same recordings in one
 process: closures (all lines of closures.csv), pose graph (largest difference of any number), bytes of the map, poses at
 keyscans, packets that count.
 """
 
 import asyncio
+import itertools
 import sys
 import tempfile
 import threading
@@ -21,7 +28,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +71,11 @@ class Scenario:
     path_m: float = PATH_M
     speed: float = SPEED
     """So many times as fast as recorded."""
+    log: str = ""
+    """A log of the SLAM benchmark, cut into so many robots; none: a simulated fleet."""
 
 
+REAL = "killed, a real log"
 SCENARIOS = {
     "undisturbed": Scenario(),
     "30 % lost": Scenario(lost=0.15, cut=0.05),
@@ -79,30 +89,44 @@ SCENARIOS = {
     "disk full": Scenario(disk_full=True),
     "clocks apart": Scenario(skewed=True),
     "20 robots, server killed": Scenario(robots=MANY_ROBOTS, path_m=MANY_PATH_M, speed=MANY_SPEED, server_kills=4),
+    REAL: Scenario(
+        lost=0.1, cut=0.05, twice=0.3, delay_s=0.5, server_kills=4, worker_kills=4, robot_kills=4, log="intel"
+    ),
 }
 
-COLUMNS = {"scenario": "", "robots": "", "packets": ",.0f", "lost": ".0f", "twice": ".0f", "closures": "",
+COLUMNS = {"scenario": "", "seed": "", "robots": "", "packets": ",.0f", "lost": ".0f", "twice": ".0f", "closures": "",
            "the same": "", "graph off by": ".1e", "map the same": "", "poses the same": "", "requests": ",.0f",
            "disturbed": ",.0f", "turned away": ",.0f", "kills": "", "s": ".0f", "passed": ""}  # fmt: skip
 
 
 def main() -> None:
     parser = common.options(__doc__)
-    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS))
+    parser.add_argument(
+        "--scenarios", nargs="+", choices=SCENARIOS, default=[name for name in SCENARIOS if name != REAL]
+    )
     parser.add_argument("--robots", type=int, help=f"in each scenario ({ROBOTS}, and {MANY_ROBOTS} in the last one)")
     parser.add_argument("--path", type=float, help=f"of each robot, m ({PATH_M}, {MANY_PATH_M})")
     parser.add_argument("--speed", type=float, help=f"so many times as fast as recorded ({SPEED}, {MANY_SPEED})")
-    parser.add_argument("--seed", type=int, default=1, help="of the fleet and of the faults")
+    parser.add_argument("--seed", type=int, default=1, help="of the fleet and of the first round's faults")
+    parser.add_argument("--rounds", type=int, default=1, help="of each scenario, each with the next seed")
+    parser.add_argument("--keep", type=Path, help="file that keeps finished rounds; the same one resumes")
     chosen = parser.parse_args()
+    kept = common.Kept(chosen.keep)
     report = common.Report(__file__, __doc__, chosen)
     rows = []
     with tempfile.TemporaryDirectory() as place:
         worlds = Worlds(Path(place), chosen.seed)
-        for name in chosen.scenarios:
+        for name, seed in itertools.product(chosen.scenarios, range(chosen.seed, chosen.seed + chosen.rounds)):
             scenario = SCENARIOS[name]
             changes = {"robots": chosen.robots, "path_m": chosen.path, "speed": chosen.speed}
             scenario = replace(scenario, **{key: value for key, value in changes.items() if value is not None})
-            rows.append((name, *play(scenario, worlds, Path(place) / name.replace(" ", "-"), chosen)))
+            folder = Path(place) / f"{name.replace(' ', '-')}-{seed}"
+            rows += kept.rows(
+                (*astuple(scenario), chosen.seed, seed),
+                lambda name=name, scenario=scenario, folder=folder, seed=seed: [
+                    (name, seed, *play(scenario, worlds, folder, seed))
+                ],
+            )
             print(*rows[-1], flush=True)
     report.table("Scenarios", COLUMNS, rows)
     report.write()
@@ -116,11 +140,11 @@ class Worlds:
     def __init__(self, folder: Path, seed: int) -> None:
         self._folder = folder
         self._seed = seed
-        self._known: dict[tuple[int, float, bool], tuple[list[Path], Path, float]] = {}
+        self._known: dict[tuple[str, int, float, bool], tuple[list[Path], Path, float]] = {}
 
     def get(self, scenario: Scenario) -> tuple[list[Path], Path, float]:
         """Recordings, the run folder of reference, and the longest recording's duration in seconds."""
-        key = scenario.robots, scenario.path_m, scenario.skewed
+        key = scenario.log, scenario.robots, scenario.path_m, scenario.skewed
         if key not in self._known:
             folder = self._folder / f"world-{len(self._known)}"
             folder.mkdir()
@@ -134,6 +158,8 @@ class Worlds:
         from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
         from fcslam.sources import write_carmen
 
+        if scenario.log:
+            return self._cut(scenario, folder)
         lidar = LidarSettings(beams=180, rate_hz=3.0)
         settings = SimulationSettings(robots=scenario.robots, path_length_m=scenario.path_m, lidar=lidar, camera=None)
         logs, longest_s = [], 0.0
@@ -142,6 +168,18 @@ class Worlds:
             skew_s = number * SKEW_S * scenario.skewed
             write_carmen(logs[-1], (replace(scan, stamp=scan.stamp + skew_s) for scan in driven.scans()))
             longest_s = max(longest_s, float(driven.stamps[-1] - driven.stamps[0]))
+        return logs, longest_s
+
+    def _cut(self, scenario: Scenario, folder: Path) -> tuple[list[Path], float]:
+        from fcslam.sources import open_source, split, write_carmen
+
+        path = common.log_path(common.recordings(f"slam-benchmark/{scenario.log}.clf.xz"), scenario.log)
+        logs, longest_s = [], 0.0
+        for part in split(open_source(path), scenario.robots):
+            logs.append(folder / f"{part.name.replace('.', '-')}.clf")
+            records = list(part.records())
+            write_carmen(logs[-1], records)
+            longest_s = max(longest_s, records[-1].stamp - records[0].stamp)
         return logs, longest_s
 
 
@@ -237,10 +275,10 @@ async def http_message(reader: asyncio.StreamReader) -> bytes:
     return head + await reader.readexactly(int(lengths[0]) if lengths else 0)
 
 
-def play(scenario: Scenario, worlds: Worlds, place: Path, chosen: Any) -> tuple:
-    """One scenario from empty folders to the compared result; a row without its name."""
+def play(scenario: Scenario, worlds: Worlds, place: Path, seed: int) -> tuple:
+    """One scenario from empty folders to the compared result; a row without its name and seed."""
     place.mkdir()
-    rng = np.random.default_rng(chosen.seed)
+    rng = np.random.default_rng(seed)
     logs, reference, duration_s = worlds.get(scenario)
     began = time.perf_counter()
     with cloud(place) as (server, port), closing(Proxy(scenario, port, rng)) as proxy, ExitStack() as stack:
