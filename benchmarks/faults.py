@@ -9,10 +9,11 @@ for what is five minutes of the recording. Processes are killed (SIGKILL) at ran
 server's disk is full for a while; the robots' clocks are minutes apart.
 
 The scenario "killed, a real log" needs recordings and runs only when `--scenarios` names it. It maps one log of
-the SLAM benchmark, cut into robots, over a network that cuts, doubles and delays requests, and kills server, worker and
-robots twelve times in each round; a robot that is done is not killed. Each round has the next seed. For 100 kills:
+the SLAM benchmark, cut into robots, over a network that cuts, doubles and delays requests. In each round it kills
+server, worker and robots up to twelve times; it kills no robot that is done. Each round has the next seed. For about
+100 kills:
 
-    FCSLAM_DATA=/path/to/data python benchmarks/faults.py --scenarios "killed, a real log" --rounds 10 --keep FILE
+    FCSLAM_DATA=/path/to/data python benchmarks/faults.py --scenarios "killed, a real log" --rounds 12 --keep FILE
 
 After each scenario the result is asked for and compared with what `fcslam map` makes of the same recordings in one
 process: closures (all lines of closures.csv), pose graph (largest difference of any number), bytes of the map, poses at
