@@ -36,7 +36,7 @@ class MapLocalizationConfig(Settings):
     """Localisation in a finished map."""
 
     first_m: float = Field(default=3.0, gt=0, description="travel before the first search of the whole map [m]")
-    growth: float = Field(default=1.2, gt=1.0, description="length of a stretch, relative to that at the search before")
+    growth: float = Field(default=1.5, gt=1.0, description="length of a stretch, relative to that at the search before")
     window_m: float = Field(default=15.0, gt=0, description="longest stretch whose walls are searched for [m]")
     ratio: float = Field(
         default=1.5,
