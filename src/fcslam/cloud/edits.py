@@ -66,7 +66,7 @@ def read_edit(kind: str, content: str) -> Change | Undo:
     """
     try:
         return _read(kind, json.loads(content))
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise EditError(f"no edit of kind '{kind}' ({type(error).__name__}: {error})") from error
 
 

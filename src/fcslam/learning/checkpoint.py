@@ -69,6 +69,6 @@ def read_checkpoint(path: Path) -> Checkpoint:
             tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
             return Checkpoint(header["stage"], header["step"], header["settings"], tensors)
         found = header["format"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise TrainingError(f"{path}: is no checkpoint of a training run ({error}); remove it") from error
     raise TrainingError(f"{path}: has format {found}, expected {FORMAT}; start again in another folder")

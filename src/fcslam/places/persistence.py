@@ -126,7 +126,9 @@ def load_index(path: Path, place_id: Callable[[Any], PlaceId], descriptor_versio
             arrays = {name: archive[name] for name in _SHAPES}
         about = json.loads(arrays.pop("about").tobytes())
         state = _state(arrays, about, place_id)
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, InputError) as error:
+    except (
+        OSError, ValueError, KeyError, EOFError, TypeError, RecursionError, zipfile.BadZipFile, InputError
+    ) as error:  # fmt: skip
         raise InputError(f"{path}: not a readable place index ({_one_line(error)}); build it again") from error
     if descriptor_version not in ("", state.descriptor_version):
         raise InputError(

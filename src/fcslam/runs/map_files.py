@@ -117,7 +117,7 @@ def _described(description: str) -> tuple[float, tuple[float, float], float, flo
         resolution_m, occupied, free = (float(content[key]) for key in ("resolution", "occupied_thresh", "free_thresh"))
         x, y, theta = map(float, content["origin"])
         plain = not content.get("negate", 0) and content.get("mode", "trinary") == "trinary" and theta == 0.0
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError("the description lacks resolution, origin, occupied_thresh or free_thresh") from error
     if not (0.0 < resolution_m < math.inf and math.isfinite(x) and math.isfinite(y) and 0.0 <= free <= occupied <= 1.0):
         raise ValueError("the description has a resolution, an origin or a threshold that is out of range")

@@ -118,7 +118,7 @@ def read_metrics(path: Path) -> dict[str, Metric]:
         return _unique(
             path.name, ((row["name"], Metric(row["name"], v, row["unit"])) for row, v in zip(rows, values, strict=True))
         )
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path.name} is not a list of name, value, unit") from error
 
 

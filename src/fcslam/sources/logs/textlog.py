@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
-from fcslam.records import Beams, LaserScan, Odometry, SensorRecord
+from fcslam.records import Beams, LaserScan, Odometry, Ranges, SensorRecord
 from fcslam.sources.contradictions import OdometryWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, scan_window
@@ -76,14 +76,18 @@ class TextLog:
             if isinstance(entry, OdometryLine):
                 yield Odometry(entry.stamp, T_odom_base)
                 continue
+            model = laser.with_beams(entry.beams)
+            ranges_m: Ranges | None
             try:
                 ranges_m = parse_ranges(entry.line, unit, number, audit)
             except ValueError:
+                ranges_m = None
+            if ranges_m is None or len(ranges_m) != model.beam_count:
                 audit.add(Fault.BROKEN_LINE, number)
-            else:
-                scan = LaserScan(entry.line.stamp, ranges_m, laser.with_beams(entry.beams), T_odom_base)
-                watch.add(number, scan)
-                yield scan
+                continue
+            scan = LaserScan(entry.line.stamp, ranges_m, model, T_odom_base)
+            watch.add(number, scan)
+            yield scan
 
     @cached_property
     def _reading(self) -> LogReading:
