@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import chain
 from typing import NamedTuple
 
+from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCAN
 from fcslam.sources.bags.container import BagFile, Topic, is_transforms
@@ -228,7 +229,9 @@ def _note(bag: BagFile, what: str, option: str, chosen: Topic, candidates: Seque
 def _known(topics: Sequence[Topic]) -> str:
     if not topics:
         return "the bag has no topics"
-    named = ", ".join(f"{topic.name} ({topic.type}, {topic.message_count})" for topic in topics[:_NAMED_AT_MOST])
+    named = ", ".join(
+        f"{one_line(topic.name)} ({one_line(topic.type)}, {topic.message_count})" for topic in topics[:_NAMED_AT_MOST]
+    )
     more = f" and {len(topics) - _NAMED_AT_MOST} more" if len(topics) > _NAMED_AT_MOST else ""
     return f"the topics are {named}{more}"
 
