@@ -95,7 +95,7 @@ def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:
     return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(model.model_fields)}"
 
 
-def parse_yaml(text: str) -> Any:
+def parse_yaml(text: str | bytes) -> Any:
     """Content of YAML text of unknown origin.
 
     Raises:

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from pydantic import ValidationError, model_validator
 
-from fcslam.config import Settings
+from fcslam.config import Settings, parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams, CameraModel, LaserModel
@@ -155,10 +155,10 @@ def read_meta(folder: Path) -> Meta:
     try:
         with path.open("rb") as file:
             text = file.read(_MAX_META_BYTES + 1)
-        content = yaml.safe_load(text) if len(text) <= _MAX_META_BYTES else None
+        content = parse_yaml(text) if len(text) <= _MAX_META_BYTES else None
     except FileNotFoundError as error:
         raise SourceError(f"{path}: is missing; it says how the laser measures, so copy the whole folder") from error
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+    except (OSError, ValueError) as error:
         raise SourceError(f"{path}: cannot be read ({_one_line(error)}); copy it again") from error
     version = content.get("version") if isinstance(content, dict) else None
     if type(version) is not int:
