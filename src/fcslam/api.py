@@ -38,7 +38,7 @@ def map_recordings(
     progress: Watch | None = None,
     force: bool = False,
     processes: int = 1,
-    onto: StrPath | None = None,
+    onto: StrPath | SavedMission | None = None,
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
@@ -70,7 +70,7 @@ def map_recordings(
     """
     if output is not None:
         prepare_output(Path(output), force)
-    earlier = None if onto is None else read_mission(Path(onto))
+    earlier = read_mission(Path(onto)) if isinstance(onto, str | os.PathLike) else onto
     settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
     robots = split_recordings(_opened(recordings, bag_options), split)
     drive = side_by_side(processes)

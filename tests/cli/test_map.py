@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from fcslam import api
 from fcslam.cli import main
 from fcslam.cli import map as mapping
 from fcslam.config import dump
@@ -419,6 +420,6 @@ def test_a_disk_that_is_full_is_one_line(tmp_path, log, monkeypatch, capsys):
 
 
 def test_the_command_refuses_before_the_long_work(tmp_path, log, monkeypatch, capsys):
-    monkeypatch.setattr("fcslam.mission.run_mission", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr(api, "run_mission", lambda *_: pytest.fail("worked"))
     refused(capsys, tmp_path, log, tmp_path / "none.log", "--output", tmp_path / "run")
     refused(capsys, tmp_path, log, "--output", log / "run")

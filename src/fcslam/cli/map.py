@@ -103,9 +103,8 @@ def map_sources(
     A run that appeared at ``output`` meanwhile is replaced only with ``force``.
     """
     with _without_collection():
+        from fcslam import api
         from fcslam.cli.progress import ProgressDisplay
-        from fcslam.driving import side_by_side
-        from fcslam.mission import run_mission
 
         surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
         gc.freeze()
@@ -116,7 +115,9 @@ def map_sources(
         faults: dict[str, Faults] = {}
         known = 0 if earlier is None else sum(len(track.stamps) for track in earlier.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
-        run = run_mission(sources, settings, progress, vetoes, side_by_side(cores()), earlier)
+        run = api.map_recordings(
+            sources, config=settings, vetoes=vetoes, progress=progress, processes=cores(), onto=earlier
+        )
         display.start("writing")
         run.save(output, force)
     print_faults(console, faults)
