@@ -50,7 +50,7 @@ def test_every_target_reads_some_inputs_and_refuses_others(target, tmp_path):
 
 
 def test_an_exception_is_a_finding_with_the_command_that_repeats_it(fuzz, tmp_path, monkeypatch):
-    monkeypatch.setattr(fuzz, "WARM_UP", -1)  # this process keeps its memory and its files unwatched
+    monkeypatch.setattr(fuzz, "WARM_UP", sys.maxsize)  # this process keeps its memory and its files unwatched
 
     def breaks(rng):
         raise KeyError("no such name")
