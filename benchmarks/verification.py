@@ -4,8 +4,9 @@
 
 The pairs are those that a mission of simulated robots in one building compares, again and again until they are enough.
 A batch has as many as there are places to compare while the fleet is small (`fleet.matcher.small_fleet`). One process
-is this one. The pool is started and has loaded its code before the clock runs. Wall-clock time: the machine must be
-quiet. The last column needs no quiet machine: CPU of one process, against that of this one and the busiest of the pool.
+is this one; of two, this one and another share the pairs. The pool is started and has loaded its code before the clock
+runs. Wall-clock time: the machine must be quiet. The last column needs no quiet machine: CPU of one process, against
+that of the busiest.
 """
 
 import itertools
@@ -24,7 +25,7 @@ COLUMNS = {"processes": "", "pairs": ",", "time, s": ".1f", "a pair, ms": ".2f",
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--pairs", type=int, default=10_000, help="number of pairs")
-    parser.add_argument("--processes", nargs="+", type=int, default=[2], help="sizes of the pool")
+    parser.add_argument("--processes", nargs="+", type=int, default=[2], help="numbers of processes")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
     batches = compared(chosen.pairs)
@@ -32,7 +33,7 @@ def main() -> None:
     rows = [(1, chosen.pairs, single_s, 1e3 * single_s / chosen.pairs, 1.0, 1.0)]
     for processes in chosen.processes:
         with ExitStack() as stack:
-            pools = [ProcessPoolExecutor(1, get_context("spawn")) for _ in range(processes)]
+            pools = [ProcessPoolExecutor(1, get_context("spawn")) for _ in range(processes - 1)]
             executors = [stack.enter_context(pool) for pool in pools]
             timed(executors, batches[:4])
             pool_s, cpu_s, found = timed(executors, batches)
@@ -72,7 +73,7 @@ def compared(count: int) -> list[list]:
 
 
 def timed(executors: list, batches: list[list]) -> tuple[float, float, list]:
-    """Seconds, seconds of CPU of this process and the busiest executor, and what was found."""
+    """Seconds, seconds of CPU of the busiest process, and what was found."""
     from fcslam.lidar.pair_verification import VerificationPool, verify_here
     from fcslam.lidar.verification import VerificationConfig
 
@@ -80,8 +81,7 @@ def timed(executors: list, batches: list[list]) -> tuple[float, float, list]:
     config, began, before_s = VerificationConfig(), time.perf_counter(), used(executors)
     found = [check for batch in batches for check in run(batch, config)]
     took_s = time.perf_counter() - began
-    here_s, *there_s = (after - before for after, before in zip(used(executors), before_s, strict=True))
-    cpu_s = here_s + max(there_s, default=0.0)
+    cpu_s = max(after - before for after, before in zip(used(executors), before_s, strict=True))
     return took_s, cpu_s, [(check.T_a_b.tobytes(), check.strict, check.loose) for check in found]
 
 

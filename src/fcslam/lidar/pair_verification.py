@@ -40,7 +40,7 @@ def verify_here(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verif
 
 
 class VerificationPool:
-    """Aligns pairs on executors of one process each, and judges them here. It has the signature ``VerifyPairs``.
+    """Aligns pairs in this process and on executors of one process each, and judges them here: a ``VerifyPairs``.
 
     A submap takes longer to send than to compare, so each process keeps those that it got.
     """
@@ -56,14 +56,14 @@ class VerificationPool:
 
     def __call__(self, pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
         """Results in the order of the pairs, whichever process is done first."""
-        size = max(1, -(-len(pairs) // len(self._processes)))
-        begins = range(0, len(pairs), size)
-        running = [
-            process.submit(pairs[begin : begin + size], config)
-            for process, begin in zip(self._processes, begins, strict=False)
+        size = max(1, -(-len(pairs) // (1 + len(self._processes))))
+        here, *there = (pairs[begin : begin + size] for begin in range(0, len(pairs) or 1, size))
+        running = [process.submit(share, config) for process, share in zip(self._processes, there, strict=False)]
+        return verify_here(here, config) + [
+            judge(aligned, config, pair.noise)
+            for share, batch in zip(there, running, strict=True)
+            for pair, aligned in zip(share, batch.result(), strict=True)
         ]
-        aligned = [each for batch in running for each in batch.result()]
-        return [judge(each, config, pair.noise) for pair, each in zip(pairs, aligned, strict=True)]
 
 
 class _Process:
