@@ -1,6 +1,8 @@
 """A robot between a network in memory and its map: what it publishes, and what it says."""
 
 import threading
+import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -131,8 +133,32 @@ def test_missing_topics_end_the_wait():
         await_sensors(MemoryNetwork(), "/robot1", BagOptions(), 0.0, 0.0)
 
 
+@contextmanager
+def running(node):
+    """The drive in a thread of its own."""
+    thread = threading.Thread(target=node.run)
+    thread.start()
+    try:
+        yield thread
+    finally:
+        node.stop()
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def wait_for(condition):
+    end = time.monotonic() + 20.0
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert condition()
+
+
 def save(network, name):
     network.say(f"/robot1/{SAVE_MAP}", STRING, CODEC.make(STRING, data=name))
+
+
+def saved_map(folder, name):
+    return parse_map(name, *((folder / f"{name}.{kind}").read_bytes() for kind in ("pgm", "yaml")))
 
 
 def test_a_map_is_saved_for_map_server(network, robot, scans, tmp_path, monkeypatch):
@@ -140,21 +166,40 @@ def test_a_map_is_saved_for_map_server(network, robot, scans, tmp_path, monkeypa
     said = []
     node = start(network, robot, said.append)
     plays(network, scans)
-    run_until(node, len(scans))
-    save(network, "office")
-    saved = parse_map("office", *((tmp_path / f"office.{kind}").read_bytes() for kind in ("pgm", "yaml")))
-    assert np.array_equal(saved.cells, robot.map().cells)
-    assert f"map saved: {tmp_path / 'office.yaml'}" in said
+    with running(node):
+        wait_for(lambda: node.scans == len(scans))
+        save(network, "office")
+        wait_for(lambda: f"map saved: {tmp_path / 'office.yaml'}" in said)
+        answer = network.services[f"/robot1/{SAVE_MAP}"]().result(20.0)
+    assert answer == (True, f"map saved: {tmp_path / 'robot1.yaml'}")
+    for name in ("office", "robot1"):
+        assert np.array_equal(saved_map(tmp_path, name).cells, robot.map().cells)
 
 
 @pytest.mark.parametrize("name", ["../office", "/etc/office", "a b", ".hidden"])
 def test_nobody_on_the_network_chooses_a_folder(network, robot, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     said = []
-    start(network, robot, said.append)
-    save(network, name)
+    with running(start(network, robot, said.append)):
+        save(network, name)
+        wait_for(lambda: said)
     assert list(tmp_path.iterdir()) == []
     assert "is no name; give letters" in said[0]
+
+
+def test_the_finish_service_ends_the_drive(network, robot):
+    with running(start(network, robot)) as thread:
+        assert network.services[f"/robot1/{FINISH}"]().result(10.0) == (True, "the drive ends")
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def test_a_flood_of_commands_is_refused_and_none_waits_for_ever(network, robot):
+    node = start(network, robot)
+    asked = [network.services[f"/robot1/{FINISH}"]() for _ in range(100)]
+    assert asked[-1].result(0.0) == (False, "8 commands wait already; ask again later")
+    node.run()
+    assert [future.result(10.0).success for future in asked[:8]] == [True] + 7 * [False]
 
 
 def test_an_initial_pose_is_refused_with_the_reason(network, robot):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from fcslam.bridges.network import RosNetwork
 from fcslam.errors import NetworkError
 
-_ADDRESS = re.compile(r"(ros[12]):(.*)", re.ASCII)
+_ADDRESS = re.compile(r"(ros[12]|zenoh):(.*)", re.ASCII)
 _NAMESPACE = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)*", re.ASCII)
 _LARGEST_DOMAIN = 232
 
@@ -17,7 +17,7 @@ class RosAddress(NamedTuple):
     """A robot on a ROS network."""
 
     network: str
-    """``ros1`` or ``ros2``."""
+    """``ros1``, ``ros2`` (over DDS) or ``zenoh`` (ROS 2 over Zenoh)."""
     namespace: str
     """Empty, or with a leading slash and without one at the end."""
 
@@ -58,9 +58,13 @@ def open_network(
         from fcslam.bridges.ros1 import Ros1Network
 
         return Ros1Network()
-    from fcslam.bridges.ros2 import Ros2Network
-
     text = environment.get("ROS_DOMAIN_ID") or "0" if domain is None else str(domain)
     if not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
         raise NetworkError(f"{text!r} is no domain of ROS 2; give a number from 0 to {_LARGEST_DOMAIN}")
+    if address.network == "zenoh":
+        from fcslam.bridges.ros2_zenoh import ZenohNetwork
+
+        return ZenohNetwork(int(text), environment)
+    from fcslam.bridges.ros2 import Ros2Network
+
     return Ros2Network(int(text), environment)

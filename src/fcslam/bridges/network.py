@@ -4,14 +4,28 @@ Messages are bytes here; ``sources.bags.codec`` decodes them, as those of bags.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from concurrent.futures import Future
+from typing import Final, NamedTuple, Protocol
 
-Deliver = Callable[[bytes], None]
+Deliver = Callable[[bytes], object]
 """Called with the bytes of each message, in a thread of the network."""
 Publish = Callable[[bytes], None]
 """Sends the bytes of one message. Any thread may call it."""
 
+TRIGGER: Final = "std_srvs/Trigger"
+"""Type of all services: a request without fields."""
 _TOPICS_NAMED = 15
+
+
+class Answer(NamedTuple):
+    """The response of a service of the type ``TRIGGER``; its fields have the names of that type."""
+
+    success: bool
+    message: str
+
+
+Act = Callable[[], Future[Answer]]
+"""Does what a service is for; called for each request, in a thread of the network."""
 
 
 class Quality(NamedTuple):
@@ -52,6 +66,9 @@ class RosNetwork(Protocol):
 
     def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
         """Begin to publish a topic."""
+
+    def serve(self, service: str, act: Act) -> None:
+        """Begin to serve requests of the type ``TRIGGER``."""
 
     def close(self) -> None:
         """Leave the network; nothing is delivered afterwards."""

@@ -1,19 +1,21 @@
 """A live robot on a ROS network: reads its sensors, maps, and publishes map and pose.
 
 Messages are read in the thread that calls ``run``. A second thread publishes ``map -> odom`` at a fixed rate, a third
-one the map, the path and diagnostics, so that neither delays the pose of a scan.
+one the map, the path and diagnostics, and a fourth one obeys commands, so that none of them delays the pose of a scan.
 """
 
 import queue
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from fcslam.bridges.clock import CLOCK, CLOCK_TOPIC, RosClock
-from fcslam.bridges.network import Endpoint, Quality, RosNetwork, named_topics, qos_conflict
+from fcslam.bridges.network import Answer, Endpoint, Quality, RosNetwork, named_topics, qos_conflict
 from fcslam.bridges.outputs import MAP, POSE, OutputNames, Outputs, nanoseconds
 from fcslam.bridges.parameters import NodeParameters
 from fcslam.bridges.sensors import LiveSensors, Notify
@@ -34,6 +36,8 @@ STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
 SAVE_MAP, FINISH, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "initialpose"
 _LONGEST_INBOX = 20_000
 """Most messages that wait to be read; beyond, newer ones are lost."""
+_COMMANDS_WAITING = 8
+"""Most commands that wait; anybody on the network may send them."""
 _POLL_S = 0.1
 _SETTLES_FOR_ODOMETRY = 4
 _SILENCE_S = 2.0
@@ -113,6 +117,7 @@ class RobotNode:
         self._robot, self._parameters, self._notify = robot, parameters, notify
         self._codec = MessageCodec(network.ros1)
         self._inbox: queue.SimpleQueue[_Message] = queue.SimpleQueue()
+        self._commands: queue.Queue[tuple[Callable[[], Answer], Future[Answer]]] = queue.Queue(_COMMANDS_WAITING)
         self._stop = threading.Event()
         self._told: set[str] = set()
         self.scans = self._lost_messages = 0
@@ -137,6 +142,7 @@ class RobotNode:
         threads = [
             threading.Thread(target=self._publish_transforms, name="tf", daemon=True),
             threading.Thread(target=self._publish_maps, name="maps", daemon=True),
+            threading.Thread(target=self._obey, name="commands", daemon=True),
         ]
         for thread in threads:
             thread.start()
@@ -254,13 +260,15 @@ class RobotNode:
             latched = topic.rsplit("/", 1)[-1] == TF_STATIC
             quality = Quality(reliable or latched, latched, _DEPTHS.get(kind, _DEPTH))
             self._network.subscribe(topic, kind, quality, self._deliver(topic))
-        commands: list[tuple[str, str, Callable[[bytes], None]]] = [
-            (SAVE_MAP, STRING, self._save_map),
+        commands: list[tuple[str, str, Callable[[bytes], object]]] = [
+            (SAVE_MAP, STRING, lambda payload: self._ask(partial(self._save_map, payload))),
             (FINISH, EMPTY, lambda _: self.stop()),
             (INITIAL_POSE, POSE, self._refuse_pose),
         ]
         for name, kind, command in commands:
             self._network.subscribe(resolved(self._namespace, name), kind, Quality(reliable=True), command)
+        self._network.serve(resolved(self._namespace, SAVE_MAP), lambda: self._ask(self._save_map))
+        self._network.serve(resolved(self._namespace, FINISH), lambda: self._ask(self._finish))
         if self._clock.simulated:
             self._network.subscribe(
                 CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload: self._clock.tick(payload, self._codec)
@@ -276,19 +284,44 @@ class RobotNode:
 
         return deliver
 
-    def _save_map(self, payload: bytes) -> None:
-        """Write the files of map_server to this process's folder; the message is their name."""
+    def _ask(self, command: Callable[[], Answer]) -> Future[Answer]:
+        """Obey a command later."""
+        asked: Future[Answer] = Future()
         try:
-            name = self._codec.decode(payload, STRING).data or self._robot.name
+            self._commands.put_nowait((command, asked))
+        except queue.Full:
+            asked.set_result(Answer(False, f"{_COMMANDS_WAITING} commands wait already; ask again later"))
+        return asked
+
+    def _obey(self) -> None:
+        while not self._stop.is_set():
+            try:
+                command, asked = self._commands.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+            asked.set_result(command())
+        while not self._commands.empty():
+            self._commands.get()[1].set_result(Answer(False, "the drive has ended"))
+
+    def _finish(self) -> Answer:
+        self.stop()
+        return Answer(True, "the drive ends")
+
+    def _save_map(self, payload: bytes | None = None) -> Answer:
+        """Write the files of map_server to this process's folder; the message is their name, else the robot's."""
+        try:
+            name = self._robot.name if payload is None else self._codec.decode(payload, STRING).data or self._robot.name
             if not NAME.fullmatch(name):  # anybody on the network may send it
                 raise ValueError(f"{name!r} is no name; give letters, digits and . _ -, without a folder")
             occupancy = self._robot.map()
             write_file(Path(f"{name}.pgm"), pgm_bytes(occupancy))
             write_file(Path(f"{name}.yaml"), map_yaml(occupancy, f"{name}.pgm"))
         except (ValueError, OSError, FcslamError) as error:
-            self._notify(f"the map cannot be saved: {error}")
+            answer = Answer(False, f"the map cannot be saved: {error}")
         else:
-            self._notify(f"map saved: {Path(f'{name}.yaml').absolute()}")
+            answer = Answer(True, f"map saved: {Path(f'{name}.yaml').absolute()}")
+        self._notify(answer.message)
+        return answer
 
     def _refuse_pose(self, _: bytes) -> None:
         self._tell_once("an initial pose is ignored: the robot maps, and its first scan is the origin of the map")

@@ -10,14 +10,16 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any, Final
 
-from fcslam.bridges.network import Deliver, Endpoint, Publish, Quality
+from fcslam.bridges.network import TRIGGER, Act, Deliver, Endpoint, Publish, Quality
 from fcslam.errors import NetworkError
-from fcslam.sources.bags.codec import full_name, typestore
+from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec, full_name, typestore
 
 INSTALL: Final = "sudo apt-get install python3-rospy"
 DEBIAN: Final = "/usr/lib/python3/dist-packages"
 """Where Debian installs rospy; a virtual environment does not look there."""
 _BUFFER_BYTES = 2**24
+_TRIGGER_CHECKSUM: Final = "937c9679a518e3a18d831e57125ea522"
+_LONGEST_ANSWER_S: Final = 60.0
 _ALWAYS: Final = Quality(reliable=True, latched=True)
 """TCP loses nothing, and nobody says whether a publisher latches."""
 
@@ -48,6 +50,7 @@ class Ros1Network:
         self._master = rosgraph.Master(rospy.get_name())
         self._lock = threading.Lock()
         self._handles: list[Any] = []
+        self._services: list[Any] = []
 
     def endpoints(self) -> Sequence[Endpoint]:
         """As in RosNetwork; nothing while the master is away."""
@@ -86,8 +89,20 @@ class Ros1Network:
         self._handles.append(handle)
         return lambda payload: handle.publish(raw(payload))
 
+    def serve(self, service: str, act: Act) -> None:
+        """As in RosNetwork."""
+        codec, response = MessageCodec(ros1=True), raw_class(TRIGGER_RESPONSE)
+
+        def answered(_: object) -> Any:
+            answer = act().result(_LONGEST_ANSWER_S)
+            return response(codec.encode(codec.make(TRIGGER_RESPONSE, **answer._asdict()), TRIGGER_RESPONSE))
+
+        self._services.append(self._rospy.Service(service, trigger_class(), answered))
+
     def close(self) -> None:
         """As in RosNetwork."""
+        for service in self._services:
+            service.shutdown()
         for handle in self._handles:
             handle.unregister()
         self._rospy.signal_shutdown("done")
@@ -111,4 +126,19 @@ def raw_class(kind: str) -> Any:
         def serialize(self, buffer: Any) -> None:
             buffer.write(self.payload)
 
+        def deserialize(self, payload: bytes) -> "Raw":
+            self.payload = payload
+            return self
+
     return Raw
+
+
+@cache
+def trigger_class() -> Any:
+    """The class of services of the type ``TRIGGER``, for rospy."""
+
+    class Trigger:
+        _type, _md5sum = TRIGGER, _TRIGGER_CHECKSUM
+        _request_class, _response_class = raw_class("std_msgs/Empty"), raw_class(TRIGGER_RESPONSE)
+
+    return Trigger

@@ -2,18 +2,24 @@
 
 The types of messages are not declared: DDS carries them as bytes. Publishers and subscriptions of Fast DDS, the usual
 middleware of ROS 2, match by name only if Cyclone is told to ignore descriptions of types.
+
+A service is a topic of requests and one of responses. Cyclone DDS puts the identity of a request before its contents;
+Fast DDS puts it where Cyclone DDS cannot write it. So a caller on Fast DDS is served, and gets no response.
 """
 
 import os
 import re
 import threading
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from fcslam.bridges.network import Deliver, Endpoint, Publish, Quality
+from fcslam.bridges.dds_names import dds_type, kind_of
+from fcslam.bridges.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
 from fcslam.errors import NetworkError
+from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec
 
 INSTALL: Final = "pip install 'fcslam[ros2]'"
 _PARTICIPANTS: Final = 32
@@ -22,7 +28,9 @@ _ENDPOINTS_READ = 4096
 _MESSAGES_TAKEN = 64
 _WAIT_NS = 200_000_000
 _BLOCKING_NS = 100_000_000
-_TOPIC, _TYPE = re.compile(r"rt(/.+)"), re.compile(r"(\w+)::msg::dds_::(\w+)_")
+_HEADER_BYTES, _IDENTITY_BYTES = 4, 16
+"""Of a message: its encoding. Of a request: the caller and the number of the request."""
+_TOPIC = re.compile(r"rt(/.+)")
 _PEER = re.compile(r"[\w.:-]+", re.ASCII)
 
 
@@ -72,29 +80,59 @@ class Ros2Network:
         found = []
         for publishes, reader, alive in self._builtin:
             for sample in reader.read(_ENDPOINTS_READ, alive):
-                topic, kind = _TOPIC.fullmatch(sample.topic_name or ""), _TYPE.fullmatch(sample.type_name or "")
+                topic, kind = _TOPIC.fullmatch(sample.topic_name or ""), kind_of(sample.type_name or "")
                 if topic and kind:
                     quality = _quality_of(sample.qos)
                     mine = sample.participant_key == own
-                    found.append(Endpoint(topic[1], f"{kind[1]}/{kind[2]}", publishes, quality, mine))
+                    found.append(Endpoint(topic[1], kind, publishes, quality, mine))
         return found
 
     def subscribe(self, topic: str, kind: str, quality: Quality, deliver: Deliver) -> None:
         """As in RosNetwork."""
-        from cyclonedds.core import Policy, ReadCondition
-        from cyclonedds.sub import DataReader
-
-        reader = DataReader(self._participant, self._topic(topic, kind), _qos(quality, Policy.IgnoreLocal.Participant))
-        self._readers = (*self._readers, (reader, deliver))
-        self._waitset.attach(ReadCondition(reader, self._any))
+        self._read(f"rt{topic}", dds_type(kind), quality, deliver)
 
     def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
         """As in RosNetwork."""
+        return self._writer(f"rt{topic}", dds_type(kind), quality)
+
+    def serve(self, service: str, act: Act) -> None:
+        """As in RosNetwork; callers on Fast DDS get no response."""
+        kind, quality, codec = dds_type(TRIGGER, "srv"), Quality(reliable=True), MessageCodec(ros1=False)
+        respond = self._writer(f"rr{service}Reply", f"{kind}Response_", quality)
+
+        def take(request: bytes) -> None:
+            identity = request[_HEADER_BYTES : _HEADER_BYTES + _IDENTITY_BYTES]
+
+            def reply(done: Future[Answer]) -> None:
+                response = codec.encode(codec.make(TRIGGER_RESPONSE, **done.result()._asdict()), TRIGGER_RESPONSE)
+                respond(response[:_HEADER_BYTES] + identity + response[_HEADER_BYTES:])
+
+            asked = act()
+            if len(identity) == _IDENTITY_BYTES:
+                asked.add_done_callback(reply)
+
+        self._read(f"rq{service}Request", f"{kind}Request_", quality, take)
+
+    def close(self) -> None:
+        """As in RosNetwork."""
+        self._closed.set()
+        self._thread.join()
+
+    def _read(self, topic: str, dds_kind: str, quality: Quality, deliver: Deliver) -> None:
+        from cyclonedds.core import Policy, ReadCondition
+        from cyclonedds.sub import DataReader
+
+        asked = _qos(quality, Policy.IgnoreLocal.Participant)
+        reader = DataReader(self._participant, self._topic(topic, dds_kind), asked)
+        self._readers = (*self._readers, (reader, deliver))
+        self._waitset.attach(ReadCondition(reader, self._any))
+
+    def _writer(self, topic: str, dds_kind: str, quality: Quality) -> Publish:
         from cyclonedds.core import DDSException
         from cyclonedds.pub import DataWriter
 
-        writer = DataWriter(self._participant, self._topic(topic, kind), _qos(quality))
-        message = raw_type(kind)
+        writer = DataWriter(self._participant, self._topic(topic, dds_kind), _qos(quality))
+        message = raw_type(dds_kind)
 
         def publish(payload: bytes) -> None:
             try:
@@ -104,17 +142,12 @@ class Ros2Network:
 
         return publish
 
-    def close(self) -> None:
-        """As in RosNetwork."""
-        self._closed.set()
-        self._thread.join()
-
-    def _topic(self, name: str, kind: str) -> Any:
+    def _topic(self, name: str, dds_kind: str) -> Any:
         from cyclonedds.topic import Topic
 
-        if (name, kind) not in self._topics:
-            self._topics[name, kind] = Topic(self._participant, f"rt{name}", raw_type(kind))
-        return self._topics[name, kind]
+        if (name, dds_kind) not in self._topics:
+            self._topics[name, dds_kind] = Topic(self._participant, name, raw_type(dds_kind))
+        return self._topics[name, dds_kind]
 
     def _receive(self) -> None:
         while not self._closed.is_set():
@@ -127,15 +160,13 @@ class Ros2Network:
 
 
 @cache
-def raw_type(kind: str) -> Any:
-    """A type of DDS messages that are kept as bytes, named as ROS 2 names ``kind``."""
+def raw_type(dds_kind: str) -> Any:
+    """A type of DDS messages that are kept as bytes."""
     from cyclonedds.idl import IdlStruct
     from cyclonedds.idl.types import uint8
 
-    package, name = kind.split("/")
-
     @dataclass
-    class _DdsMessage(IdlStruct, typename=f"{package}.msg.dds_.{name}_"):  # type: ignore[misc, call-arg]
+    class _DdsMessage(IdlStruct, typename=dds_kind.replace("::", ".")):  # type: ignore[misc, call-arg]
         placeholder: uint8  # DDS has no empty types
 
         @classmethod

@@ -92,7 +92,10 @@ def map_live(
 
 def record(
     source: Annotated[
-        str, typer.Argument(metavar="ADDRESS", help="The robot: ros2:/NAMESPACE or ros1:/NAMESPACE; ros2:/ has none.")
+        str,
+        typer.Argument(
+            metavar="ADDRESS", help="The robot: ros2:/NAMESPACE, zenoh:/NAMESPACE or ros1:/NAMESPACE; ros2:/ has none."
+        ),
     ],
     *,
     output: Annotated[
@@ -142,7 +145,7 @@ def _prepare(output: Path, network: str, force: bool) -> None:
     """Check before the recording that it can be written."""
     from fcslam.errors import OutputError
 
-    suffix = {"ros1": ".bag", "ros2": ".mcap"}[network]
+    suffix = ".bag" if network == "ros1" else ".mcap"
     if output.suffix != suffix:
         raise OutputError(f"{output}: a recording of {network} is a {suffix} file; choose such a name")
     if output.exists() and not force:

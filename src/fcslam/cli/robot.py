@@ -104,7 +104,7 @@ def robot(
         typer.Argument(
             metavar="LOG",
             help="The robot's recording, which names the robot; NAME=LOG gives another name. Or a live robot: "
-            "ros2:/NAMESPACE or ros1:/NAMESPACE, without a namespace ros2:/.",
+            "ros2:/NAMESPACE, zenoh:/NAMESPACE or ros1:/NAMESPACE, without a namespace ros2:/.",
         ),
     ],
     *,
