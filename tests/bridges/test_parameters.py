@@ -44,6 +44,9 @@ def test_the_middleware_is_configured_as_ros_2_is():
     local = configuration({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
     assert "<AllowMulticast>false<" in local
     assert 'Address="127.0.0.1"' in local
+    assert '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>' in local
+    assert "Interfaces" not in configuration({})
+    assert 'autodetermine="true"' in configuration({"ROS_LOCALHOST_ONLY": "1", "ROS_STATIC_PEERS": "10.0.0.2"})
     assert "<AllowMulticast>false<" in configuration({"ROS_LOCALHOST_ONLY": "1"})
     peers = configuration({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "10.0.0.2;robot.local"})
     assert 'Address="10.0.0.2"/><Peer Address="robot.local"' in peers

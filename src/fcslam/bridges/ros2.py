@@ -24,6 +24,7 @@ from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec
 INSTALL: Final = "pip install 'fcslam[ros2]'"
 _PARTICIPANTS: Final = 32
 """Most participants on one computer that are asked whether they are there, where there is no multicast."""
+_LOOPBACK: Final = "127.0.0.1"
 _ENDPOINTS_READ = 4096
 _MESSAGES_TAKEN = 64
 _WAIT_NS = 200_000_000
@@ -200,11 +201,17 @@ def configuration(environment: Mapping[str, str]) -> str:
     for peer in peers:
         if not _PEER.fullmatch(peer):
             raise NetworkError(f"ROS_STATIC_PEERS has {peer!r}, which is no address; separate addresses by semicolons")
-    peers += ["127.0.0.1"] * (reach != "OFF")
+    # Who is limited to this computer sends from the loopback interface; Cyclone takes that from its own interfaces only.
+    interfaces = [f'address="{_LOOPBACK}"'] * (local and reach != "OFF")
+    if interfaces and peers:
+        interfaces.append('autodetermine="true"')
+    listened = "".join(f"<NetworkInterface {interface}/>" for interface in interfaces)
+    peers += [_LOOPBACK] * (reach != "OFF")
     addresses = "".join(f'<Peer Address="{peer}"/>' for peer in peers)
     own = (
         '<CycloneDDS><Domain Id="any">'
-        f"<General><AllowMulticast>{'false' if local else 'default'}</AllowMulticast></General>"
+        f"<General><AllowMulticast>{'false' if local else 'default'}</AllowMulticast>"
+        f"{f'<Interfaces>{listened}</Interfaces>' * bool(listened)}</General>"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f"<MaxAutoParticipantIndex>{_PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{addresses}</Peers></Discovery>"
         "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
