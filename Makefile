@@ -13,8 +13,8 @@ AS_ROOT := $(if $(filter 0,$(shell id -u)),,sudo -n)
 APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire::http::Timeout=20 -o Acquire::Retries=1
 # A real ROS as the peer of tests, in an environment of its own: rclpy from PyPI, rospy and roscore from Debian.
 ROS_VENV := .venv-ros
-RCLPY := ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-sensor-msgs==5.5.1 ros-nav-msgs==5.5.1
-ROSPY := python3-rospy python3-roslaunch python3-rosmaster python3-sensor-msgs python3-nav-msgs python3-tf2-msgs
+RCLPY := ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-sensor-msgs==5.5.1 ros-nav-msgs==5.5.1 ros-std-srvs==5.5.1
+ROSPY := python3-rospy python3-roslaunch python3-rosmaster python3-sensor-msgs python3-nav-msgs python3-std-srvs python3-tf2-ros
 # torch's build for processors is a tenth of the size of the one that PyPI has.
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt

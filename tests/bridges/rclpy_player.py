@@ -14,12 +14,14 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Empty
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-LONGEST_WAIT_S = 90.0
+LONGEST_WAIT_S, LONGEST_LOOK_S = 90.0, 10.0
 
 
 def stamped(message, stamp, frame):
@@ -77,18 +79,25 @@ class Driver:
         self.sent[round(stamp * 1e9)] = time.monotonic()
         self.scans.publish(scan)
 
-    def look(self, namespace):
-        """Subscribe late, as Nav2 does; returns the seconds until the map came, the map and the path."""
-        maps, paths = [], []
+
+def look(namespace):
+    """Subscribe late, as a Nav2 that starts now; returns the seconds until the map came, the map and the path."""
+    maps, paths = [], []
+    context = Context()
+    context.init()
+    with context:
+        node = rclpy.create_node("navigation", context=context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
         asked = time.monotonic()
-        late = [
-            self.node.create_subscription(OccupancyGrid, f"{namespace}/map", maps.append, LATCHED),
-            self.node.create_subscription(Path, f"{namespace}/path", paths.append, LATCHED),
-        ]
-        self.spin_while(lambda: not maps, 10.0)
+        node.create_subscription(OccupancyGrid, f"{namespace}/map", maps.append, LATCHED)
+        node.create_subscription(Path, f"{namespace}/path", paths.append, LATCHED)
+        while not maps and time.monotonic() < asked + LONGEST_LOOK_S:
+            executor.spin_once(0.02)
         map_s = time.monotonic() - asked
-        self.spin_while(lambda: not paths, 10.0)
-        return map_s, maps, paths, late
+        while not paths and time.monotonic() < asked + LONGEST_LOOK_S:
+            executor.spin_once(0.02)
+    return map_s, maps, paths
 
 
 def main(path, namespace, speed):
@@ -96,7 +105,7 @@ def main(path, namespace, speed):
     rclpy.init()
     driver = Driver(namespace)
     driver.play(recording, speed)
-    map_s, maps, paths, _ = driver.look(namespace)
+    map_s, maps, paths = look(namespace)
     driver.finish.publish(Empty())
     time.sleep(0.5)
     answer = {"played": len(recording["stamps"]), "posed": len(driver.latencies)}

@@ -4,16 +4,18 @@ rclpy_player.py; the recording holds the laser's mounting_x, too."""
 import json
 import sys
 import time
+from itertools import pairwise
 
 import numpy as np
 
 sys.path.append("/usr/lib/python3/dist-packages")  # where Debian has rospy
 
 import rospy
+import tf2_ros
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from sensor_msgs.msg import LaserScan
-from std_msgs.msg import Empty
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 LONGEST_WAIT_S = 90.0
@@ -31,11 +33,12 @@ class Driver:
     def __init__(self, namespace):
         self.scans = rospy.Publisher(f"{namespace}/scan", LaserScan, queue_size=100)
         self.odometry = rospy.Publisher(f"{namespace}/odom", Odometry, queue_size=100)
-        self.finish = rospy.Publisher(f"{namespace}/fcslam/finish", Empty, queue_size=1)
         self.static = rospy.Publisher("/tf_static", TFMessage, queue_size=1, latch=True)
         self.poses, self.transforms = [], []
         rospy.Subscriber(f"{namespace}/pose", PoseWithCovarianceStamped, self.poses.append)
         rospy.Subscriber("/tf", TFMessage, self.transforms.append)
+        self.buffer = tf2_ros.Buffer()
+        self.listener = tf2_ros.TransformListener(self.buffer)
 
     def play(self, recording, speed):
         """Publish all scans, each with its odometry, when they are due."""
@@ -68,6 +71,14 @@ class Driver:
         scan.ranges = ranges.tolist()
         self.scans.publish(scan)
 
+    def is_known(self, stamp):
+        """Whether tf2 has ``map -> odom`` at this time, as navigation asks for it."""
+        try:
+            self.buffer.lookup_transform("map", "odom", rospy.Time(*divmod(round(stamp * 1e9), 10**9)))
+        except tf2_ros.ExtrapolationException:
+            return False
+        return True
+
 
 def main(path, namespace, speed):
     recording = np.load(path)
@@ -81,9 +92,18 @@ def main(path, namespace, speed):
     while not (maps and paths) and time.monotonic() < asked + 10.0:
         time.sleep(0.02)
     map_s = time.monotonic() - asked
-    driver.finish.publish(Empty())
-    time.sleep(0.5)
-    answer = {"played": len(recording["stamps"]), "posed": len(driver.poses), "transforms": len(driver.transforms)}
+    time.sleep(2.0)  # longer than map -> odom goes on after the last scan
+    newest = recording["stamps"][-1]
+    stamps = [message.transforms[0].header.stamp.to_nsec() for message in driver.transforms]
+    answer = {
+        "played": len(recording["stamps"]),
+        "posed": len(driver.poses),
+        "transforms": len(stamps),
+        "is_monotone": all(a < b for a, b in pairwise(stamps)),
+        "is_known": [driver.is_known(newest + later) for later in (0.0, 1.0, 1.5)],
+        "saved": rospy.ServiceProxy(f"{namespace}/fcslam/save_map", Trigger)().message,
+        "finished": rospy.ServiceProxy(f"{namespace}/fcslam/finish", Trigger)().message,
+    }
     if maps:
         grid = maps[-1]
         answer |= {"map_s": map_s, "frame": grid.header.frame_id, "values": sorted(set(grid.data))}

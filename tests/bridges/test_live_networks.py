@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from fcslam.bridges.ros1 import DEBIAN
+from fcslam.runs.map_files import Occupancy, parse_map
 from fcslam.sources import write_bag
 from tests import small_fleet
 
@@ -33,7 +34,7 @@ needs_rclpy = pytest.mark.skipif(
     not RCLPY.exists() or importlib.util.find_spec("cyclonedds") is None, reason="no rclpy or cyclonedds: make ros-test"
 )
 needs_roscore = pytest.mark.skipif(
-    not Path("/usr/bin/roscore").exists() or not Path(DEBIAN, "rospy").exists(), reason="no rospy: make ros-test"
+    not Path("/usr/bin/roscore").exists() or not Path(DEBIAN, "tf2_ros").exists(), reason="no rospy: make ros-test"
 )
 pytestmark = pytest.mark.system
 
@@ -65,9 +66,10 @@ def for_player(path, scans):
     )
 
 
-def fcslam(*arguments, **environment):
+def fcslam(*arguments, cwd=None, **environment):
     return subprocess.Popen(
         [sys.executable, "-m", "fcslam.cli", *map(str, arguments)],
+        cwd=cwd,
         env={**os.environ, "PYTHONPATH": str(ROOT / "src"), **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -214,11 +216,17 @@ def maps_of(port):
 
 @needs_roscore
 def test_a_robot_of_ros_1(folder, scans, tmp_path, roscore):
-    robot = fcslam("robot", "ros1:/robot1", mounting(scans), "-o", tmp_path / "run", **roscore)
+    robot = fcslam("robot", "ros1:/robot1", mounting(scans), "-o", tmp_path / "run", cwd=tmp_path, **roscore)
     played = play(sys.executable, "rospy_player.py", folder, **roscore)
     ended(robot)
     assert played["transforms"] > 0
+    assert played["is_monotone"]
+    assert played["is_known"] == [True, True, False]  # transform_bound and transform_timeout after the last scan
+    assert played["saved"] == f"map saved: {tmp_path / 'robot1.yaml'}"
+    assert played["finished"] == "the drive ends"
     check_drive(played, scans, tmp_path / "run", folder)
+    saved = parse_map("robot1", *((tmp_path / f"robot1.{kind}").read_bytes() for kind in ("pgm", "yaml")))
+    assert {Occupancy.FREE, Occupancy.OCCUPIED} <= set(saved.cells.ravel())
 
 
 @needs_roscore

@@ -201,7 +201,7 @@ def configuration(environment: Mapping[str, str]) -> str:
     for peer in peers:
         if not _PEER.fullmatch(peer):
             raise NetworkError(f"ROS_STATIC_PEERS has {peer!r}, which is no address; separate addresses by semicolons")
-    # Who is limited to this computer sends from the loopback interface; Cyclone takes that from its own interfaces only.
+    # Who is limited to this computer sends from the loopback interface, and Cyclone hears its own interfaces only.
     interfaces = [f'address="{_LOOPBACK}"'] * (local and reach != "OFF")
     if interfaces and peers:
         interfaces.append('autodetermine="true"')
