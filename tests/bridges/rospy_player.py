@@ -71,6 +71,18 @@ class Driver:
         scan.ranges = ranges.tolist()
         self.scans.publish(scan)
 
+    def look(self, newest, namespace):
+        """What tf2 knows after the last scan, and what the services answer."""
+        time.sleep(2.0)  # longer than map -> odom goes on after the last scan
+        stamps = [message.transforms[0].header.stamp.to_nsec() for message in self.transforms]
+        return {
+            "transforms": len(stamps),
+            "is_monotone": all(a < b for a, b in pairwise(stamps)),
+            "is_known": [self.is_known(newest + later) for later in (0.0, 1.0, 1.5)],
+            "saved": rospy.ServiceProxy(f"{namespace}/fcslam/save_map", Trigger)().message,
+            "finished": rospy.ServiceProxy(f"{namespace}/fcslam/finish", Trigger)().message,
+        }
+
     def is_known(self, stamp):
         """Whether tf2 has ``map -> odom`` at this time, as navigation asks for it."""
         try:
@@ -92,18 +104,9 @@ def main(path, namespace, speed):
     while not (maps and paths) and time.monotonic() < asked + 10.0:
         time.sleep(0.02)
     map_s = time.monotonic() - asked
-    time.sleep(2.0)  # longer than map -> odom goes on after the last scan
-    newest = recording["stamps"][-1]
-    stamps = [message.transforms[0].header.stamp.to_nsec() for message in driver.transforms]
-    answer = {
-        "played": len(recording["stamps"]),
-        "posed": len(driver.poses),
-        "transforms": len(stamps),
-        "is_monotone": all(a < b for a, b in pairwise(stamps)),
-        "is_known": [driver.is_known(newest + later) for later in (0.0, 1.0, 1.5)],
-        "saved": rospy.ServiceProxy(f"{namespace}/fcslam/save_map", Trigger)().message,
-        "finished": rospy.ServiceProxy(f"{namespace}/fcslam/finish", Trigger)().message,
-    }
+    answer = {"played": len(recording["stamps"]), "posed": len(driver.poses)}
+    if driver.poses:
+        answer |= driver.look(recording["stamps"][-1], namespace)
     if maps:
         grid = maps[-1]
         answer |= {"map_s": map_s, "frame": grid.header.frame_id, "values": sorted(set(grid.data))}
