@@ -3,6 +3,7 @@
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from fcslam.bridges import node as node_module
 from fcslam.bridges.network import Endpoint, Quality
 from fcslam.bridges.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
 from fcslam.bridges.parameters import NodeParameters
+from fcslam.bridges.sensors import STEPS_BACK_FOR_RESTART
 from fcslam.errors import NetworkError
 from fcslam.runs.map_files import parse_map
 from fcslam.sources import BagOptions
@@ -22,6 +24,7 @@ from tests.bridges.ros_messages import CODEC, odometry, scan, transform
 from tests.live.same_thread import SameThread
 
 TOPICS = (("/robot1/scan", SCAN, False), ("/robot1/odom", ODOMETRY), ("/tf_static", TRANSFORMS, True, True))
+LOST_AT_A_RESTART = STEPS_BACK_FOR_RESTART - 1
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +111,15 @@ def test_a_second_robot_of_one_name_is_refused(network, robot):
         start(network, robot)
 
 
-def test_a_simulated_clock_that_does_not_run_is_told(network, robot):
-    node = start(network, robot, use_sim_time=True, topic_timeout=0.01)
-    with pytest.raises(NetworkError, match="nobody publishes /clock; start the simulator"):
-        node.run()
+def test_a_simulated_clock_that_does_not_run_is_told_once_and_the_robot_maps(network, robot, scans):
+    said = []
+    node = start(network, robot, said.append, use_sim_time=True, topic_timeout=0.01)
+    plays(network, scans)
+    with running(node):
+        wait_for(lambda: said and node.scans == len(scans))
+        time.sleep(0.3)
+    assert len(said) == 1
+    assert "nobody publishes /clock, so map -> odom is published once for each scan; start the simulator" in said[0]
 
 
 def test_peers_that_get_nothing_are_told_once(network, robot):
@@ -223,6 +231,26 @@ def test_silence_is_told_once_and_the_robot_goes_on(network, robot, scans, monke
     assert said[0].startswith("no scan for")
     assert said[1].startswith("scans arrive again after")
     assert robot.status().scans == 20
+
+
+def test_a_bag_in_a_loop_is_told_once_and_mapped(network, robot, scans):
+    said = []
+    node = start(network, robot, said.append)
+    for _ in range(4):
+        plays(network, scans)
+    run_until(node, 4 * len(scans) - 3 * LOST_AT_A_RESTART)
+    node.publish_map()
+    assert len(said) == 1
+    assert "as when a bag is played again; the robot goes on from there" in said[0]
+    assert network.sent["/robot1/map"]
+
+
+def test_a_clock_that_jumps_ahead_is_no_event(network, robot, scans):
+    said = []
+    node = start(network, robot, said.append)
+    plays(network, [*scans[:10], *(replace(scan, stamp=scan.stamp + 1e6) for scan in scans[10:])])
+    run_until(node, len(scans))
+    assert said == []
 
 
 def test_messages_that_come_too_fast_are_counted(network, robot, scans, monkeypatch):

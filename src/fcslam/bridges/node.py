@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from fcslam.bridges.clock import CLOCK, CLOCK_TOPIC, RosClock
-from fcslam.bridges.network import Answer, Endpoint, Quality, RosNetwork, named_topics, qos_conflict
+from fcslam.bridges.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
 from fcslam.bridges.outputs import MAP, POSE, OutputNames, Outputs, nanoseconds
 from fcslam.bridges.parameters import NodeParameters
 from fcslam.bridges.sensors import LiveSensors, Notify
@@ -137,7 +137,7 @@ class RobotNode:
         """Map until ``stop``; ``watch`` gets the number of scans so far after each.
 
         Raises:
-            NetworkError: the robot cannot be mapped: the odometry, a mounting or /clock is missing.
+            NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
         """
         threads = [
             threading.Thread(target=self._publish_transforms, name="tf", daemon=True),
@@ -169,9 +169,9 @@ class RobotNode:
                     self._notify(f"no scan for {_SILENCE_S:.0f} s; the robot waits for the network or the driver")
                     is_silent = True
                 if not self._clock.is_running and now_s > began_s + self._parameters.topic_timeout:
-                    raise NetworkError(
-                        "use_sim_time is set and nobody publishes /clock; start the simulator, play the bag with "
-                        f"--clock, or leave use_sim_time out; {named_topics(self._network.endpoints())}"
+                    self._tell_once(
+                        "use_sim_time is set and nobody publishes /clock, so map -> odom is published once for each "
+                        "scan; start the simulator, play the bag with --clock, or leave use_sim_time out"
                     )
         finally:
             self._stop.set()

@@ -50,18 +50,21 @@ from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate, usual_beams
 SCANS_FOR_RIG = 5
 """Number of first scans of each laser that decide which beams it has."""
 PATIENCE_S = 5.0
-"""Time that a live robot waits for the first odometry, for the mounting of a laser and for a calibration."""
+"""Time after which a live robot says that the odometry, a laser or a mounting is missing, and waits no longer for a
+calibration."""
 ODOMETRY_PATIENCE_S = 1.0
 """Time that a scan waits for its odometry."""
 RAW_IMAGE_PERIOD_S = 0.4
 """Least time between two raw images that are read; places are a metre apart, and an image takes 10 ms to encode."""
 STEPS_BACK_FOR_RESTART = 3
 """Number of scans in a row that are far back in time until the clock is taken to have stepped back."""
+_SCANS_KEPT = 100
+"""Most first scans of a laser that decide."""
 _LONGEST_WAIT = 10_000
 """Most first messages that wait for the mounting."""
 
 Notify = Callable[[str], None]
-"""Takes one line for the user."""
+"""Takes one line for the user; what repeats a line is not said again."""
 
 
 class LiveSensors:
@@ -84,7 +87,7 @@ class LiveSensors:
         self._edge: tuple[str, str] | None = None
         """Frames of the odometry in tf."""
         self._calibration: Calibration | None = None
-        self._first: list[list[ScanMessage]] = [[] for _ in topics.scans]
+        self._first: list[deque[ScanMessage]] = [deque(maxlen=_SCANS_KEPT) for _ in topics.scans]
         self._rig: Rig | None = None
         self._early: deque[tuple[int, Message]] = deque(maxlen=_LONGEST_WAIT)
         self._counts: Counter[str] = Counter()
@@ -110,7 +113,7 @@ class LiveSensors:
             received_ns: the time of a message without a stamp.
 
         Raises:
-            NetworkError: the robot cannot be mapped: a mounting or the odometry is missing.
+            NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
         """
         self._counts[topic] += 1
         if self._is_needless(self._topics.kinds[topic], now_s):
@@ -237,10 +240,11 @@ class LiveSensors:
         except NoTransformError as error:
             if not is_late:
                 return None
-            raise NetworkError(
-                f"tf has {error}, so it does not say where a laser sits; start robot_state_publisher or "
+            self._notify(
+                f"waits for tf: it has {error}, so it does not say where a laser sits; start robot_state_publisher or "
                 "static_transform_publisher, or give --laser-pose X,Y,THETA (metres, radians)"
-            ) from error
+            )
+            return None
         camera, note = None, ""
         if self._topics.camera is not None:
             camera, note = mounted_camera(self._calibration, self._tree, base_frame)
@@ -248,18 +252,19 @@ class LiveSensors:
                 return None
         self._tell_rig(mountings, note)
         self._beams = usual
-        self._first = [[] for _ in first]
+        for scans in self._first:
+            scans.clear()
         return rig_of(first, mountings, camera)
 
     def _is_heard(self, is_late: bool) -> bool:
         """Whether there are scans of every laser, and odometry."""
         for topic, scans in zip(self._topics.scans, self._first, strict=True):
             if not scans and is_late:
-                raise NetworkError(f"{topic}: no scan that can be read arrived within {PATIENCE_S:.0f} s")
+                self._notify(f"waits for scans: none that can be read arrived on {topic} within {PATIENCE_S:.0f} s")
         if is_late and not self.odom_frame:
-            raise NetworkError(
-                f"no odometry: {self._topics.odometry or 'tf from odom to base'} is silent; the driver of the base "
-                "publishes it; start it, or choose another topic by --odom-topic"
+            self._notify(
+                f"waits for odometry: {self._topics.odometry or 'tf from odom to base'} is silent; the driver of the "
+                "base publishes it; start it, or choose another topic by --odom-topic"
             )
         enough = all(len(scans) >= (1 if is_late else SCANS_FOR_RIG) for scans in self._first)
         return enough and bool(self.odom_frame)
