@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.geometry import se2
 from fcslam.lidar.lost import LostConfig
 from fcslam.records import Channel, Constraint, Keyscan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -66,6 +67,19 @@ def test_who_cannot_be_lost_ties_the_two_places_together():
     stamps = {p.body.id.number: p.body.stamp for p in packets if isinstance(p.body, Keyscan)}
     motions = [packet.body for packet in packets if isinstance(packet.body, Constraint)]
     assert any(stamps[motion.i] <= moment < stamps[motion.j] for motion in motions)
+
+
+def test_a_robot_that_drove_on_unseen_begins_anew():
+    scans = [scan for scan in drives()[0] if scan.stamp < 1010.0]
+    T_odom_there = np.array((26.0, 3.0, 0.4))
+    after = [
+        replace(scan, stamp=scan.stamp + 300.0, T_odom_base=frozen(se2.compose(T_odom_there, scan.T_odom_base)))
+        for scan in scans
+    ]
+    robot, packets = driven([*scans, *after])
+    assert [len(track) for track in robot.tracks] == [len(scans), len(after)]
+    motions = [packet.body.T_i_j for packet in packets if isinstance(packet.body, Constraint)]
+    assert max(np.hypot(x, y) for x, y, _ in motions) < 1.0
 
 
 @pytest.mark.slow

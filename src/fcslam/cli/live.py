@@ -1,5 +1,6 @@
 """A live robot on a ROS network, for `fcslam robot` and `fcslam record`."""
 
+import logging
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -58,6 +59,7 @@ def map_live(
     output = new_folder(RUNS) if output is None else output
     prepare_output(output, force=False)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    logging.getLogger("fcslam.live").addHandler(logging.NullHandler())  # its events are printed below
 
     def notify(line: str) -> None:
         print_line(console, line)

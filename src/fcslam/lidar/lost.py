@@ -3,8 +3,11 @@
 A robot that was picked up and put down elsewhere, or whose odometry failed, sees another place than its last keyscans
 did. A single scan that explains little of the known area may come from a crowd or an opened door. So doubtful scans are
 deferred until they are enough for a submap of their own; two submaps that contradict each other show two places.
+
+A robot whose scans stopped while it drove on is lost, too: nobody saw the way.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -64,6 +67,17 @@ class LostConfig(Settings):
     overlap: float = Field(
         default=0.25, ge=0, le=1, description="least share of all points in known area; below it, nothing is decided"
     )
+    unseen_m: float = Field(
+        default=15.0,
+        gt=0,
+        description="a robot that moved farther between two scans is lost: nobody saw the way [m]",
+    )
+
+
+def has_moved_unseen(before: LaserScan, now: LaserScan, config: LostConfig) -> bool:
+    """Whether a robot moved so far between two scans that odometry alone must not tie their places together."""
+    x, y, _ = se2.between(before.T_odom_base, now.T_odom_base)
+    return math.hypot(x, y) > config.unseen_m
 
 
 def is_doubtful(tracking: TrackingResult, frontend: LidarFrontend, config: LostConfig) -> bool:

@@ -577,7 +577,10 @@ class Robot:
         part, correction = self._part, self._localizer(self._part).correction
         if part > self._newest_part:
             self._newest_part, self._applied = part, None
-            self._event(EventKind.LOST, "lost: the scans contradict the map; the robot maps in a new session")
+            self._event(
+                EventKind.LOST,
+                "lost: the scans contradict the map, or stopped while it drove on; the robot maps in a new session",
+            )
         if correction is not self._applied and correction is not None:
             self._tell_correction(self._applied, correction)
             self._applied = correction

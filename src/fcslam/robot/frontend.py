@@ -18,7 +18,7 @@ from pydantic import Field
 
 from fcslam.errors import FeatureError
 from fcslam.lidar.frontend import LidarFrontend, ScanPose
-from fcslam.lidar.lost import LostConfig, can_decide, is_doubtful, is_lost
+from fcslam.lidar.lost import LostConfig, can_decide, has_moved_unseen, is_doubtful, is_lost
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, LaserScan, SensorRecord
 from fcslam.robot.backend import (
@@ -104,6 +104,8 @@ class RobotFrontend:
         """The newest scan; None before the first."""
         self._newest: tuple[LaserScan, ScanPose] | None = None
         """The newest scan of the present session that was processed."""
+        self._previous: LaserScan | None = None
+        """The newest scan, processed or not."""
         self._scans: dict[tuple[float, float, float], LaserScan] = {}
         """The newest scan of each laser, by its mounting."""
         self._deferred: list[LaserScan | CameraImage] = []
@@ -186,6 +188,10 @@ class RobotFrontend:
 
     def _process_scan(self, scan: LaserScan) -> None:
         config = self._config.lost
+        before, self._previous = self._previous, scan
+        if before is not None and has_moved_unseen(before, scan, config):
+            self._process_deferred()
+            self._end_session()
         # 1. Localize the scan; unless it is doubtful, process it.
         tracking = self._lidar.localize(scan)
         if not is_doubtful(tracking, self._lidar, config):
@@ -204,9 +210,13 @@ class RobotFrontend:
             return
         # 3. Another place: the robot is lost, and a new session begins with them. Same place: process them.
         if is_lost(scans, self._T_local_deferred, self._lidar, config):
-            self._submit(SessionEnd())
-            self._begin()
+            self._end_session()
         self._process_deferred()
+
+    def _end_session(self) -> None:
+        """End a session and begin the next."""
+        self._submit(SessionEnd())
+        self._begin()
 
     def _begin(self) -> None:
         """Begin a session."""
