@@ -41,6 +41,7 @@ ROOMS = [
     "mission_file",
     "mission",
     "localization",
+    "map_changes",
     "api",
     "live",
     "evaluation",

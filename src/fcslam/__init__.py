@@ -35,7 +35,7 @@ from fcslam.errors import (
 )
 
 if TYPE_CHECKING:
-    from fcslam.api import localize, map_recordings
+    from fcslam.api import changes, localize, map_recordings
     from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.mission import MissionConfig, Progress
@@ -98,6 +98,7 @@ __all__ = [
     "UnavailableError",
     "Veto",
     "__version__",
+    "changes",
     "localize",
     "map_recordings",
     "open_run",
@@ -126,6 +127,7 @@ _LAZY: Final = {
     "Run": "fcslam.runs",
     "Transform": "fcslam.records",
     "Veto": "fcslam.records",
+    "changes": "fcslam.api",
     "localize": "fcslam.api",
     "map_recordings": "fcslam.api",
     "open_run": "fcslam.runs",

@@ -18,6 +18,7 @@ from fcslam.sources import BagOptions, Source
 
 if TYPE_CHECKING:
     from fcslam.localization import LocalizationProgress
+    from fcslam.maps.changes import Changes
 
 StrPath = str | os.PathLike[str]
 Recordings = StrPath | Iterable[StrPath | Source] | Mapping[str, StrPath]
@@ -124,6 +125,39 @@ def localize(
     if output is not None:
         run.save(output, force)
     return run
+
+
+def changes(
+    run: StrPath,
+    *,
+    since: str | None = None,
+    until: str | None = None,
+    map_index: int = 0,
+    output: StrPath | None = None,
+    force: bool = False,
+) -> "Changes":
+    """What changed in the building of a run between two times.
+
+    Args:
+        run: run folder with a mission file.
+        since: the earlier time: a session (the end of its period), a stamp in seconds, or a date or time of ISO 8601
+            (without a zone UTC; a date means the end of the day). None: the oldest period.
+        until: the later time; None: the newest period.
+        map_index: number of the map in the run folder.
+        output: folder to write; by default nothing is written.
+        force: replace changes that are at ``output``.
+
+    Raises:
+        InputError: the run, a time or the output folder cannot be used.
+    """
+    from fcslam.map_changes import check_output, find_changes, save_changes
+
+    if output is not None:
+        check_output(Path(output), force)
+    found = find_changes(Path(run), since, until, map_index)
+    if output is not None:
+        save_changes(found, Path(output), force)
+    return found
 
 
 def continued_config(earlier: SavedMission | None) -> MissionConfig:

@@ -57,6 +57,7 @@ def test_every_argument_and_option_is_explained(words):
 def test_long_commands_can_be_quiet():
     short = {
         ("certificates",),
+        ("changes",),
         ("info",),
         *(words for words in COMMANDS if words[:1] == ("tokens",)),
         ("config", "dump"),

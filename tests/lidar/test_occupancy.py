@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from fcslam.geometry import se2
-from fcslam.lidar.occupancy import OccupancyConfig, cast, classify
+from fcslam.lidar.occupancy import OccupancyConfig, cast, cast_periods, classify
 from fcslam.records import LaserModel
 from fcslam.runs.map_files import Occupancy
 
@@ -220,3 +220,58 @@ def test_a_cell_is_known_after_two_passes_and_occupied_by_the_share_of_hits():
         assert cells[row, near + 1] == Occupancy.FREE
     assert (classify(cast(scans[:1], CONFIG), CONFIG) == Occupancy.UNKNOWN).all()
     assert (classify(cast(scans[:2], CONFIG), CONFIG) != Occupancy.UNKNOWN).sum() == far - first + 1
+
+
+def room_cells(*halves, scans=12, config=CONFIG):
+    """The state after periods in which the room had these half sizes."""
+    periods = [
+        [(room_ranges(pose, ALL_ROUND, half), ALL_ROUND, pose) for pose in POSES_INSIDE[:scans]] for half in halves
+    ]
+    *_, grid = cast_periods(periods, config)
+    return grid, classify(grid, config)
+
+
+POSES_INSIDE = np.random.default_rng(4).uniform((-0.7, -0.7, -3.0), (0.7, 0.7, 3.0), (12, 3))
+
+
+def state_at(grid, cells, x, y):
+    column, row = np.floor((np.array((x, y)) - grid.origin_xy) / grid.resolution_m).astype(int)
+    return Occupancy(cells[row, column])
+
+
+def test_walls_that_a_later_period_looks_through_are_gone():
+    grid, cells = room_cells(1.03, HALF_ROOM_M)
+    assert state_at(grid, cells, 1.03, 0.3) is Occupancy.FREE
+    assert state_at(grid, cells, HALF_ROOM_M, 0.3) is Occupancy.OCCUPIED
+
+
+def test_walls_that_appear_are_there_and_what_they_hide_stays():
+    grid, cells = room_cells(HALF_ROOM_M, 1.03)
+    assert state_at(grid, cells, 1.03, 0.3) is Occupancy.OCCUPIED
+    assert state_at(grid, cells, HALF_ROOM_M, 0.3) is Occupancy.OCCUPIED
+    assert state_at(grid, cells, 1.5, 0.3) is Occupancy.FREE
+
+
+def test_the_newest_state_counts_however_long_another_one_lasted():
+    grid, cells = room_cells(*[1.03] * 5, HALF_ROOM_M)
+    assert state_at(grid, cells, 1.03, 0.3) is Occupancy.FREE
+    grid, cells = room_cells(*[HALF_ROOM_M] * 5, 1.03)
+    assert state_at(grid, cells, 1.03, 0.3) is Occupancy.OCCUPIED
+
+
+def test_two_scans_alone_drop_nothing():
+    before, _ = room_cells(1.03)
+    earlier = [(room_ranges(pose, ALL_ROUND, 1.03), ALL_ROUND, pose) for pose in POSES_INSIDE]
+    later = [(room_ranges(pose), ALL_ROUND, pose) for pose in POSES_INSIDE[:2]]
+    *_, grid = cast_periods([earlier, later], CONFIG)
+    assert grid.hits.sum() == before.hits.sum() + 2 * ALL_ROUND.beam_count
+
+
+def test_periods_that_agree_are_added_up():
+    scans = room_scans()
+    *_, grid = cast_periods([scans[:5], scans[5:]], CONFIG)
+    at_once = cast(scans, CONFIG)
+    assert grid.origin_xy == at_once.origin_xy
+    assert grid.hits.sum() == at_once.hits.sum()
+    walls = at_once.hits > 0
+    assert np.array_equal(classify(grid, CONFIG)[walls], classify(at_once, CONFIG)[walls])

@@ -22,6 +22,7 @@ from fcslam.cli import (
     tokens,
     train,
 )
+from fcslam.cli import changes as changed
 from fcslam.cli import convert as conversion
 from fcslam.cli import localize as localization
 from fcslam.cli import map as mapping
@@ -58,6 +59,13 @@ app.command(
         "fcslam localize today.bag --map office.yaml --initial-pose 2,3.5,1.57",
     ),
 )(localization.localize)
+app.command(
+    "changes",
+    epilog=examples(
+        "fcslam changes runs/building",
+        "fcslam changes runs/building --since 2026-11-20 -o changes/week",
+    ),
+)(changed.changes)
 app.command("info", epilog=examples("fcslam info robot1.bag", "fcslam info robot1.mcap --json"))(info.info)
 app.command(
     "convert",

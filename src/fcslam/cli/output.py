@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 RUNS, RECORDINGS, FEATURES, TRAINING, EVALUATIONS = "runs", "recordings", "features", "training", "evaluations"
+CHANGES = "changes"
 """Default parents of output folders."""
 
 

@@ -1,7 +1,11 @@
-"""Occupancy grid by ray casting: each beam passes the cells up to its end and hits the last one."""
+"""Occupancy grid by ray casting: each beam passes the cells up to its end and hits the last one.
+
+Over several periods the grid shows the newest state: where a period clearly contradicts what earlier ones counted in a
+cell, their counts are dropped. A cell that a period did not observe stays as it was.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +21,9 @@ from fcslam.runs.map_files import Cells
 
 Counts = NDArray[np.uint32]
 
+CLEAR_RATIO = 0.05
+"""Ratio of hits to passes up to which a period calls a cell free that was occupied. It is far below ``occupied_ratio``:
+beams that graze a wall hit its cells seldom, too."""
 FARTHEST_M = 1e7
 """Poses farther from the origin are refused: floats no longer resolve cells there."""
 
@@ -31,6 +38,11 @@ class OccupancyConfig(Settings):
     minimum_passes: int = Field(default=2, ge=1, description="least number of beams through a known cell")
     occupied_ratio: float = Field(
         default=0.15, gt=0, lt=1, description="ratio of hits to passes above which a cell is occupied"
+    )
+    contradicting_scans: int = Field(
+        default=3,
+        ge=1,
+        description="least number of scans of a later period that change a cell from occupied to free or back",
     )
     maximum_cells: int = Field(
         default=64_000_000,
@@ -79,6 +91,17 @@ class _Layout(NamedTuple):
     height: int
 
 
+class _Counts(NamedTuple):
+    """Of one period, by cell."""
+
+    hits: Counts
+    passes: Counts
+    scans: Counts
+    """Scans with a beam through the cell; empty if they are not counted."""
+    newest: Counts
+    """The last of these scans, counted from 1; empty if scans are not counted."""
+
+
 def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
     """Count hits and passes of all beams. Invalid ranges (0, not finite, at the maximum) add nothing.
 
@@ -94,18 +117,60 @@ def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
     Raises:
         ValueError: the number of ranges is not that of the beams, or a pose is not finite or too far away.
     """
+    (grid,) = cast_periods([keyscans], config)
+    return grid
+
+
+def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) -> Iterator[OccupancyGrid]:
+    """The grid after each period, from the oldest to the newest; all have one size.
+
+    A period changes an occupied cell to free if at least ``contradicting_scans`` scans look through the cell and at
+    most ``CLEAR_RATIO`` of their beams end there. It changes a free cell to occupied if as many beams of as many scans
+    end there, and enough to call the cell occupied. The counts of earlier periods are then dropped, else added.
+
+    Args:
+        periods: scans of each period, as for ``cast``.
+        config: as for ``cast``.
+
+    Yields:
+        Counts, shape (H, W), in ``map``; the next step changes them.
+
+    Raises:
+        ValueError: as ``cast``.
+    """
+    groups = [_by_laser(keyscans) for keyscans in periods]
+    layout = _layout([beams for period in groups for beams in period], config)
+    shape, side = (layout.height, layout.width), layout.resolution_m
+    hits, passes = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
+    uncounted = np.zeros((0, 0), np.uint32)
+    for number, period in enumerate(groups):
+        if number == 0:
+            _cast_all(period, layout, config, _Counts(hits, passes, uncounted, uncounted))
+        else:
+            counts = _Counts(*(np.zeros(shape, np.uint32) for _ in range(4)))
+            _cast_all(period, layout, config, counts)
+            _supersede(
+                hits, passes, counts, config.contradicting_scans, CLEAR_RATIO, config.occupied_ratio,
+                config.minimum_passes,
+            )  # fmt: skip
+        shown = hits.view(), passes.view()
+        for view in shown:
+            view.setflags(write=False)
+        yield OccupancyGrid(*shown, side, (layout.column * side, layout.row * side))
+
+
+def _by_laser(keyscans: Sequence[Casting]) -> list[_Beams]:
     by_laser: dict[LaserModel, list[Casting]] = {}
     for scan in keyscans:
         by_laser.setdefault(scan[1], []).append(scan)
-    groups = [_stacked(scans, laser) for laser, scans in by_laser.items()]
-    layout = _layout(groups, config)
-    hits, passes = (np.zeros((layout.height, layout.width), np.uint32) for _ in range(2))
+    return [_stacked(scans, laser) for laser, scans in by_laser.items()]
+
+
+def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, counts: _Counts) -> None:
+    first = 1
     for beams in groups:
-        _cast(beams, layout, config.usable_range_m, hits, passes)
-    for counts in (hits, passes):
-        counts.setflags(write=False)
-    side = layout.resolution_m
-    return OccupancyGrid(hits, passes, side, (layout.column * side, layout.row * side))
+        _cast(beams, layout, config.usable_range_m, counts, first)
+        first += len(beams.ranges_m)
 
 
 def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
@@ -165,7 +230,7 @@ def _bounds(beams, usable):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _cast(beams, layout, usable, hits, passes):  # type: ignore[no-untyped-def]
+def _cast(beams, layout, usable, counts, first):  # type: ignore[no-untyped-def]
     for k in range(len(beams.ranges_m)):
         pose = beams.T_map_laser[k]
         x0 = pose[0] / layout.resolution_m - layout.column
@@ -177,17 +242,18 @@ def _cast(beams, layout, usable, hits, passes):  # type: ignore[no-untyped-def]
             length = min(r, usable) / layout.resolution_m
             heading = pose[2] + beams.angles_rad[i]
             x1, y1 = x0 + length * np.cos(heading), y0 + length * np.sin(heading)
-            if _traverse(x0, y0, x1, y1, passes) and r < usable:
-                hits[int(np.floor(y1)), int(np.floor(x1))] += np.uint32(1)
+            if _traverse(x0, y0, x1, y1, counts, np.uint32(first + k)) and r < usable:
+                counts.hits[int(np.floor(y1)), int(np.floor(x1))] += np.uint32(1)
 
 
 @njit(allocates=False)
-def _traverse(x0, y0, x1, y1, passes):  # type: ignore[no-untyped-def]
+def _traverse(x0, y0, x1, y1, counts, scan):  # type: ignore[no-untyped-def]
     """Count a pass for each cell of a beam, including the first and the last; returns whether the last is in the grid.
 
     Coordinates are in cells. Amanatides and Woo, "A fast voxel traversal algorithm for ray tracing", 1987.
     """
-    height, width = passes.shape
+    height, width = counts.passes.shape
+    counts_scans = counts.scans.size > 0
     column, row = int(np.floor(x0)), int(np.floor(y0))
     last_column, last_row = int(np.floor(x1)), int(np.floor(y1))
     right, up = x1 > x0, y1 > y0
@@ -196,7 +262,10 @@ def _traverse(x0, y0, x1, y1, passes):  # type: ignore[no-untyped-def]
     per_y = 1.0 / (y1 - y0) if y1 != y0 else 0.0
     edge_x, edge_y = column + int(right) - x0, row + int(up) - y0
     while 0 <= column < width and 0 <= row < height:
-        passes[row, column] += np.uint32(1)
+        counts.passes[row, column] += np.uint32(1)
+        if counts_scans and counts.newest[row, column] != scan:
+            counts.newest[row, column] = scan
+            counts.scans[row, column] += np.uint32(1)
         if column == last_column and row == last_row:
             return True
         if row == last_row or (column != last_column and edge_x * per_x < edge_y * per_y):
@@ -206,6 +275,24 @@ def _traverse(x0, y0, x1, y1, passes):  # type: ignore[no-untyped-def]
             row += step_y
             edge_y += step_y
     return False
+
+
+@njit(allocates=False)
+def _supersede(hits, passes, period, scans, clear_ratio, occupied_ratio, minimum_passes):  # type: ignore[no-untyped-def]
+    """Add the counts of a newer period; where it clearly contradicts, they replace the older ones."""
+    for row in range(hits.shape[0]):
+        for column in range(hits.shape[1]):
+            n, h = period.passes[row, column], period.hits[row, column]
+            if n == 0:
+                continue
+            if passes[row, column] >= minimum_passes and period.scans[row, column] >= scans:
+                was_occupied = hits[row, column] > occupied_ratio * passes[row, column]
+                cleared = was_occupied and h <= clear_ratio * n
+                filled = not was_occupied and h >= scans and h > occupied_ratio * n
+                if cleared or filled:
+                    hits[row, column] = passes[row, column] = 0
+            hits[row, column] += h
+            passes[row, column] += n
 
 
 @njit

@@ -5,7 +5,7 @@ Drawn with OpenCV, which takes a sixth of the time of matplotlib and does not in
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle
 from typing import Any, Final, NamedTuple
 
@@ -61,6 +61,9 @@ WALL: Final = _bgr(palette.WALL)
 INK: Final = _bgr(palette.INK)
 CLOSURE: Final = _bgr(palette.CLOSURES[Channel.LIDAR])
 ROBOTS: Final = tuple(map(_bgr, palette.ROBOTS))
+CHANGES: Final = _bgr(palette.APPEARED), _bgr(palette.DISAPPEARED)
+_APPEARED, _DISAPPEARED = len(Occupancy), len(Occupancy) + 1
+"""Cells of a picture besides ``Occupancy``; in small pictures the highest number of a block is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +106,30 @@ def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closure
     if shared:
         labels.append((f"{len(shared)} closure{'s' * (len(shared) > 1)} between robots", CLOSURE))
     picture = np.vstack((canvas, _legend(labels, canvas.shape[1], view.cell_px / view.cell_m)))
+    return bytes(cv2.imencode(".png", picture)[1])
+
+
+def highlighted_png(
+    fused: OccupancyMap, appeared: NDArray[np.bool_], disappeared: NDArray[np.bool_], labels: tuple[str, str]
+) -> bytes:
+    """Draw the map as a PNG of about 1600 pixels on its long side, with two sets of cells in colours.
+
+    Args:
+        fused: the map.
+        appeared: cells of ``fused``, shape (H, W).
+        disappeared: other cells, shape (H, W).
+        labels: what the legend calls both.
+    """
+    painted = fused.cells.copy()
+    painted[appeared], painted[disappeared] = _APPEARED, _DISAPPEARED
+    view = _view(replace(fused, cells=painted), ())
+    canvas = _canvas(view)
+    picture = np.vstack(
+        (
+            canvas,
+            _legend(list(zip(labels, CHANGES, strict=True)), canvas.shape[1], view.cell_px / view.cell_m),
+        )
+    )
     return bytes(cv2.imencode(".png", picture)[1])
 
 
@@ -160,8 +187,9 @@ def _shrunk(cells: Cells, factor: int) -> Cells:
 
 
 def _canvas(view: _Viewport) -> Image:
-    colors = np.zeros((len(Occupancy), 3), np.uint8)
+    colors = np.zeros((_DISAPPEARED + 1, 3), np.uint8)
     colors[Occupancy.UNKNOWN], colors[Occupancy.FREE], colors[Occupancy.OCCUPIED] = PAPER, FLOOR, WALL
+    colors[_APPEARED], colors[_DISAPPEARED] = CHANGES
     drawn = cv2.resize(
         colors[view.cells[::-1]], None, fx=view.cell_px, fy=view.cell_px, interpolation=cv2.INTER_NEAREST_EXACT
     )

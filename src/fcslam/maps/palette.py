@@ -7,6 +7,8 @@ from fcslam.records import Channel
 PAPER: Final = 0xECEFF1
 FLOOR: Final = 0xFFFFFF
 WALL: Final = 0x1F2A33
+APPEARED: Final = 0xE66100
+DISAPPEARED: Final = 0x0072B2
 FURNITURE: Final = 0xB0BEC5
 INK: Final = 0x37474F
 # Distinguishable with colour vision deficiency (after Okabe and Ito).

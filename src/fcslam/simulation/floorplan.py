@@ -25,6 +25,8 @@ CLEARANCE_M = 0.5
 
 _ATTEMPTS = 20
 """Attempts to place a piece of furniture before it is omitted."""
+_DRIVEN_BY_M = 4.0
+"""Distance up to which a robot sees whether a door is closed."""
 _SHIFT_M, _TURN_RAD = 0.4, 0.3
 """Standard deviations of the shift and the turn of a moved piece of furniture."""
 
@@ -93,6 +95,10 @@ class Room:
     high: FloatArray
     """The north-east corner, shape (2,)."""
 
+    def contains(self, points: FloatArray) -> bool:
+        """Whether one of the points (N, 2) lies in the room."""
+        return bool(np.any(np.all((points > self.low) & (points < self.high), axis=1)))
+
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
@@ -135,16 +141,57 @@ def build(layout: Layout, rng: np.random.Generator) -> FloorPlan:
     return FloorPlan(size_m, tuple(pieces), segments_of(pieces), layout.lanes, tuple(rooms))
 
 
-def move_furniture(plan: FloorPlan, share: float, rng: np.random.Generator) -> FloorPlan:
+def move_furniture(
+    plan: FloorPlan, share: float, rng: np.random.Generator, visited: FloatArray | None = None
+) -> FloorPlan:
     """Shift and turn a ``share`` of the furniture in rooms a little.
 
-    Every piece stays in its room and clear of the entrance; a piece without such a position stays where it was.
+    Every piece stays in its room and clear of the entrance; a piece without such a position stays where it was. With
+    ``visited``, positions of shape (N, 2), only the rooms that contain one of them change.
     """
     moved = [
-        _moved(piece, room, rng) if (room := _room_of(piece, plan)) and rng.random() < share else piece
+        _moved(piece, room, rng)
+        if (room := _room_of(piece, plan)) and rng.random() < share and (visited is None or room.contains(visited))
+        else piece
         for piece in plan.pieces
     ]
     return replace(plan, pieces=tuple(moved), segments=segments_of(moved))
+
+
+def doors_after(
+    plan: FloorPlan, closed: frozenset[int], share: float, route: FloatArray, rng: np.random.Generator
+) -> frozenset[int]:
+    """Which doors are closed while a robot drives, by their number in ``doors_of``.
+
+    The doors that it drives through are open. Of those that it drives by, a ``share`` is closed; the others stay as
+    they were.
+
+    Args:
+        plan: the building.
+        closed: doors that were closed before.
+        share: in [0, 1].
+        route: positions of the robot, shape (N, 2).
+        rng: random generator.
+    """
+    after: set[int] = set()
+    for number, door in enumerate(doors_of(plan)):
+        distance = np.linalg.norm(route - door.centre, axis=1).min()
+        is_closed = bool(rng.random() < share) if distance < _DRIVEN_BY_M else number in closed
+        if is_closed and distance > DOOR_M:
+            after.add(number)
+    return frozenset(after)
+
+
+def with_closed_doors(plan: FloorPlan, closed: frozenset[int]) -> FloorPlan:
+    """The building with these doors closed."""
+    doors = doors_of(plan)
+    pieces = (*plan.pieces, *(Piece(PieceKind.WALL, doors[number].outline) for number in sorted(closed)))
+    return replace(plan, pieces=pieces, segments=segments_of(pieces))
+
+
+def doors_of(plan: FloorPlan) -> list[Piece]:
+    """The lintels of all doors."""
+    return [piece for piece in plan.pieces if piece.kind is PieceKind.LINTEL]
 
 
 def _moved(piece: Piece, room: Room, rng: np.random.Generator) -> Piece:

@@ -8,7 +8,7 @@ robot's number. So another robot changes nothing for the others, and cameras cha
 import math
 from collections.abc import Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -29,7 +29,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.simulation.decoration import Decoration, decorate
-from fcslam.simulation.floorplan import FloorPlan, draw_floor_plan, move_furniture
+from fcslam.simulation.floorplan import FloorPlan, doors_after, draw_floor_plan, move_furniture, with_closed_doors
 from fcslam.simulation.lighting import light_of
 from fcslam.simulation.noise import LidarSettings, scan_beams, simulate_ranges
 from fcslam.simulation.odometry import KINDS, OdometryNoiseSettings, simulate_odometry
@@ -91,6 +91,17 @@ class SimulationSettings(Settings):
         le=1.0,
         description="share of the furniture in rooms that moves before the second and each further robot; "
         "in a yard, share of the parked cars that drive away",
+    )
+    lasting_changes: bool = Field(
+        default=False,
+        description="what moved stays there for later robots, and furniture moves only in rooms that the robot then "
+        "visits, so that every change is seen; else each robot finds the first state changed",
+    )
+    closed_doors: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the doors that a robot drives by, but not through, which are closed",
     )
     lidar: LidarSettings = LidarSettings(rate_hz=10.0)
     drift: OdometryNoiseSettings = KINDS[OdometryKind.DEFAULT]
@@ -197,6 +208,7 @@ class _RandomStream(IntEnum):
     LAMPS = 4
     SCANS = 5
     IMAGES = 6
+    DOORS = 7
 
 
 def _generator(seed: int, purpose: _RandomStream, robot: int = 0, record: int = 0) -> np.random.Generator:
@@ -218,6 +230,8 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
         SimulationError: the building is too small for this many robots, or has too little free space.
     """
     outdoors = settings.building is Building.YARD
+    if settings.closed_doors and settings.camera:
+        raise SimulationError("closed doors are simulated for LiDARs only; leave the cameras off")
     if outdoors and settings.camera:
         raise SimulationError("a yard is simulated for LiDARs only; leave the cameras off (--no-camera)")
     building, goals_rng = _generator(seed, _RandomStream.BUILDING), _generator(seed, _RandomStream.GOALS)
@@ -228,8 +242,26 @@ def simulate_fleet(settings: SimulationSettings, seed: int) -> SimulatedFleet:
     else:
         goals = draw_goals(plan, settings.robots, settings.path_length_m, goals_rng)
     decoration = decorate(plan, _generator(seed, _RandomStream.LOOKS)) if settings.camera else None
-    robots = (_robot(plan, decoration, number, goals[number], settings, seed) for number in range(settings.robots))
+    robots: list[SimulatedRobot] = []
+    left, closed = plan, frozenset[int]()
+    for number in range(settings.robots):
+        rng = _generator(seed, _RandomStream.ROBOTS, number)
+        found = _moved(left, goals[number], settings, rng) if number else plan
+        robot = _robot(found, decoration, number, goals[number], settings, seed, rng)
+        if settings.closed_doors:
+            doors_rng, route = _generator(seed, _RandomStream.DOORS, number), robot.T_building_base[:, :2]
+            closed = doors_after(found, closed, settings.closed_doors, route, doors_rng)
+            robot = replace(robot, plan=with_closed_doors(found, closed))
+        robots.append(robot)
+        left = found if settings.lasting_changes else plan
     return SimulatedFleet(plan, tuple(robots))
+
+
+def _moved(plan: FloorPlan, goals: FloatArray, settings: SimulationSettings, rng: np.random.Generator) -> FloorPlan:
+    """The plan as a further robot finds it."""
+    if plan.terrain is not None:
+        return move_cars(plan, settings.moved_furniture, rng)
+    return move_furniture(plan, settings.moved_furniture, rng, goals if settings.lasting_changes else None)
 
 
 def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
@@ -249,11 +281,9 @@ def _robot(
     goals: FloatArray,
     settings: SimulationSettings,
     seed: int,
+    rng: np.random.Generator,
 ) -> SimulatedRobot:
-    rng = _generator(seed, _RandomStream.ROBOTS, number)
-    move, find_way = (move_furniture, plan_route) if plan.terrain is None else (move_cars, plan_walk)
-    if number:
-        plan = move(plan, settings.moved_furniture, rng)
+    find_way = plan_route if plan.terrain is None else plan_walk
     route = schedule(find_way(plan, goals, settings.path_length_m, rng))
     lasers = settings.lidar.models(_T_BASE_LASER)
     times = np.arange(0.0, route.duration_s, 1.0 / (settings.lidar.rate_hz * len(lasers)))
