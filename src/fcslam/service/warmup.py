@@ -184,15 +184,15 @@ def _packets() -> Iterator[bytes]:
     back = np.column_stack((14.0 - along, np.full(_STEPS, 4.5), np.full(_STEPS, np.pi)))
     codes = rng.integers(0, 256, (_LANDMARKS, CODE_BYTES), dtype=np.uint8)
     landmarks = rng.uniform((0.0, 0.0, 0.0), (16.0, 9.0, 2.0), (_LANDMARKS, 3))
-    for start_s, (robot, poses) in enumerate((("there", there), ("back", back))):
-        for number, body in enumerate(_bodies(robot, poses, landmarks, codes)):
-            yield encode(Packet(robot, 0, number, 100.0 * start_s + _STEPS, body))
+    for start_s, robot, poses in ((0.0, "there", there), (100.0, "back", back)):
+        for number, body in enumerate(_bodies(robot, start_s, poses, landmarks, codes)):
+            yield encode(Packet(robot, 0, number, start_s + _STEPS, body))
 
 
-def _bodies(robot: str, poses: FloatArray, landmarks: FloatArray, codes: np.ndarray) -> Iterator[Body]:
+def _bodies(robot: str, start_s: float, poses: FloatArray, landmarks: FloatArray, codes: np.ndarray) -> Iterator[Body]:
     yield Hello(robot, 0, (_LASER,), dict.fromkeys(Channel, _DETECTOR))
     for k, pose in enumerate(poses):
-        yield Keyscan(KeyscanId(robot, k), float(k), dequantise(quantise(_ranges(pose))))
+        yield Keyscan(KeyscanId(robot, k), start_s + k, dequantise(quantise(_ranges(pose))))
         if k:
             yield _constraint(robot, poses, k - 1, k, ConstraintKind.ODOMETRY)
         anchor = k - _AROUND
