@@ -95,6 +95,14 @@ def test_the_path_is_thinned(network, published):
     assert path.poses[-1].pose.position.x == 1.0
 
 
+def test_a_long_path_has_longer_steps(network, published, monkeypatch):
+    monkeypatch.setattr(outputs, "LONGEST_PATH", 50)
+    poses = np.column_stack((np.linspace(0.0, 100.0, 1001), np.zeros((1001, 2))))
+    published.path(1, np.arange(1001.0), poses)
+    (path,) = network.sent["/robot1/path"]
+    assert 45 <= len(path.poses) <= 52
+
+
 def test_stamps_grow_between_scans_up_to_the_bound():
     stream = TransformStream(bound_ns=SECOND, timeout_ns=SECOND // 5)
     assert stream.due(0) is None

@@ -34,6 +34,8 @@ SMALL_MAP_CELLS: Final = 1_000_000
 """A map of at most so many cells is published whole at every change."""
 PATH_STEP_M: Final = 0.1
 """Least distance between two poses of the published path."""
+LONGEST_PATH: Final = 5000
+"""Most poses of the published path, about; a longer path has longer steps."""
 LINE_WIDTH_M: Final = 0.05
 _OK, _WARN = 0, 1
 _LINE_LIST, _ADD = 5, 0
@@ -106,7 +108,7 @@ class Outputs:
         self._send(self._pose, POSE, make(POSE, header=header, pose=posed))
 
     def path(self, stamp_ns: int, stamps: FloatArray, T_map_base: FloatArray) -> None:
-        """Publish the path: stamps (N,) in seconds and poses (N, 3), thinned to steps of ``PATH_STEP_M``."""
+        """Publish the path: stamps (N,) in seconds and poses (N, 3), thinned to steps of at least ``PATH_STEP_M``."""
         header, make = self._codec.header, self._codec.make
         frame = self._names.map_frame
         poses = [
@@ -249,9 +251,12 @@ def _is_same(before: Grid, after: Grid) -> bool:
 
 def _steps(poses: FloatArray) -> Sequence[int]:
     """Indices of poses (N, 3) that are a step apart, and of the last one."""
+    length_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+    step_m = max(PATH_STEP_M, length_m / LONGEST_PATH)
     kept: list[int] = []
-    for at, (x, y, _) in enumerate(poses.tolist()):
-        if not kept or hypot(x - poses[kept[-1], 0], y - poses[kept[-1], 1]) >= PATH_STEP_M:
+    places = poses[:, :2].tolist()
+    for at, (x, y) in enumerate(places):
+        if not kept or hypot(x - places[kept[-1]][0], y - places[kept[-1]][1]) >= step_m:
             kept.append(at)
     if kept and kept[-1] != len(poses) - 1:
         kept.append(len(poses) - 1)
