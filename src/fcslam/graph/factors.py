@@ -1,5 +1,6 @@
 """GTSAM's factors of a pose graph. The wheel of GTSAM 4.3 is built without TBB: one thread, same input, same bytes."""
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Any
 
@@ -7,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fcslam.graph.chains import Chains
 from fcslam.graph.pose_graph import PoseGraph, anchors
 from fcslam.records import FloatArray
 
@@ -36,13 +38,18 @@ class Loss(StrEnum):
 class FactorCache:
     """Factors of a growing graph; each is built once."""
 
-    def __init__(self, graph: PoseGraph) -> None:
+    def __init__(self, graph: PoseGraph, chains: Chains | None = None) -> None:
+        """``chains`` of the graph, which must not grow then, leave the variables inside of them out of the factors."""
         self.graph = graph
+        self.chains = chains
         self._trusted = gtsam.NonlinearFactorGraph()
-        self._closures: list[tuple[int, int, Any, FloatArray]] = []
+        self._closures: list[tuple[int, int, Any, FloatArray, Any]] = []
+        """Ends, motion, root of the information, and the factor of weight 1."""
         self._robust: dict[Loss, list[Any]] = {}
         """Factors of the closures, by loss."""
         self._built = 0
+        if chains is not None:
+            self._add_trusted(chains.i, chains.j, chains.T_i_j, chains.information)
 
     def restricted(self, graph: PoseGraph, kept: NDArray[np.bool_]) -> "FactorCache":
         """Factors of a ``graph`` that has the same variables, all trusted edges, and the closures that are kept, (K,).
@@ -51,10 +58,24 @@ class FactorCache:
         """
         self._update()
         part = FactorCache(graph)
+        part.chains = self.chains
         part._trusted = gtsam.NonlinearFactorGraph(self._trusted)
         part._closures = [closure for closure, keep in zip(self._closures, kept.tolist(), strict=True) if keep]
         part._built = len(graph.edges)
         return part
+
+    def values(self, poses: FloatArray) -> Any:
+        """GTSAM values of the poses (N, 3) that the factors measure."""
+        return to_values(poses, None if self.chains is None else self.chains.kept.tolist())
+
+    def read(self, values: Any, poses: FloatArray) -> None:
+        """Write GTSAM values into ``poses`` (N, 3); poses inside of chains stay."""
+        poses[... if self.chains is None else self.chains.kept] = from_values(values)
+
+    def complete(self, poses: FloatArray) -> None:
+        """Set the poses inside of chains, in ``poses`` (N, 3), by those at their ends."""
+        if self.chains is not None:
+            self.chains.expand(poses)
 
     def squared(self, weights: FloatArray, poses: FloatArray) -> Any:
         """Factor graph with the information of the closures scaled by weights; closures of weight 0 are left out.
@@ -65,8 +86,10 @@ class FactorCache:
         """
         self._update()
         graph = gtsam.NonlinearFactorGraph(self._trusted)
-        for (i, j, measured, root), scale in zip(self._closures, np.sqrt(weights).tolist(), strict=True):
-            if scale > 0.0:
+        for (i, j, measured, root, unit), scale in zip(self._closures, np.sqrt(weights).tolist(), strict=True):
+            if scale == 1.0:
+                graph.push_back(unit)
+            elif scale > 0.0:
                 graph.push_back(_between(i, j, measured, _gaussian(root * scale)))
         self._anchor(graph, weights > 0.0, poses)
         return graph
@@ -88,7 +111,7 @@ class FactorCache:
         huber = loss is Loss.HUBER
         estimator = estimators.Huber.Create(HUBER_WIDTH) if huber else estimators.Cauchy.Create(CAUCHY_WIDTH)
         built = self._robust.setdefault(loss, [])
-        for i, j, measured, root in self._closures[len(built) :]:
+        for i, j, measured, root, _ in self._closures[len(built) :]:
             built.append(_between(i, j, measured, gtsam.noiseModel.Robust.Create(estimator, _gaussian(root))))
         return built
 
@@ -103,27 +126,36 @@ class FactorCache:
     def _update(self) -> None:
         """Build the factors of new edges."""
         edges = self.graph.arrays()
-        new = slice(self._built, None)
-        roots = np.linalg.cholesky(edges.information[new]).transpose(0, 2, 1)
-        columns = zip(edges.i[new].tolist(), edges.j[new].tolist(), edges.T_i_j[new].tolist(), roots, strict=True)
-        for (i, j, T_i_j, root), robust in zip(columns, edges.robust[new].tolist(), strict=True):
-            if robust:
-                self._closures.append((i, j, gtsam.Pose2(*T_i_j), root))
-            else:
-                self._trusted.push_back(_between(i, j, gtsam.Pose2(*T_i_j), _gaussian(root)))
+        new = np.arange(self._built, len(edges.i))
+        closing, trusted = new[edges.robust[new]], new[~edges.robust[new]]
+        roots = _roots(edges.information[closing])
+        columns = zip(edges.i[closing].tolist(), edges.j[closing].tolist(), edges.T_i_j[closing].tolist(), strict=True)
+        for (i, j, T_i_j), root in zip(columns, roots, strict=True):
+            measured = gtsam.Pose2(*T_i_j)
+            self._closures.append((i, j, measured, root, _between(i, j, measured, _gaussian(root))))
+        if self.chains is None:
+            self._add_trusted(edges.i[trusted], edges.j[trusted], edges.T_i_j[trusted], edges.information[trusted])
         self._built = len(edges.i)
 
+    def _add_trusted(
+        self, i: NDArray[np.int64], j: NDArray[np.int64], T_i_j: FloatArray, information: FloatArray
+    ) -> None:
+        """Add trusted motions, shapes (K,), (K,), (K, 3) and (K, 3, 3)."""
+        roots = _roots(information)
+        for first, last, motion, root in zip(i.tolist(), j.tolist(), T_i_j.tolist(), roots, strict=True):
+            self._trusted.push_back(_between(first, last, gtsam.Pose2(*motion), _gaussian(root)))
 
-def to_values(poses: ArrayLike) -> Any:
-    """GTSAM values of poses (N, 3), keyed by row."""
-    values = gtsam.Values()
-    for key, pose in enumerate(np.asarray(poses, dtype=np.float64).tolist()):
-        values.insert(key, gtsam.Pose2(*pose))
+
+def to_values(poses: ArrayLike, rows: Sequence[int] | None = None) -> Any:
+    """GTSAM values of poses (N, 3), keyed by row; of some ``rows``, or of all."""
+    values, listed = gtsam.Values(), np.asarray(poses, dtype=np.float64).tolist()
+    for key in range(len(listed)) if rows is None else rows:
+        values.insert(key, gtsam.Pose2(*listed[key]))
     return values
 
 
 def from_values(values: Any) -> FloatArray:
-    """Poses (N, 3) of GTSAM values, in the order of their keys."""
+    """Poses (M, 3) of GTSAM values, in the order of their keys."""
     poses: FloatArray = gtsam.utilities.extractPose2(values)
     return poses
 
@@ -134,3 +166,8 @@ def _between(i: int, j: int, measured: Any, noise: Any) -> Any:
 
 def _gaussian(root: FloatArray) -> Any:
     return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+
+
+def _roots(information: FloatArray) -> FloatArray:
+    """Upper triangular roots of information matrices, shape (K, 3, 3)."""
+    return np.asarray(np.linalg.cholesky(information).transpose(0, 2, 1), dtype=np.float64)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
+from fcslam.graph.chains import find_chains
 from fcslam.graph.cluster import (
     ClusterDecision,
     closure_positions,
@@ -124,7 +125,7 @@ def solve_jointly(
         Poses (N, 3), weights (E,), and the maps.
     """
     # 1. Optimise each robot's own graph.
-    factors = FactorCache(evidence.graph)
+    factors = FactorCache(evidence.graph, find_chains(evidence.graph))
     initial = evidence.graph.poses()
     own = [_solve_own_graph(evidence, robot, initial[robot], consistency, gnc, factors) for robot in evidence.robots]
     paths = [path for path, _ in own]

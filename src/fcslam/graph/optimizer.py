@@ -14,7 +14,7 @@ from scipy.special import gammaincinv
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.graph.factors import FactorCache, Loss, from_values, to_values
+from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.pose_graph import PoseGraph, anchors
 from fcslam.records import FloatArray, frozen
 
@@ -105,9 +105,11 @@ def optimize(
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
     robust = graph.arrays().robust
     counts = np.ones(int(robust.sum()), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)[robust]
-    problem, values = cache.robust(loss, counts, start), to_values(start)
+    problem, values = cache.robust(loss, counts, start), cache.values(start)
     result, iterations = _levenberg_marquardt(problem, values, _MAXIMUM_ITERATIONS)
-    poses = from_values(result)
+    poses = start.copy()
+    cache.read(result, poses)
+    cache.complete(poses)
     weights = counts * loss.weights(graph.chi2(poses)[robust])
     return _solution(graph, start, poses, weights, SolveStats(iterations, problem.error(values), problem.error(result)))
 
@@ -146,7 +148,7 @@ def optimize_gnc(
     if not graph.edges:
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
     limit = chosen.limit
-    steps = _Steps(cache, to_values(start))
+    steps = _Steps(cache, start)
     steps.solve(np.ones(int(robust.sum())), chosen.first_iterations)
     _graduate(steps, limit, chosen)
     weights = _alternate(steps, limit, (steps.chi2() <= limit).astype(np.float64))
@@ -187,32 +189,33 @@ def refine_inliers(
     if not graph.edges:
         return _solution(graph, start, start, np.ones(0), SolveStats(0, 0.0, 0.0))
     robust = graph.arrays().robust
-    steps = _Steps(cache, to_values(start))
+    steps = _Steps(cache, start)
     decided = _alternate(steps, chosen.limit, (trusted[robust] > _TRUSTED_WEIGHT).astype(np.float64))
     return _with_truncated_cost(graph, start, steps, decided, chosen.limit)
 
 
 class _Steps:
-    """State of a solve in steps: present values, and iterations so far."""
+    """State of a solve in steps: present poses (N, 3), and iterations so far."""
 
-    def __init__(self, cache: FactorCache, values: Any) -> None:
-        self.cache, self.values, self.iterations = cache, values, 0
-        self._robust = cache.graph.arrays().robust
+    def __init__(self, cache: FactorCache, poses: FloatArray) -> None:
+        self.cache, self.poses, self.iterations = cache, poses.copy(), 0
+        self._values = cache.values(poses)
+        self._robust = np.flatnonzero(cache.graph.arrays().robust)
         self._optimal_for: FloatArray | None = None
-        """The weights for which the values are optimal."""
+        """The weights for which the poses are optimal."""
 
     def solve(self, weights: FloatArray, iterations: int) -> None:
         if self._optimal_for is not None and np.array_equal(weights, self._optimal_for):
             return
-        problem = self.cache.squared(weights, from_values(self.values))
-        self.values, used = _levenberg_marquardt(problem, self.values, iterations)
+        problem = self.cache.squared(weights, self.poses)
+        self._values, used = _levenberg_marquardt(problem, self._values, iterations)
+        self.cache.read(self._values, self.poses)
         self.iterations += used
         self._optimal_for = weights if used < iterations else None
 
     def chi2(self) -> FloatArray:
         """Squared Mahalanobis lengths of the closures' residuals, shape (K,)."""
-        chi2: FloatArray = self.cache.graph.chi2(from_values(self.values))[self._robust]
-        return chi2
+        return self.cache.graph.chi2(self.poses, self._robust)
 
 
 def _graduate(steps: _Steps, limit: float, settings: GncSettings) -> None:
@@ -249,7 +252,8 @@ def _alternate(steps: _Steps, limit: float, weights: FloatArray) -> FloatArray:
 def _with_truncated_cost(
     graph: PoseGraph, start: FloatArray, steps: _Steps, weights: FloatArray, limit: float
 ) -> Solution:
-    poses, robust = from_values(steps.values), graph.arrays().robust
+    poses, robust = steps.poses, graph.arrays().robust
+    steps.cache.complete(poses)
     costs = [_truncated(graph.chi2(x), robust, limit) for x in (start, poses)]
     return _solution(graph, start, poses, weights, SolveStats(steps.iterations, *costs))
 

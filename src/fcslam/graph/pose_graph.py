@@ -134,13 +134,17 @@ class PoseGraph:
             )
         return self._arrays
 
-    def chi2(self, poses: ArrayLike | None = None) -> FloatArray:
-        """Squared Mahalanobis length of every edge's residual, shape (E,), at ``poses`` (N, 3); None: initial poses."""
+    def chi2(self, poses: ArrayLike | None = None, rows: NDArray[np.int64] | None = None) -> FloatArray:
+        """Squared Mahalanobis length of the edges' residuals at ``poses`` (N, 3); None: initial poses.
+
+        Shape (E,), or (K,) of some ``rows``, shape (K,).
+        """
         x = self.poses() if poses is None else np.asarray(poses, dtype=np.float64)
-        edges = self.arrays()
+        edges, chosen = self.arrays(), slice(None) if rows is None else rows
         # The residual that the solver minimises: the logarithm, not the difference of coordinates.
-        residual = se2.log(se2.between(edges.T_i_j, se2.between(x[edges.i], x[edges.j])))
-        chi2: FloatArray = np.einsum("ea,eab,eb->e", residual, edges.information, residual)
+        measured = se2.between(x[edges.i[chosen]], x[edges.j[chosen]])
+        residual = se2.log(se2.between(edges.T_i_j[chosen], measured))
+        chi2: FloatArray = np.einsum("ea,eab,eb->e", residual, edges.information[chosen], residual)
         return chi2
 
     def components(self, kept: ArrayLike | None = None) -> NDArray[np.int64]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fcslam.graph.chains import Chains, find_chains
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize, initialize_robust
@@ -39,7 +40,7 @@ def solve_single_robot(
     Returns:
         Poses (N, 3) in the frame of the first variable, and weights (E,).
     """
-    robust, factors = graph.arrays().robust, factors or FactorCache(graph)
+    robust, factors = graph.arrays().robust, factors or FactorCache(graph, find_chains(graph))
     odometry = initialize(graph, (~robust).astype(float))
     by_odometry = refine_inliers(graph, odometry, ~robust, settings=gnc, factors=factors)
     if not robust.any():
@@ -54,7 +55,7 @@ def solve_single_robot(
     )
     first = optimize_gnc(
         supported_graph,
-        initialize_robust(supported_graph),
+        _robust_start(supported_graph, factors.chains),
         settings=gnc,
         factors=factors.restricted(supported_graph, supported[robust]),
     )
@@ -66,6 +67,16 @@ def solve_single_robot(
         optimize_gnc(graph, odometry, settings=gnc, factors=factors),
     )
     return min(solutions, key=lambda solution: solution.stats.final_cost)
+
+
+def _robust_start(graph: PoseGraph, chains: Chains | None) -> FloatArray:
+    """Initial poses (N, 3) that false closures hardly bend; those inside of chains follow from the ends."""
+    if chains is None:
+        return initialize_robust(graph)
+    poses = graph.poses()
+    poses[chains.kept] = initialize_robust(chains.contract(graph))
+    chains.expand(poses)
+    return poses
 
 
 def robot_trajectory(graph: PoseGraph, poses: FloatArray, settings: DriftSettings) -> Trajectory:
