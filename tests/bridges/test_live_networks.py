@@ -218,6 +218,7 @@ def maps_of(port):
 def test_a_robot_of_ros_1(folder, scans, tmp_path, roscore):
     robot = fcslam("robot", "ros1:/robot1", mounting(scans), "-o", tmp_path / "run", cwd=tmp_path, **roscore)
     played = play(sys.executable, "rospy_player.py", folder, **roscore)
+    robot.send_signal(signal.SIGTERM)  # while it writes its run
     ended(robot)
     assert played["transforms"] > 0
     assert played["is_monotone"]

@@ -51,6 +51,7 @@ def test_the_middleware_is_configured_as_ros_2_is():
     peers = configuration({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "10.0.0.2;robot.local"})
     assert 'Address="10.0.0.2"/><Peer Address="robot.local"' in peers
     assert "127.0.0.1" not in peers
+    assert "<InitialLocatorPruneDelay>inf<" in peers
     assert configuration({"CYCLONEDDS_URI": "file:///etc/dds.xml"}).endswith(",file:///etc/dds.xml")
 
 

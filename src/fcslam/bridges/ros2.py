@@ -213,7 +213,8 @@ def configuration(environment: Mapping[str, str]) -> str:
         f"<General><AllowMulticast>{'false' if local else 'default'}</AllowMulticast>"
         f"{f'<Interfaces>{listened}</Interfaces>' * bool(listened)}</General>"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
-        f"<MaxAutoParticipantIndex>{_PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{addresses}</Peers></Discovery>"
+        f"<MaxAutoParticipantIndex>{_PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{addresses}</Peers>"
+        "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay></Discovery>"  # a robot may start, or return, any time
         "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
         "</Domain></CycloneDDS>"
     )

@@ -79,15 +79,15 @@ def map_live(
         node = RobotNode(network, place.namespace, topics, options, robot, parameters, notify)
         heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
         notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
-        with stopping(node.stop):
+        with stopping(node.stop):  # also while the run is written: a late SIGTERM must not lose it
             node.run(_every(_SCANS_PER_LINE, lambda scans: notify(f"{scans} scans")))
-        if not node.scans:
-            notify("no scan was mapped; nothing is written")
-            return
-        if not robot.finish(SERVER_PATIENCE_S):
-            notify("the server does not have everything; the rest is sent at the next start with the same --state")
-        node.publish_map()
-        run = robot.save(output)
+            if not node.scans:
+                notify("no scan was mapped; nothing is written")
+                return
+            if not robot.finish(SERVER_PATIENCE_S):
+                notify("the server does not have everything; the rest is sent at the next start with the same --state")
+            node.publish_map()
+            run = robot.save(output)
         print_faults(console, {robot.name: node.sensors.audit.faults()})
     print_line(answers(), f"{node.scans} scans, {len(run.trajectories)} sessions: {output}")
 
