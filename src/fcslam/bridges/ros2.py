@@ -25,7 +25,8 @@ INSTALL: Final = "pip install 'fcslam[ros2]'"
 _PARTICIPANTS: Final = 32
 """Most participants on one computer that are asked whether they are there, where there is no multicast."""
 _LOOPBACK: Final = "127.0.0.1"
-_ENDPOINTS_READ = 4096
+_ENDPOINTS_READ = _ENDPOINTS_KNOWN = 10_000
+"""Most endpoints that are read at once, and that are remembered."""
 _MESSAGES_TAKEN = 64
 _WAIT_NS = 200_000_000
 _BLOCKING_NS = 100_000_000
@@ -58,17 +59,19 @@ class Ros2Network:
             raise NetworkError(
                 f"DDS domain {domain} cannot be joined ({error}); check the network and CYCLONEDDS_URI"
             ) from error
-        alive = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
+        self._alive = core.InstanceState.Alive
         self._any = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
         self._waitset = core.WaitSet(self._participant)
-        readers = [
+        self._builtin = [
             (publishes, builtin.BuiltinDataReader(self._participant, topic))
             for publishes, topic in (
                 (True, builtin.BuiltinTopicDcpsPublication),
                 (False, builtin.BuiltinTopicDcpsSubscription),
             )
         ]
-        self._builtin = [(*known, core.ReadCondition(known[1], alive)) for known in readers]
+        self._lock = threading.Lock()
+        self._known: dict[str, Endpoint] = {}
+        """Publishers and subscriptions by their keys."""
         self._readers: tuple[tuple[Any, Deliver], ...] = ()
         self._topics: dict[tuple[str, str], Any] = {}
         self._closed = threading.Event()
@@ -77,16 +80,21 @@ class Ros2Network:
 
     def endpoints(self) -> Sequence[Endpoint]:
         """As in RosNetwork."""
-        own = self._participant.guid
-        found = []
-        for publishes, reader, alive in self._builtin:
-            for sample in reader.read(_ENDPOINTS_READ, alive):
-                topic, kind = _TOPIC.fullmatch(sample.topic_name or ""), kind_of(sample.type_name or "")
-                if topic and kind:
-                    quality = _quality_of(sample.qos)
-                    mine = sample.participant_key == own
-                    found.append(Endpoint(topic[1], kind, publishes, quality, mine))
-        return found
+        with self._lock:  # reads what changed only: in a large network, reading all takes tens of milliseconds
+            for publishes, reader in self._builtin:
+                for sample in reader.take(_ENDPOINTS_READ):
+                    self._see(publishes, sample)
+            return list(self._known.values())
+
+    def _see(self, publishes: bool, sample: Any) -> None:
+        """A publisher or a subscription appeared, changed or went."""
+        topic, kind = _TOPIC.fullmatch(sample.topic_name or ""), kind_of(sample.type_name or "")
+        is_alive = sample.sample_info.instance_state == self._alive
+        if not is_alive or topic is None or kind is None:
+            self._known.pop(str(sample.key), None)
+        elif len(self._known) < _ENDPOINTS_KNOWN:
+            mine = sample.participant_key == self._participant.guid
+            self._known[str(sample.key)] = Endpoint(topic[1], kind, publishes, _quality_of(sample.qos), mine)
 
     def subscribe(self, topic: str, kind: str, quality: Quality, deliver: Deliver) -> None:
         """As in RosNetwork."""
