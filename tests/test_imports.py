@@ -40,6 +40,7 @@ ROOMS = [
     "driving",
     "mission_file",
     "mission",
+    "map_edits",
     "localization",
     "map_changes",
     "api",

@@ -63,7 +63,7 @@ def map_recordings(
         processes: number of robots that are mapped at a time, each in a process of its own; it does not change the run.
         onto: mission file, or run folder with one, of an earlier mission that goes on. The run is that of all
             recordings at once; the earlier ones are not needed. Without ``config`` the mission keeps its settings of
-            the cloud.
+            the cloud. Without recordings it is mapped again, with the edits that it has.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -73,7 +73,7 @@ def map_recordings(
         prepare_output(Path(output), force)
     earlier = read_mission(Path(onto)) if isinstance(onto, str | os.PathLike) else onto
     settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
-    robots = split_recordings(_opened(recordings, bag_options), split)
+    robots = split_recordings(_opened(recordings, bag_options, at_least=0 if earlier else 1), split)
     drive = side_by_side(processes)
     run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes), drive, earlier)
     if output is not None:
@@ -182,7 +182,7 @@ def split_recordings(recordings: list[Source], parts: int) -> list[Source]:
     return sources.split(recordings[0], parts)
 
 
-def _opened(recordings: Recordings, options: BagOptions | None) -> list[Source]:
+def _opened(recordings: Recordings, options: BagOptions | None, at_least: int = 1) -> list[Source]:
     """The recordings as sources, each checked as far as can be without reading the ranges."""
     if isinstance(recordings, str | os.PathLike):
         recordings = [recordings]
@@ -191,7 +191,7 @@ def _opened(recordings: Recordings, options: BagOptions | None) -> list[Source]:
         if isinstance(recordings, Mapping)
         else [(item, None) for item in recordings]
     )
-    if not named:
+    if len(named) < at_least:
         raise SourceError("no recording is given; give one for each robot")
     opened = iter(
         sources.open_fleet([(Path(item), name) for item, name in named if isinstance(item, str | os.PathLike)], options)

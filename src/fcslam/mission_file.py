@@ -3,22 +3,26 @@
 A mission that goes on needs no recording of earlier robots: their packets take effect again.
 """
 
+import fcntl
+import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
+from fcslam.cloud.edits import check_edit
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.driving import Leg
 from fcslam.errors import PacketError, SourceError, StoreError
-from fcslam.records import Edit
+from fcslam.records import Change, Edit, Undo
 from fcslam.runs.folder import MISSION
 from fcslam.service.mission_store import CONFIG, MissionStore, StoredPacket, check_mission
 from fcslam.sources.faults import Faults
+from fcslam.storage.files import replacing
 from fcslam.wire.packets import SizedPacket, decode
 
 _AT_ONCE: Final = 1000
@@ -62,10 +66,7 @@ def read_mission(path: Path) -> SavedMission:
     Raises:
         SourceError: there is none, it is damaged or of another version, or a packet in it cannot be read.
     """
-    if path.is_dir():
-        path /= MISSION
-    if not path.is_file():
-        raise SourceError(f"{path}: no mission file; `fcslam map` writes one into each run folder")
+    path = mission_path(path)
     try:
         check_mission(path)
         with TemporaryDirectory() as place:  # opening it for reading would leave files beside it
@@ -105,6 +106,62 @@ def mission_bytes(
                 store.put_track(*robot_and_epoch(name), track)
             store.export(Path(place) / MISSION)
         return (Path(place) / MISSION).read_bytes()
+
+
+def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, time_s: float) -> list[Edit]:
+    """Append edits to a mission file, all or none. Two people may edit at once: one waits for the other.
+
+    Args:
+        path: the file, or the run folder that holds it.
+        contents: what to append.
+        author: who edits.
+        time_s: now, seconds since 1970.
+
+    Raises:
+        SourceError: as ``read_mission``, or the file cannot be written.
+        EditError: an edit names a session or a time that the mission does not have, or what cannot be undone.
+    """
+    path = mission_path(path)
+    try:
+        with _exclusively(path), TemporaryDirectory() as place:
+            check_mission(path)
+            copy = Path(place) / MISSION
+            copy.write_bytes(path.read_bytes())
+            with closing(MissionStore(copy)) as store:
+                for content in contents:
+                    check_edit(content)
+                    store.check_named(content)
+                edits = [store.edit(content, author, time_s) for content in contents]
+                with replacing(path) as unfinished:
+                    store.export(unfinished)
+            return edits
+    except StoreError as error:
+        raise SourceError(str(error)) from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be edited ({error}); the file is as before") from error
+
+
+def mission_path(path: Path) -> Path:
+    """The mission file that a user names by itself or by its run folder.
+
+    Raises:
+        SourceError: there is none.
+    """
+    path = path / MISSION if path.is_dir() else path
+    if not path.is_file():
+        raise SourceError(f"{path}: no mission file; `fcslam map` writes one into each run folder")
+    return path
+
+
+@contextmanager
+def _exclusively(path: Path) -> Iterator[None]:
+    """Wait until nobody else edits the file."""
+    while True:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):  # nobody replaced it meanwhile
+                yield
+                return
 
 
 def _stored(sized: SizedPacket) -> StoredPacket:

@@ -278,6 +278,9 @@ class ReasonCode(StrEnum):
     PATHS_CONTRADICT = "paths_contradict"
     SEPARATED = "robot_contradicted"
     VETOED = "vetoed"
+    CUT = "cut"
+    PINNED = "pinned"
+    MADE_BY_HAND = "made_by_hand"
     UNUSED = "not_needed_by_rigid_fusion"
 
 
@@ -306,6 +309,9 @@ _REASON_TEXT = {
     ReasonCode.PATHS_CONTRADICT: "the paths of the two robots contradict: mean chi-square {value}, {limit} allowed",
     ReasonCode.SEPARATED: "the robot has a map of its own: the paths of {value} others contradict its path",
     ReasonCode.VETOED: "vetoed by hand",
+    ReasonCode.CUT: "a stretch that was cut by hand",
+    ReasonCode.PINNED: "pinned by hand",
+    ReasonCode.MADE_BY_HAND: "made by hand",
     ReasonCode.UNUSED: "not needed by the rigid fusion",
 }
 
@@ -383,6 +389,84 @@ class Removal:
 
 
 @dataclass(frozen=True, slots=True)
+class Cut:
+    """A user's statement that a stretch of a session does not count: not in the map, and not for closures.
+
+    The session's motions stay, so its poses before and after the stretch are still connected.
+    """
+
+    session: str
+    first_s: float
+    """Stamp at which the stretch begins."""
+    last_s: float
+
+    def covers(self, session: str, stamp: float) -> bool:
+        """Whether the stretch holds the session's keyscan with this stamp."""
+        return self.session == session and self.first_s <= stamp <= self.last_s
+
+
+@dataclass(frozen=True, slots=True)
+class Pin:
+    """A user's statement that a closure that was considered is true."""
+
+    robot_i: str
+    robot_j: str
+    stamps: tuple[float, float]
+    """Of the keyscans of i and j."""
+
+    def confirms(self, robot_i: str, stamp_i: float, robot_j: str, stamp_j: float) -> bool:
+        """Whether the pin is of this closure, in either order of its ends."""
+        return Veto(self.robot_i, self.robot_j, self.stamps).forbids(robot_i, stamp_i, robot_j, stamp_j)
+
+
+@dataclass(frozen=True, slots=True)
+class ManualClosure:
+    """A user's own closure between two sessions, or within one."""
+
+    robot_i: str
+    stamp_i: float
+    robot_j: str
+    stamp_j: float
+    T_i_j: tuple[float, float, float]
+    """Pose of j in i, metres and radians. Each end is the keyscan whose stamp is nearest."""
+    tolerance: tuple[float, float]
+    """Standard deviations, metres and radians."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A user's choice of a map's coordinate frame: the pose of one of its keyscans. Of several, the last one counts."""
+
+    session: str
+    stamp: float
+    pose: tuple[float, float, float]
+    """T_map_base of the keyscan whose stamp is nearest, metres and radians."""
+
+
+class RegionUse(StrEnum):
+    """What a region is for."""
+
+    ERASE = "erase"
+    """Its cells are unknown."""
+    KEEP_OUT = "keep-out"
+    """Robots must not enter it."""
+    AREA = "area"
+    """A named part of the building."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapRegion:
+    """A polygon that a user drew in a map. It is tied to a keyscan, so it moves with the map."""
+
+    use: RegionUse
+    name: str
+    session: str
+    stamp: float
+    polygon: tuple[tuple[float, float], ...]
+    """Corners (x, y) in the base frame of the session's keyscan whose stamp is nearest, metres."""
+
+
+@dataclass(frozen=True, slots=True)
 class Undo:
     """A user's statement that an earlier edit is not in force any more."""
 
@@ -390,7 +474,7 @@ class Undo:
     """Of the edit."""
 
 
-Change = Veto | Removal
+Change = Veto | Removal | Cut | Pin | ManualClosure | Placement | MapRegion
 """What an edit changes about a mission."""
 
 

@@ -227,7 +227,9 @@ def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets,
         play(packets[:cut])
         finalized()
         until(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
-        removed = client.post(f"{API}/removals", json={"robot": "robot_2", **session}).json()
+        removed = client.post(
+            f"{API}/edits", json={"kind": "removal", "content": {"robot": "robot_2", **session}}
+        ).json()
         until(lambda: robots() == {"robot_1", "robot_3"})
         os.kill(children(service.process.pid)[0], signal.SIGKILL)
         play(packets[cut:])
@@ -239,7 +241,7 @@ def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets,
         until(lambda: client.get("/readyz").json() == {"status": "ready", "backlog": 0})
         audited = [json.loads(line)["action"] for line in (tmp_path / "data" / "audit.jsonl").read_text().splitlines()]
         assert audited[-4:] == [
-            f"POST {API}/removals", f"POST {API}/finalize", f"POST {API}/edits/1/undo", f"POST {API}/finalize"
+            f"POST {API}/edits", f"POST {API}/finalize", f"POST {API}/edits/1/undo", f"POST {API}/finalize"
         ]  # fmt: skip
 
 

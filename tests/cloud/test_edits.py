@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from fcslam.cloud.cloud import Cloud
@@ -10,7 +11,19 @@ from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import EditError
-from fcslam.records import Edit, Removal, Undo, Veto
+from fcslam.geometry import se2
+from fcslam.records import (
+    Cut,
+    Edit,
+    ManualClosure,
+    MapRegion,
+    Pin,
+    Placement,
+    RegionUse,
+    Removal,
+    Undo,
+    Veto,
+)
 from fcslam.storage.state_file import read_state, write_state
 from tests.scripted import ALIAS, closures, rectangle, stream
 from tests.small_fleet import feed, fingerprint, in_order, map_of
@@ -18,7 +31,14 @@ from tests.small_fleet import feed, fingerprint, in_order, map_of
 POSES = rectangle()
 A, B, C = ("a", POSES), ("b", POSES), ("c", POSES)
 PAIRS = [(0, 0), (8, 8), (16, 16), (24, 24), (32, 32), (40, 40)]
-CONTENTS = [Veto("a", "b"), Veto("a", "a", (1.5, 2.0)), Removal("b"), Removal("a", 3), Undo(7)]
+CONTENTS = [
+    Veto("a", "b"), Veto("a", "a", (1.5, 2.0)), Removal("b"), Removal("a", 3), Cut("a", 1.0, 2.0),
+    Pin("a", "b", (1.0, 2.0)),
+    ManualClosure("a", 1.0, "b", 2.0, (0.0, 1.0, 2.0), (0.1, 0.1)), Placement("a", 1.0, (0.0, 1.0, 2.0)),
+    MapRegion(RegionUse.KEEP_OUT, "stairs", "a", 1.0, ((0.0, 0.0), (1.0, 0.0), (1.0, 1.5))), Undo(7),
+]  # fmt: skip
+SQUARE = '"polygon": [[0, 0], [1, 0], [1, 1]]'
+T = '"stamp_i": 1, "T_i_j": [0, 0, 0]'
 
 
 def log(*contents):
@@ -35,6 +55,15 @@ def test_an_edit_survives_as_text(content):
     [
         ("rumour", "{}"), ("veto", "{"), ("veto", '{"robot_i": "a"}'), ("removal", '{"robot": "a", "epoch": "1"}'),
         ("veto", '{"robot_i": "a", "robot_j": "b", "stamps": [1, NaN]}'), ("undo", '{"number": null}'), ("undo", "[]"),
+        ("removal", '{"robot": "a", "epoch": -1}'), ("veto", '{"robot_i": "a", "robot_j": "b", "more": 1}'),
+        ("cut", '{"session": "a", "first_s": 2, "last_s": 2}'), ("pin", '{"robot_i": "a", "robot_j": "b"}'),
+        ("cut", '{"session": "a b", "first_s": 1, "last_s": 2}'),
+        ("closure", f'{{"robot_i": "a", "robot_j": "b", "stamp_j": 2, {T}, "tolerance": [0, 1]}}'),
+        ("closure", f'{{"robot_i": "a", "robot_j": "a", "stamp_j": 1, {T}, "tolerance": [1, 1]}}'),
+        ("placement", '{"session": "a", "stamp": 1, "pose": [1e9, 0, 0]}'),
+        ("region", '{"use": "erase", "name": "", "session": "a", "stamp": 1, "polygon": [[0, 0], [1, 0]]}'),
+        ("region", f'{{"use": "burn", "name": "", "session": "a", "stamp": 1, {SQUARE}}}'),
+        ("region", f'{{"use": "area", "name": "{101 * "x"}", "session": "a", "stamp": 1, {SQUARE}}}'),
     ],
 )  # fmt: skip
 def test_what_is_no_edit_is_refused(kind, content):
@@ -120,3 +149,140 @@ def test_a_veto_that_is_undone_leaves_no_trace_in_the_result(scripted):
     cloud.fleet.edit([])
     assert map_of(cloud.fleet.estimate()) == {"a": 0, "b": 0}
     assert fingerprint(cloud.finalize()) == fingerprint(feed(scripted(closures(A, B, PAIRS)), robots).finalize())
+
+
+def a_first_closure(cloud):
+    """The first accepted closure between two robots, as an edit would name it."""
+    closure = next(c for c in cloud.finalize().closures if c.i.robot != c.j.robot and c.status == "accepted")
+    stamps = {robot.robot: robot.stamps for robot in cloud.finalize().robots}
+    at_i, at_j = (float(stamps[end.robot][end.number]) for end in (closure.i, closure.j))
+    return closure, at_i, at_j
+
+
+def edits_of_every_kind(cloud):
+    closure, at_i, at_j = a_first_closure(cloud)
+    i, j = closure.i.robot, closure.j.robot
+    T_i_j = tuple((closure.T_i_j + np.array((0.4, -0.3, 0.05))).tolist())
+    return {
+        "veto": Veto(i, j),
+        "removal": Removal(j),
+        "cut": Cut(i, at_i - 3.0, at_i + 3.0),
+        "pin": Pin(i, j, (at_i, at_j)),
+        "closure": ManualClosure(i, at_i, j, at_j, T_i_j, (0.001, 0.001)),
+        "placement": Placement(i, at_i, (3.0, 4.0, 1.0)),
+        "region": MapRegion(RegionUse.AREA, "Room 1", i, at_i, ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0))),
+    }
+
+
+def told(result):
+    """As a fingerprint, with the regions."""
+    regions = [(r.use, r.name, r.map_index, r.polygon.tobytes()) for r in result.regions]
+    return fingerprint(result), regions
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["veto", "removal", "cut", "pin", "closure", "placement", "region"])
+def test_an_edit_counts_whenever_it_is_made_and_its_undo_leaves_no_trace(packets, kind):
+    plain = feed(Cloud(FleetConfig(), 0), packets)
+    before = told(plain.finalize())
+    change = edits_of_every_kind(plain)[kind]
+    results = []
+    for cut in (0, len(packets) // 2, len(packets)):
+        cloud = feed(Cloud(FleetConfig(), 0), packets[:cut])
+        cloud.fleet.edit([change])
+        results.append(told(feed(cloud, packets[cut:]).finalize()))
+        if kind != "removal":  # a removed session comes back in a new fleet only
+            cloud.fleet.edit([])
+            assert told(cloud.finalize()) == before
+    assert results[0] == results[1] == results[2]
+    assert results[0] != before
+
+
+TWO = [*stream(*A, start_s=0.0), *stream(*B, start_s=1000.0)]
+
+
+def test_a_pin_joins_maps_on_one_closure(scripted):
+    script = closures(A, B, PAIRS[:1])
+    assert map_of(feed(scripted(script), TWO).finalize()) == {"a": 0, "b": 1}
+    for before in (True, False):
+        cloud = scripted(script)
+        changes = [Pin("b", "a", (1000.0, 0.0))]
+        if before:
+            cloud.fleet.edit(changes)
+        feed(cloud, TWO)
+        cloud.fleet.edit(changes)
+        result = cloud.finalize()
+        assert map_of(result) == {"a": 0, "b": 0}
+        (closure,) = result.closures
+        assert (closure.status, closure.reason.code) == ("accepted", "pinned")
+        cloud.fleet.edit([*changes, Veto("a", "b")])
+        assert map_of(cloud.finalize()) == {"a": 0, "b": 1}, "a veto outweighs a pin"
+
+
+def test_a_closure_by_hand_joins_maps_where_nothing_was_recognised(scripted):
+    cloud = feed(scripted(), TWO)
+    cloud.fleet.edit([ManualClosure("a", 10.2, "b", 1020.0, (1.0, 2.0, 0.5), (0.1, 0.05))])
+    assert map_of(cloud.fleet.estimate()) == {"a": 0, "b": 0}
+    result = cloud.finalize()
+    a, b = result.robots
+    assert se2.between(a.T_map_base[10], b.T_map_base[20]) == pytest.approx((1.0, 2.0, 0.5), abs=1e-6)
+    assert [c.reason.code for c in result.closures] == ["made_by_hand"]
+
+
+def test_a_closure_by_hand_outweighs_others(scripted):
+    """Six closures say one thing, the user another."""
+    cloud = feed(scripted(closures(A, B, PAIRS, shift=ALIAS)), TWO)
+    cloud.fleet.edit([ManualClosure("a", 10.0, "b", 1010.0, (0.0, 0.0, 0.0), (0.01, 0.01))])
+    a, b = cloud.finalize().robots
+    assert a.map_index == b.map_index
+    assert b.T_map_base == pytest.approx(a.T_map_base, abs=0.01)
+
+
+def test_a_cut_leaves_the_path_and_takes_the_scans(scripted):
+    cloud = feed(scripted(closures(A, B, PAIRS)), TWO)
+    cloud.fleet.edit([Cut("b", 1010.0, 1060.0)])
+    result = cloud.finalize()
+    b = result.robots[1]
+    assert len(b.stamps) == len(POSES)
+    assert [keyscan.stamp for keyscan in b.keyscans] == [1000.0 + k for k in range(10)]
+    held = [c.j.number for c in result.closures if c.status == "accepted"]
+    assert all(number < 10 for number in held)
+
+
+def test_a_placement_moves_the_map_and_its_robots(scripted):
+    cloud = feed(scripted(closures(A, B, PAIRS)), TWO)
+    before = cloud.finalize()
+    cloud.fleet.edit([Placement("b", 1000.0, (5.0, 5.0, 0.0)), Placement("a", 0.0, (100.0, -7.0, np.pi / 2))])
+    after = cloud.finalize()
+    T = np.array((100.0, -7.0, np.pi / 2))
+    for old, new in zip(before.robots, after.robots, strict=True):
+        assert new.T_map_base == pytest.approx(se2.compose(T, old.T_map_base), abs=1e-9)
+        assert new.T_local_base == pytest.approx(old.T_local_base)
+    for correction in (*after.corrections, *cloud.fleet.corrections()):
+        assert correction.T_map_odom == pytest.approx(T, abs=1e-6), "both robots start at the same place"
+    assert after.graph.poses()[0] == pytest.approx(T)
+
+
+def test_a_region_moves_with_the_keyscan_to_which_it_is_tied(scripted):
+    corners = ((0.0, 0.0), (1.0, 0.0), (1.0, 2.0))
+    cloud = feed(scripted(closures(A, B, PAIRS)), TWO)
+    region = MapRegion(RegionUse.ERASE, "", "b", 1025.3, corners)
+    cloud.fleet.edit([region])
+    (placed,) = cloud.finalize().regions
+    b = cloud.finalize().robots[1]
+    assert placed.polygon == pytest.approx(se2.transform(b.T_map_base[25], np.array(corners)))
+    cloud.fleet.edit([region, Placement("a", 0.0, (1.0, 1.0, 1.0))])
+    (moved,) = cloud.finalize().regions
+    assert moved.polygon == pytest.approx(se2.transform(np.array((1.0, 1.0, 1.0)), placed.polygon))
+
+
+def test_edits_survive_in_the_state_of_a_fleet(scripted, tmp_path):
+    fleet = feed(scripted(closures(A, B, PAIRS[:1])), TWO).fleet
+    fleet.edit([Pin("a", "b", (0.0, 1000.0)), ManualClosure("a", 9.0, "b", 1009.0, (0.0, 0.0, 0.0), (0.1, 0.1))])
+    write_state(tmp_path / "state", "test", fleet.state())
+    stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in TWO}
+    again = Fleet.restored(FleetConfig(), 0, read_state(tmp_path / "state", "test"), stored.__getitem__)
+    assert fingerprint(again.estimate()) == fingerprint(fleet.estimate())
+    assert fingerprint(again.conclude()) == fingerprint(fleet.conclude())
+    again.edit([])
+    assert map_of(again.conclude()) == {"a": 0, "b": 1}

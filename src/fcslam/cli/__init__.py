@@ -12,6 +12,7 @@ from fcslam.cli import (
     certificates,
     config,
     demo,
+    edit,
     evaluate,
     extract,
     federate,
@@ -50,6 +51,7 @@ app.command(
         "fcslam map anna=run1.bag ben=run2.mcap -o runs/building",
         "fcslam map building.clf.gz --split 3 --quiet",
         "fcslam map today.bag --onto runs/building -o runs/building-2",
+        "fcslam map --onto runs/building -o runs/building-edited",
     ),
 )(mapping.map_recordings)
 app.command(
@@ -110,6 +112,7 @@ app.command(
     epilog=examples("fcslam certificates --host cloud.local --robot robot1 --admin boss"),
 )(certificates.certificates)
 app.command("warm-up", epilog=examples("fcslam warm-up"))(warming.warm_up)
+app.add_typer(edit.app, name="edit")
 app.add_typer(federate.app, name="federate")
 app.add_typer(tokens.app, name="tokens")
 app.add_typer(evaluate.app, name="evaluate")

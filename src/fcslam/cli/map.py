@@ -38,11 +38,13 @@ if TYPE_CHECKING:
 
 def map_recordings(
     logs: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
-            metavar="LOG...", help="One recording per robot. The file names the robot; NAME=LOG gives it another name."
+            metavar="LOG...",
+            help="One recording per robot. The file names the robot; NAME=LOG gives it another name. With --onto, none "
+            "maps the mission again with its edits.",
         ),
-    ],
+    ] = None,
     *,
     output: Annotated[Path | None, output_option("Run folder to write.", RUNS)] = None,
     split: Annotated[
@@ -76,6 +78,7 @@ def map_recordings(
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
     with _without_collection():
         from fcslam.api import continued_config, split_recordings
+        from fcslam.errors import InputError
         from fcslam.mission_file import read_mission
         from fcslam.runs import prepare_output, read_vetoes
 
@@ -85,7 +88,9 @@ def map_recordings(
         settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier))
         vetoes = read_vetoes(veto) if veto else ()
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
-        sources = split_recordings(open_recordings(logs, options), split)
+        if not logs and earlier is None:
+            raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
+        sources = split_recordings(open_recordings(logs or [], options), split)
     map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier)
 
 

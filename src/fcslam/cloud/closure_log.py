@@ -5,8 +5,19 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
+from fcslam.cloud.edits import edit_json, read_edit
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import Channel, ClosureStatus, Constraint, KeyscanId, LoopClosure, Reason, ReasonCode, frozen
+from fcslam.records import (
+    Channel,
+    ClosureStatus,
+    Constraint,
+    KeyscanId,
+    LoopClosure,
+    ManualClosure,
+    Reason,
+    ReasonCode,
+    frozen,
+)
 from fcslam.storage.state_file import State
 
 VERIFICATION = "fleet.matcher.verification"
@@ -22,6 +33,15 @@ class ClosureEntry:
     """Whether it is evidence for the relative pose of two maps: not if the joint map predicted it."""
     edge: int | None = None
     vetoed: bool = False
+    pinned: bool = False
+    """Whether a user says that it is true; a veto outweighs this."""
+    made_by_hand: ManualClosure | None = None
+    """The edit that made it."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it counts whatever the other evidence says."""
+        return self.pinned and not self.vetoed
 
     @property
     def is_between(self) -> bool:
@@ -78,6 +98,15 @@ class ClosureLog:
         )  # fmt: skip
         return self._add(ClosureEntry(closure, independent=False, edge=edge))
 
+    def add_by_hand(self, made: ManualClosure, i: KeyscanId, j: KeyscanId) -> ClosureEntry:
+        """Add a user's own closure between two keyscans."""
+        information = np.diag([1.0 / made.tolerance[0] ** 2] * 2 + [1.0 / made.tolerance[1] ** 2])
+        closure = LoopClosure(
+            i, j, Channel.LIDAR, 0.0, frozen(made.T_i_j), frozen(information), ClosureStatus.VERIFIED,
+            Reason(ReasonCode.MADE_BY_HAND),
+        )  # fmt: skip
+        return self._add(ClosureEntry(closure, independent=False, pinned=True, made_by_hand=made))
+
     def _add(self, entry: ClosureEntry) -> ClosureEntry:
         self._entries.append(entry)
         if not entry.is_between:
@@ -100,7 +129,8 @@ class ClosureLog:
             "information": np.array([closure.information for closure in closures]).reshape(-1, 3, 3),
             "facts": [
                 (c.i, c.j, c.channel, c.similarity, c.status, astuple(c.reason), c.informative,
-                 entry.independent, entry.edge, entry.vetoed)
+                 entry.independent, entry.edge, entry.vetoed, entry.pinned,
+                 entry.made_by_hand and edit_json(entry.made_by_hand))
                 for entry, c in zip(self._entries, closures, strict=True)
             ],
         }  # fmt: skip
@@ -108,13 +138,15 @@ class ClosureLog:
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
         rows = zip(state["facts"], frozen(state["T_i_j"]), frozen(state["information"]), strict=True)
-        for (i, j, channel, similarity, status, reason, informative, *entry), T_i_j, information in rows:
+        for (i, j, channel, similarity, status, reason, informative, *entry, by_hand), T_i_j, information in rows:
             code, *details = reason
             closure = LoopClosure(
                 KeyscanId(*i), KeyscanId(*j), Channel(channel), similarity, T_i_j, information, ClosureStatus(status),
                 Reason(ReasonCode(code), *details), informative,
             )  # fmt: skip
-            self._add(ClosureEntry(closure, *entry))
+            restored = self._add(ClosureEntry(closure, *entry))
+            if by_hand is not None and isinstance(edit := read_edit("closure", by_hand), ManualClosure):
+                restored.made_by_hand = edit
 
     def evidence(self, a: str, b: str) -> list[ClosureEntry]:
         """The verified closures between two robots that the joint map did not predict and no veto excludes."""

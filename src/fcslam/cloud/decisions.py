@@ -6,7 +6,7 @@ from dataclasses import astuple
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
-from fcslam.cloud.edits import edit_json, is_removed, kind_of, read_edit
+from fcslam.cloud.edits import edit_json, is_cut, is_removed, kind_of, read_edit
 from fcslam.cloud.joining import CONSISTENCY, decide_join, first_estimate
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.map_comparison import MapComparison
@@ -19,7 +19,18 @@ from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.trajectory import Trajectory
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import Change, ClosureStatus, Constraint, KeyscanId, Reason, ReasonCode, Removal, Veto
+from fcslam.records import (
+    Change,
+    ClosureStatus,
+    Constraint,
+    KeyscanId,
+    ManualClosure,
+    Pin,
+    Reason,
+    ReasonCode,
+    Undo,
+    Veto,
+)
 from fcslam.storage.state_file import State
 
 EXAMINED_GROWTH = 2.0
@@ -76,7 +87,7 @@ class ClosureDecisions:
         i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)
         edge = self._graph.close(i, j, closure.T_i_j, closure.information)
         entry = self.closures.add_local(closure, edge)
-        entry.vetoed = self._is_vetoed(entry)
+        self._mark(entry)
         if entry.vetoed:
             self._graph.count(edge, holds=False)
 
@@ -84,7 +95,7 @@ class ClosureDecisions:
         """Accept the matches of a session's new place that fit the joint map; join maps on a dominant cluster."""
         entries = [self.closures.add(match) for match in matches if not self.closures.confirms(match)]
         for entry in entries:
-            entry.vetoed = self._is_vetoed(entry)
+            self._mark(entry)
         undecided = [entry for entry in entries if not entry.vetoed and not self._accept_if_consistent(entry)]
         for other in dict.fromkeys(entry.closure.i.robot for entry in undecided):
             between = [entry for entry in undecided if entry.closure.i.robot == other]
@@ -101,21 +112,22 @@ class ClosureDecisions:
             self.reevaluate()
 
     def edit(self, changes: Sequence[Change]) -> bool:
-        """Replace the changes by hand that are in force: they exclude closures, and no others are excluded.
+        """Replace the changes by hand that are in force: they exclude and pin closures, and no others do.
 
         Returns whether a decision changed.
         """
         self._changes = tuple(changes)
-        turned = [entry for entry in self.closures if entry.vetoed != self._is_vetoed(entry)]
-        for entry in turned:
-            entry.vetoed = not entry.vetoed
-        decided = any(entry.closure.status is not ClosureStatus.CANDIDATE for entry in turned)
-        if decided:
+        turned = [entry for entry in self.closures if self._mark(entry)]
+        decided = any(entry.pinned or entry.closure.status is not ClosureStatus.CANDIDATE for entry in turned)
+        if decided or self._missing():
             self.reevaluate()
-        return decided
+            return True
+        return False
 
     def reevaluate(self) -> Fusion:
         """Decide every closure again from all evidence: revoke outvoted ones, separate maps that only they joined."""
+        for made in self._missing():
+            self.closures.add_by_hand(made, *self._ends(made))
         fusion = reevaluate(
             self._graph,
             self.closures,
@@ -148,18 +160,50 @@ class ClosureDecisions:
         self._examined = {frozenset(pair): size for pair, size in state["examined"]}
         self.maps, self.version = state["maps"], state["version"]
         changes = (read_edit(*change) for change in state["changes"])
-        self._changes = tuple(change for change in changes if isinstance(change, Veto | Removal))
+        self._changes = tuple(change for change in changes if not isinstance(change, Undo))
         self._contested, self._postponed_until = state["contested"], state["postponed_until"]
         self._apart = {frozenset(pair): Reason(ReasonCode(code), *details) for pair, (code, *details) in state["apart"]}
 
+    def _mark(self, entry: ClosureEntry) -> bool:
+        """Note whether users exclude or pin the closure; returns whether that is new."""
+        before = entry.vetoed, entry.pinned
+        entry.vetoed, entry.pinned = self._is_vetoed(entry), self._is_pinned(entry)
+        return before != (entry.vetoed, entry.pinned)
+
     def _is_vetoed(self, entry: ClosureEntry) -> bool:
-        """Whether a veto excludes the closure, or one of its sessions is removed."""
+        """Whether a veto excludes the closure, an end of it is cut or removed, or the edit that made it is undone."""
+        ends = [(end.robot, self._sessions.stamp(end)) for end in (entry.closure.i, entry.closure.j)]
+        if entry.made_by_hand is not None and entry.made_by_hand not in self._changes:
+            return True
+        return any(
+            is_removed(session, self._changes) or is_cut(session, stamp, self._changes) for session, stamp in ends
+        ) or any(veto.forbids(*ends[0], *ends[1]) for veto in self._changes if isinstance(veto, Veto))
+
+    def _is_pinned(self, entry: ClosureEntry) -> bool:
+        """Whether a user says that the closure is true, or made it."""
         i, j = entry.closure.i, entry.closure.j
-        stamps = self._sessions.stamp(i), self._sessions.stamp(j)
-        vetoes = (change for change in self._changes if isinstance(change, Veto))
-        return any(veto.forbids(i.robot, stamps[0], j.robot, stamps[1]) for veto in vetoes) or any(
-            is_removed(end.robot, self._changes) for end in (i, j)
+        pins = [change for change in self._changes if isinstance(change, Pin)]
+        return entry.made_by_hand is not None or any(
+            pin.confirms(i.robot, self._sessions.stamp(i), j.robot, self._sessions.stamp(j)) for pin in pins
         )
+
+    def _missing(self) -> list[ManualClosure]:
+        """Closures by hand, in force, that are not in the log yet and whose sessions are there."""
+        made = [change for change in self._changes if isinstance(change, ManualClosure)]
+        entered = {entry.made_by_hand for entry in self.closures} if made else set()
+        present = set(self._sessions.robots)
+        return [
+            change
+            for change in made
+            if change not in entered
+            and {change.robot_i, change.robot_j} <= present
+            and not any(is_removed(session, self._changes) for session in (change.robot_i, change.robot_j))
+            and len(set(self._ends(change))) == 2
+        ]
+
+    def _ends(self, made: ManualClosure) -> tuple[KeyscanId, KeyscanId]:
+        """The keyscans that a closure by hand connects."""
+        return self._sessions.nearest(made.robot_i, made.stamp_i), self._sessions.nearest(made.robot_j, made.stamp_j)
 
     def _accept_if_consistent(self, entry: ClosureEntry) -> bool:
         """Accept a verified closure that fits the joint map; False if only a cluster may accept it."""

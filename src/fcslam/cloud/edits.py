@@ -6,14 +6,48 @@ An undo is final: whoever regrets it makes the edit again.
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from itertools import chain
 from math import isfinite
-from typing import Any
+from typing import Any, Final
+
+from pydantic import TypeAdapter, ValidationError
 
 from fcslam.cloud.sessions import robot_and_epoch
+from fcslam.config import one_line
 from fcslam.errors import EditError
-from fcslam.records import Change, Edit, Removal, Undo, Veto
+from fcslam.records import (
+    NAME,
+    Change,
+    Cut,
+    Edit,
+    ManualClosure,
+    MapRegion,
+    Pin,
+    Placement,
+    Removal,
+    Undo,
+    Veto,
+)
+from fcslam.wire.limits import MAXIMUM_EPOCH
 
-_KINDS: dict[str, type[Change | Undo]] = {"veto": Veto, "removal": Removal, "undo": Undo}
+LARGEST_M: Final = 1e5
+"""Of a coordinate in an edit."""
+MOST_CORNERS: Final = 1000
+LONGEST_NAME: Final = 100
+LEAST_TOLERANCE: Final = (1e-3, 1e-4)
+"""Metres and radians: no hand, map or LiDAR is more precise."""
+
+_KINDS: Final[dict[str, type[Change | Undo]]] = {
+    "veto": Veto,
+    "removal": Removal,
+    "cut": Cut,
+    "pin": Pin,
+    "closure": ManualClosure,
+    "placement": Placement,
+    "region": MapRegion,
+    "undo": Undo,
+}
+_READERS: Final[dict[str, TypeAdapter[Change | Undo]]] = {kind: TypeAdapter(type_) for kind, type_ in _KINDS.items()}
 
 
 def undone(edits: Iterable[Edit]) -> dict[int, int]:
@@ -48,8 +82,39 @@ def is_removed(session: str, changes: Iterable[Change]) -> bool:
     return any(isinstance(change, Removal) and change.covers(robot, epoch) for change in changes)
 
 
+def is_cut(session: str, stamp: float, changes: Iterable[Change]) -> bool:
+    """Whether one of the changes cuts the session's keyscan with this stamp."""
+    return any(isinstance(change, Cut) and change.covers(session, stamp) for change in changes)
+
+
+def sessions_of(content: Change | Undo) -> tuple[str, ...]:
+    """The sessions, or the robot, that an edit names."""
+    match content:
+        case Veto() | Pin() | ManualClosure():
+            return content.robot_i, content.robot_j
+        case Removal():
+            return (content.robot,)
+        case Cut() | Placement() | MapRegion():
+            return (content.session,)
+        case Undo():
+            return ()
+
+
+def stamps_of(content: Change | Undo) -> tuple[tuple[str, float], ...]:
+    """The moments of sessions that an edit names; a cut may reach beyond its session."""
+    match content:
+        case Veto() | Pin() if content.stamps is not None:
+            return (content.robot_i, content.stamps[0]), (content.robot_j, content.stamps[1])
+        case ManualClosure():
+            return (content.robot_i, content.stamp_i), (content.robot_j, content.stamp_j)
+        case Placement() | MapRegion():
+            return ((content.session, content.stamp),)
+        case _:
+            return ()
+
+
 def kind_of(content: Change | Undo) -> str:
-    """The name of the kind of an edit: veto, removal or undo."""
+    """The name of the kind of an edit, such as veto or undo."""
     return next(kind for kind, type_ in _KINDS.items() if isinstance(content, type_))
 
 
@@ -59,24 +124,72 @@ def edit_json(content: Change | Undo) -> str:
 
 
 def read_edit(kind: str, content: str) -> Change | Undo:
-    """The content of an edit of this kind.
+    """The content of an edit of this kind, checked.
 
     Raises:
-        EditError: it is not what ``edit_json`` writes.
+        EditError: it is not what ``edit_json`` writes, or cannot be meant.
     """
     try:
-        return _read(kind, json.loads(content))
+        _KINDS[kind](**json.loads(content))  # refuses names that the kind does not have
+        edit = _READERS[kind].validate_json(content, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise EditError(f"no edit of kind '{kind}' ({where}: {first['msg']})") from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise EditError(f"no edit of kind '{kind}' ({type(error).__name__}: {error})") from error
+        raise EditError(f"no edit of kind '{kind}' ({type(error).__name__}: {one_line(str(error))})") from error
+    check_edit(edit)
+    return edit
 
 
-def _read(kind: str, fields: Any) -> Change | Undo:
-    match _KINDS[kind](**fields):
-        case Veto(str(i), str(j), None):
-            return Veto(i, j)
-        case Veto(str(i), str(j), [float() | int() as stamp_i, float() | int() as stamp_j]):
-            if isfinite(stamp_i) and isfinite(stamp_j):
-                return Veto(i, j, (stamp_i, stamp_j))
-        case Removal(str(), None | int()) | Undo(int()) as content:
-            return content
-    raise ValueError(f"{fields}")
+def check_edit(content: Change | Undo) -> None:
+    """Check the numbers and names of an edit.
+
+    Raises:
+        EditError: one cannot be meant.
+    """
+    if not all(isfinite(number) for number in _numbers(asdict(content))):
+        raise EditError("a number of the edit is not finite")
+    unnamed = next((name for name in sessions_of(content) if not NAME.fullmatch(name)), None)
+    if unnamed is not None:
+        raise EditError(f"'{unnamed[:LONGEST_NAME]}' is no name of a session")
+    match content:
+        case Removal() if not 0 <= (content.epoch or 0) <= MAXIMUM_EPOCH:
+            raise EditError(f"epoch {content.epoch}: it is from 0 to {MAXIMUM_EPOCH}")
+        case Cut() if content.last_s <= content.first_s:
+            raise EditError(f"the stretch ends at {content.last_s:.3f} s, before it begins at {content.first_s:.3f} s")
+        case ManualClosure():
+            _check_closure(content)
+        case Placement():
+            _check_coordinates(content.pose[:2])
+        case MapRegion():
+            _check_region(content)
+
+
+def _check_closure(closure: ManualClosure) -> None:
+    _check_coordinates(closure.T_i_j[:2])
+    if any(given < least for given, least in zip(closure.tolerance, LEAST_TOLERANCE, strict=True)):
+        raise EditError(f"the tolerance must be at least {LEAST_TOLERANCE[0]} m and {LEAST_TOLERANCE[1]} rad")
+    if closure.robot_i == closure.robot_j and closure.stamp_i == closure.stamp_j:
+        raise EditError("a closure connects two different keyscans")
+
+
+def _check_region(region: MapRegion) -> None:
+    _check_coordinates(chain.from_iterable(region.polygon))
+    if not 3 <= len(region.polygon) <= MOST_CORNERS:
+        raise EditError(f"a polygon has 3 to {MOST_CORNERS} corners, not {len(region.polygon)}")
+    if len(region.name) > LONGEST_NAME or not region.name.isprintable():
+        raise EditError(f"a name has at most {LONGEST_NAME} printable characters")
+
+
+def _check_coordinates(coordinates: Iterable[float]) -> None:
+    if any(abs(number) > LARGEST_M for number in coordinates):
+        raise EditError(f"a coordinate is over {LARGEST_M:g} m")
+
+
+def _numbers(content: Any) -> Iterable[float]:
+    """All numbers in it, also those in lists."""
+    if isinstance(content, dict | list | tuple):
+        values = content.values() if isinstance(content, dict) else content
+        return chain.from_iterable(map(_numbers, values))
+    return (content,) if isinstance(content, float | int) else ()

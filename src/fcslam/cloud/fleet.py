@@ -14,6 +14,7 @@ from fcslam.cloud.edits import is_removed
 from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
+from fcslam.cloud.placement import T_placed_map
 from fcslam.cloud.recognition import PlaceRecognition, VocabularyState
 from fcslam.cloud.result import FleetResult, Fusion, conclude, map_indices
 from fcslam.cloud.rigid_fusion import fuse_rigidly
@@ -21,6 +22,7 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
+from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
@@ -31,6 +33,7 @@ from fcslam.records import (
     FloatArray,
     Keyscan,
     KeyscanId,
+    ManualClosure,
     Place,
     Removal,
     frozen,
@@ -146,7 +149,9 @@ class Fleet:
         if not removals <= set(changes):
             raise ValueError("a removed session cannot come back")
         removed = [session for session in self._sessions.robots if is_removed(session, changes)]
-        self._needs_replay |= self._decisions.edit(changes) or bool(removed)
+        # A closure by hand comes after all others, in this fleet perhaps before some.
+        made = bool(self._sessions.robots) and any(isinstance(change, ManualClosure) for change in changes)
+        self._needs_replay |= self._decisions.edit(changes) or bool(removed) or made
         self._recognition.forget(removed)
         self._replayed = None
 
@@ -161,7 +166,7 @@ class Fleet:
         own: dict[str, FloatArray] = {session: frozen(self._graph.chain(session)) for session in sessions}
         entries = [e for e in self._decisions.closures if e.closure.i.robot in poses and e.closure.j.robot in poses]
         fusion = Fusion(self._present_maps(), poses, own, tuple(entry.closure for entry in entries))
-        return conclude(self._sessions, self._graph, entries, fusion, self._decisions.version)
+        return conclude(self._sessions, self._graph, entries, fusion, self._decisions.version, self._decisions.changes)
 
     def conclude(self) -> FleetResult:
         """Decide every closure from all evidence and collect the result; the fleet stays as it is."""
@@ -172,7 +177,7 @@ class Fleet:
         fusion = decisions.reevaluate()
         if self._config.fusion is not FusionStrategy.JOINT:
             fusion = fuse_rigidly(decisions.closures, fusion.T_local_base, self._config.fusion)
-        return conclude(self._sessions, graph, decisions.closures, fusion, decisions.version)
+        return conclude(self._sessions, graph, decisions.closures, fusion, decisions.version, decisions.changes)
 
     def finalize(
         self, log: PacketLog, arrived: Iterable[tuple[float, PacketNumber]], read: Callable[[PacketNumber], Packet]
@@ -233,7 +238,10 @@ class Fleet:
         if session not in indices:
             return None
         quality = self._quality.of(session, self._decisions.map_of(session), self._decisions.closures)
-        T_map_odom: FloatArray = frozen(self._graph.T_map_odom(session))
+        T_map_odom = self._graph.T_map_odom(session)
+        changes, members = self._decisions.changes, self._decisions.map_of(session)
+        T = T_placed_map(members, self._sessions, self._graph.pose, changes)
+        T_map_odom = frozen(T_map_odom if T is None else se2.compose(T, T_map_odom))
         return Correction(session, self._decisions.version, indices[session], T_map_odom, quality)
 
     def _add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:

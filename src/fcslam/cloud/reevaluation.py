@@ -1,6 +1,7 @@
 """Re-evaluation: decide every closure from all evidence, independent of earlier decisions."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from fcslam.cloud.sessions import robot_of
 from fcslam.graph.consistency import Closures, ConsistencySettings
 from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
+from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 
@@ -29,7 +31,7 @@ def reevaluate(
 
     No earlier estimate, join or decision plays a part: a closure that joined two maps and is outvoted now is revoked.
     """
-    entries = [entry for entry in closures if entry.closure.status is not ClosureStatus.CANDIDATE]
+    entries = [e for e in closures if e.is_certain or e.closure.status is not ClosureStatus.CANDIDATE]
     _enter(graph, (entry for entry in entries if entry.edge is None))
     robots = list(graph.robots())
 
@@ -69,10 +71,18 @@ def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
         informative[entry.edge] = entry.closure.informative
         independent[entry.edge] = entry.independent
         vetoed[entry.edge] = entry.vetoed
+    certain = {entry.edge for entry in entries if entry.is_certain}
+    evident = graph.graph if not certain else _with_certain(graph.graph, certain)
     sessions = graph.robots()
     senders = [robot_of(session) for session in sessions]
     numbers = tuple(map(senders.index, senders))
-    return JointEvidence(graph.graph, tuple(sessions.values()), informative, independent, vetoed, numbers)
+    return JointEvidence(evident, tuple(sessions.values()), informative, independent, vetoed, numbers)
+
+
+def _with_certain(graph: PoseGraph, certain: Container[int | None]) -> PoseGraph:
+    """The same graph, in which these closures count like odometry."""
+    edges = (replace(edge, robust=False) if k in certain else edge for k, edge in enumerate(graph.edges))
+    return PoseGraph(graph.poses(), list(edges))
 
 
 def _decide(entry: ClosureEntry, holds: bool, contradiction: Reason) -> None:
@@ -80,6 +90,9 @@ def _decide(entry: ClosureEntry, holds: bool, contradiction: Reason) -> None:
     accepted_before = entry.closure.status is ClosureStatus.ACCEPTED
     if entry.vetoed:
         entry.set(ClosureStatus.REVOKED, Reason(ReasonCode.VETOED))
+    elif entry.pinned:
+        code = ReasonCode.PINNED if entry.made_by_hand is None else ReasonCode.MADE_BY_HAND
+        entry.set(ClosureStatus.ACCEPTED, Reason(code))
     elif holds:
         fits = entry.closure.reason if accepted_before else Reason(ReasonCode.FITS_JOINT_GRAPH)
         entry.set(ClosureStatus.ACCEPTED, fits)

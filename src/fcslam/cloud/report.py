@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.cloud.regions import erased, region_files
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.cloud.sessions import robot_of
 from fcslam.geometry import se2
@@ -137,9 +138,11 @@ def _map_files(
     files: dict[str, bytes] = {}
     for k, members in sorted(maps.items()):
         stem = "map" if k == 0 else f"map_{k}"
-        fused = fuse_members(members, grid)
+        regions = [region for region in result.regions if region.map_index == k]
+        fused = erased(fuse_members(members, grid), regions)
         files[f"{stem}.pgm"] = pgm_bytes(fused)
         files[f"{stem}.yaml"] = map_yaml(fused, f"{stem}.pgm").encode()
+        files |= region_files(fused, stem, regions)
         if k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN:
             names = {robot.robot for robot in members}
             ways = {name: robot.T_map_base for name, robot in trajectories.items() if name in names}

@@ -1,16 +1,30 @@
 """The result of a fleet: all closures decided, all robots placed in maps."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.cloud.closure_log import ClosureEntry
+from fcslam.cloud.edits import is_cut
 from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.placement import PlacedRegion, T_placed_map, placed_regions
 from fcslam.cloud.session_store import SessionStore
+from fcslam.geometry import se2
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.records import ClosureStatus, Correction, FloatArray, Keyscan, LaserModel, LoopClosure, Reason, frozen
+from fcslam.records import (
+    Change,
+    ClosureStatus,
+    Correction,
+    FloatArray,
+    Keyscan,
+    KeyscanId,
+    LaserModel,
+    LoopClosure,
+    Reason,
+    frozen,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +61,8 @@ class FleetResult:
     corrections: tuple[Correction, ...]
     graph: PoseGraph
     """All keyscans at their optimised poses, with the accepted constraints."""
+    regions: tuple[PlacedRegion, ...] = ()
+    """What users drew in the maps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,9 +88,18 @@ def map_indices(maps: Sequence[Sequence[str]]) -> dict[str, int]:
 
 
 def conclude(
-    sessions: SessionStore, graph: JointGraph, closures: Iterable[ClosureEntry], fusion: Fusion, version: int
+    sessions: SessionStore,
+    graph: JointGraph,
+    closures: Iterable[ClosureEntry],
+    fusion: Fusion,
+    version: int,
+    changes: Sequence[Change],
 ) -> FleetResult:
-    """Collect the result of the robots of ``fusion``, whose closures are those of the entries."""
+    """Collect the result of the robots of ``fusion``, whose closures are those of the entries.
+
+    ``changes`` are the edits in force; those of closures were taken into account before.
+    """
+    fusion = _placed(fusion, sessions, changes)
     index = map_indices(fusion.maps)
     names = [robot for robot in sessions.robots if robot in index]
     robots = tuple(
@@ -82,7 +107,7 @@ def conclude(
             robot,
             index[robot],
             frozen(sessions.stamps(robot)),
-            sessions.keyscans(robot),
+            tuple(k for k in sessions.keyscans(robot) if not is_cut(robot, k.stamp, changes)),
             fusion.T_map_base[robot],
             fusion.T_local_base[robot],
             sessions.lasers(robot),
@@ -98,4 +123,20 @@ def conclude(
         for entry, closure in zip(closures, fusion.closures, strict=True)
         if closure.status is not ClosureStatus.ACCEPTED
     }
-    return FleetResult(robots, fusion.closures, corrections, graph.held(fusion.T_map_base, left_out))
+    regions = placed_regions(index, sessions, lambda keyscan: _pose(fusion, keyscan), changes)
+    return FleetResult(robots, fusion.closures, corrections, graph.held(fusion.T_map_base, left_out), regions)
+
+
+def _placed(fusion: Fusion, sessions: SessionStore, changes: Sequence[Change]) -> Fusion:
+    """The same with every map where users want it."""
+    T_map_base = dict(fusion.T_map_base)
+    for members in fusion.maps:
+        T = T_placed_map(members, sessions, lambda keyscan: _pose(fusion, keyscan), changes)
+        if T is not None:
+            T_map_base |= {session: frozen(se2.compose(T, T_map_base[session])) for session in members}
+    return replace(fusion, T_map_base=T_map_base)
+
+
+def _pose(fusion: Fusion, keyscan: KeyscanId) -> FloatArray:
+    pose: FloatArray = fusion.T_map_base[keyscan.robot][keyscan.number]
+    return pose

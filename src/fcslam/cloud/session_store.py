@@ -171,6 +171,10 @@ class SessionStore:
         """When the keyscan was taken."""
         return self._stamps[keyscan.robot][keyscan.number]
 
+    def nearest(self, robot: str, stamp: float) -> KeyscanId:
+        """The robot's connected keyscan whose stamp is nearest."""
+        return KeyscanId(robot, int(np.abs(self.stamps(robot) - stamp).argmin()))
+
     def stamps(self, robot: str) -> FloatArray:
         """When the robot's connected keyscans were taken, shape (N,), released or not."""
         return np.array(self._stamps[robot][: self._connected[robot]])

@@ -5,6 +5,7 @@ the robots' frames are unknown. Pairwise consistency finds these transforms; gra
 closure.
 """
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,6 +37,9 @@ ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures], Uniqueness 
 """Compares the transform that closures give between the maps of two robots with the best transform elsewhere. It takes
 the numbers of the robots, their own trajectories, and the closures."""
 
+_Relation = tuple[int, int, FloatArray]
+"""Two robots a and b, and the transform T_a_b between their own frames, shape (3,)."""
+
 INLIER_WEIGHT = 0.5
 """Weight above which a closure is an inlier: graduated non-convexity ends at weight 1 (inlier) or 0 (outlier)."""
 
@@ -45,6 +49,7 @@ class JointEvidence:
     """All measurements of several robots: odometry, closures within each robot, closures between robots."""
 
     graph: PoseGraph
+    """An edge between two robots that is not robust is known to be true: it joins their maps."""
     robots: tuple[NDArray[np.int64], ...]
     """Variables of each robot in the order of its path; every variable belongs to one robot."""
     informative: NDArray[np.bool_]
@@ -132,15 +137,16 @@ def solve_jointly(
     # 2. Find the dominant cluster of closures between every two robots (PCM).
     links = _find_links(evidence, paths, consistency, examine)
     joining = [link for link in links if link.decision.dominant]
+    known = _known_transforms(evidence, paths)
     apart: dict[tuple[int, int], Reason] = {}
     senders = evidence.senders or range(len(own))
     while True:
         # 3. Merge the robots' frames along the strongest links.
-        frames, maps = _merge_frames(len(own), joining)
+        frames, maps = _merge_frames(len(own), known, joining)
         within_maps = _edges_within_maps(evidence, maps)
         # 4. Solve with the supported closures, then decide all closures within maps by that solution.
         supported = within_maps & _supported_edges(evidence, [inliers for _, inliers in own], joining)
-        solution = _solve_supported(evidence, supported, paths, frames, bool(joining), gnc, factors)
+        solution = _solve_supported(evidence, supported, paths, frames, bool(known or joining), gnc, factors)
         solution = _refine_inliers(factors, within_maps, solution, gnc)
         # 5. Withdraw isolated closures and decide once more.
         isolated = _isolated_closures(evidence, paths, solution, consistency)
@@ -156,6 +162,8 @@ def solve_jointly(
             evidence.graph, _owners(evidence)[0], solution.poses, solution.weights, within_maps, contradiction, gnc
         )
         apart |= _separations(found, joining, senders, contradiction)
+        _, bound = _merge_frames(len(own), known, ())
+        apart = {(a, b): reason for (a, b), reason in apart.items() if bound[a] != bound[b]}
         confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         if len(confirmed) == len(joining):
             own_poses: tuple[FloatArray, ...] = tuple(frozen(path.poses) for path in paths)
@@ -230,19 +238,34 @@ def _pairs(
         yield a, b, rows, closures.reversed(owner[edges.i[rows]] == b)
 
 
-def _merge_frames(count: int, links: Sequence[Link]) -> tuple[list[FloatArray], list[int]]:
-    """``T_map_own`` of every robot and the number of its map: a spanning tree that takes the strongest links first."""
+def _known_transforms(evidence: JointEvidence, own: Sequence[Trajectory]) -> list[_Relation]:
+    """Transforms between the robots' own frames by the edges between robots that are known to be true."""
+    edges, (owner, index) = evidence.graph.arrays(), _owners(evidence)
+    between = np.flatnonzero(~edges.robust & (owner[edges.i] != owner[edges.j]))
+    relations: list[_Relation] = []
+    for i, j, T_i_j in zip(edges.i[between], edges.j[between], edges.T_i_j[between], strict=True):
+        a, b = int(owner[i]), int(owner[j])
+        T_a_i, T_b_j = own[a].poses[index[i]], own[b].poses[index[j]]
+        relations.append((a, b, se2.compose(se2.compose(T_a_i, T_i_j), se2.inverse(T_b_j))))
+    return relations
+
+
+def _merge_frames(count: int, known: Sequence[_Relation], links: Sequence[Link]) -> tuple[list[FloatArray], list[int]]:
+    """``T_map_own`` of every robot and the number of its map: a spanning tree that takes what is known first, then the
+    strongest links."""
     frames = [np.zeros(3) for _ in range(count)]
     maps = list(range(count))
-    for link in sorted(
+    strongest = sorted(
         links, key=lambda link: (-link.decision.evidence.separate_places, -len(link.decision.members), link.a, link.b)
-    ):
-        older, younger = sorted((maps[link.a], maps[link.b]))
-        if older == younger or link.T_a_b is None:
+    )
+    found = ((link.a, link.b, link.T_a_b) for link in strongest if link.T_a_b is not None)
+    for a, b, T_a_b in itertools.chain(known, found):
+        older, younger = sorted((maps[a], maps[b]))
+        if older == younger:
             continue
         # T_mapA_mapB, through the two robots
-        T = se2.compose(se2.compose(frames[link.a], link.T_a_b), se2.inverse(frames[link.b]))
-        T = T if maps[link.a] == older else se2.inverse(T)
+        T = se2.compose(se2.compose(frames[a], T_a_b), se2.inverse(frames[b]))
+        T = T if maps[a] == older else se2.inverse(T)
         for robot in (robot for robot in range(count) if maps[robot] == younger):
             frames[robot], maps[robot] = se2.compose(T, frames[robot]), older
     order = {first: number for number, first in enumerate(dict.fromkeys(maps))}

@@ -14,13 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fcslam.cloud.edits import check_undo, edit_json, kind_of, read_edit
+from fcslam.cloud.edits import check_undo, edit_json, kind_of, read_edit, sessions_of, stamps_of
 from fcslam.cloud.replies import SessionCorrection, is_news
 from fcslam.cloud.report import Track
+from fcslam.cloud.sessions import robot_of, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import one_line
 from fcslam.errors import EditError, PacketConflictError, StoreError
-from fcslam.records import Change, Channel, Correction, Edit, Undo, frozen
+from fcslam.records import Change, Channel, Correction, Edit, Removal, Undo, frozen
 from fcslam.storage.database import Database, SealedTable, check_file, translate_errors
 from fcslam.storage.recovery import fault
 from fcslam.wire.ledger import Ledger, Traffic
@@ -39,6 +40,8 @@ VERSION = 6
 """Version of the schema and of the packets."""
 LARGEST_TRACK = 1 << 28
 """Largest size of one column of a session's scans, bytes."""
+NEARBY_S = 1.0
+"""So far outside of a session an edit may name a moment: stamps are rounded when they are printed."""
 _AT_ONCE = 10_000
 """Packets that are read at once."""
 _COLUMNS = "robot, epoch, sequence, time, kind, channel, data, refusal"
@@ -247,6 +250,32 @@ class MissionStore:
             number = _next(database, "edits", "number")
             EDITS.insert(database, (number, author, float(time_s), kind_of(content), edit_json(content)))
         return Edit(number, author, time_s, content)
+
+    def check_named(self, content: Change | Undo) -> None:
+        """Check that the sessions and moments that an edit names are in the mission.
+
+        Raises:
+            EditError: they are not.
+        """
+        spans = {
+            session_name(robot, epoch): (first, last)
+            for robot, epoch, first, last in self._database.rows(
+                "SELECT robot, epoch, min(time), max(time) FROM packets WHERE refusal IS NULL GROUP BY robot, epoch"
+            )
+        }
+        named, known = sessions_of(content), set(spans)
+        match content:
+            case Removal(epoch=None):
+                known = {robot_of(name) for name in spans}
+            case Removal(epoch=int(epoch)):
+                named = (session_name(content.robot, epoch),)
+        for name in named:
+            if name not in known:
+                raise EditError(f"there is no session '{name}'; there are {', '.join(sorted(known))}")
+        for name, stamp in stamps_of(content):
+            first, last = spans[name]
+            if not first - NEARBY_S <= stamp <= last + NEARBY_S:
+                raise EditError(f"{name} has no scan at {stamp:.3f} s; its scans are from {first:.3f} to {last:.3f} s")
 
     def edits(self, after: int = 0) -> list[Edit]:
         """The edits after number ``after``, in their order."""

@@ -222,21 +222,25 @@ def test_a_full_disk_is_507_and_the_result_comes_when_there_is_room(mapped, monk
     assert len(open_run(mapped.state.mission.folder.run(asked.run)).trajectories) == 2
 
 
+def edit(mapped, kind, content, who="boss"):
+    return mapped.ask("POST", f"{API}/edits", who, json={"kind": kind, "content": content})
+
+
 def test_a_veto_parts_what_only_it_held_together(mapped):
-    assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b"}).status_code == 201
+    assert edit(mapped, "veto", {"robot_i": "a", "robot_j": "b"}).status_code == 201
     assert len(get(mapped, "maps").json()) == 2
     both = {"robot_i": "a", "robot_j": "b"}
     for wrong, status in (
-        ({"robot_i": "a", "robot_j": "x"}, 404), ({"robot_i": "a"}, 400), ({**both, "stamps": [1.0]}, 400),
-        ({**both, "stamps": [1.0, None]}, 400), ({"robot_i": "a", "robot_j": ""}, 400), ({**both, "more": 1}, 400),
+        ({"robot_i": "a", "robot_j": "x"}, 404), ({"robot_i": "a"}, 409), ({**both, "stamps": [1.0]}, 409),
+        ({**both, "stamps": [1.0, None]}, 409), ({"robot_i": "a", "robot_j": ""}, 409), ({**both, "more": 1}, 409),
+        ({**both, "stamps": [1.0, 1e9]}, 404),
     ):  # fmt: skip
-        assert mapped.ask("POST", f"{API}/vetoes", "boss", json=wrong).status_code == status
-    assert "b+x" in mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+x"}).text
-    assert mapped.ask("POST", f"{API}/vetoes", "boss", json={"robot_i": "a", "robot_j": "b+1"}).status_code == 201
+        assert edit(mapped, "veto", wrong).status_code == status, wrong
+    assert "b+x" in edit(mapped, "veto", {"robot_i": "a", "robot_j": "b+x"}).text
 
 
 def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
-    removed = mapped.ask("POST", f"{API}/removals", "boss", json={"robot": "b"}).json()
+    removed = edit(mapped, "removal", {"robot": "b"}).json()
     assert (removed["number"], removed["kind"], removed["author"]) == (1, "removal", "boss")
     assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a"]}]
     assert get(mapped, "closures").json() == []
@@ -245,18 +249,20 @@ def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
     assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a", "b"]}]
     edits = mapped.ask("GET", f"{API}/edits", "boss").json()
     assert [(edit["number"], edit["undone_by"]) for edit in edits] == [(1, 2), (2, None)]
-    for path, wrong, status in (
-        ("removals", {"robot": "x"}, 404), ("removals", {"robot": "b+1"}, 400), ("removals", {}, 400),
-        ("removals", {"robot": "b", "epoch": -1}, 400), ("edits/1/undo", None, 409), ("edits/9/undo", None, 409),
-        ("edits/x/undo", None, 400),
+    for kind, wrong, status in (
+        ("removal", {"robot": "x"}, 404), ("removal", {"robot": "b+1"}, 404), ("removal", {}, 409),
+        ("removal", {"robot": "b", "epoch": -1}, 409), ("removal", {"robot": "b", "epoch": 1}, 404),
+        ("undo", {"number": 1}, 400), ("rumour", {}, 400), ("cut", {"session": "b", "first_s": 2, "last_s": 1}, 409),
     ):  # fmt: skip
-        assert mapped.ask("POST", f"{API}/{path}", "boss", json=wrong).status_code == status
-    assert mapped.ask("POST", f"{API}/removals", "eye", json={"robot": "b"}).status_code == 403
+        assert edit(mapped, kind, wrong).status_code == status, (kind, wrong)
+    for number, status in (("1", 409), ("9", 409), ("x", 400)):
+        assert mapped.ask("POST", f"{API}/edits/{number}/undo", "boss").status_code == status
+    assert edit(mapped, "removal", {"robot": "b"}, "eye").status_code == 403
 
 
 def test_a_robot_is_told_that_it_is_removed(mapped):
     assert mapped.send("b", []).headers["Fcslam-Removed"] == "0"
-    mapped.ask("POST", f"{API}/removals", "boss", json={"robot": "b", "epoch": 0})
+    edit(mapped, "removal", {"robot": "b", "epoch": 0})
     assert mapped.send("b", []).headers["Fcslam-Removed"] == "1"
     assert mapped.send("a", []).headers["Fcslam-Removed"] == "0"
     assert [robot["removed"] for robot in get(mapped, "robots").json()] == [False, True]
@@ -281,15 +287,15 @@ def test_the_service_is_ready_when_the_worker_has_caught_up(desk, monkeypatch):
 
 
 def test_the_audit_log_says_who_did_what(mapped):
-    mapped.ask("POST", f"{API}/removals", "boss", json={"robot": "b"})
-    mapped.ask("POST", f"{API}/removals", "eye", json={"robot": "a"})
+    edit(mapped, "removal", {"robot": "b"})
+    edit(mapped, "removal", {"robot": "a"}, "eye")
     mapped.ask("POST", f"{API}/edits/7/undo", "boss")
     mapped.ask("GET", f"{API}/fleet", "eye")
     mapped.ask("GET", f"{API}/missions/mission/export?x=1", "boss")
     told = mapped.ask("GET", f"{API}/audit", "boss").json()
     assert [(line["who"], line["action"], line["status"], line["content"]) for line in told] == [
-        ("boss", f"POST {API}/removals", 201, {"robot": "b", "epoch": None}),
-        ("eye", f"POST {API}/removals", 403, {}),
+        ("boss", f"POST {API}/edits", 201, {"kind": "removal", "content": {"robot": "b"}}),
+        ("eye", f"POST {API}/edits", 403, {}),
         ("boss", f"POST {API}/edits/7/undo", 409, {}),
         ("boss", f"GET {API}/missions/mission/export?x=1", 200, {}),
     ]

@@ -1,53 +1,39 @@
-"""Decisions about the open mission: results, vetoes, detectors."""
+"""Decisions about the open mission: results, edits, detectors."""
 
 import asyncio
+import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Path, Request
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from fcslam.cloud.edits import kind_of, undone
-from fcslam.cloud.sessions import check_robot, robot_of
+from fcslam.cloud.edits import kind_of, read_edit, undone
 from fcslam.config import Settings
-from fcslam.records import NAME, Change, Edit, Removal, Undo, Veto
+from fcslam.errors import EditError
+from fcslam.records import Change, Edit, Undo
 from fcslam.service.detectors import LONGEST_FILE_BYTES
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_body, read_json
 from fcslam.service.http.responses import DetectorVersion, EditSummary, Finalized, content, refusals
 from fcslam.service.http.robots import NETWORK
 from fcslam.service.http.state import ServiceState
-from fcslam.wire.limits import MAXIMUM_EPOCH
 
 LOOK_EVERY_S = 0.1
 LEAST_FREE_BYTES = 8 * 2**20
 """A disk with less is full: neither a result nor why there is none can be written reliably."""
 
 EditNumber = Annotated[int, Path(ge=1, le=2**31 - 1)]
-SessionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
 
-class NewVeto(Settings):
-    """A veto: two keyscans, or two robots, did not see the same place."""
+class NewEdit(Settings):
+    """An edit: what changes about the mission from now on."""
 
-    robot_i: SessionName
-    robot_j: SessionName
-    stamps: tuple[float, float] | None = Field(
-        None,
-        description="stamps of the two keyscans in seconds; without them, all closures of both robots",
-    )
-
-
-class NewRemoval(Settings):
-    """A removal: the packets of a robot, or of one of its sessions, have no effect."""
-
-    robot: SessionName
-    epoch: int | None = Field(
-        None, ge=0, le=MAXIMUM_EPOCH, description="of the session; without it, all sessions, later ones as well"
-    )
+    kind: Literal["veto", "removal", "cut", "pin", "closure", "placement", "region"]
+    content: dict[str, Any] = Field(description="what it names, as `GET /edits` shows it; docs/deploy.md has examples")
 
 
 def decision_router(state: ServiceState) -> APIRouter:
@@ -77,31 +63,23 @@ def decision_router(state: ServiceState) -> APIRouter:
             await asyncio.sleep(LOOK_EVERY_S)
         raise HTTPException(503, "the mission was closed; the result will be there when it is open again")
 
-    @router.post("/vetoes", status_code=201, openapi_extra=json_body(NewVeto), responses=refusals(400, 404, 413))
-    async def veto(request: Request) -> EditSummary:
-        """Exclude closures from now on."""
-        new = await read_json(request, NewVeto)
-        veto = Veto(new.robot_i, new.robot_j, new.stamps)
-        return await run_in_threadpool(_edit, state, request.state.actor, veto, (new.robot_i, new.robot_j))
-
-    @router.post("/removals", status_code=201, openapi_extra=json_body(NewRemoval), responses=refusals(400, 404, 413))
-    async def remove(request: Request) -> EditSummary:
-        """Remove a robot or one of its sessions from all maps from now on; its packets are stored all the same."""
-        new = await read_json(request, NewRemoval)
-        check_robot(new.robot)
-        removal = Removal(new.robot, new.epoch)
-        return await run_in_threadpool(_edit, state, request.state.actor, removal, (new.robot,))
+    @router.post("/edits", status_code=201, openapi_extra=json_body(NewEdit), responses=refusals(400, 404, 409, 413))
+    async def edit(request: Request) -> EditSummary:
+        """Append an edit. It counts from now on, and can be undone; packets stay stored all the same."""
+        new = await read_json(request, NewEdit)
+        content = read_edit(new.kind, json.dumps(new.content))
+        return await run_in_threadpool(_edit, state, request.state.actor, content)
 
     @router.get("/edits")
     def get_edits() -> list[EditSummary]:
-        """All edits: vetoes, removals and what undid them."""
+        """All edits, and what undid them."""
         edits = state.mission.store.edits()
         return [_summary(edit, undone(edits)) for edit in edits]
 
     @router.post("/edits/{number}/undo", status_code=201, responses=refusals(400, 404, 409))
     async def undo(request: Request, number: EditNumber) -> EditSummary:
-        """Undo a veto or a removal. A removed session comes back when the worker has applied all packets again."""
-        return await run_in_threadpool(_edit, state, request.state.actor, Undo(number), ())
+        """Undo an edit. A removed session comes back when the worker has applied all packets again."""
+        return await run_in_threadpool(_edit, state, request.state.actor, Undo(number))
 
     @router.post(
         "/detectors",
@@ -118,13 +96,12 @@ def decision_router(state: ServiceState) -> APIRouter:
     return router
 
 
-def _edit(state: ServiceState, author: str, content: Change | Undo, sessions: Sequence[str]) -> EditSummary:
-    """Store an edit that names these sessions."""
+def _edit(state: ServiceState, author: str, content: Change | Undo) -> EditSummary:
     mission = state.mission
-    known = {robot.robot for robot in mission.intake.sessions()}
-    unknown = [name for name in sessions if robot_of(name) not in known]
-    if unknown:
-        raise HTTPException(404, f"there is no robot '{unknown[0]}'; there are {', '.join(sorted(known))}")
+    try:
+        mission.store.check_named(content)
+    except EditError as error:
+        raise HTTPException(404, str(error)) from error
     return _summary(mission.edit(content, author), {})
 
 

@@ -155,7 +155,7 @@ class EditSummary(Settings):
     """An edit: what somebody changed about the mission by hand."""
 
     number: int
-    kind: str = Field(description="veto, removal or undo")
+    kind: str = Field(description="veto, removal, cut, pin, closure, placement, region or undo")
     content: dict[str, Any] = Field(description="what it names")
     author: str
     time_s: float = Field(description="seconds since 1970")

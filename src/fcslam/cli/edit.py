@@ -1,0 +1,314 @@
+"""`fcslam edit`: corrections of a mission by hand. Each is a line of a log, counts in later maps, and can be undone."""
+
+import getpass
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.cli.examples import examples
+
+if TYPE_CHECKING:
+    from fcslam.mission_file import SavedMission
+    from fcslam.records import Change, RegionUse, Undo
+    from fcslam.runs import Run
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Correct a mission by hand. An edit counts when you map again: fcslam map --onto RUN -o NEW",
+    epilog=examples(
+        "fcslam edit list runs/building",
+        "fcslam edit veto runs/building anna 1000.5 ben 1033.25",
+        'fcslam edit erase runs/building "1,2 3,2 3,4 1,4"',
+        "fcslam edit undo runs/building 2",
+        "fcslam map --onto runs/building -o runs/building-corrected",
+    ),
+)
+
+_NEGATIVE = {"ignore_unknown_options": True}
+"""A corner may begin with a minus."""
+
+Mission = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder or mission file.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, in whose map you read the coordinates.")]
+Author = Annotated[str | None, typer.Option(help="Who edits.", show_default="your user name")]
+MapIndex = Annotated[int, typer.Option("--map", min=0, help="Number of the map, as in map_1.png.")]
+Polygon = Annotated[
+    str, typer.Argument(metavar="CORNERS", help='Corners in the map, metres: "X,Y X,Y X,Y". Two are a rectangle.')
+]
+Session = Annotated[str, typer.Argument(help="Session, such as anna or anna+1.")]
+SessionI = Annotated[str, typer.Argument(metavar="SESSION_I", help="One session, such as anna or anna+1.")]
+SessionJ = Annotated[str, typer.Argument(metavar="SESSION_J", help="The other session.")]
+StampI = Annotated[float, typer.Argument(metavar="STAMP_I", help="Seconds, as in closures.csv.")]
+StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="The same of the other session.")]
+
+
+@app.command("list", epilog=examples("fcslam edit list runs/building"))
+def list_edits(mission: Mission) -> None:
+    """Print all edits of a mission: number, time, author, content, and what undid them."""
+    from datetime import UTC, datetime
+
+    from fcslam.cli.output import answers, print_line
+    from fcslam.cloud.edits import edit_json, kind_of, undone
+    from fcslam.mission_file import read_mission
+
+    edits, console = read_mission(mission).edits, answers()
+    gone = undone(edits)
+    for edit in edits:
+        when = datetime.fromtimestamp(edit.time_s, UTC)
+        end = f"  undone by {gone[edit.number]}" if edit.number in gone else ""
+        content = f"{kind_of(edit.content)} {edit_json(edit.content)}"
+        print_line(console, f"{edit.number}  {when:%Y-%m-%d %H:%M:%S} UTC  {edit.author}  {content}{end}")
+    if not edits:
+        print_line(console, "no edits")
+
+
+@app.command(epilog=examples("fcslam edit undo runs/building 2"))
+def undo(
+    mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Of the edit.")], *, author: Author = None
+) -> None:
+    """Undo an edit. The map is then what it would have been without it."""
+    from fcslam.records import Undo
+
+    _append(mission, Undo(number), author)
+
+
+@app.command(
+    epilog=examples("fcslam edit veto runs/building anna 1000.5 ben 1033.25", "fcslam edit veto runs/building anna ben")
+)
+def veto(
+    mission: Mission,
+    ends: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SESSION_I [STAMP_I] SESSION_J [STAMP_J]",
+            help="Both ends, as in closures.csv. Without stamps: all closures between the two sessions.",
+        ),
+    ],
+    *,
+    author: Author = None,
+) -> None:
+    """Exclude a closure, or all closures between two sessions."""
+    from fcslam.errors import InputError
+    from fcslam.records import Veto
+
+    match ends:
+        case [session_i, session_j]:
+            _append(mission, Veto(session_i, session_j), author)
+        case [session_i, stamp_i, session_j, stamp_j]:
+            _append(mission, Veto(session_i, session_j, (_number(stamp_i), _number(stamp_j))), author)
+        case _:
+            raise InputError("give two sessions, or two sessions each with a stamp: anna 1000.5 ben 1033.25")
+
+
+@app.command(epilog=examples("fcslam edit pin runs/building anna 1000.5 ben 1033.25"))
+def pin(
+    mission: Mission, session_i: SessionI, stamp_i: StampI, session_j: SessionJ, stamp_j: StampJ, *,
+    author: Author = None,
+) -> None:  # fmt: skip
+    """Accept a closure of closures.csv, whatever the other evidence says. It joins maps."""
+    from fcslam.records import Pin
+
+    _append(mission, Pin(session_i, session_j, (stamp_i, stamp_j)), author)
+
+
+@app.command(epilog=examples("fcslam edit close runs/building anna 1000.5 ben 1033.25 --pose 0.5,0,3.1"))
+def close(
+    mission: Mission,
+    session_i: SessionI,
+    stamp_i: StampI,
+    session_j: SessionJ,
+    stamp_j: StampJ,
+    *,
+    pose: Annotated[str, typer.Option(metavar="X,Y,THETA", help="Pose of J in I (metres, radians).")],
+    tolerance: Annotated[
+        str, typer.Option(metavar="M,RAD", help="Standard deviations of the pose (metres, radians).")
+    ] = "0.2,0.1",
+    author: Author = None,
+) -> None:
+    """Add a closure: where session J was at a time, seen from session I at another. It joins maps."""
+    from fcslam.cli.recordings import pose as read_pose
+    from fcslam.errors import InputError
+    from fcslam.records import ManualClosure
+
+    deviations = tolerance.split(",")
+    if len(deviations) != 2:
+        raise InputError(f"--tolerance {tolerance!r}: give metres and radians, as in --tolerance 0.2,0.1")
+    T_i_j, (metres, radians) = read_pose("--pose", pose), map(_number, deviations)
+    _append(mission, ManualClosure(session_i, stamp_i, session_j, stamp_j, T_i_j, (metres, radians)), author)
+
+
+@app.command(
+    epilog=examples(
+        "fcslam edit remove runs/building ben",
+        "fcslam edit remove runs/building ben+1",
+        "fcslam edit remove runs/building ben --from 1010 --to 1025",
+    )
+)
+def remove(
+    mission: Mission,
+    session: Annotated[str, typer.Argument(help="A robot, or one of its sessions, such as anna+1 or anna+0.")],
+    *,
+    first_s: Annotated[float | None, typer.Option("--from", help="Stamp at which the stretch begins.")] = None,
+    last_s: Annotated[float | None, typer.Option("--to", help="Stamp at which it ends.")] = None,
+    author: Author = None,
+) -> None:
+    """Remove a robot, a session, or a stretch of a session from the map."""
+    from fcslam.cloud.sessions import robot_and_epoch
+    from fcslam.records import Cut, Removal
+
+    robot, epoch = robot_and_epoch(session)
+    if first_s is None and last_s is None:
+        _append(mission, Removal(robot, None if session == robot else epoch), author)
+    else:
+        stretch = (-math.inf if first_s is None else first_s, math.inf if last_s is None else last_s)
+        _append(mission, Cut(session, *_bounded(stretch)), author)
+
+
+@app.command(
+    context_settings=_NEGATIVE,
+    epilog=examples(
+        'fcslam edit erase runs/building "1,2 3,4"', 'fcslam edit erase runs/building "0,0 2,0 1,2" --map 1'
+    ),
+)
+def erase(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0, author: Author = None) -> None:
+    """Make a part of the map unknown."""
+    from fcslam.records import RegionUse
+
+    _draw(run, RegionUse.ERASE, "", corners, map_index, author)
+
+
+@app.command("keep-out", context_settings=_NEGATIVE, epilog=examples('fcslam edit keep-out runs/building "1,2 3,4"'))
+def keep_out(run: RunFolder, corners: Polygon, *, map_index: MapIndex = 0, author: Author = None) -> None:
+    """Forbid a part of the map: map_keepout.pgm and map_keepout.yaml, the mask of Nav2's keepout filter."""
+    from fcslam.records import RegionUse
+
+    _draw(run, RegionUse.KEEP_OUT, "", corners, map_index, author)
+
+
+@app.command(context_settings=_NEGATIVE, epilog=examples('fcslam edit area runs/building "Room 12" "1,2 3,4"'))
+def area(
+    run: RunFolder,
+    name: Annotated[str, typer.Argument(help="What the area is called.")],
+    corners: Polygon,
+    *,
+    map_index: MapIndex = 0,
+    author: Author = None,
+) -> None:
+    """Name a part of the map: map_areas.geojson."""
+    from fcslam.records import RegionUse
+
+    _draw(run, RegionUse.AREA, name, corners, map_index, author)
+
+
+@app.command(
+    epilog=examples(
+        "fcslam edit place runs/building --to-walls",
+        "fcslam edit place runs/building --rotate 90 --shift 10,0",
+        "fcslam edit place runs/building --at anna,1000.5 --pose 3,4,1.57",
+    )
+)
+def place(
+    run: RunFolder,
+    *,
+    to_walls: Annotated[
+        bool, typer.Option("--to-walls", help="Turn the map so that its walls run along x and y.")
+    ] = False,
+    rotate: Annotated[float, typer.Option(metavar="DEGREES", help="Turn the map about its origin.")] = 0.0,
+    shift: Annotated[str, typer.Option(metavar="X,Y", help="Then move it (metres).")] = "0,0",
+    at: Annotated[
+        str | None, typer.Option(metavar="SESSION,STAMP", help="A moment of a session whose pose you know.")
+    ] = None,
+    pose: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,THETA", help="That pose, as in a floor plan or a georeference (metres, radians)."),
+    ] = None,
+    map_index: MapIndex = 0,
+    author: Author = None,
+) -> None:
+    """Choose the map's coordinate frame."""
+    import numpy as np
+
+    from fcslam.cli.recordings import pose as read_pose
+    from fcslam.errors import InputError
+    from fcslam.map_edits import moved_map, wall_direction
+    from fcslam.records import Placement
+
+    if (at is None) != (pose is None):
+        raise InputError("--at and --pose belong together: --at anna,1000.5 --pose 3,4,1.57")
+    if at is not None and pose is not None:
+        session, _, stamp = at.rpartition(",")
+        _append(run, Placement(session, _number(stamp), read_pose("--pose", pose)), author)
+        return
+    x, y = _point("--shift", shift)
+    opened, mission = _opened(run)
+    turn = math.radians(rotate) - (
+        wall_direction(opened.maps[map_index]) if to_walls and map_index in opened.maps else 0.0
+    )
+    if not to_walls and (x, y, turn) == (0.0, 0.0, 0.0):
+        raise InputError("give --to-walls, --rotate, --shift, or --at with --pose")
+    _append(run, moved_map(opened, mission, map_index, np.array((x, y, turn))), author)
+
+
+def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: int, author: str | None) -> None:
+    from fcslam.map_edits import region_in_map
+
+    points = [_point("a corner", corner) for corner in corners.split()]
+    if len(points) == 2:
+        (left, low), (right, high) = points
+        points = [(left, low), (right, low), (right, high), (left, high)]
+    run, mission = _opened(folder)
+    _append(folder, region_in_map(run, mission, map_index, use, name, points), author)
+
+
+def _opened(folder: Path) -> "tuple[Run, SavedMission]":
+    """A run and its mission."""
+    from fcslam.errors import InputError
+    from fcslam.mission_file import read_mission
+    from fcslam.runs import open_run
+
+    if folder.is_file():
+        raise InputError(f"{folder}: give the run folder; coordinates are read in its map")
+    return open_run(folder), read_mission(folder)
+
+
+def _append(path: Path, content: "Change | Undo", author: str | None) -> None:
+    """Append an edit, and say what to do next."""
+    from fcslam.mission_file import edit_mission
+
+    (edit,) = edit_mission(path, [content], author or _user(), time.time())
+    typer.echo(f"edit {edit.number}; to apply it: fcslam map --onto {path} -o NEW", err=True)
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # no account of this number
+        return "unknown"
+
+
+def _bounded(stretch: tuple[float, float]) -> tuple[float, float]:
+    """Without infinities, which no file of edits holds."""
+    return max(stretch[0], -1e12), min(stretch[1], 1e12)
+
+
+def _point(option: str, text: str) -> tuple[float, float]:
+    from fcslam.errors import InputError
+
+    numbers = text.split(",")
+    if len(numbers) != 2:
+        raise InputError(f"{option} {text!r} is no point; give metres, as in 1.5,-2")
+    return _number(numbers[0]), _number(numbers[1])
+
+
+def _number(text: str) -> float:
+    from fcslam.errors import InputError
+
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"{text!r} is no number")
+    return number

@@ -1,0 +1,62 @@
+"""Regions that users drew, in the files of a map: erased cells, the mask of Nav2's keep-out filter, named areas."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.cloud.placement import PlacedRegion
+from fcslam.records import FloatArray, RegionUse, frozen
+from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+
+_FRACTION_BITS = 6
+"""Of the coordinates that OpenCV takes: polygons are exact to a 64th of a cell."""
+
+
+def erased(occupancy: OccupancyMap, regions: Sequence[PlacedRegion]) -> OccupancyMap:
+    """The map without what users erased: the cells of such a region are unknown."""
+    inside = _inside(occupancy, [region for region in regions if region.use is RegionUse.ERASE])
+    if not inside.any():
+        return occupancy
+    return replace(occupancy, cells=frozen(np.where(inside, Occupancy.UNKNOWN, occupancy.cells), np.uint8))
+
+
+def region_files(occupancy: OccupancyMap, stem: str, regions: Sequence[PlacedRegion]) -> dict[str, bytes]:
+    """Files beside the map ``stem``: nothing where there is nothing to say.
+
+    ``<stem>_keepout.pgm`` and ``.yaml`` are the mask of Nav2's keep-out filter, with the map's cells: occupied where
+    robots must not enter, free elsewhere. ``<stem>_areas.geojson`` holds the named areas in metres of the map.
+    """
+    files: dict[str, bytes] = {}
+    forbidden = [region for region in regions if region.use is RegionUse.KEEP_OUT]
+    if forbidden:
+        cells = np.where(_inside(occupancy, forbidden), Occupancy.OCCUPIED, Occupancy.FREE)
+        mask = replace(occupancy, cells=frozen(cells, np.uint8))
+        files[f"{stem}_keepout.pgm"] = pgm_bytes(mask)
+        files[f"{stem}_keepout.yaml"] = map_yaml(mask, f"{stem}_keepout.pgm").encode()
+    if areas := [region for region in regions if region.use is RegionUse.AREA]:
+        collection = {"type": "FeatureCollection", "features": list(map(_feature, areas))}
+        files[f"{stem}_areas.geojson"] = (json.dumps(collection, indent=1) + "\n").encode()
+    return files
+
+
+def _inside(occupancy: OccupancyMap, regions: Sequence[PlacedRegion]) -> NDArray[np.bool_]:
+    """Cells that lie in one of the regions or that its edge touches, shape (H, W)."""
+    mask = np.zeros(occupancy.cells.shape, np.uint8)
+    for region in regions:
+        cells: FloatArray = (region.polygon - occupancy.origin_xy) / occupancy.resolution_m - 0.5
+        corners = np.round(cells * (1 << _FRACTION_BITS)).astype(np.int32)  # 100 km in cells of 1 cm fit
+        cv2.fillPoly(mask, [corners], 1, shift=_FRACTION_BITS)
+    return mask.astype(bool)
+
+
+def _feature(area: PlacedRegion) -> dict[str, object]:
+    ring = [[round(x, 4), round(y, 4)] for x, y in (*area.polygon.tolist(), area.polygon[0].tolist())]
+    return {
+        "type": "Feature",
+        "properties": {"name": area.name, "map": area.map_index},
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+    }

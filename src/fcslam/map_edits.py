@@ -1,0 +1,100 @@
+"""Edits that are drawn in a finished map: they are tied to the mission's keyscans, so that they move with the map."""
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+
+from fcslam.errors import EditError
+from fcslam.geometry import se2
+from fcslam.mission_file import SavedMission
+from fcslam.records import FloatArray, MapRegion, Placement, RegionUse
+from fcslam.runs import Run
+from fcslam.runs.map_files import Occupancy, OccupancyMap
+
+_COARSE_RAD: Final = float(np.radians(0.5))
+_FINE_RAD: Final = float(np.radians(0.02))
+"""Steps of the search for the direction of walls."""
+
+
+def region_in_map(
+    run: Run, mission: SavedMission, map_index: int, use: RegionUse, name: str, polygon: Sequence[tuple[float, float]]
+) -> MapRegion:
+    """A region, tied to the keyscan that is nearest to its centre.
+
+    Args:
+        run: the finished run.
+        mission: its mission.
+        map_index: number of the map in which the polygon is drawn.
+        use: what the region is for.
+        name: what it is called.
+        polygon: corners (x, y) in ``map``, metres.
+
+    Raises:
+        EditError: the run has no such map.
+    """
+    corners = np.array(polygon, dtype=np.float64).reshape(-1, 2)
+    keyscans = list(_keyscans(run, mission, map_index))
+    centre = corners.mean(axis=0)
+    session, stamp, T_map_base = min(keyscans, key=lambda keyscan: float(np.hypot(*(keyscan[2][:2] - centre))))
+    in_base = se2.transform(se2.inverse(T_map_base), corners).tolist()
+    return MapRegion(use, name, session, stamp, tuple((x, y) for x, y in in_base))
+
+
+def moved_map(run: Run, mission: SavedMission, map_index: int, T_new_map: FloatArray) -> Placement:
+    """The placement that moves a map by a motion.
+
+    Args:
+        run: the finished run.
+        mission: its mission.
+        map_index: number of the map.
+        T_new_map: the present frame in the new one, shape (3,), metres and radians.
+
+    Raises:
+        EditError: the run has no such map.
+    """
+    session, stamp, T_map_base = next(_keyscans(run, mission, map_index))
+    x, y, theta = se2.compose(T_new_map, T_map_base).tolist()
+    return Placement(session, stamp, (x, y, theta))
+
+
+def wall_direction(occupancy: OccupancyMap) -> float:
+    """Direction of most walls, radians in [-pi/4, pi/4): walls along it and across it count alike.
+
+    The direction is the one whose projections of the occupied cells are the most peaked.
+    """
+    rows, columns = np.nonzero(occupancy.cells == Occupancy.OCCUPIED)
+    cells = np.stack((columns, rows), axis=-1) - np.array(occupancy.cells.shape[::-1]) / 2.0
+    if not len(cells):
+        return 0.0
+    coarse = np.arange(-np.pi / 4, np.pi / 4, _COARSE_RAD)
+    best = coarse[np.argmax([_peakedness(cells, angle) for angle in coarse])]
+    fine = np.arange(best - _COARSE_RAD, best + _COARSE_RAD, _FINE_RAD)
+    angle = float(fine[np.argmax([_peakedness(cells, angle) for angle in fine])])
+    return (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
+
+
+def _peakedness(cells: FloatArray, angle: float) -> float:
+    """Sum of squares of the histograms of both coordinates of cells (N, 2), turned by -angle."""
+    turned = se2.transform(np.array([0.0, 0.0, -angle]), cells)
+    reach = int(np.ceil(np.hypot(*np.abs(cells).max(axis=0)))) + 1
+    counts = (np.bincount(np.floor(axis + reach).astype(np.int64)) for axis in turned.T)
+    return float(sum((count.astype(np.float64) ** 2).sum() for count in counts))
+
+
+def _keyscans(run: Run, mission: SavedMission, map_index: int) -> Iterator[tuple[str, float, FloatArray]]:
+    """Session, stamp and T_map_base of the keyscans of a map.
+
+    Raises:
+        EditError: the run has no such map.
+    """
+    sessions = [t for t in run.trajectories.values() if t.map_index == map_index]
+    if not sessions:
+        known = sorted({trajectory.map_index for trajectory in run.trajectories.values()})
+        raise EditError(f"there is no map {map_index}; there are {', '.join(map(str, known))}")
+    for trajectory in sessions:
+        track = mission.tracks.get(trajectory.robot)
+        every = np.ones(len(trajectory.stamps), bool)
+        rows = every if track is None or len(track.stamps) != len(every) else ~track.T_keyscan_base.any(axis=1)
+        for stamp, pose in zip(trajectory.stamps[rows].tolist(), trajectory.T_map_base[rows], strict=True):
+            yield trajectory.robot, stamp, pose
