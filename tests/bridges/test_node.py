@@ -136,6 +136,15 @@ def test_peers_that_get_nothing_are_told_once(network, robot):
     assert "/robot1/map: another node takes it as nav_msgs/GridCells" in said[1]
 
 
+def test_a_robot_of_the_same_name_that_comes_later_is_told_once(network, robot):
+    said = []
+    node = start(network, robot, said.append)
+    network.others.append(offered("/robot1/map", "nav_msgs/OccupancyGrid", latched=True))
+    for _ in range(2):
+        node.watch_network()
+    assert said == ["another node publishes /robot1/map now, too; two robots must not have one name"]
+
+
 def test_missing_topics_end_the_wait():
     with pytest.raises(NetworkError, match="nobody publishes anything"):
         await_sensors(MemoryNetwork(), "/robot1", BagOptions(), 0.0, 0.0)

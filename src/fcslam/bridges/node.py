@@ -38,6 +38,8 @@ _LONGEST_INBOX = 20_000
 """Most messages that wait to be read; beyond, newer ones are lost."""
 _COMMANDS_WAITING = 8
 """Most commands that wait; anybody on the network may send them."""
+_LINES_TOLD = 1000
+"""Most lines that are told; the names in some come from the network."""
 _POLL_S = 0.1
 _SETTLES_FOR_ODOMETRY = 4
 _SILENCE_S = 2.0
@@ -349,7 +351,7 @@ class RobotNode:
             self._tell_once(f"another node publishes {taken} now, too; two robots must not have one name")
 
     def _tell_once(self, line: str) -> None:
-        if line and line not in self._told:
+        if line and line not in self._told and len(self._told) < _LINES_TOLD:
             self._told.add(line)
             self._notify(line)
 
