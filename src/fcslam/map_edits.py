@@ -5,16 +5,34 @@ from typing import Final
 
 import numpy as np
 
+from fcslam.cloud.edits import check_polygon
 from fcslam.errors import EditError
 from fcslam.geometry import se2
+from fcslam.geometry.alignment import n_point_alignment
 from fcslam.mission_file import SavedMission
-from fcslam.records import FloatArray, MapRegion, Placement, RegionUse
+from fcslam.records import FloatArray, MapRegion, Pin, Placement, RegionUse, Veto
 from fcslam.runs import Run
 from fcslam.runs.map_files import Occupancy, OccupancyMap
 
 _COARSE_RAD: Final = float(np.radians(0.5))
 _FINE_RAD: Final = float(np.radians(0.02))
 """Steps of the search for the direction of walls."""
+
+
+def check_closure(run: Run, decision: Veto | Pin) -> None:
+    """Check that a run has the closure about which a user decides.
+
+    Raises:
+        EditError: it has not.
+    """
+    if decision.stamps is None:
+        return
+    named = Veto(decision.robot_i, decision.robot_j, decision.stamps)
+    if not any(named.forbids(c.robot_i, c.stamp_i, c.robot_j, c.stamp_j) for c in run.closures):
+        (at_i, at_j), (i, j) = decision.stamps, (decision.robot_i, decision.robot_j)
+        raise EditError(
+            f"there is no closure {i} {at_i:.6f} {j} {at_j:.6f}; copy both ends from a line of closures.csv"
+        )
 
 
 def region_in_map(
@@ -31,9 +49,10 @@ def region_in_map(
         polygon: corners (x, y) in ``map``, metres.
 
     Raises:
-        EditError: the run has no such map.
+        EditError: the run has no such map, or the polygon has no inside.
     """
-    corners = np.array(polygon, dtype=np.float64).reshape(-1, 2)
+    check_polygon(polygon)
+    corners = np.array(polygon, dtype=np.float64)
     keyscans = list(_keyscans(run, mission, map_index))
     centre = corners.mean(axis=0)
     session, stamp, T_map_base = min(keyscans, key=lambda keyscan: float(np.hypot(*(keyscan[2][:2] - centre))))
@@ -56,6 +75,25 @@ def moved_map(run: Run, mission: SavedMission, map_index: int, T_new_map: FloatA
     session, stamp, T_map_base = next(_keyscans(run, mission, map_index))
     x, y, theta = se2.compose(T_new_map, T_map_base).tolist()
     return Placement(session, stamp, (x, y, theta))
+
+
+def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tuple[float, float]]) -> FloatArray:
+    """The motion that moves points of a map nearest to where they shall be, in the least-squares sense.
+
+    Args:
+        points: two or more points (x, y) in ``map``, metres.
+        targets: where each shall be, metres.
+
+    Returns:
+        The present frame in the new one, shape (3,), metres and radians.
+
+    Raises:
+        EditError: there are fewer than two different points.
+    """
+    T_new_map = n_point_alignment(np.array(targets).reshape(-1, 2), np.array(points).reshape(-1, 2))
+    if not np.isfinite(T_new_map).all():
+        raise EditError("the points fix no rotation; give two or more that lie apart")
+    return T_new_map
 
 
 def wall_direction(occupancy: OccupancyMap) -> float:

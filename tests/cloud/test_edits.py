@@ -286,3 +286,16 @@ def test_edits_survive_in_the_state_of_a_fleet(scripted, tmp_path):
     assert fingerprint(again.conclude()) == fingerprint(fleet.conclude())
     again.edit([])
     assert map_of(again.conclude()) == {"a": 0, "b": 1}
+
+
+def test_a_closure_by_hand_waits_for_its_keyscan(scripted):
+    """A later keyscan may be nearer than the newest one."""
+    made = ManualClosure("a", 10.0, "b", 1050.0, (0.0, 0.0, 0.0), (0.01, 0.01))
+    cloud = feed(scripted(), TWO[:-80])
+    cloud.fleet.edit([made])
+    assert map_of(cloud.fleet.estimate()) == {"a": 0, "b": 1}
+    feed(cloud, TWO[-80:])
+    cloud.fleet.edit([made])
+    a, b = cloud.fleet.estimate().robots
+    assert a.map_index == b.map_index
+    assert b.T_map_base[50] == pytest.approx(a.T_map_base[10], abs=0.01)

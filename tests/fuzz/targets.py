@@ -18,7 +18,20 @@ from fcslam.errors import FcslamError, PacketError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.localization import read_map
 from fcslam.mission import MissionConfig
-from fcslam.records import LaserModel, LaserScan, Removal, frozen
+from fcslam.records import (
+    Cut,
+    LaserModel,
+    LaserScan,
+    ManualClosure,
+    MapRegion,
+    Pin,
+    Placement,
+    RegionUse,
+    Removal,
+    Undo,
+    Veto,
+    frozen,
+)
 from fcslam.service.detectors import DetectorStore
 from fcslam.service.mission_recovery import recover_mission
 from fcslam.service.mission_store import MissionStore, StoredPacket, check_mission
@@ -35,6 +48,13 @@ CELLS = (
     b"\xff" * 300,
 )  # fmt: skip
 """What takes the place of a value of a mission."""
+CORNERS = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0))
+EDITS = (
+    Removal("a"), Undo(1), Veto("a", "a", (1.0, 5.0)), Pin("a", "a", (1.0, 5.0)), Cut("a", 2.0, 3.0),
+    ManualClosure("a", 1.0, "a", 6.0, (0.5, 0.0, 0.1), (0.1, 0.1)), Placement("a", 1.0, (1.0, 2.0, 0.5)),
+    MapRegion(RegionUse.ERASE, "", "a", 1.0, CORNERS), MapRegion(RegionUse.AREA, "Room 1", "a", 1.0, CORNERS),
+)  # fmt: skip
+"""Edits of every kind."""
 LONGEST_REASON = 2000
 """Characters of a refusal."""
 
@@ -307,12 +327,13 @@ def _broken_copy(rng: random.Random, path: Path, files: dict[str, bytes]) -> Pat
 
 
 def _fill(store: MissionStore) -> None:
-    """A robot's packets, as the service stores them, and an edit."""
+    """A robot's packets, as the service stores them, and edits of every kind."""
     for packet in stream("a", rectangle(9), 0.0):
         label = read_label(data := encode(packet))
         number = packet.robot, packet.epoch, packet.sequence
         store.put([StoredPacket(*number, packet.time, label.kind, label.channel, data)], 1.0)
-    store.edit(Removal("a"), "boss", 2.0)
+    for content in EDITS:
+        store.edit(content, "boss", 2.0)
     store.ask_to_finalize()
 
 

@@ -12,7 +12,7 @@ from fcslam.cli.examples import examples
 
 if TYPE_CHECKING:
     from fcslam.mission_file import SavedMission
-    from fcslam.records import Change, RegionUse, Undo
+    from fcslam.records import Change, FloatArray, Pin, RegionUse, Undo, Veto
     from fcslam.runs import Run
 
 app = typer.Typer(
@@ -38,10 +38,10 @@ Polygon = Annotated[
     str, typer.Argument(metavar="CORNERS", help='Corners in the map, metres: "X,Y X,Y X,Y". Two are a rectangle.')
 ]
 Session = Annotated[str, typer.Argument(help="Session, such as anna or anna+1.")]
-SessionI = Annotated[str, typer.Argument(metavar="SESSION_I", help="One session, such as anna or anna+1.")]
-SessionJ = Annotated[str, typer.Argument(metavar="SESSION_J", help="The other session.")]
+SessionI = Annotated[str, typer.Argument(metavar="SESSION_I")]
+SessionJ = Annotated[str, typer.Argument(metavar="SESSION_J")]
 StampI = Annotated[float, typer.Argument(metavar="STAMP_I", help="Seconds, as in closures.csv.")]
-StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="The same of the other session.")]
+StampJ = Annotated[float, typer.Argument(metavar="STAMP_J")]
 
 
 @app.command("list", epilog=examples("fcslam edit list runs/building"))
@@ -95,9 +95,9 @@ def veto(
 
     match ends:
         case [session_i, session_j]:
-            _append(mission, Veto(session_i, session_j), author)
+            _decide(mission, Veto(session_i, session_j), author)
         case [session_i, stamp_i, session_j, stamp_j]:
-            _append(mission, Veto(session_i, session_j, (_number(stamp_i), _number(stamp_j))), author)
+            _decide(mission, Veto(session_i, session_j, (_number(stamp_i), _number(stamp_j))), author)
         case _:
             raise InputError("give two sessions, or two sessions each with a stamp: anna 1000.5 ben 1033.25")
 
@@ -110,10 +110,12 @@ def pin(
     """Accept a closure of closures.csv, whatever the other evidence says. It joins maps."""
     from fcslam.records import Pin
 
-    _append(mission, Pin(session_i, session_j, (stamp_i, stamp_j)), author)
+    _decide(mission, Pin(session_i, session_j, (stamp_i, stamp_j)), author)
 
 
-@app.command(epilog=examples("fcslam edit close runs/building anna 1000.5 ben 1033.25 --pose 0.5,0,3.1"))
+@app.command(
+    epilog=examples("fcslam edit close runs/building anna 1000.5 ben 1033.25 --pose 0.5,0,3.14 --tolerance 0.2,0.05")
+)
 def close(
     mission: Mission,
     session_i: SessionI,
@@ -207,6 +209,7 @@ def area(
         "fcslam edit place runs/building --to-walls",
         "fcslam edit place runs/building --rotate 90 --shift 10,0",
         "fcslam edit place runs/building --at anna,1000.5 --pose 3,4,1.57",
+        "fcslam edit place runs/building --match 1.5,2=0,0 --match 9,2.5=7.5,0",
     )
 )
 def place(
@@ -224,31 +227,67 @@ def place(
         str | None,
         typer.Option(metavar="X,Y,THETA", help="That pose, as in a floor plan or a georeference (metres, radians)."),
     ] = None,
+    match: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X,Y=U,V", help="A point of the map and where it shall be (metres); give two or more."),
+    ] = None,
     map_index: MapIndex = 0,
     author: Author = None,
 ) -> None:
-    """Choose the map's coordinate frame."""
-    import numpy as np
-
+    """Choose the map's coordinate frame: by walls or a motion, by a pose, or by points, as of a floor plan."""
     from fcslam.cli.recordings import pose as read_pose
     from fcslam.errors import InputError
-    from fcslam.map_edits import moved_map, wall_direction
+    from fcslam.map_edits import moved_map
     from fcslam.records import Placement
 
     if (at is None) != (pose is None):
         raise InputError("--at and --pose belong together: --at anna,1000.5 --pose 3,4,1.57")
+    by_motion = to_walls or rotate != 0.0 or shift != "0,0"
+    if by_motion + (at is not None) + bool(match) != 1:
+        raise InputError(
+            "give one of: --to-walls, --rotate and --shift together; --at and --pose; --match twice or more often"
+        )
     if at is not None and pose is not None:
         session, _, stamp = at.rpartition(",")
         _append(run, Placement(session, _number(stamp), read_pose("--pose", pose)), author)
         return
-    x, y = _point("--shift", shift)
     opened, mission = _opened(run)
-    turn = math.radians(rotate) - (
-        wall_direction(opened.maps[map_index]) if to_walls and map_index in opened.maps else 0.0
-    )
-    if not to_walls and (x, y, turn) == (0.0, 0.0, 0.0):
-        raise InputError("give --to-walls, --rotate, --shift, or --at with --pose")
-    _append(run, moved_map(opened, mission, map_index, np.array((x, y, turn))), author)
+    T_new_map = _matched(match) if match else _turned(opened, map_index, to_walls, rotate, _point("--shift", shift))
+    _append(run, moved_map(opened, mission, map_index, T_new_map), author)
+
+
+def _matched(pairs: list[str]) -> "FloatArray":
+    """The motion that moves points to where they shall be; says how well they fit."""
+    import numpy as np
+
+    from fcslam.geometry import se2
+    from fcslam.map_edits import motion_to_points
+
+    ends = [pair.partition("=")[::2] for pair in pairs]
+    points, targets = ([_point("--match", end[k]) for end in ends] for k in (0, 1))
+    T_new_map = motion_to_points(points, targets)
+    off_m = np.hypot(*(se2.transform(T_new_map, np.array(points)) - targets).T)
+    typer.echo(f"the points fit to {off_m.max():.3f} m", err=True)
+    return T_new_map
+
+
+def _turned(run: "Run", map_index: int, to_walls: bool, degrees: float, shift: tuple[float, float]) -> "FloatArray":
+    import numpy as np
+
+    from fcslam.map_edits import wall_direction
+
+    walls_rad = wall_direction(run.maps[map_index]) if to_walls and map_index in run.maps else 0.0
+    return np.array((*shift, math.radians(degrees) - walls_rad))
+
+
+def _decide(mission: Path, decision: "Veto | Pin", author: str | None) -> None:
+    """Append a decision about closures; a run folder says which closures there are."""
+    from fcslam.map_edits import check_closure
+    from fcslam.runs import open_run
+
+    if mission.is_dir():
+        check_closure(open_run(mission), decision)
+    _append(mission, decision, author)
 
 
 def _draw(folder: Path, use: "RegionUse", name: str, corners: str, map_index: int, author: str | None) -> None:

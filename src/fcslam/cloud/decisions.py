@@ -6,7 +6,7 @@ from dataclasses import astuple
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
-from fcslam.cloud.edits import edit_json, is_cut, is_removed, kind_of, read_edit
+from fcslam.cloud.edits import edit_json, is_cut, is_removed, kind_of, read_edit, stamps_of
 from fcslam.cloud.joining import CONSISTENCY, decide_join, first_estimate
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.map_comparison import MapComparison
@@ -119,14 +119,17 @@ class ClosureDecisions:
         self._changes = tuple(changes)
         turned = [entry for entry in self.closures if self._mark(entry)]
         decided = any(entry.pinned or entry.closure.status is not ClosureStatus.CANDIDATE for entry in turned)
-        if decided or self._missing():
+        if decided or self._missing(final=False):
             self.reevaluate()
             return True
         return False
 
-    def reevaluate(self) -> Fusion:
-        """Decide every closure again from all evidence: revoke outvoted ones, separate maps that only they joined."""
-        for made in self._missing():
+    def reevaluate(self, *, final: bool = False) -> Fusion:
+        """Decide every closure again from all evidence: revoke outvoted ones, separate maps that only they joined.
+
+        ``final``: no packet comes after it, so closures by hand may end at the last keyscan of a session.
+        """
+        for made in self._missing(final):
             self.closures.add_by_hand(made, *self._ends(made))
         fusion = reevaluate(
             self._graph,
@@ -187,8 +190,11 @@ class ClosureDecisions:
             pin.confirms(i.robot, self._sessions.stamp(i), j.robot, self._sessions.stamp(j)) for pin in pins
         )
 
-    def _missing(self) -> list[ManualClosure]:
-        """Closures by hand, in force, that are not in the log yet and whose sessions are there."""
+    def _missing(self, final: bool) -> list[ManualClosure]:
+        """Closures by hand, in force, that are not in the log yet and whose keyscans are there.
+
+        Unless this is ``final``, a later keyscan may be nearer than the newest one of a session.
+        """
         made = [change for change in self._changes if isinstance(change, ManualClosure)]
         entered = {entry.made_by_hand for entry in self.closures} if made else set()
         present = set(self._sessions.robots)
@@ -199,7 +205,12 @@ class ClosureDecisions:
             and {change.robot_i, change.robot_j} <= present
             and not any(is_removed(session, self._changes) for session in (change.robot_i, change.robot_j))
             and len(set(self._ends(change))) == 2
+            and (final or all(self._has_passed(session, stamp) for session, stamp in stamps_of(change)))
         ]
+
+    def _has_passed(self, session: str, stamp: float) -> bool:
+        """Whether the session has a keyscan at this time or later."""
+        return bool(self._sessions.stamps(session)[-1] >= stamp)
 
     def _ends(self, made: ManualClosure) -> tuple[KeyscanId, KeyscanId]:
         """The keyscans that a closure by hand connects."""

@@ -10,6 +10,7 @@ from itertools import chain
 from math import isfinite
 from typing import Any, Final
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from fcslam.cloud.sessions import robot_and_epoch
@@ -24,6 +25,7 @@ from fcslam.records import (
     MapRegion,
     Pin,
     Placement,
+    RegionUse,
     Removal,
     Undo,
     Veto,
@@ -32,6 +34,8 @@ from fcslam.wire.limits import MAXIMUM_EPOCH
 
 LARGEST_M: Final = 1e5
 """Of a coordinate in an edit."""
+LEAST_AREA_M2: Final = 1e-6
+"""A smaller polygon has no inside."""
 MOST_CORNERS: Final = 1000
 LONGEST_NAME: Final = 100
 LEAST_TOLERANCE: Final = (1e-3, 1e-4)
@@ -174,16 +178,34 @@ def _check_closure(closure: ManualClosure) -> None:
         raise EditError("a closure connects two different keyscans")
 
 
+def check_polygon(corners: Sequence[tuple[float, float]]) -> None:
+    """Check that a polygon has an inside.
+
+    Args:
+        corners: (x, y) in metres.
+
+    Raises:
+        EditError: it has not, or a coordinate is out of range.
+    """
+    if not 3 <= len(corners) <= MOST_CORNERS:
+        raise EditError(f"a polygon has 3 to {MOST_CORNERS} corners, not {len(corners)}")
+    _check_coordinates(chain.from_iterable(corners))
+    x, y = np.array(corners).T
+    x, y = x - x[0], y - y[0]
+    if abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) < 2.0 * LEAST_AREA_M2:
+        raise EditError("the polygon has no inside; give corners that are not on one line")
+
+
 def _check_region(region: MapRegion) -> None:
-    _check_coordinates(chain.from_iterable(region.polygon))
-    if not 3 <= len(region.polygon) <= MOST_CORNERS:
-        raise EditError(f"a polygon has 3 to {MOST_CORNERS} corners, not {len(region.polygon)}")
+    check_polygon(region.polygon)
     if len(region.name) > LONGEST_NAME or not region.name.isprintable():
         raise EditError(f"a name has at most {LONGEST_NAME} printable characters")
+    if region.use is RegionUse.AREA and not region.name.strip():
+        raise EditError("an area needs a name")
 
 
 def _check_coordinates(coordinates: Iterable[float]) -> None:
-    if any(abs(number) > LARGEST_M for number in coordinates):
+    if not all(abs(number) <= LARGEST_M for number in coordinates):  # false for NaN
         raise EditError(f"a coordinate is over {LARGEST_M:g} m")
 
 

@@ -174,7 +174,7 @@ class Fleet:
         graph.restore(self._graph.state())
         decisions = ClosureDecisions(self._config, self._sessions, graph)
         decisions.restore(self._decisions.state())
-        fusion = decisions.reevaluate()
+        fusion = decisions.reevaluate(final=True)
         if self._config.fusion is not FusionStrategy.JOINT:
             fusion = fuse_rigidly(decisions.closures, fusion.T_local_base, self._config.fusion)
         return conclude(self._sessions, graph, decisions.closures, fusion, decisions.version, decisions.changes)

@@ -1,0 +1,354 @@
+"""`fcslam edit`: every correction acts on the next map, is undone to the same bytes, and bad input changes nothing."""
+
+import json
+import shutil
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from fcslam.cli import main
+from fcslam.geometry import se2
+from fcslam.mission_file import edit_mission, read_mission
+from fcslam.records import ClosureStatus, MapRegion, ReasonCode, RegionUse
+from fcslam.runs import open_run
+from fcslam.runs.map_files import Occupancy, parse_map
+
+pytestmark = pytest.mark.slow
+
+
+def contents(folder):
+    """All files of a run, without the mission, whose log of edits only grows."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "mission.fcslam")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="module")
+def mapped(logs, tmp_path_factory):
+    """The run of two recordings; no test changes it."""
+    folder = tmp_path_factory.mktemp("mapped") / "run"
+    assert main(["map", *map(str, logs[:2]), "-o", str(folder), "-q"]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(mapped, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(mapped, tmp_path / "run")
+
+
+def edit(run, command, *arguments):
+    return main(["edit", command, str(run), *map(str, arguments), "--author", "anna"])
+
+
+def again(run, name):
+    """The run folder of the mission with its edits."""
+    folder = run.with_name(name)
+    assert main(["map", "--onto", str(run), "-o", str(folder), "-q"]) == 0
+    return folder
+
+
+def ends_of(closure):
+    return closure.robot_i, f"{closure.stamp_i:.9f}", closure.robot_j, f"{closure.stamp_j:.9f}"
+
+
+def is_at(closure, ends):
+    return ends_of(closure) in (ends, ends[2:] + ends[:2])
+
+
+def between(run):
+    """Closures between robots."""
+    return [closure for closure in open_run(run).closures if closure.robot_i != closure.robot_j]
+
+
+def a_closure(run, status):
+    return ends_of(next(closure for closure in between(run) if closure.status is status))
+
+
+def middle(run):
+    """A point of the map that robots saw: where one of them stood."""
+    poses = next(iter(open_run(run).trajectories.values())).T_map_base
+    return poses[len(poses) // 2]
+
+
+def rectangle_at(x, y, half_m=0.5):
+    return f"{x - half_m:.3f},{y - half_m:.3f} {x + half_m:.3f},{y + half_m:.3f}"
+
+
+def cells_at(occupancy, x, y, half_m):
+    """The cells well inside a square."""
+    column, row = ((np.array((x, y)) - occupancy.origin_xy) / occupancy.resolution_m).astype(int)
+    cells = int(half_m / occupancy.resolution_m) - 1
+    return occupancy.cells[row - cells : row + cells, column - cells : column + cells]
+
+
+def veto(run):
+    ends = a_closure(run, ClosureStatus.ACCEPTED)
+    assert edit(run, "veto", *ends) == 0
+
+    def check(after):
+        (closure,) = [closure for closure in between(after) if is_at(closure, ends)]
+        assert closure.reason.code is ReasonCode.VETOED
+
+    return check
+
+
+def pin(run):
+    ends = a_closure(run, ClosureStatus.ACCEPTED)
+    assert edit(run, "pin", *ends) == 0
+
+    def check(after):
+        (closure,) = [closure for closure in between(after) if is_at(closure, ends)]
+        assert (closure.status, closure.reason.code) == (ClosureStatus.ACCEPTED, ReasonCode.PINNED)
+
+    return check
+
+
+def close(run):
+    ends = a_closure(run, ClosureStatus.ACCEPTED)
+    assert edit(run, "close", *ends, "--pose", "0.5,-0.25,0.1", "--tolerance", "0.001,0.001") == 0
+
+    def check(after):
+        by_hand = [closure for closure in between(after) if closure.reason.code is ReasonCode.MADE_BY_HAND]
+        assert [closure.status for closure in by_hand] == [ClosureStatus.ACCEPTED]
+        poses = [
+            open_run(after)
+            .trajectories[robot]
+            .T_map_base[np.abs(open_run(after).trajectories[robot].stamps - float(stamp)).argmin()]
+            for robot, stamp in (ends[:2], ends[2:])
+        ]
+        assert se2.between(*poses) == pytest.approx((0.5, -0.25, 0.1), abs=0.02)
+
+    return check
+
+
+def remove(run):
+    last = list(open_run(run).trajectories)[-1]
+    assert edit(run, "remove", last) == 0
+
+    def check(after):
+        assert last not in open_run(after).trajectories
+
+    return check
+
+
+def cut(run):
+    name, trajectory = next(iter(open_run(run).trajectories.items()))
+    at = trajectory.stamps[len(trajectory.stamps) // 2]
+    assert edit(run, "remove", name, "--from", at) == 0
+
+    def check(after):
+        assert len(open_run(after).trajectories[name].stamps) == len(trajectory.stamps)
+        seen = [np.count_nonzero(open_run(folder).local_maps[name].occupancy().cells) for folder in (run, after)]
+        assert seen[1] < seen[0]
+
+    return check
+
+
+def erase(run):
+    x, y, _ = middle(run)
+    assert edit(run, "erase", rectangle_at(x, y)) == 0
+
+    def check(after):
+        before, now = open_run(run).maps[0], open_run(after).maps[0]
+        assert (cells_at(before, x, y, 0.5) == Occupancy.FREE).any()
+        assert (cells_at(now, x, y, 0.5) == Occupancy.UNKNOWN).all()
+        assert np.count_nonzero(before.cells != now.cells) <= (1.0 / now.resolution_m + 2) ** 2
+
+    return check
+
+
+def keep_out(run):
+    x, y, _ = middle(run)
+    assert edit(run, "keep-out", rectangle_at(x, y)) == 0
+
+    def check(after):
+        files = open_run(after).map_files
+        mask = parse_map("mask", files["map_keepout.pgm"], files["map_keepout.yaml"].decode())
+        occupancy = open_run(after).maps[0]
+        assert (mask.cells.shape, mask.origin_xy) == (occupancy.cells.shape, occupancy.origin_xy)
+        assert (cells_at(mask, x, y, 0.5) == Occupancy.OCCUPIED).all()
+        assert np.count_nonzero(mask.cells == Occupancy.OCCUPIED) <= (1.0 / mask.resolution_m + 2) ** 2
+        assert files["map.pgm"] == open_run(run).map_files["map.pgm"]
+
+    return check
+
+
+def area(run):
+    x, y, _ = middle(run)
+    corners = [(x, y), (x + 2.0, y), (x, y + 1.0)]
+    assert edit(run, "area", "Room 12", " ".join(f"{x:.3f},{y:.3f}" for x, y in corners)) == 0
+
+    def check(after):
+        (feature,) = json.loads(open_run(after).map_files["map_areas.geojson"])["features"]
+        assert feature["properties"]["name"] == "Room 12"
+        (ring,) = feature["geometry"]["coordinates"]
+        assert np.array(ring) == pytest.approx(np.array([*corners, corners[0]]), abs=2e-3)
+
+    return check
+
+
+def place(run):
+    assert edit(run, "place", "--rotate", 90, "--shift", "10,-3") == 0
+
+    def check(after):
+        T = np.array((10.0, -3.0, np.pi / 2))
+        for name, trajectory in open_run(run).trajectories.items():
+            moved = open_run(after).trajectories[name].T_map_base
+            assert moved[:, :2] == pytest.approx(se2.compose(T, trajectory.T_map_base)[:, :2], abs=1e-6)
+
+    return check
+
+
+@pytest.mark.parametrize("make", [veto, pin, close, remove, cut, erase, keep_out, area, place])
+def test_an_edit_acts_on_the_next_map_and_is_undone_to_the_same_bytes(mapped, run, make):
+    before = contents(mapped)
+    check = make(run)
+    assert contents(run) == before, "an edit changes nothing but the mission file"
+    check(again(run, "edited"))
+    assert edit(run, "undo", 1) == 0
+    assert contents(again(run, "undone")) == before
+
+
+def test_edits_stay_in_force_when_the_mission_goes_on(run, logs):
+    ends = a_closure(run, ClosureStatus.ACCEPTED)
+    x, y, _ = middle(run)
+    assert edit(run, "veto", *ends) == 0
+    assert edit(run, "area", "hall", rectangle_at(x, y)) == 0
+    whole = run.with_name("whole")
+    assert main(["map", str(logs[2]), "--onto", str(run), "-o", str(whole), "-q"]) == 0
+    assert [closure.reason.code for closure in between(whole) if is_at(closure, ends)] == [ReasonCode.VETOED]
+    assert "map_areas.geojson" in open_run(whole).map_files
+    assert [edit.author for edit in read_mission(whole).edits] == ["anna", "anna"]
+
+
+def test_a_map_aligns_to_its_walls(run, drawn):
+    assert edit(run, "place", "--to-walls") == 0
+    straight = open_run(again(run, "straight"))
+    for robot in drawn.robots[:2]:
+        off = straight.trajectories[robot.name].T_map_base[0, 2] - robot.T_building_base[0, 2]
+        assert np.sin(2.0 * off) == pytest.approx(0.0, abs=0.02), "the walls of the building run along its axes"
+
+
+def test_a_map_is_placed_by_points_of_a_floor_plan(run, capsys):
+    assert edit(run, "place", "--match", "1,0=10,5", "--match", "3,0=10,7.2") == 0
+    assert "the points fit to 0.100 m" in capsys.readouterr().err
+    (placed,) = read_mission(run).edits
+    trajectory = open_run(run).trajectories[placed.content.session]
+    T_map_base = trajectory.T_map_base[np.abs(trajectory.stamps - placed.content.stamp).argmin()]
+    assert placed.content.pose == pytest.approx(se2.compose(np.array((10.0, 4.1, np.pi / 2)), T_map_base), abs=1e-6)
+
+
+def test_the_list_says_who_did_what_and_what_was_undone(run, capsys):
+    assert main(["edit", "list", str(run)]) == 0
+    assert capsys.readouterr().out == "no edits\n"
+    first, second = list(open_run(run).trajectories)[:2]
+    assert edit(run, "veto", first, second) == 0
+    assert f"fcslam map --onto {run}" in capsys.readouterr().err
+    assert edit(run, "undo", 1) == 0
+    capsys.readouterr()
+    assert main(["edit", "list", str(run)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["1", "2"]
+    assert all("anna" in line for line in lines)
+    assert "veto" in lines[0]
+    assert lines[0].endswith("undone by 2")
+
+
+BAD = {
+    "a session that is not there": ("veto", "nobody", "robot1"),
+    "a stamp that is not there": ("pin", "robot1", "1e9", "robot2", "0"),
+    "a closure that is not there": ("veto", "robot1", "0.001", "robot2", "0.001"),
+    "half a closure": ("veto", "robot1", "1.0", "robot2"),
+    "no edit of this number": ("undo", "7"),
+    "a session to remove that is not there": ("remove", "robot1+7"),
+    "a stretch that ends before it begins": ("remove", "robot1", "--from", "20", "--to", "10"),
+    "a stretch without numbers": ("remove", "robot1", "--from", "nan"),
+    "no corner": ("erase", ""),
+    "one corner": ("erase", "1,2"),
+    "a corner of three numbers": ("erase", "1,2 3,4,5"),
+    "a corner that is not a number": ("keep-out", "1,2 nan,3"),
+    "a corner far away": ("keep-out", "1,2 3e9,3"),
+    "a polygon without an inside": ("erase", "0,0 1,1 2,2"),
+    "a map that is not there": ("erase", "1,2 3,4", "--map", "9"),
+    "an area with a name of many characters": ("area", 101 * "x", "1,2 3,4"),
+    "an area with a line break in its name": ("area", "a\nb", "1,2 3,4"),
+    "an area without a name": ("area", "", "1,2 3,4"),
+    "nothing to do": ("place",),
+    "a pose without its moment": ("place", "--pose", "1,2,3"),
+    "two ways to place": ("place", "--to-walls", "--at", "robot1,1", "--pose", "1,2,3"),
+    "one point": ("place", "--match", "1,2=3,4"),
+    "the same point twice": ("place", "--match", "1,2=3,4", "--match", "1,2=3,4"),
+    "a point without its target": ("place", "--match", "1,2", "--match", "3,4=5,6"),
+    "a point that is not a number": ("place", "--match", "1,nan=0,0", "--match", "3,4=5,6"),
+    "a far target": ("place", "--match", "1,2=1e9,0", "--match", "3,4=1e9,6"),
+    "two ways to place at once": ("place", "--rotate", "1", "--match", "1,2=3,4", "--match", "3,2=5,4"),
+    "no shift": ("place", "--shift", "1"),
+    "a turn that is not a number": ("place", "--rotate", "nan"),
+    "no tolerance": ("close", "robot1", "1", "robot2", "1", "--pose", "0,0,0", "--tolerance", "0,0.1"),
+    "a closure with itself": ("close", "robot1", "1", "robot1", "1", "--pose", "0,0,0"),
+    "no pose": ("close", "robot1", "1", "robot2", "1", "--pose", "0,0"),
+}
+
+
+@pytest.mark.filterwarnings("error")
+def test_bad_input_is_one_line_and_changes_nothing(mapped, run, capsys):
+    sessions = list(open_run(run).trajectories)
+    names = {f"robot{number}": name for number, name in enumerate(sessions, start=1)}
+    mission = (run / "mission.fcslam").read_bytes()
+    for what, (command, *arguments) in BAD.items():
+        capsys.readouterr()
+        given = [arguments_of(argument, names) for argument in arguments]
+        assert edit(run, command, *given) == 2, what
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1, (what, error)
+        assert "Traceback" not in error, what
+        assert (run / "mission.fcslam").read_bytes() == mission, what
+
+
+def arguments_of(argument, names):
+    for placeholder, name in names.items():
+        argument = argument.replace(placeholder, name)
+    return argument
+
+
+def test_an_undo_of_an_undo_is_refused(run, capsys):
+    first, second = list(open_run(run).trajectories)[:2]
+    assert [edit(run, "veto", first, second), edit(run, "undo", 1)] == [0, 0]
+    mission = (run / "mission.fcslam").read_bytes()
+    for number, reason in ((1, "edit 1 was undone before, by edit 2"), (2, "edit 2 undoes edit 1")):
+        capsys.readouterr()
+        assert edit(run, "undo", number) == 2
+        assert reason in capsys.readouterr().err
+    assert (run / "mission.fcslam").read_bytes() == mission
+
+
+def test_what_is_drawn_needs_the_run_folder(run, tmp_path, capsys):
+    shutil.copy(run / "mission.fcslam", tmp_path / "alone.fcslam")
+    assert edit(tmp_path / "alone.fcslam", "erase", "1,2 3,4") == 2
+    assert "give the run folder" in capsys.readouterr().err
+    assert main(["map", "-o", str(tmp_path / "new")]) == 2
+    assert "no recording is given" in capsys.readouterr().err
+
+
+def test_of_people_who_edit_at_once_nobody_loses_an_edit(run):
+    session, trajectory = next(iter(open_run(run).trajectories.items()))
+    context = get_context("spawn")
+    people = [
+        context.Process(target=edit_often, args=(run, name, session, float(trajectory.stamps[0])))
+        for name in ("anna", "ben", "carl")
+    ]
+    for person in people:
+        person.start()
+    for person in people:
+        person.join()
+    assert [person.exitcode for person in people] == [0, 0, 0]
+    edits = read_mission(run).edits
+    assert [edit.number for edit in edits] == list(range(1, 10))
+    assert sorted(edit.author for edit in edits) == [name for name in ("anna", "ben", "carl") for _ in range(3)]
+
+
+def edit_often(run, author, session, stamp):
+    for number in range(3):
+        region = MapRegion(RegionUse.AREA, str(number), session, stamp, ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+        edit_mission(run, [region], author, 0.0)
