@@ -36,6 +36,7 @@ from fcslam.errors import (
 
 if TYPE_CHECKING:
     from fcslam.api import changes, localize, map_recordings
+    from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.mission import MissionConfig, Progress
@@ -72,6 +73,7 @@ __all__ = [
     "LaserModel",
     "LocalMap",
     "LocalizedPoses",
+    "LocalizedRobot",
     "Metric",
     "MissionConfig",
     "NetworkError",
@@ -114,6 +116,7 @@ _LAZY: Final = {
     "LaserModel": "fcslam.records",
     "LocalMap": "fcslam.runs",
     "LocalizedPoses": "fcslam.runs",
+    "LocalizedRobot": "fcslam.live.localized_robot",
     "Metric": "fcslam.runs",
     "MissionConfig": "fcslam.mission",
     "Occupancy": "fcslam.runs",

@@ -10,7 +10,7 @@ from fcslam import sources
 from fcslam.config import load, parse
 from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
-from fcslam.mission import MissionConfig, Watch, run_mission
+from fcslam.mission import MissionConfig, Watch, continued_config, run_mission
 from fcslam.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
 from fcslam.runs import OccupancyMap, Run, prepare_output
@@ -158,13 +158,6 @@ def changes(
     if output is not None:
         save_changes(found, Path(output), force)
     return found
-
-
-def continued_config(earlier: SavedMission | None) -> MissionConfig:
-    """The default configuration, with the cloud's settings of an earlier mission if there is one."""
-    if earlier is None:
-        return MissionConfig()
-    return MissionConfig(seed=earlier.config.seed, fleet=earlier.config.fleet, map=earlier.config.map)
 
 
 def split_recordings(recordings: list[Source], parts: int) -> list[Source]:

@@ -3,6 +3,7 @@
 sources -> robot (LiDAR tracking) -> localisation in the map -> run folder
 """
 
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +16,13 @@ from fcslam.errors import EvaluationError, SourceError
 from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
 from fcslam.maps.drawing import map_png
-from fcslam.mission import MissionConfig
+from fcslam.mission import MissionConfig, continued_config, run_mission
+from fcslam.mission_file import read_mission
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
 from fcslam.runs import LocalizedPoses, Metric, OccupancyMap, Run
+from fcslam.runs.folder import MISSION
 from fcslam.runs.map_files import map_yaml, parse_map, pgm_bytes
 from fcslam.sources import Source
 
@@ -29,6 +32,8 @@ REPORTED_SCANS: Final = 50
 """Scans between two reports of progress."""
 LARGEST_FILE: Final = 1 << 30
 """Larger map files are refused, bytes."""
+_ROW: Final = 8
+"""Numbers of one scan: stamp, pose, standard deviations, quality."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +47,14 @@ class LocalizationProgress:
 
 
 def read_map(path: Path) -> OccupancyMap:
-    """The map of a run folder (its first one), or of a YAML file of ROS map_server and the PGM file that it names.
+    """The map of a run folder (its first one), of a YAML file of ROS map_server and the PGM file that it names, or of a
+    mission file, whose packets are mapped.
 
     Raises:
         SourceError: there is no map, or it cannot be read. The image must lie in the folder of the YAML file.
     """
+    if path.suffix == Path(MISSION).suffix:
+        return _mission_map(path)
     description = path / MAP_YAML if path.is_dir() else path
     try:
         text = _content(description).decode("utf-8")
@@ -88,76 +96,105 @@ def run_localization(
     """
     localizer = MapLocalizer(frozen_map(occupancy, "the map"), config.robot.localization, config.robot.lidar, initial)
     robot = RobotFrontend(source.name, config.robot, localizer)
-    rows: list[_Row] = []
-    first_m = np.nan
+    drive = LocalizedDrive()
     for record in source.records():
         # 1. Track the scan; the localizer follows with the keyscans.
         robot.process(record)
         # 2. Place the new scans in the map.
-        fresh = _new_rows(robot, localizer.estimate, len(rows))
-        rows += fresh
-        if np.isnan(first_m) and localizer.estimate is not None:
-            first_m = robot.travel_m
-        if len(rows) // REPORTED_SCANS > (len(rows) - len(fresh)) // REPORTED_SCANS:
-            progress(LocalizationProgress(len(rows), rows[-1].T_map_base is not None, rows[-1].quality))
+        before = len(drive)
+        _place(robot, localizer.estimate, drive)
+        if len(drive) // REPORTED_SCANS > before // REPORTED_SCANS:
+            progress(LocalizationProgress(len(drive), localizer.estimate is not None, drive.quality))
     losses = localizer.losses  # without the end of the recording
     robot.finish()
-    rows += _new_rows(robot, localizer.estimate, len(rows))
-    counts = Metric("fixes", localizer.fixes, "1"), Metric("losses", losses, "1")
-    return _run(source.name, rows, occupancy, (Metric("first_fix_after", first_m, "m"), *counts), config)
+    _place(robot, localizer.estimate, drive)
+    return drive.run(source.name, occupancy, config, localizer.fixes, losses)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Row:
-    """One scan."""
+class LocalizedDrive:
+    """The poses of one robot in a finished map, scan by scan. It grows by 64 bytes a scan."""
 
-    stamp: float
-    T_map_base: FloatArray | None
-    sigma: FloatArray | None
-    quality: float
+    def __init__(self) -> None:
+        self._rows = array("d")
+        self._first_m = np.nan
 
+    def __len__(self) -> int:
+        return len(self._rows) // _ROW
 
-def _new_rows(robot: RobotFrontend, estimate: MapEstimate | None, known: int) -> list[_Row]:
-    """The scans that were tracked since ``known`` ones, at the newest estimate."""
-    rows: list[_Row] = []
-    first = known - sum(len(track) for track in robot.tracks[:-1])
-    track = robot.scan_poses
-    for number in range(first, len(track)):
+    @property
+    def quality(self) -> float:
+        """Of the newest pose; 0 without one."""
+        return self._rows[-1] if self._rows else 0.0
+
+    def add(self, stamp: float, travel_m: float, T_odom_base: FloatArray, estimate: MapEstimate | None) -> None:
+        """Append the next scan.
+
+        Args:
+            stamp: seconds.
+            travel_m: path length so far.
+            T_odom_base: its pose in the session's ``odom``, shape (3,), metres and radians.
+            estimate: where that lies in the map; None: the robot is not localised.
+        """
         if estimate is None:
-            rows.append(_Row(track[number].stamp, None, None, 0.0))
-        else:
-            T_map_base = se2.compose(estimate.T_map_odom, track.in_odom(track[number]))
-            sigma = np.sqrt(np.diag(estimate.covariance))
-            rows.append(_Row(track[number].stamp, T_map_base, sigma, estimate.quality))
-    return rows
+            self._rows.extend((stamp, *6 * (np.nan,), 0.0))
+            return
+        if np.isnan(self._first_m):
+            self._first_m = travel_m
+        T_map_base = se2.compose(estimate.T_map_odom, T_odom_base)
+        self._rows.extend((stamp, *T_map_base, *np.sqrt(np.diag(estimate.covariance)), estimate.quality))
+
+    def poses(self, robot: str) -> LocalizedPoses:
+        """The poses so far of a robot of this name."""
+        rows = np.array(self._rows).reshape(-1, _ROW)
+        stamps, T_map_base, sigma, quality = rows[:, 0], rows[:, 1:4], rows[:, 4:7], rows[:, 7]
+        return LocalizedPoses(robot, frozen(stamps), frozen(T_map_base), frozen(sigma), frozen(quality))
+
+    def run(self, robot: str, occupancy: OccupancyMap, config: MissionConfig, fixes: int, losses: int) -> Run:
+        """The run folder of the drive: believed poses, every scan, and the map.
+
+        Args:
+            robot: name of the robot.
+            occupancy: the map.
+            config: the settings of the robot.
+            fixes: how often it was found.
+            losses: how often it was localised and then was not.
+        """
+        poses = self.poses(robot)
+        believed = poses.believed()
+        metrics = (
+            Metric("scans", len(self), "1"),
+            Metric("localized_share", float(poses.is_localized.mean()) if len(self) else 0.0, "1"),
+            Metric("first_fix_after", self._first_m, "m"),
+            Metric("fixes", fixes, "1"),
+            Metric("losses", losses, "1"),
+        )
+        return Run(
+            trajectories={robot: believed},
+            metrics={metric.name: metric for metric in metrics},
+            config_yaml=dump(config),
+            map_files={
+                "map.pgm": pgm_bytes(occupancy),
+                MAP_YAML: map_yaml(occupancy, "map.pgm").encode(),
+                "map.png": map_png(occupancy, {robot: believed.T_map_base}, ()),
+            },
+            localized={robot: poses},
+        )
 
 
-def _run(name: str, rows: list[_Row], occupancy: OccupancyMap, found: tuple[Metric, ...], config: MissionConfig) -> Run:
-    unknown = np.full(3, np.nan)
-    poses = LocalizedPoses(
-        name,
-        frozen([row.stamp for row in rows]),
-        frozen(np.array([unknown if row.T_map_base is None else row.T_map_base for row in rows]).reshape(-1, 3)),
-        frozen(np.array([unknown if row.sigma is None else row.sigma for row in rows]).reshape(-1, 3)),
-        frozen([row.quality for row in rows]),
-    )
-    believed = poses.believed()
-    metrics = (
-        Metric("scans", len(rows), "1"),
-        Metric("localized_share", float(poses.is_localized.mean()) if rows else 0.0, "1"),
-        *found,
-    )
-    return Run(
-        trajectories={name: believed},
-        metrics={metric.name: metric for metric in metrics},
-        config_yaml=dump(config),
-        map_files={
-            "map.pgm": pgm_bytes(occupancy),
-            MAP_YAML: map_yaml(occupancy, "map.pgm").encode(),
-            "map.png": map_png(occupancy, {name: believed.T_map_base}, ()),
-        },
-        localized={name: poses},
-    )
+def _place(robot: RobotFrontend, estimate: MapEstimate | None, drive: LocalizedDrive) -> None:
+    """Add the scans that were tracked since the last call, at the newest estimate."""
+    track = robot.scan_poses
+    for number in range(len(drive) - sum(len(track) for track in robot.tracks[:-1]), len(track)):
+        drive.add(track[number].stamp, robot.travel_m, track.in_odom(track[number]), estimate)
+
+
+def _mission_map(path: Path) -> OccupancyMap:
+    """The first map of a mission file."""
+    saved = read_mission(path)
+    files = run_mission((), continued_config(saved), onto=saved).map_files
+    if MAP_YAML not in files:
+        raise SourceError(f"{path}: the mission has no map; no robot has sent a keyscan")
+    return parse_map(str(path), files["map.pgm"], files[MAP_YAML].decode())
 
 
 def _content(path: Path) -> bytes:

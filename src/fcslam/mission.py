@@ -65,6 +65,13 @@ class Progress:
 Watch = Callable[[Progress], None]
 
 
+def continued_config(earlier: SavedMission | None) -> MissionConfig:
+    """The default configuration, with the cloud's settings of an earlier mission if there is one."""
+    if earlier is None:
+        return MissionConfig()
+    return MissionConfig(seed=earlier.config.seed, fleet=earlier.config.fleet, map=earlier.config.map)
+
+
 def run_mission(
     sources: Sequence[Source],
     config: MissionConfig,

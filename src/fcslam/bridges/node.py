@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from fcslam.bridges.clock import CLOCK, CLOCK_TOPIC, RosClock
 from fcslam.bridges.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
 from fcslam.bridges.outputs import MAP, POSE, OutputNames, Outputs, nanoseconds
@@ -21,12 +23,14 @@ from fcslam.bridges.parameters import NodeParameters
 from fcslam.bridges.sensors import LiveSensors, Notify
 from fcslam.bridges.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
 from fcslam.bridges.transform_stream import TransformStream
+from fcslam.config import one_line
 from fcslam.errors import FcslamError, NetworkError
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.runs import RobotTrajectory
 from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, SCAN, MessageCodec
 from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.storage.files import write_file
 
 if TYPE_CHECKING:
@@ -109,14 +113,18 @@ class RobotNode:
         robot: LiveRobot,
         parameters: NodeParameters,
         notify: Notify,
+        suggest_pose: Callable[[FloatArray], None] | None = None,
     ) -> None:
         """Begin to receive and to publish.
+
+        ``suggest_pose`` takes initial poses, if the robot is one in a finished map.
 
         Raises:
             NetworkError: another node publishes what this one would.
         """
         self._network, self._namespace, self._topics = network, namespace, topics
         self._robot, self._parameters, self._notify = robot, parameters, notify
+        self._suggest_pose = suggest_pose
         self._codec = MessageCodec(network.ros1)
         self._inbox: queue.SimpleQueue[_Message] = queue.SimpleQueue()
         self._commands: queue.Queue[tuple[Callable[[], Answer], Future[Answer]]] = queue.Queue(_COMMANDS_WAITING)
@@ -124,6 +132,8 @@ class RobotNode:
         self._told: set[str] = set()
         self.scans = self._lost_messages = 0
         self._pose: RobotPose | None = None
+        self._state: tuple[bool, float] | None = None
+        """Whether the robot knows its pose in the map, and since which stamp."""
         self._clock = RosClock(parameters.use_sim_time)
         self._refuse_namesake()
         names = OutputNames(map_frame=parameters.map_frame, tf=topics.transforms[0])
@@ -187,15 +197,16 @@ class RobotNode:
         self._stop.set()
 
     def publish_map(self) -> None:
-        """Publish the map, the path and the closures as they are now, if there is a scan.
+        """Publish the map, the path and the closures as they are now; the robot's own map only if there is a scan.
 
         Raises:
             FcslamError: the map is gone.
         """
-        if self._pose is None:
+        is_finished_map = self._suggest_pose is not None
+        if self._pose is None and not is_finished_map:
             return
-        stamp_ns = nanoseconds(self._pose.stamp)
-        if self._outputs.map(stamp_ns, self._robot.map()):
+        stamp_ns = self._clock.now_ns() if self._pose is None else nanoseconds(self._pose.stamp)
+        if self._outputs.map(stamp_ns, self._robot.map()) or is_finished_map:
             trajectory = self._robot.trajectory()
             self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
             self._outputs.closures(stamp_ns, self._robot.closures())
@@ -216,6 +227,11 @@ class RobotNode:
         self.scans += 1
         self._pose = pose
         stamp_ns = nanoseconds(pose.stamp)
+        if self._state is None or self._state[0] != pose.is_localized:
+            self._state = pose.is_localized, pose.stamp
+        if np.isnan(pose.T_map_base[0]):
+            self._transforms.pause()
+            return
         if pose.T_map_odom is not None:
             self._transforms.add(stamp_ns, self._clock.now_ns(), pose.T_map_odom)
         self._outputs.pose(stamp_ns, pose.T_map_base, pose.covariance)
@@ -232,7 +248,7 @@ class RobotNode:
     def _publish_maps(self) -> None:
         """Publish diagnostics every second and the map every interval."""
         due_s = 0.0
-        drawn = 0
+        drawn = 0 if self._suggest_pose is None else -1  # a finished map is there before the first scan
         while not self._stop.wait(1.0):
             self.watch_network()
             self._diagnose()
@@ -245,14 +261,21 @@ class RobotNode:
                 self._tell_once(f"no map is published any more: {error}")
 
     def _diagnose(self) -> None:
-        pose = self._pose
-        trouble = "no scan yet" if pose is None else "" if pose.is_localized else "lost: the scans contradict the map"
+        pose, state = self._pose, self._state
+        well = "mapping"
+        if pose is None or state is None:
+            trouble = "no scan yet"
+        elif self._suggest_pose is None:
+            trouble = "" if pose.is_localized else "lost: the scans contradict the map"
+        else:
+            since = f"for {max(0.0, pose.stamp - state[1]):.0f} s"
+            trouble, well = "" if state[0] else f"not localised {since}", f"localised {since}"
         values: dict[str, object] = {"scans": self.scans, "messages lost": self._lost_messages}
         if pose is not None:
             values |= {"quality": f"{pose.quality:.3f}", "map": pose.map_index, "stamp": f"{pose.stamp:.3f}"}
         faults = self.sensors.audit.faults()
         values |= {"faults": str(faults)} if faults else {}
-        self._outputs.diagnostics(self._clock.now_ns(), self._robot.name, trouble, values)
+        self._outputs.diagnostics(self._clock.now_ns(), self._robot.name, trouble, values, well)
 
     def _subscribe(self) -> None:
         offered = [point for point in self._network.endpoints() if point.publishes]
@@ -265,7 +288,7 @@ class RobotNode:
         commands: list[tuple[str, str, Callable[[bytes], object]]] = [
             (SAVE_MAP, STRING, lambda payload: self._ask(partial(self._save_map, payload))),
             (FINISH, EMPTY, lambda _: self.stop()),
-            (INITIAL_POSE, POSE, self._refuse_pose),
+            (INITIAL_POSE, POSE, self._take_pose),
         ]
         for name, kind, command in commands:
             self._network.subscribe(resolved(self._namespace, name), kind, Quality(reliable=True), command)
@@ -325,8 +348,23 @@ class RobotNode:
         self._notify(answer.message)
         return answer
 
-    def _refuse_pose(self, _: bytes) -> None:
-        self._tell_once("an initial pose is ignored: the robot maps, and its first scan is the origin of the map")
+    def _take_pose(self, payload: bytes) -> None:
+        """Try a pose that somebody gives, as by RViz's "2D Pose Estimate"."""
+        if self._suggest_pose is None:
+            self._tell_once("an initial pose is ignored: the robot maps, and its first scan is the origin of the map")
+            return
+        try:
+            message = self._codec.decode(payload, POSE)
+            frame = message.header.frame_id.lstrip("/")
+            if frame != self._parameters.map_frame:
+                raise ValueError(f"it is in frame {one_line(repr(frame))}; give it in {self._parameters.map_frame!r}")
+            at, turn = message.pose.pose.position, message.pose.pose.orientation
+            x, y, theta = planar(transform_of((at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)))
+            self._suggest_pose(np.array((x, y, theta)))
+        except (ValueError, FcslamError) as error:  # anybody on the network may send it
+            self._notify(f"an initial pose is refused: {error}")
+            return
+        self._notify(f"initial pose ({x:.2f} m, {y:.2f} m, {theta:.2f} rad): it counts once the walls confirm it")
 
     def _refuse_namesake(self) -> None:
         taken = resolved(self._namespace, MAP)

@@ -166,15 +166,17 @@ class Outputs:
                 self._send(self._updates, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
             return True
 
-    def diagnostics(self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object]) -> None:
-        """Publish the state of the robot; ``trouble`` is empty if all is well."""
+    def diagnostics(
+        self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str = "mapping"
+    ) -> None:
+        """Publish the state of the robot: ``trouble``, or ``well`` if that is empty."""
         make = self._codec.make
         pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(value)) for key, value in values.items()]
         status = make(
             "diagnostic_msgs/DiagnosticStatus",
             level=_WARN if trouble else _OK,
             name=f"fcslam: {robot}",
-            message=trouble or "mapping",
+            message=trouble or well,
             hardware_id=robot,
             values=pairs,
         )

@@ -34,6 +34,11 @@ class TransformStream:
             if self._newest is None or stamp_ns >= self._newest[0]:
                 self._newest = stamp_ns, now_ns, T_map_odom
 
+    def pause(self) -> None:
+        """Publish nothing until the next ``add``: the transform is not known any more."""
+        with self._lock:
+            self._newest = None
+
     def restart(self) -> None:
         """Forget all stamps, as the clock stepped back."""
         with self._lock:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.bridges.parameters import NodeParameters
+    from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent
     from fcslam.live.robot import Robot
     from fcslam.sources import BagOptions
@@ -38,20 +39,21 @@ SWITCH_INTERVAL_S = 0.001
 def map_live(
     address: str,
     name: str | None,
-    start: "Callable[..., Robot]",
+    start: "Callable[..., Robot | LocalizedRobot]",
     options: "BagOptions",
     domain: int | None,
     parameters: "NodeParameters",
     output: Path | None,
     console: "Console",
 ) -> None:
-    """Map the robot at ``address`` until it is stopped, and write the run to ``output``; ``start`` makes the robot.
+    """Run the robot at ``address`` until it is stopped, and write the run to ``output``; ``start`` makes the robot.
 
     Raises:
         InputError: the network, its topics, the server or the output cannot be used.
     """
     from fcslam.bridges.addresses import open_network, parse_address
     from fcslam.bridges.node import RobotNode, await_sensors
+    from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import EventKind
     from fcslam.runs import prepare_output
 
@@ -76,7 +78,8 @@ def map_live(
         topics = await_sensors(network, place.namespace, options, parameters.topic_timeout)
         for note in topics.notes:
             notify(note)
-        node = RobotNode(network, place.namespace, topics, options, robot, parameters, notify)
+        suggest_pose = robot.suggest_pose if isinstance(robot, LocalizedRobot) else None
+        node = RobotNode(network, place.namespace, topics, options, robot, parameters, notify, suggest_pose)
         heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
         notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
         with stopping(node.stop):  # also while the run is written: a late SIGTERM must not lose it
@@ -84,7 +87,9 @@ def map_live(
             if not node.scans:
                 notify("no scan was mapped; nothing is written")
                 return
-            if not robot.finish(SERVER_PATIENCE_S):
+            if isinstance(robot, LocalizedRobot):
+                robot.finish()
+            elif not robot.finish(SERVER_PATIENCE_S):
                 notify("the server does not have everything; the rest is sent at the next start with the same --state")
             node.publish_map()
             run = robot.save(output)

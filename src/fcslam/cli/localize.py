@@ -11,6 +11,7 @@ from fcslam.cli.options import Force, Quiet, output_option
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
     CameraTopic,
+    InitialPose,
     LaserPose,
     OdomTopic,
     ScanTopic,
@@ -40,18 +41,13 @@ def localize(
     map_path: Annotated[
         Path,
         typer.Option(
-            "--map", metavar="MAP", help="Run folder, or the YAML file of a ROS map with its PGM file beside it."
+            "--map",
+            metavar="MAP",
+            help="Run folder, mission file, or the YAML file of a ROS map with its PGM file beside it.",
         ),
     ],
     output: Annotated[Path | None, output_option("Run folder to write.", RUNS)] = None,
-    initial_pose: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,THETA",
-            help="About where the recording starts in the map (metres, radians).",
-            show_default="anywhere",
-        ),
-    ] = None,
+    initial_pose: InitialPose = None,
     config: ConfigFile = None,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,

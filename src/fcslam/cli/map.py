@@ -77,8 +77,9 @@ def map_recordings(
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
     with _without_collection():
-        from fcslam.api import continued_config, split_recordings
+        from fcslam.api import split_recordings
         from fcslam.errors import InputError
+        from fcslam.mission import continued_config
         from fcslam.mission_file import read_mission
         from fcslam.runs import prepare_output, read_vetoes
 

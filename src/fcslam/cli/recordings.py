@@ -47,6 +47,16 @@ LaserPose = Annotated[
 ]
 
 
+InitialPose = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,THETA",
+        help="About where the robot starts in the map (metres, radians).",
+        show_default="anywhere",
+    ),
+]
+
+
 def bag_options(
     scan_topics: list[str] | None, odom_topic: str | None, camera_topic: str | None, laser_poses: list[str] | None
 ) -> "BagOptions | None":

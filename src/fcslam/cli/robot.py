@@ -15,11 +15,13 @@ from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import RUNS, answers, notices, print_line
 from fcslam.cli.recordings import (
     CameraTopic,
+    InitialPose,
     LaserPose,
     OdomTopic,
     ScanTopic,
     bag_options,
     open_recording,
+    pose,
     print_faults,
     print_notes,
 )
@@ -59,6 +61,15 @@ def _explain_traffic(wanted: bool) -> None:
 
 
 _NETWORK = "Network"
+
+Localize = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="MAP",
+        help="Find the live robot in a finished map, which does not change: a run folder, a mission file, or the YAML "
+        "file of a ROS map.",
+    ),
+]
 
 TokenFile = Annotated[Path | None, typer.Option(help="File with the robot's token.", rich_help_panel=_NETWORK)]
 Ca = Annotated[
@@ -123,6 +134,8 @@ def robot(
         Path | None,
         output_option("Run folder of a live robot, with its own map.", RUNS),
     ] = None,
+    localize: Localize = None,
+    initial_pose: InitialPose = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
     ] = False,
@@ -150,10 +163,15 @@ def robot(
     quiet: Quiet = False,
     _explain: ExplainTraffic = False,
 ) -> None:
-    """Map a recording or a live robot, and send places and keyscans to the cloud, through outages and restarts."""
+    """Map a recording or a live robot, and send places and keyscans to the cloud, through outages and restarts.
+
+    With --localize, find a live robot in a finished map instead.
+    """
     from fcslam.bridges.addresses import is_address
     from fcslam.cli.live import map_live
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.errors import InputError
+    from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.playback import PlaybackPace, play
     from fcslam.live.robot import Playback, Robot
     from fcslam.sources import BagOptions
@@ -164,14 +182,20 @@ def robot(
     settings = mission_config(config)
     token, own = _token(token_file), _own_certificate(certificate, key)
     if is_address(source):
-        start = partial(
+        start: Callable[..., Robot | LocalizedRobot] = partial(
             Robot, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
             outbox_mb=outbox_mb, config=settings,
         )  # fmt: skip
+        if localize is not None:
+            _refuse_network(server, state)
+            initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
+            start = partial(LocalizedRobot, map=localize, initial_pose=initial, config=settings)
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose) or BagOptions()
         parameters = node_parameters(ros_parameters, use_sim_time)
         map_live(source, name, start, options, domain, parameters, output, notices(quiet))
         return
+    if localize is not None:
+        raise InputError("--localize is for a live robot; `fcslam localize RECORDING --map MAP` localises a recording")
     server, state = _required(server, state)
     pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
     argument = source if name is None else f"{name}={source}"
@@ -198,6 +222,13 @@ def robot(
             raise
         print_faults(console, {recording.name: recording.faults.plus(Fault.ODOMETRY_JUMP, live.odometry_jumps)})
         _report(live, state, server)
+
+
+def _refuse_network(server: str | None, state: Path | None) -> None:
+    from fcslam.errors import InputError
+
+    if server is not None or state is not None:
+        raise InputError("a robot that localises sends and keeps nothing; leave --server and --state out")
 
 
 def _required(server: str | None, state: Path | None) -> tuple[str, Path]:

@@ -143,16 +143,16 @@ def checked_stamp(stamp: float, newest_s: float) -> float:
     return float(stamp)
 
 
-def checked_odometry(odometry: ArrayLike) -> FloatArray:
-    """A pose of the wheel odometry, shape (3,).
+def checked_pose(name: str, given: ArrayLike) -> FloatArray:
+    """A pose, shape (3,); ``name`` is what messages call it.
 
     Raises:
         InputError: it has another shape, or a number is not finite.
     """
     try:
-        pose: FloatArray = frozen(odometry)
+        pose: FloatArray = frozen(given)
     except (TypeError, ValueError) as error:
-        raise InputError(f"odometry: not a pose ({error}); give (x, y, theta)") from error
+        raise InputError(f"{name}: not a pose ({error}); give (x, y, theta)") from error
     if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise InputError(f"odometry: {odometry!r} is not a pose; give (x, y, theta) in metres and radians")
+        raise InputError(f"{name}: {given!r} is not a pose; give (x, y, theta) in metres and radians")
     return pose

@@ -21,14 +21,17 @@ class RobotPose:
     """Of the scan, seconds."""
     T_map_base: FloatArray
     """Pose (x, y, theta) of ``base`` in the robot's map, shape (3,), metres and radians. It jumps when a correction
-    arrives; ``T_map_odom`` holds the jump, so a controller that works in ``odom`` sees none."""
+    arrives; ``T_map_odom`` holds the jump, so a controller that works in ``odom`` sees none. NaN in a finished map
+    where the robot is not localised."""
     T_odom_base: FloatArray | None
     """The odometry that was given with the scan, shape (3,); None without odometry."""
     quality: float
     """Share of the scan's points in known area that lie on known surfaces, in [0, 1]; NaN if the scan was not
-    compared: it is the first one, or the robot stands still."""
+    compared: it is the first one, or the robot stands still. In a finished map: that of the walls seen lately; 0 where
+    the robot is not localised."""
     is_localized: bool
-    """False while the scans contradict the map, and after that until the robot's place in the map is found again."""
+    """False while the scans contradict the map, and after that until the robot's place in the map is found again; in a
+    finished map also until it is found first."""
     map_index: int | None
     """Identifies the map; robots with the same index share it. It may change when maps join. None: the robot is in
     a map of its own that has no index yet."""
@@ -36,6 +39,8 @@ class RobotPose:
     """Since the last keyscan, shape (3,)."""
     _tracked: TrackedScan
     _odometry: OdometryConfig
+    _before: FloatArray
+    """Covariance of the keyscan before in the map, shape (3, 3); 0 in a map of the robot's own, which begins there."""
 
     @property
     def x(self) -> float:
@@ -65,18 +70,19 @@ class RobotPose:
     def covariance(self) -> FloatArray:
         """Covariance of ``T_map_base`` over (x, y, theta) along the axes of ``map``, shape (3, 3), m^2, m rad, rad^2.
 
-        It is that of the match with the surfaces that the robot saw last. The error of the map is not part of it.
+        It is that of the match with the surfaces that the robot saw last; in a finished map, that of the match with the
+        map is added. The error of the map is not part of it. NaN where ``T_map_base`` is.
         """
         information = motion_information(self._motion, self._tracked, self._odometry)
         cos, sin = np.cos(self.T_map_base[2]), np.sin(self.T_map_base[2])
         turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
-        return frozen(turn @ np.linalg.inv(information) @ turn.T)
+        return frozen(self._before + turn @ np.linalg.inv(information) @ turn.T)
 
     @property
     def T_map_odom(self) -> FloatArray | None:
         """Where the frame of the given odometry lies in the map, shape (3,): the transform ``map -> odom`` of ROS
-        REP 105. None without odometry."""
-        if self.T_odom_base is None:
+        REP 105. None without odometry, and in a finished map where the robot is not localised."""
+        if self.T_odom_base is None or np.isnan(self.T_map_base[0]):
             return None
         return frozen(se2.compose(self.T_map_base, se2.inverse(self.T_odom_base)))
 
@@ -90,6 +96,10 @@ class LocalizationState(StrEnum):
     """It maps in a new session, whose transform to the map and to its earlier sessions is not known yet."""
     RELOCALISED = "relocalised"
     """It was lost, and its new session is joined to the map."""
+    LOCALISED = "localised"
+    """It knows its pose in a finished map."""
+    NOT_LOCALISED = "not localised"
+    """It does not know its pose in a finished map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,10 +131,14 @@ class RobotStatus:
     notices: tuple[str, ...]
     """Messages about packets of another mission, refused packets, the last detector update, a failed back end, and
     jumps of the odometry, if there were any."""
+    is_localized: bool | None = None
+    """Whether the robot knows its pose in a finished map; None if it makes a map of its own."""
 
     @property
     def localization(self) -> LocalizationState:
         """Whether the robot knows its pose."""
+        if self.is_localized is not None:
+            return LocalizationState.LOCALISED if self.is_localized else LocalizationState.NOT_LOCALISED
         if not self.times_lost:
             return LocalizationState.MAPPING
         return LocalizationState.RELOCALISED if self.quality > 0.0 else LocalizationState.LOST
@@ -134,7 +148,10 @@ class EventKind(StrEnum):
     """What can happen to a live robot besides its scans."""
 
     LOST = "lost"
-    """The scans contradict the map: the robot maps in a new session until its place is found."""
+    """The scans contradict the map: the robot maps in a new session until its place is found. In a finished map, it is
+    searched for again."""
+    LOCALISED = "localised"
+    """The place of the robot in a finished map is found."""
     RELOCALISED = "relocalised"
     """The place of a lost robot in the map is found."""
     JOINED = "joined"

@@ -4,9 +4,7 @@ The tracker runs in the thread that adds a scan. All else, loop closing, the map
 beside it, which is another process, so no pose waits for it.
 """
 
-import logging
 import math
-import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
@@ -14,8 +12,7 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,21 +26,18 @@ from fcslam.live.inputs import (
     Lasers,
     checked_camera,
     checked_image,
-    checked_lasers,
-    checked_odometry,
-    checked_robot,
-    checked_scan,
+    checked_pose,
     checked_stamp,
 )
 from fcslam.live.own_map import OwnMap
 from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
+from fcslam.live.tracker import LiveTracker
 from fcslam.mission import MissionConfig
-from fcslam.records import CameraModel, Correction, FloatArray, Keyscan, LaserScan, SensorRecord, frozen
+from fcslam.records import CameraModel, Correction, FloatArray, Keyscan, SensorRecord, frozen
 from fcslam.robot.beside import Beside, worker_process
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.localization import Localizer
-from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
 from fcslam.robot.outbox import Outbox, WaitingPackets
 from fcslam.robot.sender import CONNECTING
 from fcslam.robot.uplink import Uplink
@@ -56,12 +50,8 @@ from fcslam.wire.messages import Hello, Packet
 JUMP_M, JUMP_RAD = 0.01, 0.005
 """Corrections that move the robot by less are no event."""
 
-UNDETERMINED_S = 1.0
-"""Scans without odometry that leave a direction open for longer are told."""
 CLOSE_S = 5.0
 """Time that a robot whose block ends without an error waits for the server."""
-QUIET = (EventKind.CORRECTED, EventKind.ONLINE, EventKind.JOINED, EventKind.RELOCALISED)
-"""Events that are logged as information; the others are warnings."""
 POLL_INTERVAL_S = 0.1
 """Interval at which ``finish`` looks whether the server has everything."""
 LARGEST_BACKLOG = 200
@@ -80,10 +70,8 @@ class Playback(NamedTuple):
 
 LIVE = Playback("live", resume=False)
 
-_log = logging.getLogger(__name__)
 
-
-class Robot:
+class Robot(LiveTracker):
     """One robot that maps while it drives.
 
         laser = fcslam.LaserModel(beam_count=360, angle_min_rad=-math.pi, angle_increment_rad=math.radians(1.0),
@@ -149,27 +137,13 @@ class Robot:
             InputError: the name, a laser, the configuration, the address, a file or the state folder cannot be used, or
                 the worker does not start.
         """
-        self.name = checked_robot(name)
-        self._lasers = checked_lasers(laser)
+        super().__init__(name, laser, settings_of(config), on_event)
         self._camera = checked_camera(camera)
-        self._config = settings_of(config)
-        self._on_event = on_event
         self._clock = clock
-        self._lock = threading.RLock()
-        self._newest_s = -math.inf
-        self._scans = 0
-        self._pose: RobotPose | None = None
-        self._prediction: MotionPrediction | None = None
-        """Stands in for the odometry; None if there is odometry."""
-        self._determined_s = -math.inf
-        """Stamp of the newest scan that fixed the position; infinity once it was told that none does."""
         self._newest_part = 0
         """The part that the newest pose is of."""
         self._applied: Correction | None = None
         """The correction that the newest pose was made with."""
-        self._is_finished = self._is_closed = False
-        self._told: set[str] = set()
-        """Failures that were told."""
         self._localizers: tuple[dict[int, Localizer], dict[int, Localizer]] = {}, {}
         """Corrections by part: those of the robot's own map, and those of the server. After being lost, the robot goes
         on in another part."""
@@ -202,42 +176,6 @@ class Robot:
             warm_up_tracking(self._config.robot)
             self._stack = stack.pop_all()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def add_scan(
-        self, ranges_m: ArrayLike, stamp: float, odometry: ArrayLike | None = None, laser: str = ""
-    ) -> RobotPose:
-        """Localize the next scan.
-
-        Args:
-            ranges_m: metres, shape (beam_count,). NaN or negative: invalid; inf, or at least ``max_range_m``: no
-                return.
-            stamp: seconds. It may step back by 2 s at most, as clocks of several sensors disagree.
-            odometry: pose (x, y, theta) of ``base`` by wheel odometry at the stamp, metres and radians; its origin does
-                not matter. None for all scans: there is no odometry, and scan matching alone gives the motion; an event
-                says where the scans do not determine it.
-            laser: which one, if there are several.
-
-        Returns:
-            Where the robot is.
-
-        Raises:
-            InputError: the ranges do not fit the laser, the clock went back by more than 2 s, a number cannot be used,
-                or the robot is finished. The scan is ignored, and the next one may be added.
-        """
-        if laser not in self._lasers:
-            raise InputError(f"laser {laser!r} is not known; known: {', '.join(map(repr, self._lasers)) or 'none'}")
-        with self._lock:
-            stamp = checked_stamp(stamp, self._newest_s)
-            T_odom_base = self._odometry(stamp, odometry)
-            return self._process(checked_scan(ranges_m, stamp, T_odom_base, self._lasers[laser]))
-
     def add_image(self, image: ArrayLike, stamp: float, odometry: ArrayLike | None = None) -> None:
         """Add the next image of the camera, by which places are recognised. It never leaves the robot.
 
@@ -255,27 +193,10 @@ class Robot:
             raise InputError(f"{self.name}: the robot has no camera; give camera=fcslam.CameraModel(...)")
         with self._lock:
             stamp = checked_stamp(stamp, self._newest_s)
-            T_odom_base = None if odometry is None or self._prediction is not None else checked_odometry(odometry)
+            T_odom_base = (
+                None if odometry is None or self._prediction is not None else checked_pose("odometry", odometry)
+            )
             self.add(checked_image(image, stamp, T_odom_base, self._camera))
-
-    def add(self, record: SensorRecord) -> RobotPose | None:
-        """Add the next record of any sensor, as a recording yields them; returns the pose of a scan.
-
-        The caller vouches for the record: unlike ``add_scan``, this checks nothing.
-
-        Raises:
-            InputError: the robot is finished.
-        """
-        with self._lock:
-            if isinstance(record, LaserScan):
-                return self._process(record)
-            self._take(self._processed(record))
-            return None
-
-    @property
-    def pose(self) -> RobotPose | None:
-        """The pose of the newest scan; None before the first."""
-        return self._pose
 
     def status(self) -> RobotStatus:
         """What the robot has done so far."""
@@ -293,11 +214,6 @@ class Robot:
             self._scans, self._keyscans, *sent, localizer.map_index, localizer.age_s, localizer.quality, self._part,
             uplink.trouble if uplink else None, uplink is not None and uplink.is_catching_up, notices,
         )  # fmt: skip
-
-    @property
-    def odometry_jumps(self) -> int:
-        """Number of jumps of the odometry so far."""
-        return self._frontend.odometry.jumps
 
     def map(self) -> OccupancyMap:
         """The map that the robot is in, of all its scans so far, corrected by all loop closures.
@@ -426,18 +342,6 @@ class Robot:
         run.save(folder, force)
         return run
 
-    def close(self) -> None:
-        """End the worker and the connection at once. What the server does not have waits in the state folder.
-
-        A second call does nothing.
-        """
-        self._is_finished = True
-        self._stack.close()
-
-    @property
-    def _part(self) -> int:
-        return len(self._frontend.tracks) - 1
-
     def _session(self, part: int) -> str:
         return session_name(self.name, self._part_base + part)
 
@@ -501,41 +405,9 @@ class Robot:
             self._take(self._frontend.ready())
 
     def _processed(self, record: SensorRecord) -> list[Packet]:
-        if self._is_finished:
-            raise InputError(f"{self.name}: the robot is finished; make a new Robot to go on")
-        if self._uplink is not None:
+        if self._uplink is not None and not self._is_finished:
             self._uplink.before_record()
-        return self._frontend.process(record)
-
-    def _odometry(self, stamp: float, given: ArrayLike | None) -> FloatArray:
-        """The given odometry, or its prediction; the first scan decides whether there is any."""
-        if not self._scans and given is None and self._prediction is None:
-            self._prediction = MotionPrediction()
-            self._config = self._config.model_copy(update={"robot": without_odometry(self._config.robot)})
-            self._frontend.replace_settings(self._config.robot)
-        if given is None and self._prediction is not None:
-            return self._prediction.predict(stamp)
-        if given is None or self._prediction is not None:
-            raise InputError(
-                f"{self.name}: some scans have odometry and some have not; give it with every scan or with none"
-            )
-        return checked_odometry(given)
-
-    def _process(self, scan: LaserScan) -> RobotPose:
-        """Localize a scan, and tell what happened."""
-        self._take(self._processed(scan))
-        self._newest_s = max(self._newest_s, scan.stamp)
-        self._scans += 1
-        newest = self._newest()
-        T_smooth_base = self._frontend.scan_poses.in_odom(newest.pose)
-        if self._prediction is not None:
-            is_matched = newest.tracked.information.any() and not newest.is_deferred
-            self._prediction.observe(scan.stamp, T_smooth_base if is_matched else None)
-        pose = self._pose = self._pose_of(newest, T_smooth_base, scan.T_odom_base)
-        if self._prediction is not None:
-            self._tell_undetermined(pose)
-        self._tell()
-        return pose
+        return super()._processed(record)
 
     def _take(self, packets: list[Packet]) -> None:
         """Pass the next packets on."""
@@ -569,7 +441,7 @@ class Robot:
             newest.pose.stamp, frozen(T_smooth_base if corrected is None else corrected),
             T_odom_base if self._prediction is None else None, newest.quality,
             is_found and not newest.is_deferred, localizer.map_index, newest.pose.T_keyscan_base, newest.tracked,
-            self._config.robot.lidar.tracker.odometry,
+            self._config.robot.lidar.tracker.odometry, np.zeros((3, 3)),
         )  # fmt: skip
 
     def _tell(self) -> None:
@@ -589,17 +461,6 @@ class Robot:
         for failure in filter(None, broken):
             self._tell_failure(f"no loop closures from now on, as the back end failed: {failure}")
 
-    def _tell_undetermined(self, pose: RobotPose) -> None:
-        if pose.is_determined or self._scans == 1:
-            self._determined_s = pose.stamp
-        elif pose.stamp > self._determined_s + UNDETERMINED_S:
-            self._determined_s = math.inf
-            self._event(
-                EventKind.UNDETERMINED,
-                "the scans do not fix the position in every direction, and there is no odometry: the robot may move "
-                "unseen",
-            )
-
     def _tell_connection(self) -> None:
         if self._uplink is None:
             return
@@ -613,12 +474,6 @@ class Robot:
             self._is_online = False
             self._event(EventKind.OFFLINE, f"the robot goes on, and its packets wait: {trouble}")
 
-    def _tell_failure(self, text: str) -> None:
-        """Tell a failure once."""
-        if text not in self._told:
-            self._told.add(text)
-            self._event(EventKind.FAILED, text)
-
     def _tell_correction(self, before: Correction | None, now: Correction) -> None:
         if self._part > 0 and now.quality > 0.0 and (before is None or before.quality == 0.0):
             self._event(EventKind.RELOCALISED, f"relocalised in map {now.map_index}, quality {now.quality:.2f}")
@@ -630,17 +485,6 @@ class Robot:
         distance_m, turned_rad = float(np.hypot(moved[0], moved[1])), abs(float(moved[2]))
         if distance_m > JUMP_M or turned_rad > JUMP_RAD:
             self._event(EventKind.CORRECTED, f"corrected by {distance_m:.3f} m and {turned_rad:.4f} rad")
-
-    def _event(self, kind: EventKind, text: str) -> None:
-        level = logging.INFO if kind in QUIET else logging.WARNING
-        _log.log(level, "%s: %s", self.name, text)
-        if self._on_event is not None:
-            self._on_event(RobotEvent(kind, self._newest_s, text))
-
-    def _newest(self) -> NewestScan:
-        newest = self._frontend.newest
-        assert newest is not None  # there is one after a scan
-        return newest
 
 
 def _in_epoch(packet: Packet, epoch: int) -> Packet:

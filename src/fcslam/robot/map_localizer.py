@@ -120,14 +120,32 @@ class MapLocalizer:
             initial: about where the first session starts in the map, shape (3,), metres and radians; None: anywhere.
         """
         self._map, self._config, self._lidar = frozen_map, config, lidar
-        self._initial = initial
         self.estimate: MapEstimate | None = None
         """None while the robot does not know where it is in the map."""
         self.fixes = 0
         """How often a search found the robot."""
         self.losses = 0
         """How often the robot was localised and is not any more, ends of sessions included."""
+        self._suggested: tuple[FloatArray, float] | None = None
+        """``T_map_odom`` that somebody gave, and the travel at which it was given."""
         self._begin()
+        if initial is not None:
+            self.suggest(initial)
+
+    def suggest(self, T_map_odom: FloatArray) -> None:
+        """Try a pose that somebody gives, as by hand: the walls that the robot sees from now on must confirm it.
+
+        Until they do, nothing changes; after ``window_m`` it is forgotten.
+
+        Args:
+            T_map_odom: about where the ``odom`` frame of the present session lies in the map, shape (3,), metres and
+                radians.
+        """
+        newest = self._recent[-1] if self._recent else None
+        self._suggested = T_map_odom, 0.0 if newest is None else newest.travel_m
+        if newest is not None:
+            self._try_suggested(newest)
+            self._publish(newest)
 
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
         """Handle the next input of the front end at once."""
@@ -137,7 +155,6 @@ class MapLocalizer:
             case SessionEnd():
                 self._lose()
                 self._begin()
-                self._initial = None  # the robot was put down elsewhere
         done: Future[list[Body]] = Future()
         done.set_result([])
         return done
@@ -156,6 +173,7 @@ class MapLocalizer:
         self._next_search_m = self._config.first_m
         self._checked_m = self._seen_m = 0.0
         """Travel at the last comparison with the map, and at the last one that found known walls."""
+        self._suggested = None
 
     def _add(self, keyscan: MappedKeyscan) -> None:
         before = self._recent[-1] if self._recent else None
@@ -168,8 +186,10 @@ class MapLocalizer:
             # 2. Now and then, compare the walls around the robot with the map.
             if keyscan.travel_m >= self._checked_m + self._config.check_m:
                 self._check(keyscan)
+        # 3. Try the pose that somebody gave.
+        self._try_suggested(keyscan)
         if self._T_map_base is None and keyscan.travel_m >= self._next_search_m:
-            # 3. Without a pose, search the whole map.
+            # 4. Without a pose, search the whole map.
             self._search(keyscan)
         self._publish(keyscan)
 
@@ -235,20 +255,12 @@ class MapLocalizer:
 
     def _search(self, keyscan: MappedKeyscan) -> None:
         """Align the walls of the newest stretch with the whole map."""
-        from fcslam.lidar.uniqueness import align_map, two_best  # SciPy's transforms take long to load
+        from fcslam.lidar.uniqueness import two_best  # SciPy's transforms take long to load
 
         config = self._config
         length_m = min(keyscan.travel_m - self._searched_m, config.window_m)
         submap = self._submap(length_m)
         self._next_search_m = keyscan.travel_m + max(config.check_m, (config.growth - 1.0) * length_m)
-        if self._initial is not None:
-            guess = se2.compose(self._initial, keyscan.T_local_base)
-            near = align_map(self._map, submap, guess)
-            off = se2.between(guess, near.T_a_b)
-            is_near = np.hypot(off[0], off[1]) <= config.initial_m and abs(off[2]) <= config.initial_rad
-            if is_near and near.score_m >= LEAST_RIVAL_M and near.violation <= config.violation:
-                self._fix(near.T_a_b, keyscan)
-                return
         found = two_best(self._map, submap)
         if found is None:
             return
@@ -257,6 +269,23 @@ class MapLocalizer:
         if ratio < config.ratio or best.violation > config.violation:
             return
         self._vote(best.T_a_b, ratio, keyscan)
+
+    def _try_suggested(self, keyscan: MappedKeyscan) -> None:
+        """Fix the suggested pose if the walls seen since then lie on walls of the map there."""
+        if self._suggested is None:
+            return
+        from fcslam.lidar.uniqueness import align_map
+
+        config, (T_map_odom, given_m) = self._config, self._suggested
+        if keyscan.travel_m > given_m + config.window_m:
+            self._suggested = None
+            return
+        guess = se2.compose(T_map_odom, keyscan.T_local_base)
+        near = align_map(self._map, self._submap(keyscan.travel_m - given_m), guess)
+        off = se2.between(guess, near.T_a_b)
+        is_near = np.hypot(off[0], off[1]) <= config.initial_m and abs(off[2]) <= config.initial_rad
+        if is_near and near.score_m >= LEAST_RIVAL_M and near.violation <= config.violation:
+            self._fix(near.T_a_b, keyscan)
 
     def _vote(self, T_map_base: FloatArray, ratio: float, keyscan: MappedKeyscan) -> None:
         """Count the best alignment of a stretch; with enough evidence it fixes the pose."""
@@ -278,6 +307,7 @@ class MapLocalizer:
 
     def _fix(self, T_map_base: FloatArray, keyscan: MappedKeyscan) -> None:
         self.fixes += 1
+        self._suggested = None
         self._T_map_base = T_map_base
         self._covariance = np.diag((FIRST_SIGMA_M**2, FIRST_SIGMA_M**2, FIRST_SIGMA_RAD**2))
         self._checked_m = self._seen_m = keyscan.travel_m

@@ -1,0 +1,208 @@
+"""A robot that finds its pose in a finished map live: scans in, its pose in the map out. The map does not change.
+
+The tracker runs in the thread that adds a scan. The search of the map and the match with it run in a worker beside it,
+which is another process, so no pose waits for them.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import BrokenExecutor, Executor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fcslam.api import StrPath, settings_of
+from fcslam.errors import InputError
+from fcslam.geometry import se2
+from fcslam.live.inputs import Lasers, checked_pose
+from fcslam.live.records import EventKind, RobotEvent, RobotPose, RobotStatus
+from fcslam.live.tracker import LiveTracker
+from fcslam.localization import LocalizedDrive, read_map
+from fcslam.mission import MissionConfig
+from fcslam.records import FloatArray, frozen
+from fcslam.robot.beside import worker_process
+from fcslam.robot.frontend import NewestScan, RobotFrontend
+from fcslam.robot.localizer_beside import LocalizerBeside
+from fcslam.robot.map_localizer import MapEstimate
+from fcslam.robot.outbox import WaitingPackets
+from fcslam.robot.warmup import warm_up_tracking
+from fcslam.runs import RobotTrajectory, Run, prepare_output
+from fcslam.runs.map_files import OccupancyMap
+from fcslam.wire.messages import Packet
+
+_NOWHERE = MapEstimate(frozen(np.full(3, np.nan)), frozen(np.full((3, 3), np.nan)), 0.0)
+"""The estimate of a robot that is not localised."""
+
+
+class LocalizedRobot(LiveTracker):
+    """One robot in a finished map.
+
+        with fcslam.LocalizedRobot("anna", "runs/building", laser) as robot:
+            for ranges_m, stamp, odometry in my_driver():
+                pose = robot.add_scan(ranges_m, stamp, odometry)
+                if pose.is_localized:
+                    print(pose.x, pose.y, pose.theta)
+
+    Its starting pose need not be known. While the robot does not know where it is, its poses are NaN, never a guess.
+    Threads and processes are as for :class:`fcslam.Robot`. It needs no network, and it sends and keeps nothing.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        map: StrPath | OccupancyMap,  # the word that users expect
+        laser: Lasers | None = None,
+        *,
+        initial_pose: ArrayLike | None = None,
+        config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
+        on_event: Callable[[RobotEvent], None] | None = None,
+        executor: Executor | None = None,
+    ) -> None:
+        """Start the robot; takes some seconds, after which the first scan is as quick as every other.
+
+        Args:
+            name: of the robot; letters, digits and ``. _ -``.
+            map: a run folder, whose first map is used; a mission file, which is mapped first; the YAML file of a ROS
+                map with the PGM file beside it; or a map.
+            laser: its LiDAR, or several by name. None: only ``add`` is used.
+            initial_pose: about where it starts in the map, (x, y, theta), metres and radians. None: anywhere.
+            config: as in ``map_recordings``; ``robot`` counts.
+            on_event: called by ``add_scan`` and ``add``, in their thread, before they return.
+            executor: searches the map, in its only worker. None: a process of its own, which ends with the robot.
+
+        Raises:
+            InputError: the name, a laser, the configuration, the map or the pose cannot be used, or the worker does not
+                start.
+        """
+        super().__init__(name, laser, settings_of(config), on_event)
+        self._map = map if isinstance(map, OccupancyMap) else read_map(Path(map))
+        initial = None if initial_pose is None else self._checked("initial_pose", initial_pose)
+        self._drive = LocalizedDrive()
+        self._was_localized = False
+        robot = self._config.robot
+        with ExitStack() as stack:
+            if executor is None:
+                executor = worker_process()
+                stack.callback(executor.shutdown, cancel_futures=True)
+            try:
+                self._localizer = LocalizerBeside(
+                    self.name, self._map, robot.localization, robot.lidar, initial, executor
+                )
+            except BrokenExecutor as error:
+                raise InputError(
+                    f"{self.name}: the process that searches the map does not start; a script that makes a "
+                    'LocalizedRobot needs `if __name__ == "__main__":` around its own code'
+                ) from error
+            self._frontend = RobotFrontend(self.name, robot, self._localizer)
+            warm_up_tracking(robot)
+            self._stack = stack.pop_all()
+
+    def suggest_pose(self, pose: ArrayLike) -> None:
+        """Say about where the robot is now, as by hand. Any thread may call this.
+
+        The pose counts once the walls around the robot confirm it; until then nothing changes, and after 15 m of travel
+        (``robot.localization.window_m``) it is forgotten.
+
+        Args:
+            pose: (x, y, theta) of ``base`` in the map, metres and radians.
+
+        Raises:
+            InputError: it is no pose, or outside of the map.
+        """
+        T_map_base = self._checked("pose", pose)
+        with self._lock:
+            newest = self._frontend.newest
+            here = np.zeros(3) if newest is None else self._frontend.scan_poses.in_odom(newest.pose)
+            self._localizer.suggest(se2.compose(T_map_base, se2.inverse(here)))
+
+    def status(self) -> RobotStatus:
+        """What the robot has done so far."""
+        estimate, failure = self._estimate(), self._frontend.backend_failure
+        broken = f"not localised any more, as the search failed: {failure}" if failure else None
+        jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
+        return RobotStatus(
+            scans=self._scans, keyscans=self._localizer.keyscans, waiting=WaitingPackets(0, 0), confirmed=0,
+            sent_bytes=0, left_out=0, refused=0, map_index=0, correction_age_s=None,
+            times_lost=self._localizer.state.losses,
+            quality=0.0 if estimate is None else estimate.quality, trouble=None, catching_up=False,
+            notices=tuple(filter(None, (broken, jumps))), is_localized=estimate is not None,
+        )  # fmt: skip
+
+    def map(self) -> OccupancyMap:
+        """The map, which never changes."""
+        return self._map
+
+    def closures(self) -> FloatArray:
+        """Both ends of each loop closure, shape (0, 2, 2): the robot makes no map."""
+        return np.empty((0, 2, 2))
+
+    def trajectory(self) -> RobotTrajectory:
+        """The poses of the scans at which the robot was localised, as ``add_scan`` returned them."""
+        with self._lock:
+            return self._drive.poses(self.name).believed()
+
+    def finish(self) -> None:
+        """End the drive. Nothing can be added after it."""
+        self._is_finished = True
+
+    def save(self, folder: StrPath, force: bool = False) -> Run:
+        """Write a run folder, as ``fcslam localize`` does: the poses that ``add_scan`` returned.
+
+        Args:
+            folder: the folder to make.
+            force: replace a run that is there.
+
+        Returns:
+            What was written.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        prepare_output(Path(folder), force)
+        state = self._localizer.state
+        with self._lock:
+            run = self._drive.run(self.name, self._map, self._config, state.fixes, state.losses)
+        run.save(folder, force)
+        return run
+
+    def _checked(self, name: str, given: ArrayLike) -> FloatArray:
+        """A pose within the map, shape (3,)."""
+        pose = checked_pose(name, given)
+        low = np.array(self._map.origin_xy)
+        high = low + self._map.resolution_m * np.array(self._map.cells.shape[::-1])
+        if not ((low <= pose[:2]) & (pose[:2] <= high)).all():
+            raise InputError(
+                f"{name}: ({pose[0]:.6g} m, {pose[1]:.6g} m) is outside of the map, which extends from "
+                f"({low[0]:.1f} m, {low[1]:.1f} m) to ({high[0]:.1f} m, {high[1]:.1f} m)"
+            )
+        return pose
+
+    def _estimate(self) -> MapEstimate | None:
+        """Where the present session's ``odom`` lies in the map."""
+        state = self._localizer.state
+        return state.estimate if state.session == self._part else None
+
+    def _take(self, packets: list[Packet]) -> None:
+        """Nothing leaves a robot that makes no map."""
+
+    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray) -> RobotPose:
+        known = None if newest.is_deferred else self._estimate()
+        self._drive.add(newest.pose.stamp, self._frontend.travel_m, T_smooth_base, known)
+        estimate = known or _NOWHERE
+        return RobotPose(
+            newest.pose.stamp, frozen(se2.compose(estimate.T_map_odom, T_smooth_base)),
+            T_odom_base if self._prediction is None else None, estimate.quality, known is not None, 0,
+            newest.pose.T_keyscan_base, newest.tracked, self._config.robot.lidar.tracker.odometry, estimate.covariance,
+        )  # fmt: skip
+
+    def _tell(self) -> None:
+        estimate, was_localized = self._estimate(), self._was_localized
+        self._was_localized = estimate is not None
+        if estimate is not None and not was_localized:
+            self._event(EventKind.LOCALISED, f"localised, quality {estimate.quality:.2f}")
+        elif estimate is None and was_localized:
+            self._event(EventKind.LOST, "not localised any more: the walls are others than in the map")
+        if self._frontend.backend_failure:
+            self._tell_failure(f"not localised from now on, as the search failed: {self._frontend.backend_failure}")

@@ -1,0 +1,207 @@
+"""What every live robot has: it takes scans, tracks them at once and tells what happens."""
+
+import logging
+import math
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Self
+
+from numpy.typing import ArrayLike
+
+from fcslam.errors import InputError
+from fcslam.live.inputs import Lasers, checked_lasers, checked_pose, checked_robot, checked_scan, checked_stamp
+from fcslam.live.records import EventKind, RobotEvent, RobotPose
+from fcslam.mission import MissionConfig
+from fcslam.records import FloatArray, LaserScan, SensorRecord
+from fcslam.robot.frontend import NewestScan, RobotFrontend
+from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
+from fcslam.wire.messages import Packet
+
+UNDETERMINED_S = 1.0
+"""Scans without odometry that leave a direction open for longer are told."""
+QUIET = (EventKind.CORRECTED, EventKind.ONLINE, EventKind.JOINED, EventKind.RELOCALISED, EventKind.LOCALISED)
+"""Events that are logged as information; the others are warnings."""
+
+_log = logging.getLogger(__name__)
+
+
+class LiveTracker(ABC):
+    """Tracks the scans of one robot in the thread that adds them; a subclass knows where they are in a map."""
+
+    _frontend: RobotFrontend
+    _stack: ExitStack
+    """What ends with the robot."""
+
+    def __init__(
+        self, name: str, laser: Lasers | None, config: MissionConfig, on_event: Callable[[RobotEvent], None] | None
+    ) -> None:
+        """Check the arguments; the subclass starts the front end.
+
+        Raises:
+            InputError: the name or a laser cannot be used.
+        """
+        self.name = checked_robot(name)
+        self._lasers = checked_lasers(laser)
+        self._config = config
+        self._on_event = on_event
+        self._lock = threading.RLock()
+        self._newest_s = -math.inf
+        self._scans = 0
+        self._pose: RobotPose | None = None
+        self._prediction: MotionPrediction | None = None
+        """Stands in for the odometry; None if there is odometry."""
+        self._determined_s = -math.inf
+        """Stamp of the newest scan that fixed the position; infinity once it was told that none does."""
+        self._is_finished = False
+        self._told: set[str] = set()
+        """Failures that were told."""
+
+    @abstractmethod
+    def _take(self, packets: list[Packet]) -> None:
+        """Pass the next packets of the front end on."""
+
+    @abstractmethod
+    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray) -> RobotPose:
+        """The pose of the newest scan, given that in the tracker's frame and by odometry, each of shape (3,)."""
+
+    @abstractmethod
+    def _tell(self) -> None:
+        """Tell what happened between two scans."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def add_scan(
+        self, ranges_m: ArrayLike, stamp: float, odometry: ArrayLike | None = None, laser: str = ""
+    ) -> RobotPose:
+        """Localize the next scan.
+
+        Args:
+            ranges_m: metres, shape (beam_count,). NaN or negative: invalid; inf, or at least ``max_range_m``: no
+                return.
+            stamp: seconds. It may step back by 2 s at most, as clocks of several sensors disagree.
+            odometry: pose (x, y, theta) of ``base`` by wheel odometry at the stamp, metres and radians; its origin does
+                not matter. None for all scans: there is no odometry, and scan matching alone gives the motion; an event
+                says where the scans do not determine it.
+            laser: which one, if there are several.
+
+        Returns:
+            Where the robot is.
+
+        Raises:
+            InputError: the ranges do not fit the laser, the clock went back by more than 2 s, a number cannot be used,
+                or the robot is finished. The scan is ignored, and the next one may be added.
+        """
+        if laser not in self._lasers:
+            raise InputError(f"laser {laser!r} is not known; known: {', '.join(map(repr, self._lasers)) or 'none'}")
+        with self._lock:
+            stamp = checked_stamp(stamp, self._newest_s)
+            T_odom_base = self._odometry(stamp, odometry)
+            return self._process(checked_scan(ranges_m, stamp, T_odom_base, self._lasers[laser]))
+
+    def add(self, record: SensorRecord) -> RobotPose | None:
+        """Add the next record of any sensor, as a recording yields them; returns the pose of a scan.
+
+        The caller vouches for the record: unlike ``add_scan``, this checks nothing.
+
+        Raises:
+            InputError: the robot is finished.
+        """
+        with self._lock:
+            if isinstance(record, LaserScan):
+                return self._process(record)
+            self._take(self._processed(record))
+            return None
+
+    @property
+    def pose(self) -> RobotPose | None:
+        """The pose of the newest scan; None before the first."""
+        return self._pose
+
+    @property
+    def odometry_jumps(self) -> int:
+        """Number of jumps of the odometry so far."""
+        return self._frontend.odometry.jumps
+
+    def close(self) -> None:
+        """End the worker and the connection at once. What the server does not have waits in the state folder.
+
+        A second call does nothing.
+        """
+        self._is_finished = True
+        self._stack.close()
+
+    @property
+    def _part(self) -> int:
+        return len(self._frontend.tracks) - 1
+
+    def _processed(self, record: SensorRecord) -> list[Packet]:
+        if self._is_finished:
+            raise InputError(f"{self.name}: the robot is finished; make a new Robot to go on")
+        return self._frontend.process(record)
+
+    def _odometry(self, stamp: float, given: ArrayLike | None) -> FloatArray:
+        """The given odometry, or its prediction; the first scan decides whether there is any."""
+        if not self._scans and given is None and self._prediction is None:
+            self._prediction = MotionPrediction()
+            self._config = self._config.model_copy(update={"robot": without_odometry(self._config.robot)})
+            self._frontend.replace_settings(self._config.robot)
+        if given is None and self._prediction is not None:
+            return self._prediction.predict(stamp)
+        if given is None or self._prediction is not None:
+            raise InputError(
+                f"{self.name}: some scans have odometry and some have not; give it with every scan or with none"
+            )
+        return checked_pose("odometry", given)
+
+    def _process(self, scan: LaserScan) -> RobotPose:
+        """Localize a scan, and tell what happened."""
+        self._take(self._processed(scan))
+        self._newest_s = max(self._newest_s, scan.stamp)
+        self._scans += 1
+        newest = self._newest()
+        T_smooth_base = self._frontend.scan_poses.in_odom(newest.pose)
+        if self._prediction is not None:
+            is_matched = newest.tracked.information.any() and not newest.is_deferred
+            self._prediction.observe(scan.stamp, T_smooth_base if is_matched else None)
+        pose = self._pose = self._pose_of(newest, T_smooth_base, scan.T_odom_base)
+        if self._prediction is not None:
+            self._tell_undetermined(pose)
+        self._tell()
+        return pose
+
+    def _tell_undetermined(self, pose: RobotPose) -> None:
+        if pose.is_determined or self._scans == 1:
+            self._determined_s = pose.stamp
+        elif pose.stamp > self._determined_s + UNDETERMINED_S:
+            self._determined_s = math.inf
+            self._event(
+                EventKind.UNDETERMINED,
+                "the scans do not fix the position in every direction, and there is no odometry: the robot may move "
+                "unseen",
+            )
+
+    def _tell_failure(self, text: str) -> None:
+        """Tell a failure once."""
+        if text not in self._told:
+            self._told.add(text)
+            self._event(EventKind.FAILED, text)
+
+    def _event(self, kind: EventKind, text: str) -> None:
+        level = logging.INFO if kind in QUIET else logging.WARNING
+        _log.log(level, "%s: %s", self.name, text)
+        if self._on_event is not None:
+            self._on_event(RobotEvent(kind, self._newest_s, text))
+
+    def _newest(self) -> NewestScan:
+        newest = self._frontend.newest
+        assert newest is not None  # there is one after a scan
+        return newest
