@@ -12,12 +12,15 @@ import fcslam
 from fcslam.bridges import node as node_module
 from fcslam.bridges.network import Endpoint, Quality
 from fcslam.bridges.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
+from fcslam.bridges.outputs import POSE
 from fcslam.bridges.parameters import NodeParameters
 from fcslam.bridges.sensors import STEPS_BACK_FOR_RESTART
 from fcslam.errors import NetworkError
+from fcslam.geometry import se2
 from fcslam.runs.map_files import parse_map
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
+from fcslam.sources.bags.transforms import in_space
 from tests import small_fleet
 from tests.bridges.memory_network import MemoryNetwork, offered
 from tests.bridges.ros_messages import CODEC, odometry, scan, transform
@@ -43,9 +46,11 @@ def robot():
         yield robot
 
 
-def start(network, robot, notify=lambda _: None, **parameters):
+def start(network, robot, notify=lambda _: None, suggest_pose=None, **parameters):
     topics = await_sensors(network, "/robot1", BagOptions(), 0.0, 0.0)
-    return RobotNode(network, "/robot1", topics, BagOptions(), robot, NodeParameters(**parameters), notify)
+    return RobotNode(
+        network, "/robot1", topics, BagOptions(), robot, NodeParameters(**parameters), notify, suggest_pose
+    )
 
 
 def plays(network, scans):
@@ -225,6 +230,65 @@ def test_an_initial_pose_is_refused_with_the_reason(network, robot):
     for _ in range(2):
         network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))
     assert said == ["an initial pose is ignored: the robot maps, and its first scan is the origin of the map"]
+
+
+def given_pose(x, y, theta, frame="map"):
+    pose = CODEC.pose(in_space(np.array((x, y, theta))))
+    posed = CODEC.make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+    return CODEC.make(POSE, header=CODEC.header(0, frame), pose=posed)
+
+
+@pytest.fixture(scope="module")
+def own_map(scans):
+    with fcslam.Robot("robot1", executor=SameThread()) as robot:
+        for scan in scans:
+            robot.add(scan)
+        robot.finish()
+        return robot.map()
+
+
+def test_a_robot_in_a_finished_map_publishes_tf_only_while_it_is_localised(network, scans, own_map):
+    said = []
+    with fcslam.LocalizedRobot("robot1", own_map, executor=SameThread()) as robot:
+        node = start(network, robot, said.append, suggest_pose=robot.suggest_pose)
+        node.publish_map()
+        (grid,) = network.sent["/robot1/map"]
+        assert (grid.info.height, grid.info.width) == own_map.cells.shape
+        plays(network, scans[:10])
+        run_until(node, 10)
+        assert not network.sent["/tf"]
+        assert not network.sent["/robot1/pose"]
+        node._diagnose()
+        assert "not localised for" in network.sent["/diagnostics"][-1].status[0].message
+        x, y, theta = se2.between(scans[0].T_odom_base, scans[9].T_odom_base)  # the map begins at the first scan
+        network.say(f"/robot1/{INITIAL_POSE}", POSE, given_pose(x, y, theta))
+        assert said[-1].endswith("it counts once the walls confirm it")
+        node = start(network, robot, said.append, suggest_pose=robot.suggest_pose)
+        plays(network, scans[10:20])
+        run_until(node, 10)
+        assert len(network.sent["/robot1/pose"]) >= 10
+        node._diagnose()
+        assert network.sent["/diagnostics"][-1].status[0].message.startswith("localised for")
+        node.publish_map()
+        assert len(network.sent["/robot1/map"]) <= 2, "once for each start"
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (given_pose(0.0, 0.0, 0.0, "odom"), "it is in frame 'odom'; give it in 'map'"),
+        (given_pose(1e300, 0.0, 0.0), "is outside of the map"),
+        (given_pose(np.nan, 0.0, 0.0), "no sane transform"),
+    ],
+)
+def test_an_initial_pose_that_cannot_be_used_is_refused(network, own_map, message, reason):
+    said = []
+    with fcslam.LocalizedRobot("robot1", own_map, executor=SameThread()) as robot:
+        start(network, robot, said.append, suggest_pose=robot.suggest_pose)
+        network.say(f"/robot1/{INITIAL_POSE}", POSE, message)
+        network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))
+    assert reason in said[0]
+    assert "no message of this type" in said[1]
 
 
 def test_silence_is_told_once_and_the_robot_goes_on(network, robot, scans, monkeypatch):
