@@ -1,5 +1,8 @@
 """One small fleet for all tests that need one: simulated once, its packets made once."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -23,8 +26,15 @@ SIMULATED = frozenset({"drawn", "packets", "logs"})
 """Fixtures that simulate and map a fleet: what uses one of them is slow."""
 
 
+SECURITY = Path(__file__).parents[1] / "docs" / "security.md"
+THREATS = frozenset(re.findall(r"`(test_\w+)`", SECURITY.read_text(encoding="utf-8")))
+"""The tests that the page on security names: they play an attacker."""
+
+
 def pytest_collection_modifyitems(items):
     for item in items:
+        if item.originalname in THREATS:
+            item.add_marker(pytest.mark.attack)
         if SIMULATED & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
 

@@ -277,6 +277,7 @@ class ReasonCode(StrEnum):
     CONTRADICTS_JOINT_GRAPH = "contradicts_joint_graph"
     PATHS_CONTRADICT = "paths_contradict"
     SEPARATED = "robot_contradicted"
+    FALSE_BRIDGE = "joins_contradicting_maps"
     VETOED = "vetoed"
     CUT = "cut"
     PINNED = "pinned"
@@ -308,6 +309,7 @@ _REASON_TEXT = {
     ReasonCode.CONTRADICTS_JOINT_GRAPH: "contradicts the joint graph",
     ReasonCode.PATHS_CONTRADICT: "the paths of the two robots contradict: mean chi-square {value}, {limit} allowed",
     ReasonCode.SEPARATED: "the robot has a map of its own: the paths of {value} others contradict its path",
+    ReasonCode.FALSE_BRIDGE: "one robot alone joins maps that contradict each other at {value} separate places",
     ReasonCode.VETOED: "vetoed by hand",
     ReasonCode.CUT: "a stretch that was cut by hand",
     ReasonCode.PINNED: "pinned by hand",

@@ -48,7 +48,7 @@ class ClosureDecisions:
         self._config = config
         self._sessions = sessions
         self._graph = graph
-        self._comparison = MapComparison(sessions)
+        self._comparison = MapComparison(sessions, config.matcher.verification, config.consistency.separation_m)
         self._examined: dict[frozenset[str], int] = {}
         """Size of the cluster when the maps of two sessions were compared last."""
         self.closures = ClosureLog()
@@ -137,6 +137,7 @@ class ClosureDecisions:
             self._config.consistency,
             self._config.contradiction,
             self._comparison.uniqueness,
+            self._comparison.overlap,
         )
         self.maps = [list(sessions) for sessions in fusion.maps]
         self._apart = dict(fusion.apart)

@@ -1,6 +1,6 @@
 """Re-evaluation: decide every closure from all evidence, independent of earlier decisions."""
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +10,16 @@ from fcslam.cloud.joining import CONSISTENCY, ExamineSessions
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.sessions import robot_of
+from fcslam.graph.bridges import Overlap
 from fcslam.graph.consistency import Closures, ConsistencySettings
 from fcslam.graph.evidence import Uniqueness
 from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import ClosureStatus, FloatArray, Reason, ReasonCode, frozen
+
+CompareSessions = Callable[[tuple[str, str], FloatArray, FloatArray], Overlap]
+"""As ``MapComparison.overlap``."""
 
 CONTRADICTS = Reason(ReasonCode.CONTRADICTS_JOINT_GRAPH)
 
@@ -26,6 +30,7 @@ def reevaluate(
     settings: ConsistencySettings,
     contradiction: float,
     examine: ExamineSessions,
+    compare: CompareSessions,
 ) -> Fusion:
     """Solve the joint graph from all evidence; update the poses of the graph and the status of every entry.
 
@@ -38,7 +43,16 @@ def reevaluate(
     def examine_pair(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> Uniqueness | None:
         return examine((robots[a], robots[b]), path_a, path_b, members)
 
-    solution = solve_jointly(_evidence(graph, entries), settings, examine=examine_pair, contradiction=contradiction)
+    def compare_pair(a: int, b: int, poses_a: FloatArray, poses_b: FloatArray) -> Overlap:
+        return compare((robots[a], robots[b]), poses_a, poses_b)
+
+    solution = solve_jointly(
+        _evidence(graph, entries),
+        settings,
+        examine=examine_pair,
+        contradiction=contradiction,
+        compare=compare_pair,
+    )
     graph.take(solution.poses)
     reasons = _reasons(solution, robots)
     maps = dict(zip(robots, solution.maps, strict=True))

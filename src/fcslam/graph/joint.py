@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
+from fcslam.graph.bridges import Overlap, contradicted_bridges
 from fcslam.graph.chains import find_chains
 from fcslam.graph.cluster import (
     ClusterDecision,
@@ -36,6 +37,10 @@ from fcslam.records import FloatArray, Reason, ReasonCode, frozen
 ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures], Uniqueness | None]
 """Compares the transform that closures give between the maps of two robots with the best transform elsewhere. It takes
 the numbers of the robots, their own trajectories, and the closures."""
+
+CompareJointMaps = Callable[[int, int, FloatArray, FloatArray], Overlap]
+"""Compares the maps of two robots at joint poses. It takes the numbers of the robots and the poses of their variables,
+shape (N, 3) each."""
 
 _Relation = tuple[int, int, FloatArray]
 """Two robots a and b, and the transform T_a_b between their own frames, shape (3,)."""
@@ -107,17 +112,24 @@ def not_examined(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members
     """Leave the maps unaligned: only separate places count."""
 
 
+def not_compared(*_: object) -> Overlap:
+    """Leave the joint maps uncompared: nothing contradicts."""
+    return Overlap(0, 0)
+
+
 def solve_jointly(
     evidence: JointEvidence,
     consistency: ConsistencySettings,
     gnc: GncSettings | None = None,
     examine: ExaminePair = not_examined,
     contradiction: float = np.inf,
+    compare: CompareJointMaps = not_compared,
 ) -> JointSolution:
     """Find poses, maps and inlier closures from the evidence alone; no earlier estimate plays a part.
 
     A link is dropped, and the rest solved again, if a third of its cluster turns out as outliers in the joint solution,
-    if the remaining members would not be enough to join two maps, or if one of its robots contradicts others.
+    if the remaining members would not be enough to join two maps, if one of its robots contradicts others, or if it
+    joins maps that contradict each other.
 
     Args:
         evidence: graph of N variables and E edges, with the role of every edge.
@@ -125,6 +137,7 @@ def solve_jointly(
         gnc: settings of graduated non-convexity.
         examine: called for two robots where only the amount of evidence is open.
         contradiction: mean chi-square of the closures between two robots above which they contradict each other.
+        compare: called for robots of one map that only one other sender connects.
 
     Returns:
         Poses (N, 3), weights (E,), and the maps.
@@ -165,6 +178,11 @@ def solve_jointly(
         _, bound = _merge_frames(len(own), known, ())
         apart = {(a, b): reason for (a, b), reason in apart.items() if bound[a] != bound[b]}
         confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
+        # 8. Robots that alone join maps that contradict each other leave them.
+        if len(confirmed) == len(joining):
+            bridges = _false_bridges(evidence, solution, senders, consistency, compare)
+            apart |= {(a, b): reason for (a, b), reason in bridges.items() if bound[a] != bound[b]}
+            confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         if len(confirmed) == len(joining):
             own_poses: tuple[FloatArray, ...] = tuple(frozen(path.poses) for path in paths)
             return JointSolution(solution.poses, solution.weights, tuple(maps), tuple(links), own_poses, apart)
@@ -409,6 +427,26 @@ def _separations(
     crossing = {pair: reason for pair, reason in alone.items() if len(left.keys() & set(pair)) == 1}
     dropped = crossing or not {(link.a, link.b) for link in joining}.isdisjoint(apart)
     return (crossing if dropped else alone) | apart
+
+
+def _false_bridges(
+    evidence: JointEvidence,
+    solution: Solution,
+    senders: Sequence[int],
+    consistency: ConsistencySettings,
+    compare: CompareJointMaps,
+) -> dict[tuple[int, int], Reason]:
+    """Pairs of robots that must not share a map, because they alone join maps that contradict each other."""
+    edges, (owner, _) = evidence.graph.arrays(), _owners(evidence)
+    counting = (solution.weights > INLIER_WEIGHT) & (owner[edges.i] != owner[edges.j])
+    ends = np.sort(np.stack((owner[edges.i[counting]], owner[edges.j[counting]])), axis=0)
+    ties = [(int(a), int(b)) for a, b in np.unique(ends, axis=1).T]
+
+    def compare_pair(a: int, b: int) -> Overlap:
+        return compare(a, b, solution.poses[evidence.robots[a]], solution.poses[evidence.robots[b]])
+
+    found = contradicted_bridges(ties, senders, compare_pair, consistency.minimum_evidence)
+    return {pair: Reason(ReasonCode.FALSE_BRIDGE, places) for pair, places in found.items()}
 
 
 def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

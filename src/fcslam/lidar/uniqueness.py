@@ -50,6 +50,8 @@ class MapAlignment:
     """Surface of one map in free space of the other: of both maps, the one with more."""
     violation: float
     """The same as a share of the surface in known area."""
+    known_m: float
+    """Surface of one map in known area of the other: of both maps, the one with less."""
 
     @property
     def score_m(self) -> float:
@@ -71,7 +73,8 @@ def align_map(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment:
     known = [side.overlap * len(surface) for side, surface in zip(sides, (b.surface, a.surface), strict=True)]
     violating = [side.violation * count for side, count in zip(sides, known, strict=True)]
     explained_m, violating_m = SPACING_M * min(side.count for side in sides), SPACING_M * max(violating)
-    return MapAlignment(T_a_b, explained_m, violating_m, max(side.violation for side in sides))
+    known_m = SPACING_M * min(known)
+    return MapAlignment(T_a_b, explained_m, violating_m, max(side.violation for side in sides), known_m)
 
 
 def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | None:

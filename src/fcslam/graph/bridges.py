@@ -1,0 +1,93 @@
+"""Robots that alone join others whose maps contradict each other.
+
+A robot that sends what others saw in two buildings joins these. Its closures to both sides are as good as true ones,
+and robots of different sides share no closure that could contradict it. But where the joint poses lay their maps over
+each other, walls of one side stand in free space of the other.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from itertools import combinations, product
+from typing import NamedTuple
+
+Pair = tuple[int, int]
+"""Two robots a < b."""
+
+_SEVERAL = 2
+"""Senders of one side that contradict the other side: one alone may be the one that is wrong."""
+
+
+class Overlap(NamedTuple):
+    """Separate places where the joint poses lay the maps of two robots over each other."""
+
+    agreeing: int
+    contradicting: int
+
+
+CompareMaps = Callable[[int, int], Overlap]
+"""Compares the maps of two robots at the joint poses."""
+
+
+def contradicted_bridges(
+    ties: Collection[Pair], senders: Sequence[int], compare: CompareMaps, least_places: float
+) -> dict[Pair, int]:
+    """The ties of robots that alone join two sides of a map, although the maps of both sides contradict each other.
+
+    Two robots contradict each other if their maps do so at enough separate places. If robots of several senders on each
+    side contradict the other side, and the maps agree at no place, the robot between them is wrong and loses its ties
+    to both. If several contradict one robot that is a side by itself, that robot may be wrong as well, and loses its
+    ties. Otherwise a single sender on a side may be the one that is wrong, and everything stays.
+
+    Args:
+        ties: pairs of robots between which closures count.
+        senders: who sent each robot's packets; robots of one sender, its sessions, count as one.
+        compare: called for robots that only one sender connects.
+        least_places: separate places at which two maps contradict each other, at least.
+
+    Returns:
+        The ties that are false, and at how many separate places the maps contradict each other.
+    """
+    found: dict[Pair, int] = {}
+    for bridge in sorted(set(senders)):
+        for side, other in combinations(_sides(ties, senders, bridge), 2):
+            against, places = _contradicting(side, other, compare, least_places)
+            several = [len({senders[pair[end]] for pair in against}) >= _SEVERAL for end in (0, 1)]
+            leaving = [
+                *(side if several[1] and (several[0] or _is_one(side, senders)) else ()),
+                *(other if several[0] and (several[1] or _is_one(other, senders)) else ()),
+            ]
+            found |= {pair: places for pair in ties if _connects(pair, bridge, leaving, senders)}
+    return found
+
+
+def _sides(ties: Collection[Pair], senders: Sequence[int], bridge: int) -> list[list[int]]:
+    """Groups of robots that are tied to the sender's robots, and to those of other groups through these only."""
+    group = {robot: robot for robot, sender in enumerate(senders) if sender != bridge}
+    for a, b in ties:
+        if a in group and b in group and group[a] != group[b]:
+            kept, gone = sorted((group[a], group[b]))
+            group = {robot: kept if number == gone else number for robot, number in group.items()}
+    reached = {group[robot] for pair in ties for robot in pair if robot in group and not group.keys() >= set(pair)}
+    return [[robot for robot in group if group[robot] == number] for number in sorted(reached)]
+
+
+def _contradicting(
+    side: Sequence[int], other: Sequence[int], compare: CompareMaps, least_places: float
+) -> tuple[list[Pair], int]:
+    """Robots of both sides whose maps contradict each other, and the places; none if any maps agree."""
+    pairs, places = [], 0
+    for pair in product(side, other):
+        overlap = compare(*pair)
+        if overlap.agreeing:
+            return [], 0
+        if overlap.contradicting >= least_places:
+            pairs.append(pair)
+            places += overlap.contradicting
+    return pairs, places
+
+
+def _is_one(side: Sequence[int], senders: Sequence[int]) -> bool:
+    return len({senders[robot] for robot in side}) == 1
+
+
+def _connects(pair: Pair, bridge: int, side: Collection[int], senders: Sequence[int]) -> bool:
+    return any(senders[a] == bridge and b in side for a, b in (pair, pair[::-1]))
