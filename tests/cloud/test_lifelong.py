@@ -29,7 +29,7 @@ SESSIONS, BETWEEN_S = 4, 1000.0
 ONE_A_SQUARE = FleetConfig(matcher=MatcherConfig(most_nearby=1, nearby_m=6.0))
 FEW_ENOUGH_TO_MEET = FleetConfig(matcher=MatcherConfig(most_nearby=1, nearby_m=4.0))
 """With still fewer places, sessions that meet are not joined any more."""
-NEVER_FORGETS = FleetConfig(matcher=MatcherConfig(most_nearby=10**6))
+NEVER_FORGETS = FleetConfig(matcher=MatcherConfig(most_nearby=10**6, most_sessions_nearby=10**6))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.geometry.thinning import surplus_places
+from fcslam.geometry.thinning import places_of_old_sessions, surplus_places
 
 coordinates = st.floats(-4.0, 4.0)
 ways = st.lists(st.tuples(coordinates, coordinates), max_size=60)
@@ -51,3 +51,12 @@ def test_a_robot_that_sweeps_a_floor_lane_by_lane_keeps_all_of_the_floor():
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_few_places_are_never_too_many(count):
     assert not len(surplus_places(np.zeros((count, 2)), 5.0, 3))
+
+
+def test_a_square_keeps_the_places_of_its_newest_sessions():
+    positions = np.array([(0, 0), (10, 0), (0, 0), (0, 1), (0, 0), (0, 1)], float)
+    sessions = ["a", "a", "a+1", "a+1", "a+2", "a+2"]
+    assert places_of_old_sessions(positions, sessions, 5.0, 2).tolist() == [0]
+    assert places_of_old_sessions(positions, sessions, 5.0, 1).tolist() == [0, 2, 3]
+    assert not len(places_of_old_sessions(positions, sessions, 5.0, 3))
+    assert not len(places_of_old_sessions(positions[:2], sessions[:2], 5.0, 1)), "a session never forgets itself"

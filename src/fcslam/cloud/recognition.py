@@ -14,7 +14,7 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.submaps import SubmapCache
 from fcslam.cloud.visits import NEWEST_PLACES, Visit, visits_near, worth_comparing
 from fcslam.geometry import se2
-from fcslam.geometry.thinning import surplus_places
+from fcslam.geometry.thinning import places_of_old_sessions, surplus_places
 from fcslam.lidar.pair_verification import VerifyPairs
 from fcslam.places.matcher import PlaceMatch, PlaceMatcher
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
@@ -65,14 +65,16 @@ class PlaceRecognition:
         return matches
 
     def thin(self, place: Place, mates: Collection[str]) -> None:
-        """Forget the oldest places of the robot's sessions in one map where it has very many."""
+        """Forget the oldest places of the robot in one map where it has very many, and those of its old sessions."""
         settings, matcher = self._config.matcher, self._matchers[place.channel, place.detector_version]
-        if len(matcher) <= settings.most_nearby:
-            return
         sessions = {session for session in mates if robot_of(session) == robot_of(place.id.robot)}
+        if len(matcher) <= settings.most_nearby and len(sessions) <= settings.most_sessions_nearby:
+            return
         ids = [i for i in matcher if i.robot in sessions]
-        positions = self._graph.poses(ids)[:, :2]
-        for row in surplus_places(positions, settings.nearby_m, settings.most_nearby):
+        positions, owners = self._graph.poses(ids)[:, :2], [i.robot for i in ids]
+        surplus = surplus_places(positions, settings.nearby_m, settings.most_nearby)
+        old = places_of_old_sessions(positions, owners, settings.nearby_m, settings.most_sessions_nearby)
+        for row in np.union1d(surplus, old):
             matcher.forget(ids[row])
 
     def forget(self, sessions: Collection[str]) -> None:

@@ -1,5 +1,7 @@
 """Which places the cloud may forget where a robot has stored very many (density limit per area)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,5 +25,31 @@ def surplus_places(positions_m: FloatArray, side_m: float, most: int) -> NDArray
     """
     if len(positions_m) <= most:
         return np.empty(0, np.int64)
+    return _in_newest_square(positions_m, side_m)[:-most]
+
+
+def places_of_old_sessions(
+    positions_m: FloatArray, sessions: Sequence[str], side_m: float, most: int
+) -> NDArray[np.int64]:
+    """Find the places in the newest place's grid square that are not of the ``most`` newest sessions there.
+
+    A robot that comes back every day thus keeps a few visits of each square, and no area loses its last place.
+
+    Args:
+        positions_m: as for ``surplus_places``.
+        sessions: the session of each place.
+        side_m: as for ``surplus_places``.
+        most: sessions whose places a square may hold, 1 or more.
+
+    Returns:
+        Rows of ``positions_m`` to forget, shape (K,), ascending.
+    """
+    rows = _in_newest_square(positions_m, side_m)
+    newest = list(dict.fromkeys(sessions[row] for row in rows[::-1]))[:most]
+    return np.array([row for row in rows if sessions[row] not in newest], np.int64)
+
+
+def _in_newest_square(positions_m: FloatArray, side_m: float) -> NDArray[np.int64]:
+    """Rows in the square of the newest place, ascending."""
     squares = np.floor(positions_m / side_m + 0.5)
-    return np.flatnonzero((squares == squares[-1]).all(axis=1))[:-most]
+    return np.flatnonzero((squares == squares[-1]).all(axis=1))

@@ -47,8 +47,14 @@ class MatcherConfig(Settings):
         gt=0,
         description="most places of one robot and channel in a square of nearby_m; beyond, the oldest is forgotten",
     )
+    most_sessions_nearby: int = Field(
+        default=2,
+        gt=0,
+        description="most sessions of one robot that keep places of one channel in a square of nearby_m; beyond, the "
+        "oldest are forgotten",
+    )
     nearby_m: float = Field(
-        default=2.0, gt=0.0, description="side of the squares of the map in which most_nearby limits the places [m]"
+        default=2.0, gt=0.0, description="side of the squares of the map in which the number of places is limited [m]"
     )
     aligned_candidates: int = Field(
         default=2,
