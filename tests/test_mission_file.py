@@ -1,14 +1,19 @@
 """A mission that goes on from its file is the mission of all recordings at once, byte for byte."""
 
 import shutil
+import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
 
 import pytest
 
 import fcslam
+from fcslam.cloud.edits import kind_of
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import SourceError
-from fcslam.mission_file import mission_bytes, read_mission
-from fcslam.records import Veto
+from fcslam.errors import EditError, SourceError
+from fcslam.mission_file import edit_mission, mission_bytes, read_mission
+from fcslam.records import Cut, MapRegion, Pin, RegionUse, Removal, Undo, Veto
 from fcslam.runs import open_run
 
 pytestmark = pytest.mark.slow
@@ -102,3 +107,76 @@ def test_reading_is_the_inverse_of_writing(begun, tmp_path):
     for name, track in saved.tracks.items():
         assert again.tracks[name].stamps.tobytes() == track.stamps.tobytes()
         assert again.tracks[name].T_keyscan_base.tobytes() == track.T_keyscan_base.tobytes()
+
+
+GOLDEN = Path(__file__).parent / "golden" / "mission_6.fcslam"
+
+
+def test_the_golden_mission_means_what_it_says():
+    mission = read_mission(GOLDEN)
+    assert {robot: len(sent) for robot, sent in mission.packets.items()} == {"anna": 24, "ben": 26}
+    assert [len(track.stamps) for track in mission.tracks.values()] == [19, 19]
+    assert mission.tracks["ben"].stamps[[0, -1]].tolist() == [1000.001, 1009.001]
+    assert [kind_of(edit.content) for edit in mission.edits] == ["veto", "cut", "region", "undo"]
+    assert {edit.author for edit in mission.edits} == {"boss"}
+    assert mission.config == CloudConfig()
+    assert mission.refused == ()
+
+
+def test_a_mission_is_mapped_again_with_its_edits():
+    run = fcslam.map_recordings([], onto=GOLDEN)
+    assert set(run.trajectories) == {"anna", "ben"}
+    assert b"Room 1" in run.map_files["map_areas.geojson"]
+
+
+@pytest.mark.parametrize("version", [5, 7])
+def test_a_mission_file_of_another_version_is_refused(tmp_path, version):
+    other = tmp_path / "mission.fcslam"
+    shutil.copy(GOLDEN, other)
+    with closing(sqlite3.connect(other)) as connection:
+        connection.execute(f"PRAGMA user_version={version}")
+    with pytest.raises(SourceError, match=f"a file of version {version}; this fcslam reads version 6"):
+        read_mission(other)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.99])
+def test_a_truncated_mission_file_is_refused_and_stays_as_it_is(tmp_path, share):
+    whole = GOLDEN.read_bytes()
+    cut = tmp_path / "mission.fcslam"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    for read in (read_mission, lambda path: edit_mission(path, [Removal("ben")], "me", 0.0)):
+        with pytest.raises(SourceError) as refused:
+            read(cut)
+        assert "\n" not in str(refused.value)
+    assert cut.read_bytes() == whole[: int(share * len(whole))]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Removal("zoe"), Removal("ben", 1), Veto("anna", "zoe"), Pin("anna", "ben", (1000.0, 5000.0)), Undo(1), Undo(9),
+        Cut("ben", 2.0, 1.0), MapRegion(RegionUse.ERASE, "", "ben", 1000.0, ((0.0, 0.0), (1.0, 0.0))),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_wrong_edit_leaves_the_file_as_it_was(tmp_path, wrong):
+    mission = tmp_path / "mission.fcslam"
+    shutil.copy(GOLDEN, mission)
+    with pytest.raises(EditError) as refused:
+        edit_mission(mission, [Removal("ben"), wrong], "me", 0.0)
+    assert "\n" not in str(refused.value)
+    assert mission.read_bytes() == GOLDEN.read_bytes()
+
+
+def test_two_people_who_edit_at_once_lose_nothing(tmp_path):
+    mission = tmp_path / "mission.fcslam"
+    shutil.copy(GOLDEN, mission)
+    with ThreadPoolExecutor(4) as people:
+        made = [
+            people.submit(edit_mission, mission, [Cut("anna", 1000.0, 1001.0 + k)], f"person{k}", 0.0) for k in range(8)
+        ]
+        numbers = sorted(edit.number for one in made for edit in one.result())
+    assert numbers == list(range(5, 13))
+    edits = read_mission(mission).edits
+    assert {edit.author for edit in edits[4:]} == {f"person{k}" for k in range(8)}
+    assert list(tmp_path.iterdir()) == [mission]

@@ -67,8 +67,7 @@ class Database:
         with self.transaction() as connection:
             if not shape(connection)[1]:
                 _make(connection, schema, version)
-            if shape(connection) != expected_shape(schema, version):
-                raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
+            _check_shape(path, connection, schema, version)
 
     def close(self) -> None:
         """Close the file, and seal its pages if no other process has it open."""
@@ -193,8 +192,7 @@ def check_file(path: Path, schema: str, version: int) -> None:
         closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as found,
     ):
         found.execute("PRAGMA trusted_schema=OFF")
-        if shape(found) != expected_shape(schema, version):
-            raise StoreError(f"{path}: no file of this kind, or of another version of fcslam")
+        _check_shape(path, found, schema, version)
         if found.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":
             raise StoreError(f"{path}: broken")
 
@@ -206,6 +204,16 @@ def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> sqlite3.
         connection.execute(f"PRAGMA {pragma}")
     connection.create_function("seal", -1, seal, deterministic=True)
     return connection
+
+
+def _check_shape(path: Path, connection: sqlite3.Connection, schema: str, version: int) -> None:
+    """Refuse a database of another version, or with other tables than those of ``schema``, or anything else."""
+    found, parts = shape(connection)
+    if (found, parts) == expected_shape(schema, version):
+        return
+    if found not in (0, version):
+        raise StoreError(f"{path}: a file of version {found}; this fcslam reads version {version}")
+    raise StoreError(f"{path}: no file of this kind")
 
 
 def _make(connection: sqlite3.Connection, schema: str, version: int) -> None:
