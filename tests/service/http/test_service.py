@@ -9,7 +9,7 @@ import pytest
 
 from fcslam.errors import ServiceError, StoreError
 from fcslam.features.detector import BUNDLED_NETWORK
-from fcslam.records import Channel, Correction, Keyscan
+from fcslam.records import Channel, Correction, Keyscan, ReasonCode
 from fcslam.runs import open_run
 from fcslam.service import intake
 from fcslam.service.http import operations
@@ -237,6 +237,41 @@ def test_a_veto_parts_what_only_it_held_together(mapped):
     ):  # fmt: skip
         assert edit(mapped, "veto", wrong).status_code == status, wrong
     assert "b+x" in edit(mapped, "veto", {"robot_i": "a", "robot_j": "b+x"}).text
+
+
+def test_edits_of_every_kind_reach_the_result_and_their_undos_leave_no_trace(mapped):
+    def result():
+        run = open_run(mapped.ask("POST", f"{API}/finalize", "boss").json()["run"])
+        poses = {name: trajectory.T_map_base.tobytes() for name, trajectory in run.trajectories.items()}
+        return run, (poses, run.map_files, run.pose_graph_g2o, [str(closure.reason) for closure in run.closures])
+
+    before, plain = result()
+    closure = get(mapped, "closures?status=accepted").json()[0]
+    i, j, stamps = closure["robot_i"], closure["robot_j"], [closure["stamp_i"], closure["stamp_j"]]
+    moment = {"session": i, "stamp": stamps[0]}
+    corners = {"polygon": [[-2, -2], [2, -2], [0, 2]]}
+    made = {
+        "pin": {"robot_i": i, "robot_j": j, "stamps": stamps},
+        "closure": {
+            "robot_i": i, "stamp_i": stamps[0], "robot_j": j, "stamp_j": stamps[1], "T_i_j": closure["T_i_j"],
+            "tolerance": [0.5, 0.5],
+        },
+        "cut": {"session": j, "first_s": stamps[1] + 1.0, "last_s": stamps[1] + 2.0},
+        "placement": {**moment, "pose": [50.0, 60.0, 0.5]},
+        "region": {"use": "keep-out", "name": "", **moment, **corners},
+    }  # fmt: skip
+    assert [edit(mapped, kind, content).status_code for kind, content in made.items()] == 5 * [201]
+    assert edit(mapped, "region", {"use": "area", "name": "hall", **moment, **corners}).status_code == 201
+    run, _ = result()
+    assert {c.reason.code for c in run.closures} >= {ReasonCode.PINNED, ReasonCode.MADE_BY_HAND}
+    trajectory = run.trajectories[i]
+    assert trajectory.T_map_base[list(trajectory.stamps).index(stamps[0])] == pytest.approx((50.0, 60.0, 0.5))
+    assert run.map_files.keys() - before.map_files.keys() == {
+        "map_areas.geojson", "map_keepout.pgm", "map_keepout.yaml"
+    }  # fmt: skip
+    for number in range(1, 7):
+        assert mapped.ask("POST", f"{API}/edits/{number}/undo", "boss").status_code == 201
+    assert result()[1] == plain
 
 
 def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
