@@ -179,14 +179,19 @@ class _WorkerError(Exception):
 
 
 def _work(number: int, source: Source, config: RobotConfig, channel: Any, turns: Any) -> None:
-    """Drive one robot when it is its turn, in a process of its own."""
+    """Drive one robot when it is its turn, in a process of its own.
+
+    The first leg needs no turn: the cloud applies packets in the order of time, so it waits until each robot has begun.
+    """
     obey_parent()
-    with turns:
-        try:
-            for leg in _legs(source, config):
+    try:
+        legs = _legs(source, config)
+        channel.put(_packed(number, next(legs)))
+        with turns:
+            for leg in legs:
                 channel.put(_packed(number, leg))
-        except Exception as error:
-            channel.put(_packed(number, _Failure(error, traceback.format_exc())))
+    except Exception as error:
+        channel.put(_packed(number, _Failure(error, traceback.format_exc())))
 
 
 def _packed(number: int, leg: Leg | _Failure) -> bytes:
