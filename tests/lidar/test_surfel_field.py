@@ -110,9 +110,8 @@ def test_growth_of_storage_changes_nothing():
     poses = ring_drive()[::25]
     scans = [(scan_at(pose, ring(), noise_m=0.01, rng=np.random.default_rng(k)), pose) for k, pose in enumerate(poses)]
     grown, large = SurfelField(poses[0]), SurfelField(poses[0])
-    cells = large.arrays.labels, large.arrays.distances2
-    labels, distances2 = (np.full((4000, TILE, TILE), array.flat[0], array.dtype) for array in cells)
-    large.arrays = large.arrays._replace(labels=labels, distances2=distances2, surfels=np.zeros((50_000, 6)))
+    roomy = {"labels": np.full((4000, TILE, TILE), EMPTY, np.int16), "surfels": np.zeros((50_000, 6))}
+    large.arrays = large.arrays._replace(**roomy)
     for scan, pose in scans:
         grown.insert(scan, pose)
         large.insert(scan, pose)

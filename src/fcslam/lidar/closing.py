@@ -14,9 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
+from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
@@ -38,8 +37,6 @@ ALIGNMENT_MARGIN_M, ALIGNMENT_MARGIN_RAD = 0.3, 0.1
 """The refined alignment may lie this far outside the search window."""
 CLOSURE_PATH_M = 1.0
 """Path length that crossing an accepted closure counts as, metres: a closure is not exact."""
-_MINIMUM_PATH_M = 1e-3
-"""Added to the path length between consecutive submaps: a sparse graph takes an edge of length 0 for none."""
 
 CONCLUSIVE_OVERLAP = 0.4
 """Least overlap of a closure that is accepted after a wide search without support."""
@@ -227,12 +224,8 @@ class LoopCloser:
 
     def _paths_from(self, later: int) -> FloatArray:
         """Shortest path through the pose graph from one submap to every other, metres, shape (S,)."""
-        n, closures = len(self.submaps), np.array(self._accepted, dtype=np.int64).reshape(-1, 2)
-        rows = np.concatenate((np.arange(n - 1), closures[:, 0]))
-        columns = np.concatenate((np.arange(1, n), closures[:, 1]))
-        lengths = np.concatenate((np.diff(self._travel) + _MINIMUM_PATH_M, np.full(len(closures), CLOSURE_PATH_M)))
-        links = coo_array((lengths, (rows, columns)), shape=(n, n))
-        paths: FloatArray = dijkstra(links.tocsr(), directed=False, indices=[later])[0]
+        closures = np.array(self._accepted, dtype=np.int64).reshape(-1, 2)
+        paths: FloatArray = _shortest_paths(later, np.diff(self._travel), closures, CLOSURE_PATH_M)
         return paths
 
     def _drift_allowance(self, path_m: ArrayLike) -> FloatArray:
@@ -381,3 +374,26 @@ class LoopCloser:
             np.hypot(residual[0], residual[1]) < LOOP_M + LOOP_PER_M * path_m
             and abs(residual[2]) < LOOP_RAD + LOOP_RAD_PER_M * path_m
         )
+
+
+@njit
+def _shortest_paths(source, steps, closures, closure_m):  # type: ignore[no-untyped-def]
+    """Shortest paths (S,) from a vertex of a chain with ``steps`` (S - 1,) between its vertices and closures (K, 2).
+
+    Bellman-Ford, a sweep along the chain and back each time: a path crosses few closures, so few sweeps are enough.
+    """
+    paths = np.full(len(steps) + 1, np.inf)
+    paths[source] = 0.0
+    changed = True
+    while changed:
+        changed = False
+        for k in range(len(steps)):
+            paths[k + 1] = min(paths[k + 1], paths[k] + steps[k])
+        for k in range(len(steps) - 1, -1, -1):
+            paths[k] = min(paths[k], paths[k + 1] + steps[k])
+        for k in range(len(closures)):
+            i, j = closures[k, 0], closures[k, 1]
+            if paths[i] + closure_m < paths[j] or paths[j] + closure_m < paths[i]:
+                paths[i], paths[j] = min(paths[i], paths[j] + closure_m), min(paths[j], paths[i] + closure_m)
+                changed = True
+    return paths

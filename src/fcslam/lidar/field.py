@@ -20,8 +20,6 @@ TILE: Final = 16
 """Cells along one side of a tile."""
 REACH_M: Final = 0.5
 """Cells farther than this from every surfel hold none."""
-_REACH_CELLS: Final = round(REACH_M / CELL_M)
-_REACH2: Final = (REACH_M / CELL_M) ** 2
 MERGE_M: Final = 0.05
 """A return this close to a surfel that faces the same way is merged into it."""
 MEAN_OVER: Final = 30.0
@@ -35,6 +33,8 @@ MOST_SURFELS: Final = 32767
 MOST_NEW_TILES: Final = 9
 """Largest number of tiles within reach of one surfel."""
 
+_REACH_CELLS = round(REACH_M / CELL_M)
+
 
 class FieldArrays(NamedTuple):
     """The arrays of a field, for compiled code."""
@@ -45,10 +45,6 @@ class FieldArrays(NamedTuple):
     """Storage number of each tile, or EMPTY; shape (rows, columns)."""
     labels: NDArray[np.int16]
     """Nearest surfel of each cell of each stored tile, or EMPTY; shape (tiles, TILE, TILE)."""
-    distances2: NDArray[np.float32]
-    """Squared distance from each cell to its surfel when that was new, or to none within reach, in cells; shape as
-    ``labels``, without a tile in a complete field. Comparing whole rows takes a quarter of the time of looking up the
-    surfel of each cell."""
     surfels: FloatArray
     """x, y, normal x, normal y, number of returns, whether all of them were solitary; shape (capacity, 6)."""
     used: NDArray[np.int64]
@@ -63,7 +59,6 @@ class SurfelField:
             corner=np.asarray(origin_xy[:2], dtype=np.float64) - 0.5 * TABLE * TILE * CELL_M,
             table=np.full((TABLE, TABLE), EMPTY, np.int32),
             labels=np.full((64, TILE, TILE), EMPTY, np.int16),
-            distances2=np.full((64, TILE, TILE), _REACH2, np.float32),
             surfels=np.zeros((1024, 6)),
             used=np.zeros(2, np.int64),
         )
@@ -97,8 +92,8 @@ class SurfelField:
         return labels
 
     def compact(self) -> None:
-        """Free the storage that a complete field does not need."""
-        corner, table, labels, distances2, surfels, used = self.arrays
+        """Free unused storage of a complete field."""
+        corner, table, labels, surfels, used = self.arrays
         rows, columns = np.nonzero(table != EMPTY)
         if not len(rows):
             rows = columns = np.zeros(1, np.int64)
@@ -107,18 +102,14 @@ class SurfelField:
             corner=corner + TILE * CELL_M * np.array((first[1], first[0]), dtype=np.float64),
             table=table[first[0] : last[0], first[1] : last[1]].copy(),
             labels=labels[: max(1, used[0])].copy(),
-            distances2=distances2[:0].copy(),
             surfels=surfels[: max(1, used[1])].copy(),
             used=used,
         )
 
     def _grow(self) -> None:
-        _, _, labels, distances2, surfels, used = self.arrays
+        _, _, labels, surfels, used = self.arrays
         if len(labels) - used[0] < MOST_NEW_TILES:
-            self.arrays = self.arrays._replace(
-                labels=np.concatenate([labels, np.full_like(labels, EMPTY)]),
-                distances2=np.concatenate([distances2, np.full_like(distances2, _REACH2)]),
-            )
+            self.arrays = self.arrays._replace(labels=np.concatenate([labels, np.full_like(labels, EMPTY)]))
         if used[1] == len(surfels):
             self.arrays = self.arrays._replace(surfels=np.concatenate([surfels, np.zeros_like(surfels)]))
 
@@ -220,34 +211,28 @@ def _merge(x, y, nx, ny, solitary, label, field):  # type: ignore[no-untyped-def
 
 @njit(allocates=False)
 def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
-    """Label every cell within reach that has no nearer surfel: whole rows of tiles, many cells at a time."""
-    u, v = (x - field.corner[0]) / CELL_M, (y - field.corner[1]) / CELL_M
-    cx, cy = int(np.floor(u)), int(np.floor(v))
-    for ty in range((cy - _REACH_CELLS) // TILE, (cy + _REACH_CELLS) // TILE + 1):
-        low, high = max(ty * TILE, cy - _REACH_CELLS), min(ty * TILE + TILE - 1, cy + _REACH_CELLS)
-        for tx in range((cx - _REACH_CELLS) // TILE, (cx + _REACH_CELLS) // TILE + 1):
+    """Label every cell within reach that has no nearer surfel, row by row of the disc and tile by tile."""
+    corner, labels, surfels = field.corner, field.labels, field.surfels
+    cx = int(np.floor((x - corner[0]) / CELL_M))
+    cy = int(np.floor((y - corner[1]) / CELL_M))
+    for gy in range(cy - _REACH_CELLS, cy + _REACH_CELLS + 1):
+        py = corner[1] + (gy + 0.5) * CELL_M
+        across = REACH_M * REACH_M - (py - y) ** 2
+        if across < 0.0:
+            continue
+        ty = gy // TILE
+        row = gy - ty * TILE
+        half = np.sqrt(across)
+        low = max(cx - _REACH_CELLS, int(np.ceil((x - half - corner[0]) / CELL_M - 0.5)))
+        high = min(cx + _REACH_CELLS, int(np.floor((x + half - corner[0]) / CELL_M - 0.5)))
+        for tx in range(low // TILE, high // TILE + 1):
             tile = _tile_at(tx, ty, field)
-            left = np.float32(tx * TILE + 0.5 - u)
-            for gy in range(low, high + 1):
-                dy = np.float32(gy + 0.5 - v)
-                _label_row(
-                    left, dy * dy, np.int16(label), field.labels[tile, gy - ty * TILE],
-                    field.distances2[tile, gy - ty * TILE],
-                )  # fmt: skip
-
-
-@njit(allocates=False)
-def _label_row(left, dy2, label, labels, distances2):  # type: ignore[no-untyped-def]
-    """Label the cells of a row, the first of which is ``left`` from the surfel.
-
-    Without a branch, and over a length that the compiler does not know, which it would unroll: so it computes vectors.
-    """
-    for k in range(len(labels)):
-        dx = left + np.float32(k)
-        d2 = dx * dx + dy2
-        nearer = d2 < distances2[k]
-        labels[k] = label if nearer else labels[k]
-        distances2[k] = d2 if nearer else distances2[k]
+            for gx in range(max(low, tx * TILE), min(high, tx * TILE + TILE - 1) + 1):
+                px = corner[0] + (gx + 0.5) * CELL_M
+                old = labels[tile, row, gx - tx * TILE]
+                d2 = (px - x) ** 2 + (py - y) ** 2
+                if old == EMPTY or (px - surfels[old, 0]) ** 2 + (py - surfels[old, 1]) ** 2 > d2:
+                    labels[tile, row, gx - tx * TILE] = label
 
 
 @njit(allocates=False)
