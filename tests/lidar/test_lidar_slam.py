@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 from fcslam.geometry import se2
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.backend import LidarBackend, chained
-from fcslam.lidar.closing import ClosingConfig
+from fcslam.lidar.closing import ClosingConfig, _shortest_paths
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend, motion_information
 from fcslam.lidar.odometry import OdometryConfig
 from fcslam.lidar.tracker import TrackedScan
@@ -215,3 +216,16 @@ def test_a_well_known_area_holds_no_more_submaps_however_often_it_is_crossed():
     assert len(squares) >= 3
     assert all(submap.closures for submap in newest)
     assert pose_errors(mapped.poses, truth)[0].max() < 0.05
+
+
+def test_shortest_paths_are_those_of_dijkstra():
+    rng = np.random.default_rng(0)
+    steps, closures = rng.uniform(0.0, 3.0, 59), rng.integers(0, 60, (25, 2))
+    ends = np.concatenate((np.stack((np.arange(59), np.arange(1, 60)), axis=1), closures))
+    links = np.full((60, 60), np.inf)
+    for (i, j), length in zip(ends, (*steps, *np.full(25, 1.0)), strict=True):
+        links[i, j] = links[j, i] = min(links[i, j], length)
+    for source in (0, 31, 59):
+        paths = _shortest_paths(source, steps, closures, 1.0)
+        np.testing.assert_allclose(paths, dijkstra(csgraph_from_dense(links, np.inf), indices=source), rtol=1e-12)
+    assert _shortest_paths(0, np.empty(0), np.empty((0, 2), np.int64), 1.0) == [0.0]
