@@ -24,7 +24,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import common
 import numpy as np
@@ -182,18 +182,35 @@ def strangers(folder: Path, logs: Sequence[str], mapped: str, work: Path) -> Ite
             print(error, flush=True)
 
 
-def carried_away(building: str, seed: int) -> Iterable[tuple]:
+class Carried(NamedTuple):
+    """A robot that was carried away, and what it believed."""
+
+    poses: LocalizedPoses
+    drive: Drive
+    moment: int
+    """Number of the first scan at the other place."""
+    T_building_map: FloatArray
+
+
+def carry_away(building: str, seed: int) -> Carried | None:
+    """Localise a robot that is carried away; None if the building is too small."""
     settings = SimulationSettings(building=Building(building), robots=5, path_length_m=PATH_M, camera=None)
     robots = simulate_fleet(settings, seed).robots
     drives = [Drive(robot.name, list(robot.scans()), robot.T_building_base) for robot in robots]
     drive, moment = kidnap(drives[1], drives[2], np.random.default_rng(seed))
     if not moment:
-        return
+        return None
     run = fcslam.map_recordings([Scans(drives[k].name, drives[k].scans) for k in MAPPING])
     first = run.trajectories[drives[0].name]
     T_building_map = align(drives[0].truth(first.stamps), first.T_map_base)
     poses = localized(Scans(drive.name, drive.scans), run.maps[first.map_index])[0].localized[drive.name]
-    yield building, seed, *verdict(poses, drive, moment, T_building_map)
+    return Carried(poses, drive, moment, T_building_map)
+
+
+def carried_away(building: str, seed: int) -> Iterable[tuple]:
+    carried = carry_away(building, seed)
+    if carried is not None:
+        yield building, seed, *verdict(*carried)
 
 
 def verdict(poses: LocalizedPoses, drive: Drive, moment: int, T_building_map: FloatArray) -> tuple:

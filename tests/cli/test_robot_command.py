@@ -77,6 +77,7 @@ def test_the_token_goes_with_every_request(log, cloud, tmp_path):
         ),
         (["--state", "/dev/null/state"], "cannot be made"),
         (["--ca", "nowhere"], "cannot read a certificate authority"),
+        (["--localize", "nowhere"], "`fcslam localize RECORDING --map MAP` localises a recording"),
     ],
 )
 def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reason):
@@ -86,6 +87,21 @@ def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reas
     assert reason in err
     assert err.count("\n") == 1
     assert cloud.cloud.stored == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--localize", "nowhere", "--server", "https://cloud.example"], "leave --server and --state out"),
+        (["--localize", "nowhere", "--initial-pose", "1,2"], "--initial-pose '1,2' is no pose"),
+        (["--initial-pose", "1,2,3"], "an initial pose is one in a finished map; give --localize, too"),
+    ],
+)
+def test_what_a_localised_robot_cannot_use_is_one_line(capsys, arguments, reason):
+    assert main(["robot", "ros2:/robot1", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert reason in err
+    assert err.count("\n") == 1
 
 
 def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, capsys):

@@ -1,5 +1,8 @@
 """A robot in a finished map: found where it is, followed, lost when carried away, never placed in another building."""
 
+from concurrent.futures import Future
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +16,8 @@ from fcslam.localization import run_localization
 from fcslam.maps.fusion import fuse
 from fcslam.mission import MissionConfig
 from fcslam.records import Keyscan, KeyscanId
+from fcslam.robot.frontend import RobotFrontend
+from fcslam.robot.map_localizer import MapLocalizer
 from tests import small_fleet
 from tests.robot.kidnapping import put_down
 
@@ -112,6 +117,37 @@ def test_a_robot_that_is_carried_away_is_found_again_and_never_wrong(fleet, buil
     assert run.metrics["losses"].value == 1
     assert wrong.sum() <= 5  # scans until the robot notices
     assert poses.is_localized[-1]
+
+
+class Keyscans:
+    """Keeps what the front end gives its back end."""
+
+    def __init__(self):
+        self.inputs = []
+
+    def submit(self, input):
+        self.inputs.append(input)
+        done = Future()
+        done.set_result([])
+        return done
+
+
+def test_quality_falls_with_the_first_keyscan_that_shows_other_walls(fleet, building):
+    robot, kept, config = fleet.robots[2], Keyscans(), MissionConfig().robot
+    frontend = RobotFrontend("robot", config, kept)
+    for scan in robot.scans():
+        frontend.process(scan)
+    start = small_fleet.truth_at(robot, [robot.stamps[0]])[0]
+    localizer = MapLocalizer(frozen_map(building, "building"), config.localization, config.lidar, start)
+    qualities = []
+    for new in kept.inputs[:8]:
+        localizer.submit(new)
+        qualities.append(localizer.estimate.quality)
+    assert min(qualities) > 0.9
+    last = kept.inputs[8].keyscan
+    mirrored = replace(last.points, points=last.points.points * (1, -1), normals=last.points.normals * (1, -1))
+    localizer.submit(replace(kept.inputs[8], keyscan=replace(last, points=mirrored)))
+    assert localizer.estimate is None or localizer.estimate.quality < 0.7
 
 
 def test_the_best_alignment_is_the_one_that_nothing_elsewhere_beats(fleet):

@@ -93,6 +93,7 @@ app.command(
         "fcslam robot robot1.clf.gz --server http://127.0.0.1:8340 --state state",
         "fcslam robot robot1.bag --server https://cloud:8340 --state s --token-file t",
         "fcslam robot ros2:/robot1 -o runs/robot1",
+        "fcslam robot ros2:/robot1 --localize runs/building",
         "fcslam robot --explain-traffic",
     ),
 )(robots.robot)

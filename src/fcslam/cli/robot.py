@@ -181,6 +181,8 @@ def robot(
     keep_private()
     settings = mission_config(config)
     token, own = _token(token_file), _own_certificate(certificate, key)
+    if localize is None and initial_pose is not None:
+        raise InputError("an initial pose is one in a finished map; give --localize, too")
     if is_address(source):
         start: Callable[..., Robot | LocalizedRobot] = partial(
             Robot, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,

@@ -93,7 +93,8 @@ class MapEstimate:
     covariance: FloatArray
     """Of the keyscan's pose in the map, over (x, y, theta), shape (3, 3)."""
     quality: float
-    """Share of the walls seen lately, where the map knows the area, that lie on walls of the map; in [0, 1]."""
+    """Share of the walls, where the map knows the area, that lie on walls of the map: the smaller one of those seen in
+    the last metres and of those of the newest keyscan; in [0, 1]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,7 +166,8 @@ class MapLocalizer:
         self._T_map_base: FloatArray | None = None
         """Pose of the newest keyscan; None: unknown."""
         self._covariance: FloatArray = np.zeros((3, 3))
-        self._quality = 0.0
+        self._quality = self._newest_share = 0.0
+        """Shares of the walls of the last metres, and of those of the newest keyscan, that lie on walls of the map."""
         self._votes: list[_Vote] = []
         """The alignments of separate stretches that agree so far."""
         self._searched_m = 0.0
@@ -183,7 +185,8 @@ class MapLocalizer:
         if self._T_map_base is not None and before is not None:
             # 1. Prediction by the robot's own motion, correction by the map.
             self._T_map_base = self._match(self._predict(self._T_map_base, before, keyscan), keyscan)
-            # 2. Now and then, compare the walls around the robot with the map.
+            # 2. Compare the newest walls with the map, and now and then all around the robot.
+            self._newest_share = self._explained(0.0, self._newest_share)
             if keyscan.travel_m >= self._checked_m + self._config.check_m:
                 self._check(keyscan)
         # 3. Try the pose that somebody gave.
@@ -203,6 +206,12 @@ class MapLocalizer:
         motion = turn @ np.linalg.inv(keyscan.odometry.information) @ turn.T
         self._covariance = lever @ self._covariance @ lever.T + motion
         return predicted
+
+    def _explained(self, reach_m: float, otherwise: float) -> float:
+        """Share of the walls of the last metres that lie on walls of the map; ``otherwise``, if it knows too little."""
+        assert self._T_map_base is not None
+        found = self._agreement(self._T_map_base, reach_m)
+        return found.explained if found.overlap >= self._config.overlap else otherwise
 
     def _match(self, T_map_guess: FloatArray, keyscan: MappedKeyscan) -> FloatArray:
         """The pose matched with the map, with the guess as prior."""
@@ -312,6 +321,7 @@ class MapLocalizer:
         self._covariance = np.diag((FIRST_SIGMA_M**2, FIRST_SIGMA_M**2, FIRST_SIGMA_RAD**2))
         self._checked_m = self._seen_m = keyscan.travel_m
         self._quality = self._agreement(T_map_base, self._config.checked_m).explained
+        self._newest_share = self._explained(0.0, self._quality)
 
     def _lose(self) -> None:
         self.losses += self._T_map_base is not None
@@ -325,7 +335,8 @@ class MapLocalizer:
             self.estimate = None
             return
         T_map_odom = se2.compose(self._T_map_base, se2.inverse(keyscan.T_local_base))
-        self.estimate = MapEstimate(frozen(T_map_odom), frozen(self._covariance), self._quality)
+        quality = min(self._quality, self._newest_share)
+        self.estimate = MapEstimate(frozen(T_map_odom), frozen(self._covariance), quality)
 
 
 def _turn(theta: float) -> FloatArray:

@@ -41,8 +41,8 @@ class LocalizedPoses:
     sigma: FloatArray
     """Standard deviations of x, y (m) and theta (rad), shape (N, 3); NaN where the robot was not localised."""
     quality: FloatArray
-    """Share of the walls seen lately, where the map knows the area, that lie on walls of the map, shape (N,); 0 where
-    the robot was not localised."""
+    """Share of the walls, where the map knows the area, that lie on walls of the map, shape (N,): the smaller one of
+    those seen in the last metres and of those of the newest keyscan; 0 where the robot was not localised."""
 
     @property
     def is_localized(self) -> NDArray[np.bool_]:
