@@ -43,8 +43,14 @@ def attached(number):
 class ZenohPeer:
     def __init__(self, port, domain=0):
         self.session = _session('"peer"', "tcp/127.0.0.1:0", f"tcp/127.0.0.1:{port}")
-        self.domain, self.entities, self.tokens = domain, 0, []
+        self.domain, self.entities, self.tokens, self.seen = domain, 0, [], set()
+        everything = f"@ros2_lv/{domain}/**"
+        self.tokens.append(self.session.liveliness().declare_subscriber(everything, self._see, history=True))
         self._declare("NN")
+
+    def _see(self, sample):
+        is_there = sample.kind == zenoh.SampleKind.PUT
+        (self.seen.add if is_there else self.seen.discard)(str(sample.key_expr))
 
     def _declare(self, entity, *words):
         number = f"0/{self.entities}"
@@ -100,12 +106,9 @@ class ZenohPeer:
 
     def graph(self):
         """The entities of the domain as rmw_zenoh reads their tokens: 9 words of a node, 13 of an endpoint."""
-        found = []
-        for reply in self.session.liveliness().get(f"@ros2_lv/{self.domain}/**"):
-            words = str(reply.ok.key_expr).split("/")
-            assert len(words) == (9 if words[5] == "NN" else 13)
-            found.append(tuple(words[5:]))
-        return found
+        found = [token.split("/") for token in tuple(self.seen)]
+        assert all(len(words) == (9 if words[5] == "NN" else 13) for words in found)
+        return {tuple(words[5:]) for words in found}
 
     def close(self):
         self.session.close()
