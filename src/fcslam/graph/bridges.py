@@ -34,8 +34,7 @@ def contradicted_bridges(
 
     Two robots contradict each other if their maps do so at enough separate places. If robots of several senders on each
     side contradict the other side, and the maps agree at no place, the robot between them is wrong and loses its ties
-    to both. If several contradict one robot that is a side by itself, that robot may be wrong as well, and loses its
-    ties. Otherwise a single sender on a side may be the one that is wrong, and everything stays.
+    to both. Otherwise a single sender on a side may be the one that is wrong, or has drifted, and everything stays.
 
     Args:
         ties: pairs of robots between which closures count.
@@ -48,14 +47,11 @@ def contradicted_bridges(
     """
     found: dict[Pair, int] = {}
     for bridge in sorted(set(senders)):
-        for side, other in combinations(_sides(ties, senders, bridge), 2):
+        sides = [side for side in _sides(ties, senders, bridge) if _are_several(side, senders)]
+        for side, other in combinations(sides, 2):
             against, places = _contradicting(side, other, compare, least_places)
-            several = [len({senders[pair[end]] for pair in against}) >= _SEVERAL for end in (0, 1)]
-            leaving = [
-                *(side if several[1] and (several[0] or _is_one(side, senders)) else ()),
-                *(other if several[0] and (several[1] or _is_one(other, senders)) else ()),
-            ]
-            found |= {pair: places for pair in ties if _connects(pair, bridge, leaving, senders)}
+            if all(_are_several([pair[end] for pair in against], senders) for end in (0, 1)):
+                found |= {pair: places for pair in ties if _connects(pair, bridge, (*side, *other), senders)}
     return found
 
 
@@ -68,6 +64,10 @@ def _sides(ties: Collection[Pair], senders: Sequence[int], bridge: int) -> list[
             group = {robot: kept if number == gone else number for robot, number in group.items()}
     reached = {group[robot] for pair in ties for robot in pair if robot in group and not group.keys() >= set(pair)}
     return [[robot for robot in group if group[robot] == number] for number in sorted(reached)]
+
+
+def _are_several(robots: Sequence[int], senders: Sequence[int]) -> bool:
+    return len({senders[robot] for robot in robots}) >= _SEVERAL
 
 
 def _contradicting(
@@ -83,10 +83,6 @@ def _contradicting(
             pairs.append(pair)
             places += overlap.contradicting
     return pairs, places
-
-
-def _is_one(side: Sequence[int], senders: Sequence[int]) -> bool:
-    return len({senders[robot] for robot in side}) == 1
 
 
 def _connects(pair: Pair, bridge: int, side: Collection[int], senders: Sequence[int]) -> bool:
