@@ -58,6 +58,7 @@ def serve(
     import logging
 
     from fcslam.errors import ServiceError
+    from fcslam.page.routes import page_router
     from fcslam.service.http.app import create_app
     from fcslam.service.warmup import warm_up_decoding
     from fcslam.storage.files import keep_private
@@ -74,7 +75,7 @@ def serve(
         tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
-        server = _server(create_app(state, docs=docs), tls_certificate, tls_key, client_ca)
+        server = _server(create_app(state, (page_router(),), docs), tls_certificate, tls_key, client_ca)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
         shown = f"[{address}]" if ":" in address else address

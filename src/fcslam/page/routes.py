@@ -1,0 +1,36 @@
+"""The files of the page. They hold no data of a mission, so nobody needs a token for them."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from fastapi import APIRouter
+from fastapi.responses import FileResponse
+
+ASSETS = Path(__file__).parent / "assets"
+FILES = {
+    "/": ("index.html", "text/html"),
+    "/page.js": ("page.js", "text/javascript"),
+    "/page.css": ("page.css", "text/css"),
+}
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",
+}
+
+
+def page_router() -> APIRouter:
+    """The page at ``/``, its script and its style."""
+    router = APIRouter(include_in_schema=False)
+    for path, (name, media_type) in FILES.items():
+        router.add_api_route(path, _sender(name, media_type), methods=["GET"])
+    return router
+
+
+def _sender(name: str, media_type: str) -> Callable[[], FileResponse]:
+    def send() -> FileResponse:
+        return FileResponse(ASSETS / name, media_type=media_type, headers=HEADERS)
+
+    return send
