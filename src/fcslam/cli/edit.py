@@ -38,10 +38,10 @@ Polygon = Annotated[
     str, typer.Argument(metavar="CORNERS", help='Corners in the map, metres: "X,Y X,Y X,Y". Two are a rectangle.')
 ]
 Session = Annotated[str, typer.Argument(help="Session, such as anna or anna+1.")]
-SessionI = Annotated[str, typer.Argument(metavar="SESSION_I")]
-SessionJ = Annotated[str, typer.Argument(metavar="SESSION_J")]
+SessionI = Annotated[str, typer.Argument(metavar="SESSION_I", help="One session, such as anna or anna+1.")]
+SessionJ = Annotated[str, typer.Argument(metavar="SESSION_J", help="The other session.")]
 StampI = Annotated[float, typer.Argument(metavar="STAMP_I", help="Seconds, as in closures.csv.")]
-StampJ = Annotated[float, typer.Argument(metavar="STAMP_J")]
+StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="The same of the other session.")]
 
 
 @app.command("list", epilog=examples("fcslam edit list runs/building"))
@@ -113,9 +113,7 @@ def pin(
     _decide(mission, Pin(session_i, session_j, (stamp_i, stamp_j)), author)
 
 
-@app.command(
-    epilog=examples("fcslam edit close runs/building anna 1000.5 ben 1033.25 --pose 0.5,0,3.14 --tolerance 0.2,0.05")
-)
+@app.command(epilog=examples("fcslam edit close runs/building anna 1000.5 ben 1033.25 --pose 0.5,0,3.1"))
 def close(
     mission: Mission,
     session_i: SessionI,
