@@ -52,6 +52,13 @@ def without(said, topic):
 
 
 @pytest.mark.parametrize("name", KINDS)
+def test_a_topic_with_an_endless_name(tmp_path, name):
+    topic = "/scan" + "[" * 2000
+    said = [scan(100.0 + k, topic=topic) for k in range(3)]
+    assert "a topic's name has 2005 characters" in refusal(save(tmp_path / name, [*drive(), *said]))
+
+
+@pytest.mark.parametrize("name", KINDS)
 def test_an_empty_bag(tmp_path, name):
     assert "the bag has no topics" in refusal(save(tmp_path / name, []))
 

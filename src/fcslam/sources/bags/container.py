@@ -23,6 +23,8 @@ _ROS1, _MCAP, _SQLITE = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
 _METADATA = "metadata.yaml"
 _LONGEST_REASON = 200
 _SQLITE_HEADER_BYTES = 100
+_LONGEST_TOPIC = 255
+"""Characters in a topic's name, as in ROS 2."""
 
 
 class Topic(NamedTuple):
@@ -81,6 +83,9 @@ class BagFile:
         counts: Counter[tuple[str, str]] = Counter()
         with self._opened() as reader:
             for connection in reader.connections:
+                if len(connection.topic) > _LONGEST_TOPIC:
+                    length = len(connection.topic)
+                    raise SourceError(f"{self.path}: a topic's name has {length} characters; {self._remedy()}")
                 counts[connection.topic, _type_of(connection)] += connection.msgcount
         return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
