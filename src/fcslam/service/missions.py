@@ -11,11 +11,12 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import ServiceError, StoreError
 from fcslam.records import Change, Edit, Undo
 from fcslam.service.detectors import STAGING, DetectorStore
-from fcslam.service.intake import Intake
+from fcslam.service.intake import Intake, SessionState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_recovery import recover_mission
 from fcslam.service.mission_store import MissionStore
 from fcslam.service.supervisor import RunningWorker
+from fcslam.service.viewed_mission import PacketCounts
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing, write_file
 from fcslam.wire.checks import check_name
@@ -32,7 +33,7 @@ Launch = Callable[[MissionFolder], RunningWorker]
 
 
 class OpenMission:
-    """A mission with an intake and a worker."""
+    """A mission with an intake and a worker. Viewers see it as a ``ViewedMission``."""
 
     def __init__(
         self, folder: MissionFolder, config: CloudConfig, clock: Callable[[], float],
@@ -50,6 +51,28 @@ class OpenMission:
         self.intake = Intake(self.store, clock, wall_clock, detectors.announced, limits)
         self.worker = launch(folder)
         self._wall_clock = wall_clock
+
+    @property
+    def name(self) -> str:
+        """Of the mission."""
+        return self.folder.name
+
+    @property
+    def run_folder(self) -> Path | None:
+        """The live run folder as it is now; None: the worker has written none yet."""
+        return self.folder.live.resolve() if self.folder.live.exists() else None
+
+    def sessions(self, robot: str | None = None) -> list[SessionState]:
+        """Sessions of one robot or of all, by robot and epoch."""
+        return self.intake.sessions(robot)
+
+    def last_heard_s(self, robot: str) -> float | None:
+        """Seconds since the robot's last batch; None: never since the service started."""
+        return self.intake.last_heard_s(robot)
+
+    def packet_counts(self) -> PacketCounts:
+        """How far the packets of all robots are."""
+        return PacketCounts(self.intake.ready_count(), self.store.applied(), self.intake.waiting_count())
 
     def edit(self, content: Change | Undo, author: str) -> Edit:
         """Append an edit to the mission's log; the worker follows it.

@@ -19,9 +19,9 @@ from fcslam.service.http.state import ACTOR, ServiceState
 from fcslam.service.http.viewers import fleet_router, map_router
 
 PREFIX = "/api/v1"
-ROUTERS = (
-    robot_router, detector_router, fleet_router, map_router, mission_router, file_router, decision_router, event_router,
-)  # fmt: skip
+VIEWER_ROUTERS = (fleet_router, map_router, event_router)
+"""Routes of the page; they read."""
+ROUTERS = (robot_router, detector_router, mission_router, file_router, decision_router)
 
 
 class Service(FastAPI):
@@ -56,7 +56,7 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
         lifespan=lifespan,
     )
     add_handlers(app)
-    for make in ROUTERS:
+    for make in (*ROUTERS, *VIEWER_ROUTERS):
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(operations_router(state))
     for router in more:

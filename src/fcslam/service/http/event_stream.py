@@ -8,12 +8,12 @@ from fastapi.responses import Response, StreamingResponse
 
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import content, refusals
-from fcslam.service.http.state import ServiceState
+from fcslam.service.http.state import ViewerState
 
 EVENTS = "text/event-stream"
 
 
-def event_router(state: ServiceState) -> APIRouter:
+def event_router(state: ViewerState) -> APIRouter:
     """One stream."""
     router = APIRouter(
         tags=["viewers"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503)

@@ -65,6 +65,7 @@ class FleetSummary(Settings):
     """Counts."""
 
     mission: str
+    read_only: bool = Field(description="whether nobody can change the mission here: it is a finished run")
     packets: int
     applied: int = Field(description="packets that took effect")
     waiting: int = Field(description="packets that wait for an earlier one")

@@ -9,9 +9,17 @@ from starlette.concurrency import run_in_threadpool
 from fcslam.records import NAME, Channel
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import RateLimit, read_body
-from fcslam.service.http.responses import PacketProblem, PacketRefusal, RobotState, content, refusals
+from fcslam.service.http.responses import (
+    DetectorSummary,
+    PacketProblem,
+    PacketRefusal,
+    RobotState,
+    content,
+    refusals,
+)
 from fcslam.service.http.state import ServiceState
 from fcslam.service.intake import IntakeReply
+from fcslam.service.mission_store import MissionStore
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,
@@ -84,7 +92,7 @@ def robot_router(state: ServiceState) -> APIRouter:
             next={str(session.epoch): session.next for session in sessions},
             correction=correction.correction.version if correction else -1,
             map=correction.correction.map_index if correction else None,
-            refused=refused_packets(state, robot),
+            refused=refused_packets(store, robot),
         )
 
     return router
@@ -92,10 +100,20 @@ def robot_router(state: ServiceState) -> APIRouter:
 
 def detector_router(state: ServiceState) -> APIRouter:
     """Detectors for robots."""
-    router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
+    router = APIRouter(responses=refusals(400, 401, 403, 503))
+
+    @router.get("/detectors", tags=["fleet"], dependencies=state.require(Role.VIEWER, Role.ADMIN))
+    def get_detectors() -> list[DetectorSummary]:
+        """Detectors that robots may download, and whether they are announced."""
+        announced = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
+        return [
+            DetectorSummary(channel=Channel(channel), version=version, announced=(channel, version) in announced)
+            for channel, version in state.detectors.versions()
+        ]
 
     @router.get(
         "/detectors/{channel}/{version}",
+        tags=["robots"],
         dependencies=state.require(*Role),
         response_class=Response,
         responses={**refusals(404), 200: content(NETWORK)},
@@ -110,11 +128,11 @@ def detector_router(state: ServiceState) -> APIRouter:
     return router
 
 
-def refused_packets(state: ServiceState, robot: str) -> list[PacketRefusal]:
+def refused_packets(store: MissionStore, robot: str) -> list[PacketRefusal]:
     """Refused packets of a robot."""
     return [
         PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
-        for epoch, sequence, reason in state.mission.store.refusals(robot)
+        for epoch, sequence, reason in store.refusals(robot)
     ]
 
 

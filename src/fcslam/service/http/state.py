@@ -4,6 +4,7 @@ import asyncio
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from fastapi import Depends, HTTPException, Request, Security
 from fastapi.params import Depends as Dependency
@@ -17,6 +18,7 @@ from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission
 from fcslam.service.token_buckets import TokenBuckets
+from fcslam.service.viewed_mission import ViewedMission
 
 UNKNOWN_PER_S, UNKNOWN_BURST = 50.0, 1000.0
 """Requests without a known token that are answered 401, on average and at once; further ones are hung up on."""
@@ -25,6 +27,25 @@ ANYBODY = "anybody"
 ACTOR = "actor"
 """What the state of a request names whoever asks for what only administrators may do."""
 _BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
+
+
+class ViewerState(Protocol):
+    """Passed to the routers of viewers: by the service, or for a run that nobody can change."""
+
+    @property
+    def mission(self) -> ViewedMission:
+        """The mission that viewers see."""
+
+    @property
+    def events(self) -> EventStream:
+        """Changes of it."""
+
+    @property
+    def read_only(self) -> bool:
+        """Whether nobody can change the mission here, whoever asks."""
+
+    def require(self, *roles: Role) -> list[Dependency]:
+        """Dependencies of a route that only these roles may ask."""
 
 
 @dataclass(slots=True)
@@ -43,6 +64,11 @@ class ServiceState:
     """Whether the service is stopping and takes no new requests."""
     changing: asyncio.Lock = field(default_factory=asyncio.Lock)
     """Held while missions are created, opened or imported."""
+
+    @property
+    def read_only(self) -> bool:
+        """Administrators change the mission."""
+        return False
 
     @property
     def mission(self) -> OpenMission:

@@ -12,12 +12,11 @@ from fastapi.responses import FileResponse, Response
 from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.sessions import session_name
 from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
-from fcslam.records import Channel, ClosureStatus
+from fcslam.records import ClosureStatus
 from fcslam.runs import POSE_GRAPH, TRAJECTORIES, ClosureRow, Run, open_run
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
     ClosureSummary,
-    DetectorSummary,
     FleetSummary,
     MapSummary,
     RobotSummary,
@@ -26,7 +25,7 @@ from fcslam.service.http.responses import (
     refusals,
 )
 from fcslam.service.http.robots import Name, refused_packets
-from fcslam.service.http.state import ServiceState
+from fcslam.service.http.state import ViewerState
 
 MOST = 2**31 - 1
 """Largest number of a map or tile."""
@@ -36,7 +35,7 @@ TEXT = "text/plain"
 MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "application/yaml"}
 
 
-def fleet_router(state: ServiceState) -> APIRouter:
+def fleet_router(state: ViewerState) -> APIRouter:
     """Robots, closures and vocabularies."""
     router = APIRouter(
         tags=["fleet"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503, 507)
@@ -45,12 +44,14 @@ def fleet_router(state: ServiceState) -> APIRouter:
     @router.get("/fleet")
     def get_fleet() -> FleetSummary:
         """Counts."""
-        mission, run = state.mission, _live_run(state)
+        mission, run = state.mission, _run_of(state)
+        counts = mission.packet_counts()
         return FleetSummary(
-            mission=mission.folder.name,
-            packets=mission.intake.ready_count(),
-            applied=mission.store.applied(),
-            waiting=mission.intake.waiting_count(),
+            mission=mission.name,
+            read_only=state.read_only,
+            packets=counts.arrived,
+            applied=counts.applied,
+            waiting=counts.waiting,
             robots=list(run.trajectories),
             maps=len({robot.map_index for robot in run.trajectories.values()}),
             # JSON has no NaN
@@ -64,7 +65,7 @@ def fleet_router(state: ServiceState) -> APIRouter:
         """All robots' sessions."""
         return [
             robot
-            for name in dict.fromkeys(s.robot for s in state.mission.intake.sessions())
+            for name in dict.fromkeys(s.robot for s in state.mission.sessions())
             for robot in _sessions(state, name)
         ]
 
@@ -74,33 +75,28 @@ def fleet_router(state: ServiceState) -> APIRouter:
         sessions = _sessions(state, robot)
         if not sessions:
             raise HTTPException(404, f"there is no robot '{robot}'")
-        return RobotSummary(robot=robot, sessions=sessions, refused=refused_packets(state, robot))
+        return RobotSummary(robot=robot, sessions=sessions, refused=refused_packets(state.mission.store, robot))
 
     @router.get("/closures", responses=refusals(400))
     def get_closures(
         status: ClosureStatus | None = None, limit: Annotated[int, Query(ge=1, le=10_000)] = 1000
     ) -> list[ClosureSummary]:
         """The newest closures."""
-        chosen = [closure for closure in _live_run(state).closures if status in (None, closure.status)]
+        chosen = [closure for closure in _run_of(state).closures if status in (None, closure.status)]
         return [_closure(closure) for closure in chosen[-limit:]]
 
     @router.get("/vocabulary")
     def get_vocabulary() -> dict[str, float]:
         """Words by channel and detector version."""
         prefix = "words_"
-        metrics = _live_run(state).metrics
+        metrics = _run_of(state).metrics
         return {name.removeprefix(prefix): m.value for name, m in metrics.items() if name.startswith(prefix)}
-
-    @router.get("/detectors")
-    def get_detectors() -> list[DetectorSummary]:
-        """Detectors that robots may download, and whether they are announced."""
-        return _detectors(state)
 
     return router
 
 
-def map_router(state: ServiceState) -> APIRouter:
-    """The live run's files."""
+def map_router(state: ViewerState) -> APIRouter:
+    """The run's files."""
     router = APIRouter(
         tags=["maps"], dependencies=state.require(Role.VIEWER, Role.ADMIN), responses=refusals(401, 403, 503)
     )
@@ -108,7 +104,7 @@ def map_router(state: ServiceState) -> APIRouter:
     @router.get("/maps")
     def get_maps() -> list[MapSummary]:
         """The robots of each map."""
-        robots = _live_run(state).trajectories.values()
+        robots = _run_of(state).trajectories.values()
         numbers = sorted({robot.map_index for robot in robots})
         return [MapSummary(map=k, robots=[r.robot for r in robots if r.map_index == k]) for k in numbers]
 
@@ -127,7 +123,7 @@ def map_router(state: ServiceState) -> APIRouter:
     def get_tile(k: Index, z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)], x: Square, y: Square) -> Response:
         """A square of a map: at zoom z it has 256 m / 2^z; x and y count squares from the origin, y upwards."""
         try:
-            tile = tile_png(_live_folder(state), _stem(k), z, x, y)
+            tile = tile_png(_folder_of(state), _stem(k), z, x, y)
         except FileNotFoundError as error:
             raise HTTPException(404, f"there is no {_stem(k)}") from error
         return Response(tile, media_type=MEDIA["png"])
@@ -147,40 +143,33 @@ def map_router(state: ServiceState) -> APIRouter:
     return router
 
 
-def _live_folder(state: ServiceState) -> Path:
-    """The live run folder as it is now.
+def _folder_of(state: ViewerState) -> Path:
+    """The run folder as it is now.
 
     Refuses (HTTPException 404): there is none yet.
     """
-    live = state.mission.folder.live
-    if not live.exists():
+    folder = state.mission.run_folder
+    if folder is None:
         raise HTTPException(404, "there is no map yet")
-    return live.resolve()
+    return folder
 
 
-def _live_run(state: ServiceState) -> Run:
-    return _run(_live_folder(state)) if state.mission.folder.live.exists() else Run({})
+def _run_of(state: ViewerState) -> Run:
+    folder = state.mission.run_folder
+    return Run({}) if folder is None else _run(folder)
 
 
-def _file(state: ServiceState, name: str, media_type: str = TEXT) -> FileResponse:
-    path = _live_folder(state) / name
+def _file(state: ViewerState, name: str, media_type: str = TEXT) -> FileResponse:
+    path = _folder_of(state) / name
     if not path.is_file():
         raise HTTPException(404, f"there is no {name}")
     return FileResponse(path, media_type=media_type)
 
 
-def _detectors(state: ServiceState) -> list[DetectorSummary]:
-    announced = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
-    return [
-        DetectorSummary(channel=Channel(channel), version=version, announced=(channel, version) in announced)
-        for channel, version in state.detectors.versions()
-    ]
-
-
-def _sessions(state: ServiceState, robot: str) -> list[SessionSummary]:
-    store, mapped = state.mission.store, _live_run(state).trajectories
+def _sessions(state: ViewerState, robot: str) -> list[SessionSummary]:
+    store, mapped = state.mission.store, _run_of(state).trajectories
     sessions, changes = [], in_force(store.edits())
-    for session in state.mission.intake.sessions(robot):
+    for session in state.mission.sessions(robot):
         name = session_name(robot, session.epoch)
         known, correction = mapped.get(name), store.correction(robot, session.epoch)
         sessions.append(
@@ -197,7 +186,7 @@ def _sessions(state: ServiceState, robot: str) -> list[SessionSummary]:
                 correction=correction.correction.version if correction else -1,
                 quality=correction.correction.quality if correction else 0.0,
                 removed=is_removed(name, changes),
-                last_heard_s=state.mission.intake.last_heard_s(robot),
+                last_heard_s=state.mission.last_heard_s(robot),
             )
         )
     return sessions

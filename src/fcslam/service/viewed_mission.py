@@ -1,0 +1,43 @@
+"""What viewers see of a mission. A live mission and a finished run give it in the same form, so one page shows both."""
+
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from fcslam.service.intake import SessionState
+from fcslam.service.mission_store import MissionStore
+
+
+class PacketCounts(NamedTuple):
+    """How far the packets of a mission are."""
+
+    arrived: int
+    """With all those before them in their sessions."""
+    applied: int
+    """That took effect."""
+    waiting: int
+    """That wait for an earlier one."""
+
+
+class ViewedMission(Protocol):
+    """A mission as viewers see it. Any thread may call; nothing here changes the mission."""
+
+    @property
+    def name(self) -> str:
+        """Of the mission or of the run folder."""
+
+    @property
+    def run_folder(self) -> Path | None:
+        """The newest run folder, in which no file ever changes; None: there is none yet."""
+
+    @property
+    def store(self) -> MissionStore:
+        """Packets, edits and corrections, for reading."""
+
+    def sessions(self, robot: str | None = None) -> list[SessionState]:
+        """Sessions of one robot or of all, by robot and epoch."""
+
+    def last_heard_s(self, robot: str) -> float | None:
+        """Seconds since the robot's last batch; None: never."""
+
+    def packet_counts(self) -> PacketCounts:
+        """How far the packets of all robots are."""
