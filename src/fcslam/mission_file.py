@@ -5,6 +5,7 @@ A mission that goes on needs no recording of earlier robots: their packets take 
 
 import fcntl
 import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from fcslam.records import Change, Edit, Undo
 from fcslam.runs.folder import MISSION
 from fcslam.service.mission_store import CONFIG, MissionStore, StoredPacket, check_mission
 from fcslam.sources.faults import Faults
+from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing
 from fcslam.wire.packets import SizedPacket, decode
 
@@ -68,16 +70,29 @@ def read_mission(path: Path) -> SavedMission:
     """
     path = mission_path(path)
     try:
-        check_mission(path)
-        with TemporaryDirectory() as place:  # opening it for reading would leave files beside it
-            copy = Path(place) / MISSION
-            copy.write_bytes(path.read_bytes())
-            with closing(MissionStore(copy)) as store:
-                return _read(store)
+        with opened_copy(path) as store:
+            return _read(store)
     except PacketError as error:
         raise SourceError(f"{path}: {error}") from error
     except StoreError as error:
         raise SourceError(str(error)) from error
+
+
+@contextmanager
+def opened_copy(path: Path | None) -> Iterator[MissionStore]:
+    """Open a copy of a mission file, which itself is not changed; None: a mission before its first packet.
+
+    Raises:
+        StoreError: the file is damaged or of another version, or cannot be read.
+    """
+    with TemporaryDirectory() as place:  # opening the file for reading would leave files beside it
+        copy = Path(place) / MISSION
+        if path is not None:
+            check_mission(path)
+            with translate_errors(path):
+                shutil.copyfile(path, copy)
+        with closing(MissionStore(copy)) as store:
+            yield store
 
 
 def mission_bytes(
@@ -97,7 +112,7 @@ def mission_bytes(
         tracks: the scans of each session, by its name.
     """
     with TemporaryDirectory() as place:
-        with closing(MissionStore(Path(place) / "mission.sqlite")) as store:
+        with opened_copy(None) as store:
             store.configure(config)
             store.put([*map(_stored, packets), *refused], 0.0)
             for edit in edits:
@@ -123,18 +138,14 @@ def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, tim
     """
     path = mission_path(path)
     try:
-        with _exclusively(path), TemporaryDirectory() as place:
-            check_mission(path)
-            copy = Path(place) / MISSION
-            copy.write_bytes(path.read_bytes())
-            with closing(MissionStore(copy)) as store:
-                for content in contents:
-                    check_edit(content)
-                    store.check_named(content)
-                edits = [store.edit(content, author, time_s) for content in contents]
-                with replacing(path) as unfinished:
-                    store.export(unfinished)
-            return edits
+        with _exclusively(path), opened_copy(path) as store:
+            for content in contents:
+                check_edit(content)
+                store.check_named(content)
+            edits = [store.edit(content, author, time_s) for content in contents]
+            with replacing(path) as unfinished:
+                store.export(unfinished)
+        return edits
     except StoreError as error:
         raise SourceError(str(error)) from error
     except OSError as error:

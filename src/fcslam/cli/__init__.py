@@ -19,6 +19,7 @@ from fcslam.cli import (
     info,
     live,
     serve,
+    show,
     simulate,
     tokens,
     train,
@@ -108,6 +109,14 @@ app.command(
         "fcslam serve --data missions --host 0.0.0.0 --tokens tokens.yaml",
     ),
 )(serve.serve)
+app.command(
+    "show",
+    epilog=examples(
+        "fcslam show runs/building",
+        "fcslam show runs/building --html report.html",
+        "fcslam show runs/building/mission.fcslam --port 8350 --no-open",
+    ),
+)(show.show)
 app.command(
     "certificates",
     epilog=examples("fcslam certificates --host cloud.local --robot robot1 --admin boss"),

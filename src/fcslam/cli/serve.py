@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.listening import listen
 from fcslam.cli.mission_options import ConfigFile, mission_config
 from fcslam.cli.options import Quiet
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
 
 if TYPE_CHECKING:
-    import socket
-
     import uvicorn
     from fastapi import FastAPI
 
@@ -68,7 +67,7 @@ def serve(
     _check_tls(tls_certificate, tls_key, client_ca)
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    with _listen(host, port) as listening:
+    with listen(host, port) as listening:
         authenticator = _authenticator(tokens, client_ca)
         state = _state(data, authenticator, _cloud_config(config))
         _reload_on_hangup(state, tokens)
@@ -195,15 +194,3 @@ def _check_tls(certificate: Path | None, key: Path | None, client_ca: Path | Non
         context.load_verify_locations(client_ca)
     except (OSError, ssl.SSLError) as error:
         raise ServiceError(f"{client_ca}: no certificate authority can be read ({error})") from error
-
-
-def _listen(host: str, port: int) -> "socket.socket":
-    import socket
-
-    from fcslam.errors import ServiceError
-
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        return socket.create_server(address[:2], family=family, backlog=512)
-    except OSError as error:
-        raise ServiceError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error

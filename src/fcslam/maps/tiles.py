@@ -1,5 +1,6 @@
 """Square tiles of a map as pictures, for viewers that show parts of it."""
 
+import math
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,6 +14,11 @@ WORLD_M = 256.0
 """Side of a tile at zoom 0; each zoom halves it."""
 TILE_PX = 256
 DEEPEST_ZOOM = 8
+
+
+def finest_zoom(resolution_m: float) -> int:
+    """The zoom whose pixels are no larger than cells; deeper ones show nothing more."""
+    return min(max(math.ceil(math.log2(WORLD_M / TILE_PX / resolution_m)), 0), DEEPEST_ZOOM)
 
 
 def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes:

@@ -94,6 +94,14 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
         raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
 
 
+def resolution_of(name: str, description: str) -> float:
+    """The side of a cell in metres, by the content of the YAML file; ``name`` and errors as for ``parse_map``."""
+    try:
+        return _described(description)[0]
+    except ValueError as error:
+        raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
+
+
 def _parsed(pgm: bytes, description: str) -> OccupancyMap:
     header = _PGM_HEADER.match(pgm)
     if header is None:

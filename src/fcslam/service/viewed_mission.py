@@ -1,8 +1,10 @@
 """What viewers see of a mission. A live mission and a finished run give it in the same form, so one page shows both."""
 
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from fcslam.runs import Run, open_run
 from fcslam.service.intake import SessionState
 from fcslam.service.mission_store import MissionStore
 
@@ -41,3 +43,13 @@ class ViewedMission(Protocol):
 
     def packet_counts(self) -> PacketCounts:
         """How far the packets of all robots are."""
+
+
+@lru_cache(maxsize=4)
+def viewed_run(folder: Path) -> Run:
+    """The run in a ``run_folder`` of a viewed mission.
+
+    Raises:
+        EvaluationError: it is broken.
+    """
+    return open_run(folder)

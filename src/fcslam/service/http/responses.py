@@ -123,6 +123,7 @@ class MapSummary(Settings):
 
     map: int
     robots: list[str]
+    zoom: int = Field(description="of the tiles that show every cell; deeper ones show nothing more")
 
 
 class DetectorVersion(Settings):

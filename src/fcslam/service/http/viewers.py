@@ -1,7 +1,6 @@
 """Routes for viewers: the live run as numbers and as files."""
 
 import math
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +10,10 @@ from fastapi.responses import FileResponse, Response
 
 from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.sessions import session_name
-from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
+from fcslam.maps.tiles import DEEPEST_ZOOM, finest_zoom, tile_png
 from fcslam.records import ClosureStatus
-from fcslam.runs import POSE_GRAPH, TRAJECTORIES, ClosureRow, Run, open_run
+from fcslam.runs import POSE_GRAPH, TRAJECTORIES, ClosureRow, Run
+from fcslam.runs.map_files import resolution_of
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
     ClosureSummary,
@@ -26,6 +26,7 @@ from fcslam.service.http.responses import (
 )
 from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
+from fcslam.service.viewed_mission import viewed_run
 
 MOST = 2**31 - 1
 """Largest number of a map or tile."""
@@ -104,9 +105,12 @@ def map_router(state: ViewerState) -> APIRouter:
     @router.get("/maps")
     def get_maps() -> list[MapSummary]:
         """The robots of each map."""
-        robots = _run_of(state).trajectories.values()
-        numbers = sorted({robot.map_index for robot in robots})
-        return [MapSummary(map=k, robots=[r.robot for r in robots if r.map_index == k]) for k in numbers]
+        run = _run_of(state)
+        robots = run.trajectories.values()
+        return [
+            MapSummary(map=k, robots=[r.robot for r in robots if r.map_index == k], zoom=_zoom(run, k))
+            for k in sorted({robot.map_index for robot in robots})
+        ]
 
     @router.get(
         "/maps/{k}.{suffix}", response_class=Response, responses={**refusals(400, 404), 200: content(*MEDIA.values())}
@@ -156,7 +160,7 @@ def _folder_of(state: ViewerState) -> Path:
 
 def _run_of(state: ViewerState) -> Run:
     folder = state.mission.run_folder
-    return Run({}) if folder is None else _run(folder)
+    return Run({}) if folder is None else viewed_run(folder)
 
 
 def _file(state: ViewerState, name: str, media_type: str = TEXT) -> FileResponse:
@@ -192,10 +196,9 @@ def _sessions(state: ViewerState, robot: str) -> list[SessionSummary]:
     return sessions
 
 
-@lru_cache(maxsize=4)
-def _run(folder: Path) -> Run:
-    """A snapshot, which never changes."""
-    return open_run(folder)
+def _zoom(run: Run, k: int) -> int:
+    description = run.map_files.get(f"{_stem(k)}.yaml")
+    return 0 if description is None else finest_zoom(resolution_of(_stem(k), description.decode(errors="replace")))
 
 
 def _stem(k: int) -> str:

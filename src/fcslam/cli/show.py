@@ -1,0 +1,127 @@
+"""`fcslam show`: the page of `fcslam serve` on a finished run, or as one file."""
+
+import os
+import sys
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fcslam.cli.listening import listen
+from fcslam.cli.options import Force, Quiet
+from fcslam.cli.output import notices
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fcslam.page.shown_run import ShownRun
+
+LARGEST_BYTES = 2 * 2**30
+"""Of the files of a run folder: the page's server holds most of them in memory."""
+HOST = "127.0.0.1"
+
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 chooses a free one.")]
+OpenBrowser = Annotated[
+    bool | None,
+    typer.Option("--open/--no-open", help="Open the page in a browser.", show_default="if this machine has a display"),
+]
+
+
+def show(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Run folder, or mission file, which is mapped again first.")
+    ],
+    *,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the page as one file to send, and serve nothing.")
+    ] = None,
+    port: Port = 0,
+    open_browser: OpenBrowser = None,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Show a finished run in the browser, read-only; Ctrl-C ends it."""
+    from fcslam.errors import OutputError
+    from fcslam.page.shown_run import ShownRun
+    from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
+
+    if html is not None and html.exists() and not (force and html.is_file()):
+        raise OutputError(f"{html}: exists; name a new file, or give --force to replace it")
+    console = notices(quiet)
+    with _run_folder(run, console) as folder, ShownRun(folder, folder.resolve().name) as shown:
+        if html is not None:
+            _write_report(shown, html, run)
+            return
+        with listen(HOST, port) as listening:
+            address = f"http://{HOST}:{listening.getsockname()[1]}/"
+            typer.echo(f"fcslam shows {run} at {address}; Ctrl-C ends it")
+            if _has_display() if open_browser is None else open_browser:
+                webbrowser.open(address)
+            run_viewer(viewer_app(ReadOnly(shown)), listening)
+
+
+@contextmanager
+def _run_folder(run: Path, console: "Console") -> Iterator[Path]:
+    """The run folder to show; that of a mission file is made, and removed in the end.
+
+    Raises:
+        InputError: there is no run, it is too large, or it is damaged.
+    """
+    from fcslam.runs.folder import is_run_folder
+    from fcslam.service.viewed_mission import viewed_run
+
+    if run.is_file():
+        with _mapped(run, console) as folder:
+            yield folder
+        return
+    if is_run_folder(run):
+        _check_size(run)
+    viewed_run(run.resolve())  # refuses a damaged one, and what is none
+    yield run
+
+
+@contextmanager
+def _mapped(mission: Path, console: "Console") -> Iterator[Path]:
+    from tempfile import TemporaryDirectory
+
+    from fcslam import api
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.cli.warm_up import compiled
+
+    with TemporaryDirectory() as place:
+        folder = Path(place) / mission.stem
+        with compiled(console), ProgressDisplay(console) as display:
+            display.start("mapping")
+            api.map_recordings([], onto=mission).save(folder)
+        yield folder
+
+
+def _check_size(run: Path) -> None:
+    from fcslam.errors import InputError
+
+    size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
+    if size > LARGEST_BYTES:
+        raise InputError(
+            f"{run}: the files have {size / 2**30:.1f} GiB; fcslam show reads at most {LARGEST_BYTES / 2**30:.0f} GiB"
+        )
+
+
+def _write_report(shown: "ShownRun", html: Path, run: Path) -> None:
+    from fcslam.errors import OutputError
+    from fcslam.page.report import report_html
+    from fcslam.storage.files import write_file
+
+    content = report_html(shown).encode()
+    try:
+        write_file(html, content)
+    except OSError as error:
+        raise OutputError(f"{html}: cannot be written ({error})") from error
+    typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")
+
+
+def _has_display() -> bool:
+    """Whether a browser has somewhere to open a window."""
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

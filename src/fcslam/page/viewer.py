@@ -1,0 +1,59 @@
+"""The page over a run that nobody can change: the routes of viewers alone, for this machine, without tokens."""
+
+import signal
+import socket
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import uvicorn
+from fastapi import FastAPI
+from fastapi.params import Depends as Dependency
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+
+import fcslam
+from fcslam.page.routes import page_router
+from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.events import EventStream
+from fcslam.service.http.problems import add_handlers
+from fcslam.service.viewed_mission import ViewedMission
+
+HOSTS = ("127.0.0.1", "localhost")
+"""Names by which a browser may ask. Other ones are of web pages whose host was pointed to this machine, to read it."""
+LAST_ANSWERS_S = 1
+"""Time for requests in progress when the viewer ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOnly:
+    """A ``ViewerState`` without roles: whoever reaches it may read, and nobody may change anything."""
+
+    mission: ViewedMission
+    events: EventStream = field(default_factory=EventStream)
+    read_only: bool = True
+
+    def require(self, *_: Role) -> list[Dependency]:
+        """Nothing."""
+        return []
+
+
+def viewer_app(state: ReadOnly) -> FastAPI:
+    """The page and what it asks."""
+    app = FastAPI(title="fcslam", version=fcslam.__version__, openapi_url=None, redirect_slashes=False)
+    add_handlers(app)
+    for make in VIEWER_ROUTERS:
+        app.include_router(make(state), prefix=PREFIX)
+    app.include_router(page_router())
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=list(HOSTS))
+    return app
+
+
+def run_viewer(app: FastAPI, listening: socket.socket) -> None:
+    """Serve until Ctrl-C or SIGTERM."""
+    # requests that fail say so to the page; an open page is a request that never ends by itself
+    config = uvicorn.Config(
+        app, log_level="critical", ws="none", server_header=False, timeout_graceful_shutdown=LAST_ANSWERS_S
+    )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with suppress(KeyboardInterrupt):
+        uvicorn.Server(config).run(sockets=[listening])

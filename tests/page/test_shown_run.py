@@ -1,0 +1,179 @@
+"""A finished run behind the page: what the service answers, in a viewer or in one file, and nothing can change it."""
+
+import asyncio
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import httpx
+import numpy as np
+import pytest
+
+from fcslam.cloud.settings import CloudConfig
+from fcslam.mission_file import mission_bytes
+from fcslam.page.report import ASKED, MOST_TILES, report_html
+from fcslam.page.routes import ASSETS
+from fcslam.page.shown_run import ShownRun
+from fcslam.page.viewer import ReadOnly, viewer_app
+from fcslam.records import Channel, ClosureStatus, Edit, Reason, ReasonCode, Veto
+from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run
+from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+from fcslam.wire.packets import decode, measure
+from tests.service.http.desk import A
+
+HOSTILE = "</script><script>alert(1)</script>"
+
+
+def files(stem, side, resolution_m=0.05):
+    cells = np.full((side, side), Occupancy.FREE, np.uint8)
+    cells[side // 2] = Occupancy.OCCUPIED
+    occupancy = OccupancyMap(cells, resolution_m, (-3.0, -2.0))
+    return {f"{stem}.pgm": pgm_bytes(occupancy), f"{stem}.yaml": map_yaml(occupancy, f"{stem}.pgm").encode()}
+
+
+def trajectory(robot, map_index):
+    stamps = np.arange(5.0)
+    return RobotTrajectory(robot, map_index, stamps, np.column_stack((stamps, stamps / 2.0, np.zeros(5))))
+
+
+@pytest.fixture
+def run():
+    closure = ClosureRow(
+        "a", 1.0, "a+1", 2.0, Channel.LIDAR, 0.25, np.array([1.0, -2.5, 3.0]), ClosureStatus.ACCEPTED,
+        Reason(ReasonCode.FEW_PLACES, 2, 3.5, HOSTILE),
+    )  # fmt: skip
+    return Run(
+        trajectories={t.robot: t for t in (trajectory("a", 0), trajectory("a+1", 0), trajectory("b", 1))},
+        closures=(closure,),
+        metrics={"error": Metric("error", float("nan"), "m")},
+        map_files=files("map", 160) | files("map_1", 40),
+        mission=mission_bytes(
+            CloudConfig(), [Edit(1, "anna", 1e9, Veto("a", "b"))], [measure(decode(data)) for data in A], [], {}
+        ),
+    )
+
+
+@pytest.fixture
+def shown(run, tmp_path):
+    run.save(tmp_path / "run")
+    with ShownRun(tmp_path / "run", "run") as shown:
+        yield shown
+
+
+def ask(shown, *paths, method="GET", host="127.0.0.1:80"):
+    async def answers():
+        transport = httpx.ASGITransport(app=viewer_app(ReadOnly(shown)))
+        async with httpx.AsyncClient(transport=transport, base_url=f"http://{host}") as client:
+            return [await client.request(method, path) for path in paths]
+
+    return asyncio.run(answers())
+
+
+def test_a_finished_run_answers_as_the_service_does(shown):
+    answers = ask(shown, *(f"/api/v1/{path}" for path in (*ASKED, "robots/a", "trajectories/b.tum", "maps/1.yaml")))
+    assert [answer.status_code for answer in answers] == [200] * len(answers)
+    fleet, maps, robots, closures, one, *_ = (answer.json() for answer in answers[:5])
+    assert (fleet["read_only"], fleet["packets"], fleet["metrics"]) == (True, len(A), {"error": None})
+    assert [(m["map"], m["robots"], m["zoom"]) for m in maps] == [(0, ["a", "a+1"], 5), (1, ["b"], 5)]
+    assert [(r["session"], r["packets"], r["map"]) for r in robots] == [("a", len(A), 0), ("a+1", 0, 0), ("b", 0, 1)]
+    assert robots[0]["T_map_base"] == [4.0, 2.0, 0.0]
+    assert [closure["setting"] for closure in closures] == [HOSTILE]
+    assert one["sessions"] == robots[:2]
+    assert [edit.author for edit in shown.store.edits()] == ["anna"]
+
+
+def test_a_run_without_a_mission_file_is_shown_too(run, tmp_path):
+    replace(run, mission=b"").save(tmp_path / "run")
+    with ShownRun(tmp_path / "run", "run") as shown:
+        (robots,) = ask(shown, "/api/v1/robots")
+    assert [(robot["session"], robot["packets"]) for robot in robots.json()] == [("a", 0), ("a+1", 0), ("b", 0)]
+
+
+def test_nobody_changes_a_shown_run_or_reads_it_by_another_name_of_this_machine(shown):
+    before = {path: path.stat().st_mtime_ns for path in shown.run_folder.rglob("*")}
+    paths = [f"/api/v1/{path}" for path in ("edits", "edits/1/undo", "finalize", "missions", "robots/a/packets")]
+    assert {answer.status_code for answer in ask(shown, *paths, method="POST")} <= {404, 405}
+    (page,) = ask(shown, "/")
+    assert page.status_code == 200
+    (page,) = ask(shown, "/", host="attacker.example")
+    assert page.status_code == 400
+    assert {path: path.stat().st_mtime_ns for path in shown.run_folder.rglob("*")} == before
+
+
+def test_a_viewer_follows_a_link_to_the_newest_run(run, tmp_path):
+    link = tmp_path / "live"
+    with ShownRun(link, "live") as shown:
+        assert [answer.json() for answer in ask(shown, "/api/v1/robots", "/api/v1/maps")] == [[], []]
+        replace(run, mission=b"").save(tmp_path / "1")
+        link.symlink_to(tmp_path / "1")
+        assert shown.sessions("b") == [("b", 0, 0)]
+        run.save(tmp_path / "2")
+        link.unlink()
+        link.symlink_to(tmp_path / "2")
+        assert shown.sessions("a")[0] == ("a", 0, len(A))
+
+
+class Elements(HTMLParser):
+    """Every start tag with its attributes, and the text in it."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.found = []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs), []))
+
+    def handle_endtag(self, tag):  # noqa: ARG002
+        self.found.append(("", {}, []))  # takes the text between elements
+
+    def handle_data(self, data):
+        if self.found:
+            self.found[-1][2].append(data)
+
+    def of(self, tag):
+        return [(attributes, "".join(texts)) for name, attributes, texts in self.found if name == tag]
+
+
+def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
+    elements = Elements(report_html(shown))
+    assert not elements.of("link")
+    assert not any({"src", "href"} & set(attributes) for _, attributes, _ in elements.found)
+    (data, texts), (module, script) = elements.of("script")
+    assert (data, module) == ({"type": "application/json", "id": "responses"}, {"type": "module"})
+    ((_, style),) = elements.of("style")
+    policy = next(meta["content"] for meta, _ in elements.of("meta") if "http-equiv" in meta)
+    for kind, content in (("script-src", script), ("style-src", style)):
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert f"{kind} 'sha256-{digest}';" in policy
+    assert policy.startswith("default-src 'none';")
+    responses = json.loads(texts)
+    paths = [*ASKED, *(f"trajectories/{name}.tum" for name in ("a", "a%2B1", "b"))]
+    assert set(responses["texts"]) == set(paths)
+    for path, answer in zip(paths, ask(shown, *(f"/api/v1/{path}" for path in paths)), strict=True):
+        assert responses["texts"][path].splitlines() == answer.text.splitlines() or path == "maps"
+    deepest = [path for path in responses["pictures"] if path.startswith("maps/0/tiles/5/")]
+    assert len(deepest) == 4  # 8 m from -3 m and -2 m on, in tiles of 8 m
+    (tile,) = ask(shown, f"/api/v1/{deepest[0]}")
+    assert base64.b64decode(responses["pictures"][deepest[0]]) == tile.content
+
+
+@pytest.mark.parametrize(("resolution_m", "zoom"), [(2.0, 0), (8.0, 0), (64.0, -1)])
+def test_a_report_of_a_huge_map_holds_coarse_tiles_or_none(run, tmp_path, resolution_m, zoom):
+    replace(run, map_files=files("map", 400, resolution_m)).save(tmp_path / "run")
+    with ShownRun(tmp_path / "run", "run") as shown:
+        ((_, texts), _) = Elements(report_html(shown)).of("script")
+    responses = json.loads(texts)
+    assert json.loads(responses["texts"]["maps"])[0]["zoom"] == zoom
+    assert len(responses["pictures"]) <= MOST_TILES
+
+
+def test_a_report_holds_every_path_that_the_page_names():
+    script = (ASSETS / "page.js").read_text(encoding="utf-8")
+    named = re.findall(r'\b(?:json|ask)\("([^"]+)"\)', script)
+    assert "maps" in named
+    assert set(named) - {"events"} <= set(ASKED)
+    assert "import" not in script
