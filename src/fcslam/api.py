@@ -10,7 +10,7 @@ from fcslam import sources
 from fcslam.config import load, parse
 from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
-from fcslam.mission import MissionConfig, Watch, continued_config, run_mission
+from fcslam.mission import Live, MissionConfig, Watch, continued_config, run_mission
 from fcslam.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
 from fcslam.runs import OccupancyMap, Run, prepare_output
@@ -40,6 +40,7 @@ def map_recordings(
     force: bool = False,
     processes: int = 1,
     onto: StrPath | SavedMission | None = None,
+    live: Live | None = None,
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
@@ -64,6 +65,7 @@ def map_recordings(
         onto: mission file, or run folder with one, of an earlier mission that goes on. The run is that of all
             recordings at once; the earlier ones are not needed. Without ``config`` the mission keeps its settings of
             the cloud. Without recordings it is mapped again, with the edits that it has.
+        live: called with the mission's cloud after every packet; it must return at once and change nothing.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -75,7 +77,9 @@ def map_recordings(
     settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
     robots = split_recordings(_opened(recordings, bag_options, at_least=0 if earlier else 1), split)
     drive = side_by_side(processes)
-    run = run_mission(robots, settings, progress or (lambda _: None), tuple(vetoes), drive, earlier)
+    run = run_mission(
+        robots, settings, progress or (lambda _: None), tuple(vetoes), drive, earlier, live or (lambda _: None)
+    )
     if output is not None:
         run.save(output, force)
     return run

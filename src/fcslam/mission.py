@@ -65,6 +65,10 @@ class Progress:
 Watch = Callable[[Progress], None]
 
 
+Live = Callable[["MissionCloud"], None]
+"""Called after every packet; it may look at the cloud, and changes nothing."""
+
+
 def continued_config(earlier: SavedMission | None) -> MissionConfig:
     """The default configuration, with the cloud's settings of an earlier mission if there is one."""
     if earlier is None:
@@ -79,6 +83,7 @@ def run_mission(
     vetoes: Sequence[Veto] = (),
     drive: Drive = one_by_one,
     onto: SavedMission | None = None,
+    live: Live = lambda _: None,
 ) -> Run:
     """Map recordings together, one robot each.
 
@@ -90,6 +95,7 @@ def run_mission(
         drive: runs the robots.
         onto: an earlier mission that goes on; its packets take effect again, and the result is that of all recordings
             at once. A robot of it that has a recording again begins a new session.
+        live: called with the cloud after every packet.
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
@@ -106,6 +112,7 @@ def run_mission(
         streams = [_packets(legs, meter) for legs in (*onto.legs(), *new)]
         for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
             cloud.apply(sent)
+            live(cloud)
     meter.report(fusing=True)
     return cloud.run(meter.tracks, meter.scans, meter.recorded_s)
 
@@ -145,6 +152,13 @@ class MissionCloud:
         for packet in (sent, *map(measure, replies)):
             self._traffic.accept(packet.label, packet.size)
         return replies
+
+    def run_so_far(self) -> Run:
+        """The map so far, as the service shows it live: without new decisions, and of the keyscans alone."""
+        result = self.fleet.estimate()
+        tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+        metrics = traffic_metrics(self._traffic.ledger(), tracks)
+        return run_of(result, tracks, metrics, dump(self.config), self.config.map, with_local_maps=False)
 
     def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
         """The result of all packets so far.

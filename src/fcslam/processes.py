@@ -1,11 +1,34 @@
-"""Worker processes that end with the process that started them, however that ends."""
+"""Processes that end with the process that started them, however that ends: workers, and tasks beside it."""
 
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-from typing import Any
+from collections.abc import Callable
+from multiprocessing.process import BaseProcess
+from typing import Any, Protocol
+
+NICENESS = 10
+"""Increment of the niceness of a task in a copy of this process: what the process itself does goes first."""
+
+
+class Background(Protocol):
+    """A task that runs beside this process."""
+
+    @property
+    def exitcode(self) -> int | None:
+        """None while it runs, 0 if it succeeded."""
+
+    def terminate(self) -> None:
+        """End it now, if it still runs."""
+
+    def join(self) -> None:
+        """Wait for its end."""
+
+
+Start = Callable[[Callable[[], None]], Background]
+"""Starts a task beside this process."""
 
 
 def start_method() -> Any:
@@ -17,6 +40,23 @@ def obey_parent() -> None:
     """Make this process a worker: Ctrl-C, which reaches all processes, is its parent's, and it ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def start_copy(task: Callable[[], None]) -> Background:
+    """Run a task in a copy of this process. It sees everything as it is now, and nothing that it changes is seen here.
+
+    Threads do not exist in the copy; OpenCV must have one thread (``cv2.setNumThreads``), or the copy waits for others.
+    """
+    process: BaseProcess = multiprocessing.get_context("fork").Process(target=_in_copy, args=(task,), daemon=True)
+    process.start()
+    return process
+
+
+def _in_copy(task: Callable[[], None]) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    obey_parent()
+    os.nice(NICENESS)
+    task()
 
 
 def _end_with_parent() -> None:

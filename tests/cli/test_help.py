@@ -111,7 +111,7 @@ def completed(line):
     [
         ("fcslam ma", ["map"]),
         ("fcslam federate ", ["local", "serve", "join"]),
-        ("fcslam map --no", ["--no-fuse"]),
+        ("fcslam map --no-f", ["--no-fuse"]),
         ("fcslam simulate --building of", ["office"]),
         ("fcslam extract pho", []),
         ("fcslam map --output ru", []),

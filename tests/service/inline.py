@@ -12,3 +12,9 @@ class InlineTask:
             task()
         except SystemExit as end:
             self.exitcode = end.code
+
+    def terminate(self) -> None:
+        pass
+
+    def join(self) -> None:
+        pass

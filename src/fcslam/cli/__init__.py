@@ -51,6 +51,7 @@ app.command(
         "fcslam map robot1.clf.gz robot2.clf.gz",
         "fcslam map anna=run1.bag ben=run2.mcap -o runs/building",
         "fcslam map building.clf.gz --split 3 --quiet",
+        "fcslam map robot1.bag robot2.bag --live",
         "fcslam map today.bag --onto runs/building -o runs/building-2",
         "fcslam map --onto runs/building -o runs/building-edited",
     ),
@@ -86,7 +87,7 @@ app.command(
     ),
 )(simulate.simulate)
 app.command("extract", epilog=examples("fcslam extract photos -o features --keypoints 1000"))(extract.extract)
-app.command("demo", epilog=examples("fcslam demo", "fcslam demo --robots 4 --no-camera -o demo4"))(demo.demo)
+app.command("demo", epilog=examples("fcslam demo --live", "fcslam demo --robots 4 --no-camera -o demo4"))(demo.demo)
 app.command("train", epilog=examples("fcslam train photos -o detector", "fcslam train photos --quick"))(train.train)
 app.command(
     "robot",

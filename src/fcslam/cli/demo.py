@@ -3,6 +3,7 @@
 import shutil
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +11,7 @@ import typer
 
 from fcslam.cli.options import BuildingKind, BuildingSeed, NoCamera, PathLength, Quiet
 from fcslam.cli.output import answers, notices, print_line
+from fcslam.cli.show import Live, OpenBrowser, Port, live_page
 from fcslam.simulation.options import Building
 
 if TYPE_CHECKING:
@@ -35,6 +37,9 @@ def demo(
     building: BuildingKind = Building.DEFAULT,
     path_length: PathLength = 60.0,
     no_camera: NoCamera = False,
+    live: Live = False,
+    port: Port = 0,
+    open_browser: OpenBrowser = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
@@ -57,12 +62,13 @@ def demo(
     sources = [open_source(place) for place in recordings]
     config = _learn(sources, output / LEARNING, seed, camera is not None, console)
     _announce(console, 3, "map each robot, recognise places, fuse the maps")
-    map_sources(sources, config, output / RUN, console, force=True)
-    _evaluate(output, console)
-    _draw(output, fleet, console)
-    typer.echo(f"{time.perf_counter() - began:.0f} s in all")
-    for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
-        typer.echo(f"{content}: {output / name}")
+    with live_page(output / RUN, port, open_browser) if live else nullcontext() as page:
+        map_sources(sources, config, output / RUN, console, force=True, page=page)
+        _evaluate(output, console)
+        _draw(output, fleet, console)
+        typer.echo(f"{time.perf_counter() - began:.0f} s in all")
+        for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
+            typer.echo(f"{content}: {output / name}")
 
 
 def _check_libraries(settings: "SimulationSettings") -> None:

@@ -3,7 +3,7 @@
 import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +22,7 @@ from fcslam.cli.recordings import (
     print_faults,
     print_notes,
 )
+from fcslam.cli.show import Live, OpenBrowser, Port, live_page
 from fcslam.cli.warm_up import compiled, cores
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.mission import MissionConfig, Progress
     from fcslam.mission_file import SavedMission
+    from fcslam.page.live_map import LiveMap
     from fcslam.records import Veto
     from fcslam.runs import Run
     from fcslam.sources import Source
@@ -72,6 +74,9 @@ def map_recordings(
     camera_topic: CameraTopic = None,
     laser_pose: LaserPose = None,
     seed: MissionSeed = None,
+    live: Live = False,
+    port: Port = 0,
+    open_browser: OpenBrowser = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -92,7 +97,8 @@ def map_recordings(
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         sources = split_recordings(open_recordings(logs or [], options), split)
-    map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier)
+    with live_page(output, port, open_browser) if live else nullcontext() as page:
+        map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page)
 
 
 def map_sources(
@@ -103,6 +109,7 @@ def map_sources(
     force: bool = False,
     vetoes: "Sequence[Veto]" = (),
     earlier: "SavedMission | None" = None,
+    page: "LiveMap | None" = None,
 ) -> "Run":
     """Run the mission, write the run folder and print a summary; progress and notices go to ``console``.
 
@@ -122,10 +129,13 @@ def map_sources(
         known = 0 if earlier is None else sum(len(track.stamps) for track in earlier.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
         run = api.map_recordings(
-            sources, config=settings, vetoes=vetoes, progress=progress, processes=cores(), onto=earlier
-        )
+            sources, config=settings, vetoes=vetoes, progress=progress, processes=cores(), onto=earlier,
+            live=None if page is None else page.look,
+        )  # fmt: skip
         display.start("writing")
         run.save(output, force)
+    if page is not None:
+        page.finish(output)
     print_faults(console, faults)
     _report(answers(), run, time.perf_counter() - began, output, settings)
     return run

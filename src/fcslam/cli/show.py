@@ -1,10 +1,11 @@
 """`fcslam show`: the page of `fcslam serve` on a finished run, or as one file."""
 
 import os
+import signal
 import sys
 import webbrowser
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,8 +16,11 @@ from fcslam.cli.options import Force, Quiet
 from fcslam.cli.output import notices
 
 if TYPE_CHECKING:
+    from socket import socket
+
     from rich.console import Console
 
+    from fcslam.page.live_map import LiveMap
     from fcslam.page.shown_run import ShownRun
 
 LARGEST_BYTES = 2 * 2**30
@@ -24,6 +28,7 @@ LARGEST_BYTES = 2 * 2**30
 HOST = "127.0.0.1"
 
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 chooses a free one.")]
+Live = Annotated[bool, typer.Option("--live", help="Show the map on a page while it grows, and after that the run.")]
 OpenBrowser = Annotated[
     bool | None,
     typer.Option("--open/--no-open", help="Open the page in a browser.", show_default="if this machine has a display"),
@@ -56,10 +61,7 @@ def show(
             _write_report(shown, html, run)
             return
         with listen(HOST, port) as listening:
-            address = f"http://{HOST}:{listening.getsockname()[1]}/"
-            typer.echo(f"fcslam shows {run} at {address}; Ctrl-C ends it")
-            if _has_display() if open_browser is None else open_browser:
-                webbrowser.open(address)
+            _announce(run, listening, open_browser)
             run_viewer(viewer_app(ReadOnly(shown)), listening)
 
 
@@ -107,6 +109,31 @@ def _check_size(run: Path) -> None:
         raise InputError(
             f"{run}: the files have {size / 2**30:.1f} GiB; fcslam show reads at most {LARGEST_BYTES / 2**30:.0f} GiB"
         )
+
+
+@contextmanager
+def live_page(run: Path, port: int, open_browser: bool | None) -> "Iterator[LiveMap]":
+    """Serve the page of a run while it is mapped, and in the end until Ctrl-C if there is a terminal for that.
+
+    Raises:
+        ServiceError: the port is in use.
+    """
+    from fcslam.page import live_map
+
+    with listen(HOST, port) as listening, live_map.live_page(listening, run.name) as live:
+        _announce(run, listening, open_browser)
+        yield live
+        if sys.stdin.isatty():
+            typer.echo("The page shows the finished run; Ctrl-C ends it")
+            with suppress(KeyboardInterrupt):
+                signal.pause()
+
+
+def _announce(run: Path, listening: "socket", open_browser: bool | None) -> None:
+    address = f"http://{HOST}:{listening.getsockname()[1]}/"
+    typer.echo(f"fcslam shows {run} at {address}; Ctrl-C ends it")
+    if _has_display() if open_browser is None else open_browser:
+        webbrowser.open(address)
 
 
 def _write_report(shown: "ShownRun", html: Path, run: Path) -> None:

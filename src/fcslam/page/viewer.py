@@ -1,8 +1,11 @@
 """The page over a run that nobody can change: the routes of viewers alone, for this machine, without tokens."""
 
+import asyncio
+import itertools
 import signal
 import socket
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 
 import uvicorn
@@ -20,6 +23,8 @@ from fcslam.service.viewed_mission import ViewedMission
 
 HOSTS = ("127.0.0.1", "localhost")
 """Names by which a browser may ask. Other ones are of web pages whose host was pointed to this machine, to read it."""
+LOOK_S = 0.2
+"""Between two looks for a new run folder."""
 LAST_ANSWERS_S = 1
 """Time for requests in progress when the viewer ends."""
 
@@ -38,14 +43,33 @@ class ReadOnly:
 
 
 def viewer_app(state: ReadOnly) -> FastAPI:
-    """The page and what it asks."""
-    app = FastAPI(title="fcslam", version=fcslam.__version__, openapi_url=None, redirect_slashes=False)
+    """The page and what it asks; while it runs, its events follow the run folder."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        following = asyncio.create_task(_follow(state))
+        yield
+        following.cancel()
+
+    app = FastAPI(
+        title="fcslam", version=fcslam.__version__, openapi_url=None, redirect_slashes=False, lifespan=lifespan
+    )
     add_handlers(app)
     for make in VIEWER_ROUTERS:
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(page_router())
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=list(HOSTS))
     return app
+
+
+async def _follow(state: ReadOnly) -> None:
+    """Tell of every new run folder."""
+    folder = state.mission.run_folder
+    for number in itertools.count(1):
+        while folder == (newest := state.mission.run_folder):
+            await asyncio.sleep(LOOK_S)
+        folder = newest
+        state.events.publish("live", number)
 
 
 def run_viewer(app: FastAPI, listening: socket.socket) -> None:

@@ -24,10 +24,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import cache
 from hashlib import blake2b
-from multiprocessing import get_context
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import IO, NamedTuple, Protocol
+from typing import IO, NamedTuple
 
 import cv2
 
@@ -42,7 +40,7 @@ from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
-from fcslam.processes import obey_parent
+from fcslam.processes import Background, Start, start_copy
 from fcslam.records import Edit, Removal
 from fcslam.runs import Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
@@ -63,8 +61,6 @@ LIVE_SHARE = 0.1
 """Of the time, for writing the live run folder beside the worker."""
 LIVE_LOOK_S = 0.05
 """Between two looks whether the live run folder is written."""
-LIVE_NICENESS = 10
-"""Increment of the niceness of the process that writes the live run folder: packets and corrections go first."""
 REPORT_EVERY_S = 0.1
 """Corrections are not stored more often than this: packets that come in wait until they are on the disk."""
 PAUSE_S = 30.0
@@ -80,18 +76,6 @@ _log = logging.getLogger(__name__)
 
 Tell = Callable[[str, int], None]
 """Is told of an event and its number."""
-
-
-class Background(Protocol):
-    """A task that runs beside the worker."""
-
-    @property
-    def exitcode(self) -> int | None:
-        """None while it runs, 0 if it succeeded."""
-
-
-Start = Callable[[Callable[[], None]], Background]
-"""Starts a task beside the worker."""
 
 
 class Worker:
@@ -442,7 +426,7 @@ def main(arguments: Sequence[str]) -> int:
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
     folder = MissionFolder(Path(arguments[0]))
     alone = _alone(folder)
-    worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print, _start)
+    worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print, start_copy)
     _print(READY, 0)
     while True:
         wait_s = 0.0 if worker.step() else worker.wait_s()
@@ -459,20 +443,6 @@ def _alone(folder: MissionFolder) -> IO[str]:
     file = folder.worker_lock.open("w")
     fcntl.flock(file, fcntl.LOCK_EX)
     return file
-
-
-def _start(task: Callable[[], None]) -> Background:
-    """Run a task in a copy of this process, which ends with it."""
-    process: BaseProcess = get_context("fork").Process(target=_in_copy, args=(task,), daemon=True)
-    process.start()
-    return process
-
-
-def _in_copy(task: Callable[[], None]) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    obey_parent()
-    os.nice(LIVE_NICENESS)
-    task()
 
 
 def _print(event: str, number: int) -> None:

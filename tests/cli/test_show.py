@@ -1,0 +1,164 @@
+"""`fcslam show` and `--live`: what is refused at once, the file, and the real commands."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+
+import httpx
+import numpy as np
+import pytest
+
+from fcslam.cli import main, show
+from fcslam.mission_file import mission_path
+from fcslam.runs import RobotTrajectory, Run
+from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+
+API = "/api/v1"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A small one."""
+    occupancy = OccupancyMap(np.full((40, 60), Occupancy.FREE, np.uint8), 0.05, (0.0, 0.0))
+    trajectory = RobotTrajectory("a", 0, np.arange(3.0), np.zeros((3, 3)))
+    files = {"map.pgm": pgm_bytes(occupancy), "map.yaml": map_yaml(occupancy, "map.pgm").encode()}
+    Run({"a": trajectory}, map_files=files).save(tmp_path / "run")
+    return tmp_path / "run"
+
+
+def refused(capsys, *words):
+    """The one line that the command says."""
+    assert main(["show", *map(str, words)]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    return line
+
+
+def test_what_is_no_run_is_told_in_one_line(run, tmp_path, capsys):
+    (tmp_path / "text").write_text("no mission")
+    assert "no run folder" in refused(capsys, tmp_path)
+    assert "no run folder" in refused(capsys, tmp_path / "nothing")
+    assert "text" in refused(capsys, tmp_path / "text")
+    (run / "closures.csv").write_text("damaged")
+    assert "broken run folder" in refused(capsys, run)
+
+
+def test_a_damaged_mission_file_is_told_in_one_line(run, capsys):
+    (run / "mission.fcslam").write_text("no mission")
+    assert "mission.fcslam" in refused(capsys, run)
+
+
+def test_a_huge_run_is_refused_before_it_is_read(run, capsys, monkeypatch):
+    monkeypatch.setattr(show, "LARGEST_BYTES", 1000)
+    monkeypatch.setattr("fcslam.service.viewed_mission.open_run", lambda _: pytest.fail("it is read"))
+    assert "GiB" in refused(capsys, run)
+
+
+def test_a_port_in_use_is_told_in_one_line(run, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert f":{port}" in refused(capsys, run, "--port", port)
+        assert main(["map", "x.clf", "--live", "--port", str(port), "-o", str(run.parent / "out")]) == 2
+
+
+def test_a_report_is_one_file_and_replaces_another_only_if_told(run, tmp_path, capsys):
+    report = tmp_path / "report.html"
+    assert main(["show", str(run), "--html", str(report)]) == 0
+    assert "report.html" in capsys.readouterr().out
+    before = report.read_bytes()
+    assert b"maps/0/tiles/5/0/0.png" in before
+    assert "--force" in refused(capsys, run, "--html", report)
+    assert main(["show", str(run), "--html", str(report), "--force"]) == 0
+    assert report.read_bytes() == before
+    assert "cannot be written" in refused(capsys, run, "--html", tmp_path / "no" / "report.html")
+    assert "exists" in refused(capsys, run, "--html", tmp_path, "--force")
+
+
+def test_a_browser_opens_where_there_is_a_display_and_nobody_forbids_it(run, monkeypatch):
+    opened = []
+    monkeypatch.setattr(show.webbrowser, "open", opened.append)
+    monkeypatch.setattr("fcslam.page.viewer.run_viewer", lambda *_: None)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    for display, options in (("", []), (":0", []), (":0", ["--no-open"]), ("", ["--open"])):
+        monkeypatch.setenv("DISPLAY", display)
+        assert main(["show", str(run), *options]) == 0
+    assert len(opened) == 2
+    assert all(re.fullmatch(r"http://127\.0\.0\.1:\d+/", address) for address in opened)
+
+
+class Command:
+    """A real one that shows a page."""
+
+    def __init__(self, *words):
+        command = [sys.executable, "-m", "fcslam.cli", *map(str, words), "--no-open"]
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=environment,
+        )
+        self.url = re.search(r"http://\S+:\d+", self.process.stdout.readline())[0]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.communicate()
+
+    def get(self, path):
+        return httpx.get(f"{self.url}{path}", timeout=30.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_the_page_with_success_also_while_somebody_looks(run, end):
+    with Command("show", run) as command:
+        assert "<canvas" in command.get("/").text
+        assert command.get(f"{API}/fleet").json()["read_only"]
+        with httpx.stream("GET", f"{command.url}{API}/events", timeout=30.0) as events:
+            assert events.status_code == 200
+            command.process.send_signal(end)
+            assert command.process.wait(30.0) == 0
+
+
+@pytest.mark.slow
+def test_a_mission_file_is_mapped_and_shown(logs, tmp_path):
+    assert main(["map", str(logs[0]), "-o", str(tmp_path / "run"), "-q"]) == 0
+    mission = mission_path(tmp_path / "run").rename(tmp_path / "alone.fcslam")
+    report = tmp_path / "report.html"
+    assert main(["show", str(mission), "--html", str(report), "-q"]) == 0
+    assert "maps/0/tiles/" in report.read_text()
+
+
+@pytest.mark.slow
+def test_a_page_beside_the_mapping_does_not_change_the_run(logs, tmp_path):
+    plain, live = tmp_path / "plain", tmp_path / "live"
+    assert main(["map", *map(str, logs), "-o", str(plain), "-q"]) == 0
+    shown = []
+
+    def watch(command):
+        while command.process.poll() is None:
+            with suppress(httpx.HTTPError):
+                shown.append(command.get(f"{API}/fleet").json()["read_only"])
+            time.sleep(0.05)
+
+    with Command("map", *logs, "-o", live, "--live") as command:
+        watcher = threading.Thread(target=watch, args=(command,))
+        watcher.start()
+        command.process.communicate(timeout=120.0)
+        watcher.join()
+    assert command.process.returncode == 0, "without a terminal it does not wait"
+    assert shown
+    assert all(shown)
+    for file in sorted(path.relative_to(plain) for path in plain.rglob("*") if path.is_file()):
+        assert (live / file).read_bytes() == (plain / file).read_bytes(), file
