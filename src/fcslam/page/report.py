@@ -21,7 +21,7 @@ from fcslam.runs import OccupancyMap
 from fcslam.service.http.app import PREFIX
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 
-ASKED = ("fleet", "maps", "robots", "closures?status=accepted&limit=5000")
+ASKED = ("fleet", "maps", "robots", "closures?status=accepted&limit=5000", "metrics.json", "config.yaml")
 """What the page asks for, besides events, trajectories and tiles."""
 MOST_TILES = 800
 """Of all maps together: a tile has about 5 kB. Of a larger map, the file holds coarser tiles."""

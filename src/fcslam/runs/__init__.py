@@ -1,7 +1,9 @@
 """The result of a mission, in memory and as a run folder."""
 
 from fcslam.runs.folder import (
+    CONFIG,
     LOCAL,
+    METRICS,
     POSE_GRAPH,
     TRAJECTORIES,
     Run,
@@ -16,7 +18,9 @@ from fcslam.runs.tables import metrics_json, read_vetoes
 from fcslam.runs.trajectories import read_tum, write_tum
 
 __all__ = [
+    "CONFIG",
     "LOCAL",
+    "METRICS",
     "POSE_GRAPH",
     "TRAJECTORIES",
     "ClosureRow",

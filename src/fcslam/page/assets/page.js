@@ -7,7 +7,8 @@ const at = (id) => document.getElementById(id);
 const canvas = at("map"), pen = canvas.getContext("2d");
 const tiles = new Map();
 let token = sessionStorage.getItem("token") ?? "";
-let view = null, mapIndex = 0, version = 0, robots = [], closures = [], trails = new Map(), zooms = new Map(), queued = false;
+let view = null, mapIndex = 0, version = 0, robots = [], closures = [], trails = new Map(), zooms = new Map(), queued = false, readOnly = false;
+const hidden = new Set(); // sessions whose paths are not drawn
 
 class Refused extends Error {}
 
@@ -36,12 +37,12 @@ async function trail(name) {
 }
 
 async function update(number) {
-  const [maps, fleet, accepted] = await Promise.all([json("maps"), json("robots"), json("closures?status=accepted&limit=5000")]);
+  const [counts, maps, fleet, accepted] = await Promise.all([json("fleet"), json("maps"), json("robots"), json("closures?status=accepted&limit=5000")]);
   const seen = fleet.filter((r) => r.T_map_base);
   const paths = await Promise.all(seen.map((r) => trail(r.session)));
   trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
   zooms = new Map(maps.map((m) => [m.map, m.zoom]));
-  robots = fleet; closures = accepted;
+  readOnly = counts.read_only; robots = fleet; closures = accepted;
   if (number !== version) { version = number; tiles.clear(); }
   at("maps").replaceChildren(...maps.map((m) => new Option(`${m.map}: ${m.robots.join(", ")}`, m.map, false, m.map === mapIndex)));
   at("robots").replaceChildren(...fleet.map(describe));
@@ -51,11 +52,24 @@ async function update(number) {
 }
 
 function describe(robot, i) {
-  const item = document.createElement("li"); // textContent: a name is never markup
-  const heard = robot.last_heard_s === null ? "not heard" : `heard ${robot.last_heard_s.toFixed(0)} s ago`;
-  item.textContent = `${robot.session}: ${robot.map === null ? "no map yet" : `map ${robot.map}`}, ${robot.path_length_m.toFixed(0)} m, ${heard}`;
-  item.style.color = COLOURS[i % COLOURS.length];
+  const item = document.createElement("li"), label = document.createElement("label"), box = document.createElement("input");
+  const heard = readOnly ? "" : robot.last_heard_s === null ? ", not heard" : `, heard ${robot.last_heard_s.toFixed(0)} s ago`;
+  box.type = "checkbox"; box.checked = !hidden.has(robot.session);
+  box.addEventListener("change", () => { if (box.checked) hidden.delete(robot.session); else hidden.add(robot.session); redraw(); });
+  label.append(box, ` ${robot.session}: ${robot.map === null ? "no map yet" : `map ${robot.map}`}, ${robot.path_length_m.toFixed(0)} m${heard}`); // text: a name is never markup
+  label.style.color = COLOURS[i % COLOURS.length];
+  item.append(label);
   return item;
+}
+
+async function facts() {
+  const [metrics, config] = await Promise.all([json("metrics.json"), ask("config.yaml").then((a) => a.text())]);
+  at("config").textContent = config;
+  at("metrics").replaceChildren(...metrics.map(({ name, value, unit }) => {
+    const row = document.createElement("tr");
+    for (const text of [name.replaceAll("_", " "), value === null ? "–" : String(Number(value.toPrecision(4))), unit === "1" ? "" : unit]) row.insertCell().textContent = text;
+    return row;
+  }));
 }
 
 function fit() {
@@ -103,7 +117,7 @@ function draw() {
   }
   pen.globalAlpha = 1;
   robots.forEach((r, i) => {
-    if (r.map !== mapIndex || !r.T_map_base) return;
+    if (r.map !== mapIndex || !r.T_map_base || hidden.has(r.session)) return;
     const colour = COLOURS[i % COLOURS.length], [x, y, heading] = r.T_map_base, [px, py] = onScreen(x, y);
     line((trails.get(r.session) ?? []).map((p) => [p[1], p[2]]), colour);
     pen.save(); pen.translate(px, py); pen.rotate(-heading); pen.fillStyle = colour;
@@ -139,13 +153,14 @@ canvas.addEventListener("keydown", (e) => {
 at("maps").addEventListener("change", (e) => { mapIndex = Number(e.target.value); fit(); redraw(); });
 at("login").addEventListener("submit", (e) => { e.preventDefault(); token = at("token").value; sessionStorage.setItem("token", token); at("login").hidden = true; follow(); });
 at("shown").addEventListener("change", redraw);
+at("facts").addEventListener("toggle", () => { if (at("facts").open) facts().catch(() => {}); });
 new ResizeObserver(redraw).observe(canvas);
 
 async function follow() {
   try {
     const reader = (await ask("events")).body.pipeThrough(new TextDecoderStream()).getReader();
     await update(version); // what is there already; events tell of changes only
-    at("status").textContent = "live";
+    at("status").textContent = readOnly ? "read-only" : "live";
     let rest = "";
     for (;;) {
       const { value, done } = await reader.read();

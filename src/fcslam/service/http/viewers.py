@@ -12,7 +12,7 @@ from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.sessions import session_name
 from fcslam.maps.tiles import DEEPEST_ZOOM, finest_zoom, tile_png
 from fcslam.records import ClosureStatus
-from fcslam.runs import POSE_GRAPH, TRAJECTORIES, ClosureRow, Run
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, ClosureRow, Run
 from fcslam.runs.map_files import resolution_of
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
@@ -32,7 +32,7 @@ MOST = 2**31 - 1
 """Largest number of a map or tile."""
 Index = Annotated[int, PathParameter(ge=0, le=MOST)]
 Square = Annotated[int, PathParameter(ge=-MOST, le=MOST)]
-TEXT = "text/plain"
+TEXT, JSON = "text/plain", "application/json"
 MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "application/yaml"}
 
 
@@ -131,6 +131,16 @@ def map_router(state: ViewerState) -> APIRouter:
         except FileNotFoundError as error:
             raise HTTPException(404, f"there is no {_stem(k)}") from error
         return Response(tile, media_type=MEDIA["png"])
+
+    @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON)})
+    def get_metrics() -> FileResponse:
+        """All metrics with their units."""
+        return _file(state, METRICS, JSON)
+
+    @router.get(f"/{CONFIG}", response_class=Response, responses={**refusals(404), 200: content(MEDIA["yaml"])})
+    def get_config() -> FileResponse:
+        """The complete configuration."""
+        return _file(state, CONFIG, MEDIA["yaml"])
 
     @router.get("/pose_graph.g2o", response_class=Response, responses={**refusals(404), 200: content(TEXT)})
     def get_pose_graph() -> FileResponse:
