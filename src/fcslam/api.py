@@ -41,6 +41,7 @@ def map_recordings(
     processes: int = 1,
     onto: StrPath | SavedMission | None = None,
     live: Live | None = None,
+    floors: str | Mapping[str, str] = "",
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
@@ -66,6 +67,8 @@ def map_recordings(
             recordings at once; the earlier ones are not needed. Without ``config`` the mission keeps its settings of
             the cloud. Without recordings it is mapped again, with the edits that it has.
         live: called with the mission's cloud after every packet; it must return at once and change nothing.
+        floors: the floor on which all recordings were made, or a mapping of robot names to floors. Places of different
+            floors are never compared, so each floor has maps of its own.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -77,9 +80,10 @@ def map_recordings(
     settings = settings_of(continued_config(earlier) if config is None else config, seed, join_maps)
     robots = split_recordings(_opened(recordings, bag_options, at_least=0 if earlier else 1), split)
     drive = side_by_side(processes)
-    run = run_mission(
-        robots, settings, progress or (lambda _: None), tuple(vetoes), drive, earlier, live or (lambda _: None)
-    )
+    if isinstance(floors, str):
+        floors = {robot.name: floors for robot in robots if floors}
+    watch, look = progress or (lambda _: None), live or (lambda _: None)
+    run = run_mission(robots, settings, watch, tuple(vetoes), drive, earlier, look, floors)
     if output is not None:
         run.save(output, force)
     return run

@@ -8,6 +8,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 from pydantic import Field
 
@@ -18,7 +19,7 @@ from fcslam.cloud.report import Track, keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.config import Settings, dump
-from fcslam.driving import Drive, Leg, continued, one_by_one
+from fcslam.driving import Drive, Leg, continued, on_floor, one_by_one
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.metrics.jumps import JumpLimits
@@ -28,7 +29,7 @@ from fcslam.robot.frontend import RobotConfig
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
-from fcslam.wire.checks import check_name
+from fcslam.wire.checks import check_floor, check_name
 from fcslam.wire.ledger import Counter
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import SizedPacket, measure
@@ -84,6 +85,7 @@ def run_mission(
     drive: Drive = one_by_one,
     onto: SavedMission | None = None,
     live: Live = lambda _: None,
+    floors: Mapping[str, str] = MappingProxyType({}),
 ) -> Run:
     """Map recordings together, one robot each.
 
@@ -96,19 +98,25 @@ def run_mission(
         onto: an earlier mission that goes on; its packets take effect again, and the result is that of all recordings
             at once. A robot of it that has a recording again begins a new session.
         live: called with the cloud after every packet.
+        floors: floor of each recording that has one, by its robot's name; places of different floors are never
+            compared.
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
-        ConfigError: a veto names a robot that is not there.
+        ConfigError: a veto or a floor names a robot that is not there, or a floor is not valid.
         OutputError: a robot's name cannot be a file name.
     """
     onto = onto or EMPTY
     _check_robots(sources)
     _check_vetoes(vetoes, [*onto.packets, *(source.name for source in sources)])
+    _check_floors(floors, [source.name for source in sources])
     cloud = MissionCloud(config, onto, vetoes)
     meter = _Meter(watch, cloud.fleet, [*onto.packets, *(source.name for source in sources)])
     with drive(sources, config.robot) as robots:
-        new = [continued(legs, onto.epochs(source.name)) for legs, source in zip(robots, sources, strict=True)]
+        new = [
+            on_floor(continued(legs, onto.epochs(source.name)), floors.get(source.name, ""))
+            for legs, source in zip(robots, sources, strict=True)
+        ]
         streams = [_packets(legs, meter) for legs in (*onto.legs(), *new)]
         for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
             cloud.apply(sent)
@@ -241,6 +249,16 @@ def _check_robots(sources: Sequence[Source]) -> None:
         except PacketError as error:
             raise SourceError(f"{error}; a robot is named by its file, so rename it, or give NAME=LOG") from error
     check_names(names)
+
+
+def _check_floors(floors: Mapping[str, str], robots: Sequence[str]) -> None:
+    for name, floor in floors.items():
+        if name not in robots:
+            raise ConfigError(f"a floor names '{name}', but the recordings are {', '.join(robots)}")
+        try:
+            check_floor(floor)
+        except PacketError as error:
+            raise ConfigError(str(error)) from error
 
 
 def _check_vetoes(vetoes: Sequence[Veto], robots: Sequence[str]) -> None:

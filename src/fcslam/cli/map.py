@@ -2,9 +2,11 @@
 
 import gc
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -59,6 +61,14 @@ def map_recordings(
             help="Run folder or mission file of an earlier mission to continue; its recordings are not needed.",
         ),
     ] = None,
+    floor: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]FLOOR",
+            help="Floor of all LOGs, or of the robot NAME. Places of different floors are never compared. Can be "
+            "repeated.",
+        ),
+    ] = None,
     no_fuse: NoFuse = False,
     fusion: Fusion = None,
     veto: Annotated[
@@ -97,8 +107,25 @@ def map_recordings(
         if not logs and earlier is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         sources = split_recordings(open_recordings(logs or [], options), split)
+        floors = floors_of(floor or [], [source.name for source in sources])
     with live_page(output, port, open_browser) if live else nullcontext() as page:
-        map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page)
+        map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page, floors)
+
+
+def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, str]:
+    """The floor of each robot that has one; NAME=FLOOR counts before FLOOR.
+
+    Raises:
+        InputError: a robot or all of them are given two floors.
+    """
+    from fcslam.errors import InputError
+
+    common = [option for option in options if "=" not in option]
+    named = [(name, floor) for name, _, floor in (option.partition("=") for option in options if "=" in option)]
+    twice = next((name for name, count in Counter(name for name, _ in named).items() if count > 1), None)
+    if twice is not None or len(common) > 1:
+        raise InputError(f"--floor: {'all recordings' if twice is None else twice} can be on one floor only")
+    return dict.fromkeys(robots, common[0]) | dict(named) if common else dict(named)
 
 
 def map_sources(
@@ -110,6 +137,7 @@ def map_sources(
     vetoes: "Sequence[Veto]" = (),
     earlier: "SavedMission | None" = None,
     page: "LiveMap | None" = None,
+    floors: "Mapping[str, str]" = MappingProxyType({}),
 ) -> "Run":
     """Run the mission, write the run folder and print a summary; progress and notices go to ``console``.
 
@@ -130,7 +158,7 @@ def map_sources(
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
         run = api.map_recordings(
             sources, config=settings, vetoes=vetoes, progress=progress, processes=cores(), onto=earlier,
-            live=None if page is None else page.look,
+            live=None if page is None else page.look, floors=floors,
         )  # fmt: skip
         display.start("writing")
         run.save(output, force)
@@ -175,10 +203,15 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, sett
     from fcslam.cloud.sessions import robot_of
 
     values = {name: metric.value for name, metric in run.metrics.items()}
-    table = Table("robot", "map", "path, m", "scans")
+    has_floors = any(trajectory.floor for trajectory in run.trajectories.values())
+    table = Table("robot", *["floor"] * has_floors, "map", "path, m", "scans")
     for trajectory in run.trajectories.values():
         table.add_row(
-            trajectory.robot, str(trajectory.map_index), f"{trajectory.path_length_m:.1f}", str(len(trajectory.stamps))
+            trajectory.robot,
+            *[trajectory.floor] * has_floors,
+            str(trajectory.map_index),
+            f"{trajectory.path_length_m:.1f}",
+            str(len(trajectory.stamps)),
         )
     console.print(table)
     print_line(

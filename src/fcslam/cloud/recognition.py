@@ -26,17 +26,19 @@ class VocabularyState(NamedTuple):
 
     channel: Channel
     detector_version: str
+    floor: str
+    """Empty: that of the sessions that name none."""
     words: int
     places: int
     """Places that can be retrieved."""
 
 
-_VocabularyKey = tuple[Channel, str]
-"""Channel and detector version; words of different channels or detectors are never compared."""
+_VocabularyKey = tuple[Channel, str, str]
+"""Channel, detector version and floor; places that differ in one of these are never compared."""
 
 
 class PlaceRecognition:
-    """One matcher for each channel and detector version."""
+    """One matcher for each channel, detector version and floor."""
 
     def __init__(
         self, config: FleetConfig, seed: int, sessions: SessionStore, graph: JointGraph, closures: ClosureLog,
@@ -58,7 +60,7 @@ class PlaceRecognition:
 
         ``mates`` are the sessions that share its map, its own included. The keyscans of the place's submap are held.
         """
-        key = place.channel, place.detector_version
+        key = self._key(place)
         matcher = self._matcher(key)
         matches = matcher.match(place, self._predicted(place, mates), _outside(mates))
         self._places.setdefault((key, place.id.robot), []).append(place.id)
@@ -66,7 +68,7 @@ class PlaceRecognition:
 
     def thin(self, place: Place, mates: Collection[str]) -> None:
         """Forget the oldest places of the robot in one map where it has very many, and those of its old sessions."""
-        settings, matcher = self._config.matcher, self._matchers[place.channel, place.detector_version]
+        settings, matcher = self._config.matcher, self._matchers[self._key(place)]
         sessions = {session for session in mates if robot_of(session) == robot_of(place.id.robot)}
         if len(matcher) <= settings.most_nearby and len(sessions) <= settings.most_sessions_nearby:
             return
@@ -85,24 +87,24 @@ class PlaceRecognition:
 
     def vocabularies(self) -> tuple[VocabularyState, ...]:
         """The state of every vocabulary."""
-        return tuple(
-            VocabularyState(channel, version, matcher.word_count, len(matcher))
-            for (channel, version), matcher in self._matchers.items()
-        )
+        return tuple(VocabularyState(*key, matcher.word_count, len(matcher)) for key, matcher in self._matchers.items())
 
     def state(self) -> State:
         """What ``restore`` needs; submaps are built again when they are needed."""
-        return {f"{channel} {version}": matcher.state() for (channel, version), matcher in self._matchers.items()}
+        return {" ".join(key): matcher.state() for key, matcher in self._matchers.items()}
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
         for name, kept in state.items():
-            channel, _, version = name.partition(" ")
-            key = Channel(channel), version
+            channel, version, floor = name.split(" ")
+            key = Channel(channel), version, floor
             matcher = self._matcher(key)
-            matcher.restore(kept, *key)
+            matcher.restore(kept, Channel(channel), version)
             for place in matcher:
                 self._places.setdefault((key, place.robot), []).append(place)
+
+    def _key(self, place: Place) -> _VocabularyKey:
+        return place.channel, place.detector_version, self._sessions.floor(place.id.robot)
 
     def _matcher(self, key: _VocabularyKey) -> PlaceMatcher:
         if key not in self._matchers:
@@ -119,13 +121,13 @@ class PlaceRecognition:
 
     def _forget(self, place: Place) -> None:
         """DetectorUpdate what only a place needs that is never compared again."""
-        self._places[(place.channel, place.detector_version), place.id.robot].remove(place.id)
+        self._places[self._key(place), place.id.robot].remove(place.id)
         self._submaps.drop(place)
         self._sessions.release(place)
 
     def _predicted(self, place: Place, mates: Collection[str]) -> dict[KeyscanId, FloatArray]:
         """T_i_j (3,) to the nearest places of other sessions in the map: one for each visit, few for each group."""
-        pose, key = self._graph.pose(place.id), (place.channel, place.detector_version)
+        pose, key = self._graph.pose(place.id), self._key(place)
         visits: dict[str, list[Visit]] = {}
         for session in mates:
             ids = self._places.get((key, session), []) if session != place.id.robot else []

@@ -60,7 +60,11 @@ def run_of(
     mapped = {robot.robot: robot for robot in result.robots}
     trajectories = {
         name: RobotTrajectory(
-            name, mapped[name].map_index, frozen(track.stamps), frozen(track.on_keyscans(mapped[name].T_map_base))
+            name,
+            mapped[name].map_index,
+            frozen(track.stamps),
+            frozen(track.on_keyscans(mapped[name].T_map_base)),
+            mapped[name].floor,
         )
         for name, track in tracks.items()
     }

@@ -45,6 +45,8 @@ class MappedRobot:
     first keyscan."""
     lasers: tuple[LaserModel, ...]
     """As the robot announced them."""
+    floor: str = ""
+    """Floor that the session named; empty: none."""
 
     def numbers(self) -> NDArray[np.int64]:
         """Rows of ``keyscans`` in stamps and poses, ascending."""
@@ -111,6 +113,7 @@ def conclude(
             fusion.T_map_base[robot],
             fusion.T_local_base[robot],
             sessions.lasers(robot),
+            sessions.floor(robot),
         )
         for robot in names
     )

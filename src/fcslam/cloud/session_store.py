@@ -61,9 +61,11 @@ class SessionStore:
         ``sequence`` is the number of its packet.
 
         Raises:
-            PacketError: a laser of before is missing or different.
+            PacketError: a laser of before is missing or different, or the floor is another one.
         """
         before = self._hellos.get(hello.robot)
+        if before is not None and before.floor != hello.floor:
+            raise PacketError(f"{hello.robot}: says hello again on another floor; that takes a new session")
         if before is not None and before.lasers != hello.lasers[: len(before.lasers)]:
             raise PacketError(f"{hello.robot}: says hello again with another laser")
         self._hellos[hello.robot] = hello
@@ -182,6 +184,10 @@ class SessionStore:
     def detector_versions(self, robot: str) -> Mapping[Channel, str]:
         """What the robot describes places with now; nothing before its hello."""
         return self._hellos[robot].detector_versions if robot in self._hellos else {}
+
+    def floor(self, robot: str) -> str:
+        """Floor that the robot named; empty if it named none."""
+        return self._hellos[robot].floor
 
     def lasers(self, robot: str) -> tuple[LaserModel, ...]:
         """The lasers that the robot announced."""

@@ -1,7 +1,7 @@
 """The run folder: what a mission leaves behind. Writer and reader stand side by side.
 
     trajectories/<robot>.tum   stamp x y z qx qy qz qw: pose of base in the robot's map at every laser scan
-    robots.csv                 robot, map, path_length_m, scans
+    robots.csv                 robot, map, path_length_m, scans, floor
     closures.csv               every loop closure considered, with its status and reason
     pose_graph.g2o             the optimised pose graph
     metrics.json               [{name, value, unit}]
@@ -164,7 +164,7 @@ def open_run(folder: str | os.PathLike[str]) -> Run:
     try:
         maps = read_robots(path / ROBOTS)
         return Run(
-            trajectories={robot: _read_trajectory(path, robot, index) for robot, index in maps.items()},
+            trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in maps.items()},
             closures=read_closures(path / CLOSURES),
             metrics=read_metrics(path / METRICS),
             config_yaml=(path / CONFIG).read_text(encoding="utf-8"),
@@ -214,11 +214,11 @@ def _tum_path(folder: Path, robot: str) -> Path:
     return folder / TRAJECTORIES / f"{robot}.tum"
 
 
-def _read_trajectory(folder: Path, robot: str, map_index: int) -> RobotTrajectory:
+def _read_trajectory(folder: Path, robot: str, map_index: int, floor: str) -> RobotTrajectory:
     if not _SAFE_NAME.fullmatch(robot):
         raise ValueError(f"{ROBOTS}: {robot!r} is no robot's name")
     stamps, poses = read_tum(_tum_path(folder, robot))
-    return RobotTrajectory(robot, map_index, stamps, poses)
+    return RobotTrajectory(robot, map_index, stamps, poses, floor)
 
 
 def _write_local_map(folder: Path, local: LocalMap) -> None:

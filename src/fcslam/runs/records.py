@@ -21,6 +21,8 @@ class RobotTrajectory:
     """Shape (N,), seconds of the recording's own clock."""
     T_map_base: FloatArray
     """Poses (x, y, theta) of ``base`` in the coordinate frame of the robot's map, metres and radians, shape (N, 3)."""
+    floor: str = ""
+    """Floor that the session named; empty: none."""
 
     @property
     def path_length_m(self) -> float:

@@ -42,10 +42,11 @@ class Separation:
 
 
 def separations(run: Run) -> list[Separation]:
-    """One record for every two maps of the run, in the order of their numbers."""
+    """One record for every two maps of one floor, in the order of their numbers."""
     members: dict[int, list[str]] = defaultdict(list)
     for trajectory in run.trajectories.values():
         members[trajectory.map_index].append(trajectory.robot)
+    floors = {trajectory.map_index: trajectory.floor for trajectory in run.trajectories.values()}
     between: dict[tuple[int, ...], list[ClosureRow]] = defaultdict(list)
     for closure in run.closures:
         ends = {run.trajectories[robot].map_index for robot in (closure.robot_i, closure.robot_j)}
@@ -53,6 +54,7 @@ def separations(run: Run) -> list[Separation]:
     return [
         _separation((a, b), (tuple(members[a]), tuple(members[b])), between[a, b])
         for a, b in combinations(sorted(members), 2)
+        if floors[a] == floors[b]
     ]
 
 

@@ -16,6 +16,8 @@ from fcslam.runs.records import ClosureRow, LocalizedPoses, Metric, RobotTraject
 _Value = TypeVar("_Value")
 
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
+_FLOOR = "floor"
+"""Column of robots.csv that older runs do not have."""
 _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
 _LOCALIZED_COLUMNS = ["stamp", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "quality"]
 _REASON_COLUMNS = ["reason", "value", "limit", "setting"]
@@ -24,16 +26,17 @@ _CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", 
 
 def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
     """Write robots.csv."""
-    _write_csv(path, _ROBOT_COLUMNS, map(_robot_fields, trajectories))
+    _write_csv(path, [*_ROBOT_COLUMNS, _FLOOR], map(_robot_fields, trajectories))
 
 
-def read_robots(path: Path) -> dict[str, int]:
-    """Map index by robot, in the order of robots.csv.
+def read_robots(path: Path) -> dict[str, tuple[int, str]]:
+    """Map index and floor by robot, in the order of robots.csv.
 
     Raises:
         ValueError: a column is missing, a map index is no number, or a robot occurs twice.
     """
-    return _unique(path.name, ((row["robot"], int(row["map"])) for row in _read_csv(path, _ROBOT_COLUMNS)))
+    rows = _read_csv(path, _ROBOT_COLUMNS)
+    return _unique(path.name, ((row["robot"], (int(row["map"]), row.get(_FLOOR) or "")) for row in rows))
 
 
 def write_closures(path: Path, closures: Iterable[ClosureRow]) -> None:
@@ -139,7 +142,8 @@ def _unique(file: str, items: Iterable[tuple[str, _Value]]) -> dict[str, _Value]
 
 
 def _robot_fields(trajectory: RobotTrajectory) -> list[Any]:
-    return [trajectory.robot, trajectory.map_index, f"{trajectory.path_length_m:.3f}", len(trajectory.stamps)]
+    length_m, scans = f"{trajectory.path_length_m:.3f}", len(trajectory.stamps)
+    return [trajectory.robot, trajectory.map_index, length_m, scans, trajectory.floor]
 
 
 def _closure_fields(closure: ClosureRow) -> list[Any]:

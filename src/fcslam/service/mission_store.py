@@ -17,16 +17,16 @@ import numpy as np
 from fcslam.cloud.edits import check_undo, edit_json, kind_of, read_edit, sessions_of, stamps_of
 from fcslam.cloud.replies import SessionCorrection, is_news
 from fcslam.cloud.report import Track
-from fcslam.cloud.sessions import robot_of, session_name
+from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import one_line
 from fcslam.errors import EditError, PacketConflictError, StoreError
-from fcslam.records import Change, Channel, Correction, Edit, Removal, Undo, frozen
+from fcslam.records import Change, Channel, Correction, Edit, ManualClosure, Removal, Undo, frozen
 from fcslam.storage.database import Database, SealedTable, check_file, translate_errors
 from fcslam.storage.recovery import fault
 from fcslam.wire.ledger import Ledger, Traffic
-from fcslam.wire.messages import PacketKind
-from fcslam.wire.packets import Label
+from fcslam.wire.messages import Hello, PacketKind
+from fcslam.wire.packets import Label, decode
 
 APPLIED = "applied"
 """A fact: how many packets took effect."""
@@ -276,6 +276,17 @@ class MissionStore:
             first, last = spans[name]
             if not first - NEARBY_S <= stamp <= last + NEARBY_S:
                 raise EditError(f"{name} has no scan at {stamp:.3f} s; its scans are from {first:.3f} to {last:.3f} s")
+        if isinstance(content, ManualClosure) and len({self._floor(name) for name in named}) > 1:
+            raise EditError(f"{' and '.join(named)} are on different floors, which no closure joins")
+
+    def _floor(self, session: str) -> str:
+        """Floor that a session names; empty if none."""
+        statement = (
+            "SELECT data FROM packets WHERE robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL ORDER BY sequence"
+        )
+        rows = self._database.rows(f"{statement} LIMIT 1", (*robot_and_epoch(session), PacketKind.HELLO))
+        hellos = (decode(data).body for (data,) in rows)
+        return next((hello.floor for hello in hellos if isinstance(hello, Hello)), "")
 
     def edits(self, after: int = 0) -> list[Edit]:
         """The edits after number ``after``, in their order."""

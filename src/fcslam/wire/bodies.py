@@ -63,6 +63,7 @@ def _write_hello(hello: Hello) -> pb.Hello:
             for channel, code in _CHANNELS.items()
             if channel in hello.detector_versions
         ],
+        floor=hello.floor,
     )
 
 
@@ -73,7 +74,7 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
     if codes != sorted(set(codes)):
         raise PacketError("hello: detectors are not in ascending order of their channels")
     versions = {read_channel(detector.channel): detector.version for detector in message.detectors}
-    return Hello(envelope.robot, envelope.epoch, lasers, MappingProxyType(versions))
+    return Hello(envelope.robot, envelope.epoch, lasers, MappingProxyType(versions), message.floor)
 
 
 def _write_laser(laser: LaserModel) -> pb.Laser:

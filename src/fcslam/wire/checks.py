@@ -1,6 +1,7 @@
 """Validation of packets: the same checks before writing and after reading."""
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from fcslam.wire.limits import (
     MAXIMUM_BEAMS,
     MAXIMUM_COORDINATE_M,
     MAXIMUM_EPOCH,
+    MAXIMUM_FLOOR_LENGTH,
     MAXIMUM_INFORMATION,
     MAXIMUM_KEYPOINTS,
     MAXIMUM_LASER_RANGE_M,
@@ -28,6 +30,8 @@ from fcslam.wire.limits import (
 )
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
+
+_FLOOR = re.compile(rf"[A-Za-z0-9._+-]{{1,{MAXIMUM_FLOOR_LENGTH}}}")
 
 
 def check(packet: Packet) -> None:
@@ -66,6 +70,18 @@ def _check_hello(hello: Hello, packet: Packet) -> None:
         _check_laser(laser)
     for channel, version in hello.detector_versions.items():
         check_name(version, f"hello: detector version of {channel}")
+    if hello.floor:
+        check_floor(hello.floor)
+
+
+def check_floor(floor: str) -> None:
+    """Refuse a floor that is not 1 to 16 letters, digits and ``. _ + -``; "-1" is one.
+
+    Raises:
+        PacketError: the floor is not valid.
+    """
+    valid = _FLOOR.fullmatch(floor) is not None
+    _require(valid, f"floor {floor[:64]!r} is not 1 to {MAXIMUM_FLOOR_LENGTH} of A-Z a-z 0-9 . _ + -")
 
 
 def _check_laser(laser: LaserModel) -> None:

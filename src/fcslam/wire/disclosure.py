@@ -19,6 +19,7 @@ REVEALS: Mapping[str, str] = MappingProxyType(
         "Packet.time": "when it drove, by its own clock",
         "Hello.lasers": "how many LiDARs it has",
         "Hello.detectors": "whether it has a camera, and which software describes what it sees",
+        "Hello.floor": "which floor it drives on",
         "Laser.beam_count": "which LiDAR it has",
         "Laser.angle_min_rad": "which LiDAR it has, and how it is mounted",
         "Laser.angle_increment_rad": "which LiDAR it has",

@@ -64,12 +64,14 @@ class Pose(_message.Message):
     def __init__(self, x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., theta_rad: _Optional[float] = ...) -> None: ...
 
 class Hello(_message.Message):
-    __slots__ = ("lasers", "detectors")
+    __slots__ = ("lasers", "detectors", "floor")
     LASERS_FIELD_NUMBER: _ClassVar[int]
     DETECTORS_FIELD_NUMBER: _ClassVar[int]
+    FLOOR_FIELD_NUMBER: _ClassVar[int]
     lasers: _containers.RepeatedCompositeFieldContainer[Laser]
     detectors: _containers.RepeatedCompositeFieldContainer[Detector]
-    def __init__(self, lasers: _Optional[_Iterable[_Union[Laser, _Mapping]]] = ..., detectors: _Optional[_Iterable[_Union[Detector, _Mapping]]] = ...) -> None: ...
+    floor: str
+    def __init__(self, lasers: _Optional[_Iterable[_Union[Laser, _Mapping]]] = ..., detectors: _Optional[_Iterable[_Union[Detector, _Mapping]]] = ..., floor: _Optional[str] = ...) -> None: ...
 
 class Laser(_message.Message):
     __slots__ = ("beam_count", "angle_min_rad", "angle_increment_rad", "max_range_m", "t_base_laser")

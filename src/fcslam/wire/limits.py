@@ -1,8 +1,12 @@
-"""All limits of the format, version 2. Packets beyond a limit are neither written nor read."""
+"""All limits of the format, versions 2 and 3. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
 PROTOCOL_VERSION = 2
+FLOOR_VERSION = 3
+"""Of a hello that names a floor. All other packets are of version 2, which receivers without floors read."""
+
+MAXIMUM_FLOOR_LENGTH = 16
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""

@@ -1,7 +1,7 @@
 """A packet: one record in the envelope that orders and addresses it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from fcslam.records import Channel, Constraint, Correction, DetectorFile, Keyscan, LaserModel, Place
@@ -32,6 +32,8 @@ class Hello:
     lasers: tuple[LaserModel, ...]
     """One or more; keyscans name theirs by its index."""
     detector_versions: Mapping[Channel, str]
+    floor: str = ""
+    """Floor of the building that the session maps, the same in all hellos of an epoch; empty: not named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,3 +76,7 @@ class Packet:
     def order(self) -> tuple[float, str, int, int]:
         """Key of the canonical order, which does not depend on the order of arrival."""
         return self.time, self.robot, self.epoch, self.sequence
+
+    def on_floor(self, floor: str) -> "Packet":
+        """A hello that names the floor; any other packet as it is."""
+        return replace(self, body=replace(self.body, floor=floor)) if isinstance(self.body, Hello) else self

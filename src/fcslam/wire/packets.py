@@ -13,6 +13,7 @@ from fcslam.wire.checks import check, check_name
 from fcslam.wire.limits import (
     BYTES_PER_AXIS,
     BYTES_PER_RANGE,
+    FLOOR_VERSION,
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
     MAXIMUM_EPOCH,
@@ -21,7 +22,9 @@ from fcslam.wire.limits import (
     MAXIMUM_SEQUENCE,
     PROTOCOL_VERSION,
 )
-from fcslam.wire.messages import Packet, PacketKind
+from fcslam.wire.messages import Body, Hello, Packet, PacketKind
+
+_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION)
 
 
 class Label(NamedTuple):
@@ -43,7 +46,7 @@ def encode(packet: Packet) -> bytes:
     kind, codec = CODEC_OF_TYPE[type(packet.body)]
     body: dict[str, Any] = {kind: codec.write(packet.body)}
     message = pb.Packet(
-        version=PROTOCOL_VERSION,
+        version=_version(packet.body),
         robot=packet.robot,
         epoch=packet.epoch,
         sequence=packet.sequence,
@@ -93,6 +96,8 @@ def decode(data: bytes) -> Packet:
     body = CODECS[kind].read(getattr(message, kind), message)
     packet = Packet(message.robot, message.epoch, message.sequence, message.time, body)
     check(packet)
+    if message.version != _version(body):
+        raise PacketError(f"version {message.version} of a packet of version {_version(body)}")
     return packet
 
 
@@ -145,8 +150,12 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
     except (DecodeError, PacketError):
         return None
     numbered = message.epoch <= MAXIMUM_EPOCH and message.sequence <= MAXIMUM_SEQUENCE
-    known = message.version == PROTOCOL_VERSION and numbered
+    known = message.version in _VERSIONS and numbered
     return (message.robot, message.epoch, message.sequence) if known else None
+
+
+def _version(body: Body) -> int:
+    return FLOOR_VERSION if isinstance(body, Hello) and body.floor else PROTOCOL_VERSION
 
 
 def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
@@ -157,8 +166,9 @@ def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
         message.ParseFromString(data)
     except DecodeError as error:
         raise PacketError("not a protobuf message of a packet") from error
-    if message.version != PROTOCOL_VERSION:
-        raise PacketError(f"version {message.version} is unknown, this side speaks version {PROTOCOL_VERSION}")
+    if message.version not in _VERSIONS:
+        known = " and ".join(map(str, _VERSIONS))
+        raise PacketError(f"version {message.version} is unknown, this side speaks versions {known}")
     message.DiscardUnknownFields()
     if message.ByteSize() != len(data):
         raise PacketError("unknown, repeated or overlong fields")

@@ -15,6 +15,7 @@ _LONGEST_RANGE_M = 1000.0
 _COUNT_TOLERANCE = 0.01
 """Share of the ranges by which drivers that round the increment are wrong."""
 _MAX_COORDINATE_M = 1e7
+_LONGEST_FRAME = 255
 _NANOSECONDS = 10**9
 
 
@@ -147,6 +148,8 @@ def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
 
 def _frame(name: str) -> str:
     """Frame name without the leading slash of ROS 1."""
+    if len(name) > _LONGEST_FRAME:
+        raise ValueError("no name of a frame")
     return name.lstrip("/")
 
 
