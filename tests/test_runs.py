@@ -88,8 +88,8 @@ def test_local_maps_may_be_left_out_as_a_whole(tmp_path, run):
 def test_tables_have_the_columns_promised(tmp_path, run):
     run.save(tmp_path / "run")
     robots = (tmp_path / "run" / "robots.csv").read_text().splitlines()
-    assert robots[0] == "robot,map,path_length_m,scans"
-    assert robots[2] == "b-2,1,0.000,1"
+    assert robots[0] == "robot,map,path_length_m,scans,floor"
+    assert robots[2] == "b-2,1,0.000,1,"
     closures = (tmp_path / "run" / "closures.csv").read_text().splitlines()
     assert (
         closures[0] == "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason,value,limit,setting"

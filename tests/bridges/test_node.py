@@ -46,10 +46,18 @@ def robot():
         yield robot
 
 
-def start(network, robot, notify=lambda _: None, suggest_pose=None, **parameters):
+def start(network, robot, notify=lambda _: None, suggest_pose=None, change_floor=None, **parameters):
     topics = await_sensors(network, "/robot1", BagOptions(), 0.0, 0.0)
     return RobotNode(
-        network, "/robot1", topics, BagOptions(), robot, NodeParameters(**parameters), notify, suggest_pose
+        network,
+        "/robot1",
+        topics,
+        BagOptions(),
+        robot,
+        NodeParameters(**parameters),
+        notify,
+        suggest_pose,
+        change_floor,
     )
 
 
@@ -230,6 +238,23 @@ def test_an_initial_pose_is_refused_with_the_reason(network, robot):
     for _ in range(2):
         network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))
     assert said == ["an initial pose is ignored: the robot maps, and its first scan is the origin of the map"]
+
+
+def test_a_floor_begins_a_session_on_it(network, robot, scans):
+    said = []
+    start(network, robot, said.append)
+    network.say("/robot1/fcslam/floor", STRING, CODEC.make(STRING, data="2"))
+    assert said == ["a floor is ignored: the robot localises in one finished map"]
+    said.clear()
+    network = MemoryNetwork([offered(*topic) for topic in TOPICS])
+    node = start(network, robot, said.append, None, robot.change_floor)
+    for floor in ("2", "not a floor"):
+        network.say("/robot1/fcslam/floor", STRING, CODEC.make(STRING, data=floor))
+    assert said == ["a floor is refused: floor 'not a floor' is not 1 to 16 of A-Z a-z 0-9 . _ + -"]
+    plays(network, scans)
+    run_until(node, len(scans))
+    robot.finish()
+    assert robot.trajectory().floor == "2"
 
 
 def given_pose(x, y, theta, frame="map"):

@@ -334,3 +334,31 @@ def test_two_lasers_are_told_apart_by_name(scans):
         with pytest.raises(InputError, match="laser '' is not known; known: 'front', 'rear'"):
             robot.add_scan(scans[0].ranges_m, scans[9].stamp, scans[9].T_odom_base)
         assert len(robot.trajectory().stamps) == 20
+
+
+def test_a_lift_begins_a_session_on_another_floor(scans, tmp_path):
+    events = []
+    half = len(scans) // 2
+    with fcslam.Robot("anna", scans[0].laser, floor="1", executor=SameThread(), on_event=events.append) as robot:
+        drive(robot, scans[:half])
+        robot.change_floor("1")
+        robot.change_floor("2")
+        poses = drive(robot, scans[half:])
+        with pytest.raises(InputError, match="is not 1 to 16"):
+            robot.change_floor("the attic")
+        robot.finish()
+        run = robot.save(tmp_path / "run")
+    assert {name: trajectory.floor for name, trajectory in run.trajectories.items()} == {"anna": "1", "anna+1": "2"}
+    assert {trajectory.map_index for trajectory in run.trajectories.values()} == {0, 1}
+    assert all(pose.is_localized for pose in poses)
+    assert [event.kind for event in events if event.kind == fcslam.EventKind.FLOOR] == ["floor"]
+    assert not [event for event in events if event.kind == fcslam.EventKind.LOST]
+
+
+def test_a_robot_that_has_not_moved_changes_its_floor_at_once(scans, tmp_path):
+    with fcslam.Robot("anna", scans[0].laser, executor=SameThread()) as robot:
+        robot.change_floor("2")
+        drive(robot, scans)
+        robot.finish()
+        run = robot.save(tmp_path / "run")
+    assert [trajectory.floor for trajectory in run.trajectories.values()] == ["2"]

@@ -34,6 +34,7 @@ HELLO = Hello(
     ),
     {Channel.LIDAR: "orb-1", Channel.CAMERA: "cnn-0.3+r12"},
 )
+FLOOR_HELLO = replace(HELLO, floor="-1")
 KEYSCAN = Keyscan(
     KeyscanId("alice", 12),
     1042.25,
@@ -82,6 +83,7 @@ def packet(body: Body) -> Packet:
 
 EXAMPLES = {
     "hello": packet(HELLO),
+    "floor_hello": packet(FLOOR_HELLO),
     "keyscan": packet(KEYSCAN),
     "varied_keyscan": packet(VARIED_KEYSCAN),
     "odometry": packet(ODOMETRY),

@@ -110,7 +110,12 @@ def bodies(robot, epoch, time):
     identity = st.builds(KeyscanId, st.just(robot), NUMBERS)
     return st.one_of(
         st.builds(
-            Hello, st.just(robot), st.just(epoch), st.lists(lasers(), min_size=1, max_size=8).map(tuple), versions
+            Hello,
+            st.just(robot),
+            st.just(epoch),
+            st.lists(lasers(), min_size=1, max_size=8).map(tuple),
+            versions,
+            st.from_regex(r"([A-Za-z0-9._+-]{1,16})?", fullmatch=True),
         ),
         keyscans(identity, stamps),
         constraints(robot),

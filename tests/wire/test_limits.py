@@ -241,7 +241,14 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
 @pytest.mark.parametrize(
     ("name", "fields", "reason"),
     [
-        ("hello", {"version": 0}, "version 0 is unknown, this side speaks version 2"),
+        ("hello", {"version": 0}, "version 0 is unknown, this side speaks versions 2 and 3"),
+        ("hello", {"version": 3}, "version 3 of a packet of version 2"),
+        ("keyscan", {"version": 3}, "version 3 of a packet of version 2"),
+        ("floor_hello", {"version": 2}, "version 2 of a packet of version 3"),
+        ("floor_hello", {"floor": "two words"}, "floor 'two words' is not 1 to 16"),
+        ("floor_hello", {"floor": "x" * 17}, "is not 1 to 16"),
+        ("floor_hello", {"floor": "<b>"}, "is not 1 to 16"),
+        ("floor_hello", {"floor": "1\n"}, "is not 1 to 16"),
         ("hello", {"version": 1}, "version 1 is unknown"),
         ("hello", {"robot": "a/b"}, "no name"),
         ("hello", {"epoch": 2**31}, "epoch"),

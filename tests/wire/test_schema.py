@@ -39,6 +39,7 @@ LONGEST = {
     "Place.descriptors": 32 * 2048,
     "Hello.lasers": 8,
     "Hello.detectors": 2,
+    "Hello.floor": 16,
     "Constraint.information": 6,
 }
 """Every field that holds more than one number, and how much of it, in bytes, characters or elements."""

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from fcslam.live.records import RobotPose
 
 STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
-SAVE_MAP, FINISH, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "initialpose"
+SAVE_MAP, FINISH, FLOOR, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "fcslam/floor", "initialpose"
 _LONGEST_INBOX = 20_000
 """Most messages that wait to be read; beyond, newer ones are lost."""
 _COMMANDS_WAITING = 8
@@ -114,17 +114,19 @@ class RobotNode:
         parameters: NodeParameters,
         notify: Notify,
         suggest_pose: Callable[[FloatArray], None] | None = None,
+        change_floor: Callable[[str], None] | None = None,
     ) -> None:
         """Begin to receive and to publish.
 
-        ``suggest_pose`` takes initial poses, if the robot is one in a finished map.
+        ``suggest_pose`` takes initial poses, if the robot is one in a finished map. ``change_floor`` takes floors, if
+        it maps.
 
         Raises:
             NetworkError: another node publishes what this one would.
         """
         self._network, self._namespace, self._topics = network, namespace, topics
         self._robot, self._parameters, self._notify = robot, parameters, notify
-        self._suggest_pose = suggest_pose
+        self._suggest_pose, self._change_floor = suggest_pose, change_floor
         self._codec = MessageCodec(network.ros1)
         self._inbox: queue.SimpleQueue[_Message] = queue.SimpleQueue()
         self._commands: queue.Queue[tuple[Callable[[], Answer], Future[Answer]]] = queue.Queue(_COMMANDS_WAITING)
@@ -289,6 +291,7 @@ class RobotNode:
             (SAVE_MAP, STRING, lambda payload: self._ask(partial(self._save_map, payload))),
             (FINISH, EMPTY, lambda _: self.stop()),
             (INITIAL_POSE, POSE, self._take_pose),
+            (FLOOR, STRING, self._take_floor),
         ]
         for name, kind, command in commands:
             self._network.subscribe(resolved(self._namespace, name), kind, Quality(reliable=True), command)
@@ -365,6 +368,16 @@ class RobotNode:
             self._notify(f"an initial pose is refused: {error}")
             return
         self._notify(f"initial pose ({x:.2f} m, {y:.2f} m, {theta:.2f} rad): it counts once the walls confirm it")
+
+    def _take_floor(self, payload: bytes) -> None:
+        """Begin a session on another floor, as a lift's controller says."""
+        if self._change_floor is None:
+            self._tell_once("a floor is ignored: the robot localises in one finished map")
+            return
+        try:
+            self._change_floor(self._codec.decode(payload, STRING).data)
+        except (ValueError, FcslamError) as error:  # anybody on the network may send it
+            self._tell_once(f"a floor is refused: {one_line(str(error))}")
 
     def _refuse_namesake(self) -> None:
         taken = resolved(self._namespace, MAP)

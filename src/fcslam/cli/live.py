@@ -79,7 +79,10 @@ def map_live(
         for note in topics.notes:
             notify(note)
         suggest_pose = robot.suggest_pose if isinstance(robot, LocalizedRobot) else None
-        node = RobotNode(network, place.namespace, topics, options, robot, parameters, notify, suggest_pose)
+        change_floor = None if isinstance(robot, LocalizedRobot) else robot.change_floor
+        node = RobotNode(
+            network, place.namespace, topics, options, robot, parameters, notify, suggest_pose, change_floor
+        )
         heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
         notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
         with stopping(node.stop):  # also while the run is written: a late SIGTERM must not lose it

@@ -136,6 +136,9 @@ def robot(
     ] = None,
     localize: Localize = None,
     initial_pose: InitialPose = None,
+    floor: Annotated[
+        str, typer.Option(help="Floor of the building. Places of different floors are never compared.")
+    ] = "",
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
     ] = False,
@@ -186,10 +189,10 @@ def robot(
     if is_address(source):
         start: Callable[..., Robot | LocalizedRobot] = partial(
             Robot, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
-            outbox_mb=outbox_mb, config=settings,
+            outbox_mb=outbox_mb, config=settings, floor=floor,
         )  # fmt: skip
         if localize is not None:
-            _refuse_network(server, state)
+            _refuse_mapping(server, state, floor)
             initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
             start = partial(LocalizedRobot, map=localize, initial_pose=initial, config=settings)
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose) or BagOptions()
@@ -206,10 +209,11 @@ def robot(
     survey = recording.survey()
     console = notices(quiet)
     print_notes(console, survey.notes)
-    fingerprint = _fingerprint(recording.name, survey, settings.robot, budget_kbps)
+    fingerprint = _fingerprint(recording.name, survey, settings.robot, budget_kbps, floor)
     live = Robot(
         recording.name, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
-        outbox_mb=outbox_mb, config=settings, own_map=False, playback=Playback(fingerprint, resume),
+        outbox_mb=outbox_mb, config=settings, own_map=False, floor=floor,
+        playback=Playback(fingerprint, resume),
     )  # fmt: skip
     with closing(live):
         try:
@@ -226,11 +230,11 @@ def robot(
         _report(live, state, server)
 
 
-def _refuse_network(server: str | None, state: Path | None) -> None:
+def _refuse_mapping(server: str | None, state: Path | None, floor: str) -> None:
     from fcslam.errors import InputError
 
-    if server is not None or state is not None:
-        raise InputError("a robot that localises sends and keeps nothing; leave --server and --state out")
+    if server is not None or state is not None or floor:
+        raise InputError("a robot that localises sends and keeps nothing; leave --server, --state and --floor out")
 
 
 def _required(server: str | None, state: Path | None) -> tuple[str, Path]:
@@ -296,7 +300,7 @@ def _own_certificate(certificate: Path | None, key: Path | None) -> tuple[Path, 
     return None if certificate is None or key is None else (certificate, key)
 
 
-def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kbps: float | None) -> str:
+def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kbps: float | None, floor: str) -> str:
     """A digest of the inputs that determine the packets; digests of the packets themselves reveal other changes."""
     import hashlib
 
@@ -304,7 +308,7 @@ def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kb
     from fcslam.config import dump
 
     length = survey.scan_count, survey.duration_s, survey.path_length_m
-    inputs = (fcslam.__version__, name, *length, survey.lasers, budget_kbps)
+    inputs = (fcslam.__version__, name, *length, survey.lasers, budget_kbps, floor)
     return hashlib.sha256(f"{inputs} {dump(settings)}".encode()).hexdigest()
 
 

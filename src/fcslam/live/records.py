@@ -150,6 +150,8 @@ class EventKind(StrEnum):
     LOST = "lost"
     """The scans contradict the map: the robot maps in a new session until its place is found. In a finished map, it is
     searched for again."""
+    FLOOR = "floor"
+    """The robot is on another floor, and maps in a new session."""
     LOCALISED = "localised"
     """The place of the robot in a finished map is found."""
     RELOCALISED = "relocalised"

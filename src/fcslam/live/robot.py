@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from fcslam.api import StrPath, settings_of
 from fcslam.cloud.sessions import session_name
 from fcslam.driving import track_of
-from fcslam.errors import InputError, StateError
+from fcslam.errors import InputError, PacketError, StateError
 from fcslam.geometry import se2
 from fcslam.live.inputs import (
     Lasers,
@@ -44,6 +44,7 @@ from fcslam.robot.uplink import Uplink
 from fcslam.robot.warmup import warm_up_tracking
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.map_files import OccupancyMap
+from fcslam.wire.checks import check_floor
 from fcslam.wire.http_transport import BatchTransport, HttpTransport
 from fcslam.wire.messages import Hello, Packet
 
@@ -103,6 +104,7 @@ class Robot(LiveTracker):
         outbox_mb: float = 256.0,
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
         own_map: bool = True,
+        floor: str = "",
         playback: Playback | None = None,
         on_event: Callable[[RobotEvent], None] | None = None,
         executor: Executor | None = None,
@@ -126,6 +128,8 @@ class Robot(LiveTracker):
             outbox_mb: limit of the packets that wait for the server, MB; above three quarters, places are left out.
             config: as in ``map_recordings``.
             own_map: whether the robot has a map of its own; a robot with a server may do without.
+            floor: floor of the building, 1 to 16 letters, digits and ``. _ + -``. Places of different floors are never
+                compared. Empty: none is named.
             playback: the recording that is played. None: live.
             on_event: called by ``add_scan``, ``add_image`` and ``add``, in their thread, before they return.
             executor: runs the back end and the map, in its only worker. None: a process of its own, which ends with the
@@ -134,9 +138,11 @@ class Robot(LiveTracker):
             sleep: sleeps for so many seconds while ``finish`` waits for the server.
 
         Raises:
-            InputError: the name, a laser, the configuration, the address, a file or the state folder cannot be used, or
-                the worker does not start.
+            InputError: the name, a laser, the configuration, the floor, the address, a file or the state folder cannot
+                be used, or the worker does not start.
         """
+        self._floors = {0: _checked_floor(floor)}
+        """Floor by the first part that is on it."""
         super().__init__(name, laser, settings_of(config), on_event)
         self._camera = checked_camera(camera)
         self._clock = clock
@@ -197,6 +203,22 @@ class Robot(LiveTracker):
                 None if odometry is None or self._prediction is not None else checked_pose("odometry", odometry)
             )
             self.add(checked_image(image, stamp, T_odom_base, self._camera))
+
+    def change_floor(self, floor: str) -> None:
+        """Go on in a new session on another floor: after a ride in a lift, before the first scan there.
+
+        Args:
+            floor: as for the robot itself.
+
+        Raises:
+            InputError: it is no floor.
+        """
+        _checked_floor(floor)
+        with self._lock:
+            if floor != self._floor(self._part):
+                if len(self._frontend.scan_poses):
+                    self._frontend.begin_session()
+                self._floors[self._part] = floor
 
     def status(self) -> RobotStatus:
         """What the robot has done so far."""
@@ -271,7 +293,9 @@ class Robot(LiveTracker):
         poses = np.concatenate((known, se2.compose(T_map_odom, T_odom_keyscan[len(known) :])))
         index = self._localizer(part).map_index
         T_map_base = se2.compose(poses[keyscans], offsets)
-        return RobotTrajectory(self._session(part), 0 if index is None else index, frozen(stamps), frozen(T_map_base))
+        return RobotTrajectory(
+            self._session(part), 0 if index is None else index, frozen(stamps), frozen(T_map_base), self._floor(part)
+        )
 
     def finish(self, timeout_s: float | None = None, watch: Callable[[RobotStatus], None] | None = None) -> bool:
         """End the recording: close the last loops, and wait until the server has everything. Nothing can be added
@@ -413,6 +437,7 @@ class Robot(LiveTracker):
         """Pass the next packets on."""
         if not packets:
             return
+        packets = [packet.on_floor(self._floor(packet.epoch)) for packet in packets]
         self._keyscans += sum(isinstance(packet.body, Keyscan) for packet in packets)
         if self._uplink is not None:
             self._uplink.put(packets)
@@ -428,6 +453,9 @@ class Robot(LiveTracker):
         """Take a correction of the server, in any thread."""
         self._localizers[1].setdefault(part, Localizer(self._clock)).correct(correction)
 
+    def _floor(self, part: int) -> str:
+        return self._floors[max(first for first in self._floors if first <= part)]
+
     def _localizer(self, part: int) -> Localizer:
         """That of the server as soon as it has corrected this part of the start."""
         own, by_server = self._localizers
@@ -436,7 +464,7 @@ class Robot(LiveTracker):
     def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray) -> RobotPose:
         localizer = self._localizer(self._part)
         corrected = localizer.T_map_base(T_smooth_base)
-        is_found = self._part == 0 or localizer.quality > 0.0
+        is_found = self._part in self._floors or localizer.quality > 0.0
         return RobotPose(
             newest.pose.stamp, frozen(T_smooth_base if corrected is None else corrected),
             T_odom_base if self._prediction is None else None, newest.quality,
@@ -449,10 +477,13 @@ class Robot(LiveTracker):
         part, correction = self._part, self._localizer(self._part).correction
         if part > self._newest_part:
             self._newest_part, self._applied = part, None
-            self._event(
-                EventKind.LOST,
-                "lost: the scans contradict the map, or stopped while it drove on; the robot maps in a new session",
-            )
+            if part in self._floors:
+                self._event(EventKind.FLOOR, f"on floor {self._floors[part] or 'without a name'}, in a new session")
+            else:
+                self._event(
+                    EventKind.LOST,
+                    "lost: the scans contradict the map, or stopped while it drove on; the robot maps in a new session",
+                )
         if correction is not self._applied and correction is not None:
             self._tell_correction(self._applied, correction)
             self._applied = correction
@@ -485,6 +516,15 @@ class Robot(LiveTracker):
         distance_m, turned_rad = float(np.hypot(moved[0], moved[1])), abs(float(moved[2]))
         if distance_m > JUMP_M or turned_rad > JUMP_RAD:
             self._event(EventKind.CORRECTED, f"corrected by {distance_m:.3f} m and {turned_rad:.4f} rad")
+
+
+def _checked_floor(floor: str) -> str:
+    try:
+        if floor:
+            check_floor(floor)
+    except PacketError as error:
+        raise InputError(str(error)) from error
+    return floor
 
 
 def _in_epoch(packet: Packet, epoch: int) -> Packet:

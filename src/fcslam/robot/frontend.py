@@ -180,6 +180,12 @@ class RobotFrontend:
         """
         return self._submit(NewDetector(file, path))
 
+    def begin_session(self) -> None:
+        """End the present session and begin another: the next scan is of another place, as after a ride in a lift."""
+        self._process_deferred()
+        self._end_session()
+        self._previous = None
+
     def finish(self) -> list[Packet]:
         """End the recording; returns all packets that are left."""
         self._process_deferred()

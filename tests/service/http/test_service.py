@@ -155,7 +155,7 @@ def test_viewers_see_the_fleet(mapped):
     assert len(accepted) == 4
     assert {(c["robot_i"], c["robot_j"]) for c in accepted} == {("a", "b")}
     assert get(mapped, "closures?status=accepted&limit=3").json() == accepted[1:]
-    assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a", "b"], "zoom": 5}]
+    assert get(mapped, "maps").json() == [{"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5}]
 
 
 def test_viewers_get_the_files_of_the_live_run(mapped):
@@ -277,11 +277,11 @@ def test_edits_of_every_kind_reach_the_result_and_their_undos_leave_no_trace(map
 def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
     removed = edit(mapped, "removal", {"robot": "b"}).json()
     assert (removed["number"], removed["kind"], removed["author"]) == (1, "removal", "boss")
-    assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a"], "zoom": 5}]
+    assert get(mapped, "maps").json() == [{"map": 0, "floor": "", "robots": ["a"], "zoom": 5}]
     assert get(mapped, "closures").json() == []
     undone = mapped.ask("POST", f"{API}/edits/1/undo", "boss").json()
     assert (undone["kind"], undone["content"]) == ("undo", {"number": 1})
-    assert get(mapped, "maps").json() == [{"map": 0, "robots": ["a", "b"], "zoom": 5}]
+    assert get(mapped, "maps").json() == [{"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5}]
     edits = mapped.ask("GET", f"{API}/edits", "boss").json()
     assert [(edit["number"], edit["undone_by"]) for edit in edits] == [(1, 2), (2, None)]
     for kind, wrong, status in (

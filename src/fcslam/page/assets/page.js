@@ -44,7 +44,7 @@ async function update(number) {
   zooms = new Map(maps.map((m) => [m.map, m.zoom]));
   readOnly = counts.read_only; robots = fleet; closures = accepted;
   if (number !== version) { version = number; tiles.clear(); }
-  at("maps").replaceChildren(...maps.map((m) => new Option(`${m.map}: ${m.robots.join(", ")}`, m.map, false, m.map === mapIndex)));
+  at("maps").replaceChildren(...maps.map((m) => new Option(`${m.map}${m.floor && `, floor ${m.floor}`}: ${m.robots.join(", ")}`, m.map, false, m.map === mapIndex)));
   at("robots").replaceChildren(...fleet.map(describe));
   at("closures").textContent = `${accepted.filter((c) => c.robot_i !== c.robot_j).length} between robots, ${accepted.filter((c) => c.robot_i === c.robot_j).length} within`;
   if (!view && trails.size) fit();

@@ -122,6 +122,7 @@ class MapSummary(Settings):
     """Which robots share a map."""
 
     map: int
+    floor: str = Field(description="floor that its robots named; empty: none")
     robots: list[str]
     zoom: int = Field(description="of the tiles that show every cell; deeper ones show nothing more")
 

@@ -108,8 +108,8 @@ def map_router(state: ViewerState) -> APIRouter:
         run = _run_of(state)
         robots = run.trajectories.values()
         return [
-            MapSummary(map=k, robots=[r.robot for r in robots if r.map_index == k], zoom=_zoom(run, k))
-            for k in sorted({robot.map_index for robot in robots})
+            MapSummary(map=k, floor=floor, robots=[r.robot for r in robots if r.map_index == k], zoom=_zoom(run, k))
+            for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
         ]
 
     @router.get(

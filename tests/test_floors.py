@@ -1,0 +1,114 @@
+"""Floors: places of different floors are never compared, even if the floors look alike."""
+
+from dataclasses import replace
+
+import pytest
+
+import fcslam
+from fcslam.cloud.cloud import Cloud
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.packet_log import PacketNumber
+from fcslam.cloud.settings import FleetConfig
+from fcslam.errors import ConfigError, EditError, PacketError
+from fcslam.mission_file import edit_mission
+from fcslam.records import ManualClosure
+from fcslam.runs import open_run, separations
+from fcslam.storage.state_file import read_state, write_state
+from fcslam.wire.messages import Hello
+from tests import small_fleet
+from tests.small_fleet import feed, fingerprint, in_order, map_of
+from tests.test_mission_file import contents
+
+
+@pytest.fixture(scope="module")
+def alike():
+    """Two robots that see the very same rooms."""
+    robot = small_fleet.draw(1).robots[0]
+    return small_fleet.sent_by(robot, "below"), small_fleet.sent_by(robot, "above")
+
+
+def on_floors(packets, floors):
+    return in_order(packet.on_floor(floor) for sent, floor in zip(packets, floors, strict=True) for packet in sent)
+
+
+@pytest.mark.parametrize(("floors", "maps"), [(("", ""), 1), (("1", "1"), 1), (("1", "2"), 2), (("", "2"), 2)])
+def test_only_floors_keep_rooms_apart_that_look_alike(alike, floors, maps):
+    result = feed(Cloud(FleetConfig(), 0), on_floors(alike, floors)).finalize()
+    assert len(set(map_of(result).values())) == maps
+    assert {robot.robot: robot.floor for robot in result.robots} == dict(zip(("below", "above"), floors, strict=True))
+    between = [closure for closure in result.closures if closure.i.robot != closure.j.robot]
+    assert bool(between) == (maps == 1)
+
+
+def test_the_name_of_the_floor_changes_no_pose(alike):
+    named, unnamed = (feed(Cloud(FleetConfig(), 0), on_floors(alike, (floor, floor))).finalize() for floor in ("7", ""))
+    assert fingerprint(named) == fingerprint(unnamed)
+
+
+def test_a_fleet_with_floors_goes_on_from_its_state(alike, tmp_path):
+    packets = on_floors(alike, ("1", "2"))
+    stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in packets}
+    fleet, half = Fleet(FleetConfig(), 0), len(packets) // 2
+    for packet in packets[:half]:
+        fleet.apply(packet)
+    write_state(tmp_path / "state", "test", fleet.state())
+    again = Fleet.restored(FleetConfig(), 0, read_state(tmp_path / "state", "test"), stored.__getitem__)
+    for one in (fleet, again):
+        for packet in packets[half:]:
+            one.apply(packet)
+    assert fingerprint(again.conclude()) == fingerprint(fleet.conclude())
+    assert again.vocabularies() == fleet.vocabularies()
+    assert {state.floor for state in again.vocabularies()} == {"1", "2"}
+
+
+def test_a_session_stays_on_its_floor(alike):
+    fleet = Fleet(FleetConfig(), 0)
+    (hello,) = (packet for packet in alike[0] if isinstance(packet.body, Hello))
+    fleet.apply(hello.on_floor("1"))
+    with pytest.raises(PacketError, match="another floor; that takes a new session"):
+        fleet.apply(replace(hello.on_floor("2"), sequence=1))
+
+
+@pytest.fixture(scope="module")
+def mapped(logs, tmp_path_factory):
+    """Two robots of one floor, and the first of them again under another name on another floor, at once."""
+    folder = tmp_path_factory.mktemp("floors")
+    first, second = logs[:2]
+    recordings = {"a": first, "b": second, "c": first}
+    fcslam.map_recordings(recordings, output=folder / "whole", floors={"a": "1", "b": "1", "c": "2"})
+    return folder / "whole", recordings
+
+
+@pytest.mark.slow
+def test_a_run_folder_names_the_floors(mapped):
+    run = open_run(mapped[0])
+    assert {name: trajectory.floor for name, trajectory in run.trajectories.items()} == {"a": "1", "b": "1", "c": "2"}
+    assert [run.trajectories[name].map_index for name in "abc"] == [0, 0, 1]
+    assert separations(run) == []
+
+
+@pytest.mark.slow
+def test_a_mission_goes_on_with_another_floor(mapped, tmp_path):
+    whole, recordings = mapped
+    below, above = {name: recordings[name] for name in "ab"}, recordings["c"]
+    fcslam.map_recordings(below, output=tmp_path / "first", floors="1")
+    fcslam.map_recordings({"c": above}, output=tmp_path / "both", onto=tmp_path / "first", floors="2")
+    assert contents(tmp_path / "both") == contents(whole)
+
+
+@pytest.mark.slow
+def test_no_closure_by_hand_joins_floors(mapped):
+    whole, _ = mapped
+    run = open_run(whole)
+    stamps = [float(run.trajectories[name].stamps[0]) for name in "ac"]
+    closure = ManualClosure("a", stamps[0], "c", stamps[1], (0.0, 0.0, 0.0), (0.1, 0.1))
+    with pytest.raises(EditError, match="a and c are on different floors"):
+        edit_mission(whole, [closure], "me", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("floors", "reason"), [({"x": "1"}, "a floor names 'x'"), ("first floor", "floor 'first floor' is not 1 to 16")]
+)
+def test_floors_that_cannot_be(logs, floors, reason):
+    with pytest.raises(ConfigError, match=reason):
+        fcslam.map_recordings(logs[:1], floors=floors)
