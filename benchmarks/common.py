@@ -82,7 +82,9 @@ def run_fcslam(*arguments: object, environment: Mapping[str, str] | None = None)
     command = [sys.executable, "-c", _COMMAND, *map(str, arguments)]
     with tempfile.TemporaryFile() as output:
         began = time.perf_counter()
-        process = subprocess.Popen(command, env=process_environment, stdout=output, stderr=output)
+        process = subprocess.Popen(
+            command, env=process_environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output
+        )
         _, status, usage = os.wait4(process.pid, 0)
         wall_s = time.perf_counter() - began
         process.returncode = os.waitstatus_to_exitcode(status)

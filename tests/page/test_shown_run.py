@@ -5,6 +5,8 @@ import base64
 import hashlib
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -172,6 +174,22 @@ def test_a_report_of_a_huge_map_holds_coarse_tiles_or_none(run, tmp_path, resolu
     responses = json.loads(texts)
     assert json.loads(responses["texts"]["maps"])[0]["zoom"] == zoom
     assert len(responses["pictures"]) <= MOST_TILES
+
+
+CHROMIUM = shutil.which("chromium")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
+def test_a_browser_shows_a_report_from_a_file(shown, tmp_path):
+    (tmp_path / "report.html").write_text(report_html(shown))
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    command = [CHROMIUM, *options, "--virtual-time-budget=3000", "--dump-dom", f"file://{tmp_path / 'report.html'}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0)
+    elements = Elements(done.stdout)
+    assert [text for attributes, text in elements.of("p") if attributes.get("id") == "status"] == ["read-only"]
+    assert [text.strip() for _, text in elements.of("option")] == ["0: a, a+1", "1: b"]
+    assert len(elements.of("li")) == 3
 
 
 def test_a_report_holds_every_path_that_the_page_names():

@@ -61,7 +61,8 @@ def show(
             _write_report(shown, html, run)
             return
         with listen(HOST, port) as listening:
-            _announce(run, listening, open_browser)
+            _announce(f"fcslam shows {run}", listening, open_browser)
+            typer.echo("Ctrl-C ends it")
             run_viewer(viewer_app(ReadOnly(shown)), listening)
 
 
@@ -121,7 +122,7 @@ def live_page(run: Path, port: int, open_browser: bool | None) -> "Iterator[Live
     from fcslam.page import live_map
 
     with listen(HOST, port) as listening, live_map.live_page(listening, run.name) as live:
-        _announce(run, listening, open_browser)
+        _announce(f"fcslam shows the map of {run} while it grows", listening, open_browser)
         yield live
         if sys.stdin.isatty():
             typer.echo("The page shows the finished run; Ctrl-C ends it")
@@ -129,9 +130,9 @@ def live_page(run: Path, port: int, open_browser: bool | None) -> "Iterator[Live
                 signal.pause()
 
 
-def _announce(run: Path, listening: "socket", open_browser: bool | None) -> None:
+def _announce(what: str, listening: "socket", open_browser: bool | None) -> None:
     address = f"http://{HOST}:{listening.getsockname()[1]}/"
-    typer.echo(f"fcslam shows {run} at {address}; Ctrl-C ends it")
+    typer.echo(f"{what} at {address}")
     if _has_display() if open_browser is None else open_browser:
         webbrowser.open(address)
 
