@@ -13,6 +13,7 @@ from html.parser import HTMLParser
 import httpx
 import numpy as np
 import pytest
+from fastapi.routing import iter_route_contexts
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.mission_file import mission_bytes
@@ -23,6 +24,7 @@ from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.records import Channel, ClosureStatus, Edit, Reason, ReasonCode, Veto
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+from fcslam.service.http.app import PREFIX
 from fcslam.wire.packets import decode, measure
 from tests.service.http.desk import A
 
@@ -88,6 +90,15 @@ def test_a_finished_run_answers_as_the_service_does(shown):
     assert metrics == [{"name": "error", "value": None, "unit": "m"}]
     assert one["sessions"] == robots[:2]
     assert [edit.author for edit in shown.store.edits()] == ["anna"]
+
+
+def test_every_route_of_viewers_answers_for_a_finished_run(shown):
+    app = viewer_app(ReadOnly(shown))
+    paths = [route.path for route in iter_route_contexts(app.routes)]
+    plain = [path for path in paths if "{" not in path and not path.endswith("/events")]
+    assert f"{PREFIX}/closures" in plain
+    answers = ask(shown, *plain)
+    assert {answer.request.url.path: answer.status_code for answer in answers} == dict.fromkeys(plain, 200)
 
 
 def test_a_run_without_a_mission_file_is_shown_too(run, tmp_path):
