@@ -49,6 +49,11 @@ def test_what_is_no_run_is_told_in_one_line(run, tmp_path, capsys):
     assert "broken run folder" in refused(capsys, run)
 
 
+def test_a_damaged_map_is_told_in_one_line(run, capsys):
+    (run / "map.pgm").write_bytes(b"P5 60 40 255 ")
+    assert "map.pgm" in refused(capsys, run)
+
+
 def test_a_damaged_mission_file_is_told_in_one_line(run, capsys):
     (run / "mission.fcslam").write_text("no mission")
     assert "mission.fcslam" in refused(capsys, run)

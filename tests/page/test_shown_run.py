@@ -16,6 +16,7 @@ import pytest
 from fastapi.routing import iter_route_contexts
 
 from fcslam.cloud.settings import CloudConfig
+from fcslam.errors import EvaluationError
 from fcslam.mission_file import mission_bytes
 from fcslam.page.report import ASKED, MOST_TILES, report_html
 from fcslam.page.routes import ASSETS
@@ -185,6 +186,13 @@ def test_a_report_of_a_huge_map_holds_coarse_tiles_or_none(run, tmp_path, resolu
     responses = json.loads(texts)
     assert json.loads(responses["texts"]["maps"])[0]["zoom"] == zoom
     assert len(responses["pictures"]) <= MOST_TILES
+
+
+def test_a_report_of_what_cannot_be_shown_says_what(run, tmp_path):
+    (closure,) = run.closures
+    replace(run, closures=(replace(closure, T_i_j=np.full(3, np.nan)),)).save(tmp_path / "run")
+    with ShownRun(tmp_path / "run", "run") as shown, pytest.raises(EvaluationError, match="closures"):
+        report_html(shown)
 
 
 CHROMIUM = shutil.which("chromium")

@@ -82,7 +82,7 @@ def _run_folder(run: Path, console: "Console") -> Iterator[Path]:
         return
     if is_run_folder(run):
         _check_size(run)
-    viewed_run(run.resolve())  # refuses a damaged one, and what is none
+    _ = viewed_run(run.resolve()).maps  # refuses a damaged run, and what is none
     yield run
 
 

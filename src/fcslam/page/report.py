@@ -14,6 +14,7 @@ from urllib.parse import quote
 import httpx
 from fastapi import FastAPI
 
+from fcslam.errors import EvaluationError
 from fcslam.maps.tiles import WORLD_M, finest_zoom
 from fcslam.page.routes import ASSETS
 from fcslam.page.viewer import ReadOnly, viewer_app
@@ -32,7 +33,11 @@ Get = Callable[[str], Awaitable[httpx.Response]]
 
 
 def report_html(mission: ViewedMission) -> str:
-    """The page of a finished run, with all that it shows."""
+    """The page of a finished run, with all that it shows.
+
+    Raises:
+        EvaluationError: something of the run is broken.
+    """
     return _page(asyncio.run(_responses(viewer_app(ReadOnly(mission)), _maps(mission))))
 
 
@@ -42,11 +47,14 @@ def _maps(mission: ViewedMission) -> dict[int, OccupancyMap]:
 
 async def _responses(app: FastAPI, maps: dict[int, OccupancyMap]) -> dict[str, dict[str, str]]:
     """What the service answers to the page, by path: texts, and pictures in base64."""
-    transport = httpx.ASGITransport(app=app)
+    transport = httpx.ASGITransport(app=app, raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url=f"http://localhost{PREFIX}/") as client:
 
         async def get(path: str) -> httpx.Response:
-            return (await client.get(path)).raise_for_status()
+            answer = await client.get(path)
+            if not answer.is_success:
+                raise EvaluationError(f"the run has no {path} that can be shown ({answer.json()['error']})")
+            return answer
 
         texts = {path: (await get(path)).text for path in ASKED}
         sessions = [robot["session"] for robot in json.loads(texts["robots"]) if robot["T_map_base"]]
