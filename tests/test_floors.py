@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import fcslam
@@ -9,7 +10,8 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
-from fcslam.errors import ConfigError, EditError, PacketError
+from fcslam.errors import ConfigError, EditError, PacketError, SourceError
+from fcslam.localization import read_map
 from fcslam.mission_file import edit_mission
 from fcslam.records import ManualClosure
 from fcslam.runs import open_run, separations
@@ -94,6 +96,23 @@ def test_a_mission_goes_on_with_another_floor(mapped, tmp_path):
     fcslam.map_recordings(below, output=tmp_path / "first", floors="1")
     fcslam.map_recordings({"c": above}, output=tmp_path / "both", onto=tmp_path / "first", floors="2")
     assert contents(tmp_path / "both") == contents(whole)
+
+
+@pytest.mark.slow
+def test_a_robot_is_localised_in_the_map_of_its_floor(mapped):
+    whole, recordings = mapped
+    found = fcslam.localize(recordings["c"], whole, floor="2").trajectories.values()
+    assert [robot.floor for robot in found if len(robot.stamps)] == ["2"]
+    maps = [read_map(whole / name) for name in ("map.yaml", "map_1.yaml")]
+    for place in (whole, whole / "mission.fcslam"):
+        for floor, expected in zip("12", maps, strict=True):
+            assert np.array_equal(read_map(place, floor).cells, expected.cells)
+        with pytest.raises(SourceError, match=r"has maps of several floors \(1, 2\); say which floor"):
+            read_map(place)
+        with pytest.raises(SourceError, match="has no map of floor '3'; its floors: 1, 2"):
+            read_map(place, "3")
+    with pytest.raises(SourceError, match="leave the floor out"):
+        read_map(whole / "map.yaml", "1")
 
 
 @pytest.mark.slow

@@ -88,8 +88,8 @@ def test_local_maps_may_be_left_out_as_a_whole(tmp_path, run):
 def test_tables_have_the_columns_promised(tmp_path, run):
     run.save(tmp_path / "run")
     robots = (tmp_path / "run" / "robots.csv").read_text().splitlines()
-    assert robots[0] == "robot,map,path_length_m,scans,floor"
-    assert robots[2] == "b-2,1,0.000,1,"
+    assert robots[0] == "robot,map,path_length_m,scans"
+    assert robots[2] == "b-2,1,0.000,1"
     closures = (tmp_path / "run" / "closures.csv").read_text().splitlines()
     assert (
         closures[0] == "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason,value,limit,setting"
@@ -97,6 +97,14 @@ def test_tables_have_the_columns_promised(tmp_path, run):
     line = (tmp_path / "run" / "trajectories" / "robot_1.tum").read_text().splitlines()[0].split()
     assert line[3:6] == ["0", "0", "0"]
     assert [len(line[i].split(".")[1]) for i in (0, 1, 2, 6, 7)] == [9] * 5
+
+
+def test_robots_name_their_floors_if_one_has_a_floor(tmp_path):
+    Run({"a": trajectory("a"), "b": replace(trajectory("b", 1), floor="-1")}).save(tmp_path / "run")
+    header, *rows = (tmp_path / "run" / "robots.csv").read_text().splitlines()
+    assert header == "robot,map,path_length_m,scans,floor"
+    assert [row.split(",")[-1] for row in rows] == ["", "-1"]
+    assert [robot.floor for robot in open_run(tmp_path / "run").trajectories.values()] == ["", "-1"]
 
 
 def test_path_length_is_that_of_the_polygon():
@@ -208,6 +216,7 @@ def test_what_is_no_run_folder_is_refused(tmp_path):
         ("robots.csv", "robot,map\nrobot_1,0\n", "line 2"),
         ("robots.csv", "robot,map,path_length_m,scans\n../../x,0,1,1\n", "no robot's name"),
         ("robots.csv", "robot,map,path_length_m,scans\nrobot_1,zero,1,1\n", "zero"),
+        ("robots.csv", "robot,map,path_length_m,scans,floor\nrobot_1,0,1,1,<b>\n", "'<b>' is no floor"),
         ("closures.csv", "robot_i\nrobot_1\n", "closures.csv, line 2"),
         ("closures.csv", None, "closures.csv"),
         ("local/robot_1.tum", None, "robot_1.tum"),

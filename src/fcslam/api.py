@@ -99,6 +99,7 @@ def localize(
     bag_options: BagOptions | None = None,
     progress: "Callable[[LocalizationProgress], None]" = lambda _: None,
     force: bool = False,
+    floor: str = "",
 ) -> Run:
     """Localise the robot of a recording in a finished map, which does not change.
 
@@ -106,13 +107,14 @@ def localize(
 
     Args:
         recording: a recording of any known format, or an object of your own that implements ``Source``.
-        map: a run folder, whose first map is used; the YAML file of a ROS map with the PGM file beside it; or a map.
+        map: a run folder or mission file; the YAML file of a ROS map with the PGM file beside it; or a map.
         initial_pose: about where the recording starts in the map, (x, y, theta), metres and radians; None: anywhere.
         config: as for :func:`map_recordings`; ``robot`` counts.
         output: run folder to write; by default nothing is written.
         bag_options: topics and the pose of the laser, where a ROS bag leaves a choice.
         progress: called every 50 scans.
         force: replace a run that is at ``output``.
+        floor: floor of the recording, whose first map is used; it must be named if the run has maps of several floors.
 
     Returns:
         A run whose trajectory holds the poses that the robot believed; ``localized`` has every scan with standard
@@ -126,7 +128,7 @@ def localize(
     if output is not None:
         prepare_output(Path(output), force)
     settings = settings_of(config, None, None)
-    occupancy = map if isinstance(map, OccupancyMap) else read_map(Path(map))
+    occupancy = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
     (source,) = _opened([recording], bag_options)
     initial: FloatArray | None = None if initial_pose is None else frozen(initial_pose)
     run = run_localization(source, occupancy, settings, initial, progress)

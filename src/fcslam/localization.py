@@ -3,9 +3,10 @@
 sources -> robot (LiDAR tracking) -> localisation in the map -> run folder
 """
 
+import csv
 from array import array
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -22,8 +23,9 @@ from fcslam.records import FloatArray, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
 from fcslam.runs import LocalizedPoses, Metric, OccupancyMap, Run
-from fcslam.runs.folder import MISSION
-from fcslam.runs.map_files import map_yaml, parse_map, pgm_bytes
+from fcslam.runs.folder import MISSION, ROBOTS
+from fcslam.runs.map_files import map_stem, map_yaml, parse_map, pgm_bytes
+from fcslam.runs.tables import read_robots
 from fcslam.sources import Source
 
 MAP_YAML: Final = "map.yaml"
@@ -46,16 +48,47 @@ class LocalizationProgress:
     """Of the newest pose; 0 where the robot is not localised."""
 
 
-def read_map(path: Path) -> OccupancyMap:
-    """The map of a run folder (its first one), of a YAML file of ROS map_server and the PGM file that it names, or of a
-    mission file, whose packets are mapped.
+def read_map(path: Path, floor: str = "") -> OccupancyMap:
+    """The first map of a floor of a run folder or of a mission file, whose packets are mapped; or the map of a YAML
+    file of ROS map_server and the PGM file that it names.
+
+    Args:
+        path: the folder or file.
+        floor: the floor; it must be named where the run has several, as they may look alike.
 
     Raises:
         SourceError: there is no map, or it cannot be read. The image must lie in the folder of the YAML file.
     """
     if path.suffix == Path(MISSION).suffix:
-        return _mission_map(path)
-    description = path / MAP_YAML if path.is_dir() else path
+        return _mission_map(path, floor)
+    if (path / ROBOTS).is_file():
+        number, floor = _map_on(floor, _floors(path), path)
+        return replace(_read_map_file(path / f"{map_stem(number)}.yaml"), floor=floor)
+    if floor:
+        raise SourceError(f"{path}: only run folders and mission files know floors; leave the floor out")
+    return _read_map_file(path / MAP_YAML if path.is_dir() else path)
+
+
+def _floors(folder: Path) -> dict[int, str]:
+    """Floor of each map of a run folder."""
+    try:
+        return dict(read_robots(folder / ROBOTS).values())
+    except (OSError, ValueError, csv.Error) as error:
+        raise SourceError(f"{folder}: a broken run folder ({one_line(str(error))})") from error
+
+
+def _map_on(floor: str, floors: Mapping[int, str], path: Path) -> tuple[int, str]:
+    """Number and floor of the first map on a floor; without ``floor``, on the only one."""
+    named = sorted(set(floors.values()) - {""})
+    if not floor and len(set(floors.values())) > 1:
+        raise SourceError(f"{path}: has maps of several floors ({', '.join(named)}); say which floor the robot is on")
+    if floor and floor not in named:
+        raise SourceError(f"{path}: has no map of floor {floor!r}; its floors: {', '.join(named) or 'none is named'}")
+    number = min((k for k, its in floors.items() if its == floor or not floor), default=0)
+    return number, floors.get(number, "")
+
+
+def _read_map_file(description: Path) -> OccupancyMap:
     try:
         text = _content(description).decode("utf-8")
         image = parse_yaml(text)["image"]
@@ -169,7 +202,7 @@ class LocalizedDrive:
             Metric("losses", losses, "1"),
         )
         return Run(
-            trajectories={robot: believed},
+            trajectories={robot: replace(believed, floor=occupancy.floor)},
             metrics={metric.name: metric for metric in metrics},
             config_yaml=dump(config),
             map_files={
@@ -188,13 +221,15 @@ def _place(robot: RobotFrontend, estimate: MapEstimate | None, drive: LocalizedD
         drive.add(track[number].stamp, robot.travel_m, track.in_odom(track[number]), estimate)
 
 
-def _mission_map(path: Path) -> OccupancyMap:
-    """The first map of a mission file."""
+def _mission_map(path: Path, floor: str) -> OccupancyMap:
     saved = read_mission(path)
-    files = run_mission((), continued_config(saved), onto=saved).map_files
-    if MAP_YAML not in files:
+    run = run_mission((), continued_config(saved), onto=saved)
+    floors = {trajectory.map_index: trajectory.floor for trajectory in run.trajectories.values()}
+    number, floor = _map_on(floor, floors, path)
+    files, stem = run.map_files, map_stem(number)
+    if f"{stem}.yaml" not in files:
         raise SourceError(f"{path}: the mission has no map; no robot has sent a keyscan")
-    return parse_map(str(path), files["map.pgm"], files[MAP_YAML].decode())
+    return replace(parse_map(str(path), files[f"{stem}.pgm"], files[f"{stem}.yaml"].decode()), floor=floor)
 
 
 def _content(path: Path) -> bytes:

@@ -25,6 +25,9 @@ CODE_BYTES = 32
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,63}", re.ASCII)
 """Names of robots and detector versions; they are also safe file names."""
 
+FLOOR = re.compile(r"[A-Za-z0-9._+-]{1,16}", re.ASCII)
+"""Floors of a building, as "-1" or "west.3"."""
+
 SAME_STAMP_S = 1e-6
 """Largest difference of equal stamps: files print stamps with microseconds."""
 

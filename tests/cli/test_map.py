@@ -423,3 +423,39 @@ def test_the_command_refuses_before_the_long_work(tmp_path, log, monkeypatch, ca
     monkeypatch.setattr(api, "run_mission", lambda *_: pytest.fail("worked"))
     refused(capsys, tmp_path, log, tmp_path / "none.log", "--output", tmp_path / "run")
     refused(capsys, tmp_path, log, "--output", log / "run")
+
+
+@pytest.mark.parametrize(
+    ("options", "floors"),
+    [
+        ([], {}),
+        (["2"], {"a": "2", "b": "2"}),
+        (["b=-1"], {"b": "-1"}),
+        (["1", "b=2"], {"a": "1", "b": "2"}),
+    ],
+)
+def test_floors_are_those_of_all_recordings_or_of_one(options, floors):
+    assert mapping.floors_of(options, ["a", "b"]) == floors
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["1", "2"], "all recordings can be on one floor only"),
+        (["r=1", "r=2"], "r can be on one floor only"),
+        (["x=1"], "a floor names 'x', but the recordings are r"),
+        (["r="], "floor '' is not 1 to 16 of"),
+        (["=1"], "a floor names ''"),
+        (["x" * 17], "is not 1 to 16 of"),
+        (["a\x1b[2J"], "is not 1 to 16 of"),
+    ],
+)
+def test_floors_that_cannot_be_are_one_line(tmp_path, capsys, options, reason):
+    log = save(tmp_path / "r.clf", drive(20))
+    given = [word for option in options for word in ("--floor", option)]
+    assert main(["map", str(log), *given, "--output", str(tmp_path / "run")]) == 2
+    err = capsys.readouterr().err
+    assert reason in err
+    assert err.strip().count("\n") == 0
+    assert "\x1b" not in err
+    assert not (tmp_path / "run").exists()

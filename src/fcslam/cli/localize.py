@@ -48,6 +48,9 @@ def localize(
     ],
     output: Annotated[Path | None, output_option("Run folder to write.", RUNS)] = None,
     initial_pose: InitialPose = None,
+    floor: Annotated[
+        str, typer.Option(help="Floor that the robot is on.", show_default="that of the map, if it has one only")
+    ] = "",
     config: ConfigFile = None,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
@@ -74,8 +77,9 @@ def localize(
     print_notes(console, survey.notes)
     with compiled(console), ProgressDisplay(console) as display:
         run = localize_recording(
-            source, map_path, initial_pose=initial, config=settings, progress=_watch(display, survey.scan_count)
-        )
+            source, map_path, initial_pose=initial, config=settings, progress=_watch(display, survey.scan_count),
+            floor=floor,
+        )  # fmt: skip
         run.save(output, force)
     print_faults(console, {source.name: source.faults})
     _report(run, source.name, output)

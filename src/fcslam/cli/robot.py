@@ -192,9 +192,9 @@ def robot(
             outbox_mb=outbox_mb, config=settings, floor=floor,
         )  # fmt: skip
         if localize is not None:
-            _refuse_mapping(server, state, floor)
+            _refuse_network(server, state)
             initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
-            start = partial(LocalizedRobot, map=localize, initial_pose=initial, config=settings)
+            start = partial(LocalizedRobot, map=localize, initial_pose=initial, config=settings, floor=floor)
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose) or BagOptions()
         parameters = node_parameters(ros_parameters, use_sim_time)
         map_live(source, name, start, options, domain, parameters, output, notices(quiet))
@@ -230,11 +230,11 @@ def robot(
         _report(live, state, server)
 
 
-def _refuse_mapping(server: str | None, state: Path | None, floor: str) -> None:
+def _refuse_network(server: str | None, state: Path | None) -> None:
     from fcslam.errors import InputError
 
-    if server is not None or state is not None or floor:
-        raise InputError("a robot that localises sends and keeps nothing; leave --server, --state and --floor out")
+    if server is not None or state is not None:
+        raise InputError("a robot that localises sends and keeps nothing; leave --server and --state out")
 
 
 def _required(server: str | None, state: Path | None) -> tuple[str, Path]:

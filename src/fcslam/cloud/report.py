@@ -17,7 +17,7 @@ from fcslam.maps.drawing import DrawnClosure, map_png
 from fcslam.maps.fusion import fuse
 from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure, frozen
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
-from fcslam.runs.map_files import OccupancyMap, map_yaml, pgm_bytes
+from fcslam.runs.map_files import OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 
@@ -141,7 +141,7 @@ def _map_files(
     drawn = _drawn_closures(result)
     files: dict[str, bytes] = {}
     for k, members in sorted(maps.items()):
-        stem = "map" if k == 0 else f"map_{k}"
+        stem = map_stem(k)
         regions = [region for region in result.regions if region.map_index == k]
         fused = erased(fuse_members(members, grid), regions)
         files[f"{stem}.pgm"] = pgm_bytes(fused)

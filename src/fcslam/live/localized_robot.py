@@ -56,6 +56,7 @@ class LocalizedRobot(LiveTracker):
         laser: Lasers | None = None,
         *,
         initial_pose: ArrayLike | None = None,
+        floor: str = "",
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
         on_event: Callable[[RobotEvent], None] | None = None,
         executor: Executor | None = None,
@@ -64,10 +65,12 @@ class LocalizedRobot(LiveTracker):
 
         Args:
             name: of the robot; letters, digits and ``. _ -``.
-            map: a run folder, whose first map is used; a mission file, which is mapped first; the YAML file of a ROS
-                map with the PGM file beside it; or a map.
+            map: a run folder; a mission file, which is mapped first; the YAML file of a ROS map with the PGM file
+                beside it; or a map.
             laser: its LiDAR, or several by name. None: only ``add`` is used.
             initial_pose: about where it starts in the map, (x, y, theta), metres and radians. None: anywhere.
+            floor: floor that the robot is on, whose first map is used; it must be named if the run has maps of several
+                floors.
             config: as in ``map_recordings``; ``robot`` counts.
             on_event: called by ``add_scan`` and ``add``, in their thread, before they return.
             executor: searches the map, in its only worker. None: a process of its own, which ends with the robot.
@@ -77,7 +80,7 @@ class LocalizedRobot(LiveTracker):
                 start.
         """
         super().__init__(name, laser, settings_of(config), on_event)
-        self._map = map if isinstance(map, OccupancyMap) else read_map(Path(map))
+        self._map = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
         initial = None if initial_pose is None else self._checked("initial_pose", initial_pose)
         self._drive = LocalizedDrive()
         self._was_localized = False

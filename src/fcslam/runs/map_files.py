@@ -45,6 +45,13 @@ class OccupancyMap:
     """Side of a cell."""
     origin_xy: tuple[float, float]
     """Lower left corner of cell (0, 0) in the coordinate frame of the map, metres."""
+    floor: str = ""
+    """Floor that the map shows, if it is known."""
+
+
+def map_stem(number: int) -> str:
+    """What the names of the map's files in a run folder begin with: ``map`` for map 0, ``map_1`` for map 1."""
+    return f"map_{number}" if number else "map"
 
 
 def pgm_bytes(occupancy: OccupancyMap) -> bytes:

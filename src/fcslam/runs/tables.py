@@ -10,14 +10,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from fcslam.errors import ConfigError
-from fcslam.records import Channel, ClosureStatus, FloatArray, Reason, ReasonCode, Veto, frozen
+from fcslam.records import FLOOR, Channel, ClosureStatus, FloatArray, Reason, ReasonCode, Veto, frozen
 from fcslam.runs.records import ClosureRow, LocalizedPoses, Metric, RobotTrajectory
 
 _Value = TypeVar("_Value")
 
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
 _FLOOR = "floor"
-"""Column of robots.csv that older runs do not have."""
+"""Last column of robots.csv, if a robot names its floor."""
 _CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
 _LOCALIZED_COLUMNS = ["stamp", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "quality"]
 _REASON_COLUMNS = ["reason", "value", "limit", "setting"]
@@ -26,17 +26,25 @@ _CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", 
 
 def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
     """Write robots.csv."""
-    _write_csv(path, [*_ROBOT_COLUMNS, _FLOOR], map(_robot_fields, trajectories))
+    robots = list(trajectories)
+    columns = [*_ROBOT_COLUMNS, _FLOOR] if any(robot.floor for robot in robots) else _ROBOT_COLUMNS
+    _write_csv(path, columns, (_robot_fields(robot)[: len(columns)] for robot in robots))
 
 
 def read_robots(path: Path) -> dict[str, tuple[int, str]]:
     """Map index and floor by robot, in the order of robots.csv.
 
     Raises:
-        ValueError: a column is missing, a map index is no number, or a robot occurs twice.
+        ValueError: a column is missing, a map index or a floor is none, or a robot occurs twice.
     """
     rows = _read_csv(path, _ROBOT_COLUMNS)
-    return _unique(path.name, ((row["robot"], (int(row["map"]), row.get(_FLOOR) or "")) for row in rows))
+    return _unique(path.name, ((row["robot"], (int(row["map"]), _floor(row.get(_FLOOR) or ""))) for row in rows))
+
+
+def _floor(text: str) -> str:
+    if text and not FLOOR.fullmatch(text):
+        raise ValueError(f"{text[:64]!r} is no floor")
+    return text
 
 
 def write_closures(path: Path, closures: Iterable[ClosureRow]) -> None:

@@ -20,7 +20,7 @@ import select
 import signal
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from functools import cache
 from hashlib import blake2b
@@ -381,10 +381,10 @@ class Worker:
         return False
 
     def _run(self, result: FleetResult, traffic: Ledger, with_local_maps: bool = True) -> Run:
-        words = [
-            Metric(f"words_{state.channel}_{state.detector_version}", state.words, "1")
-            for state in self._fleet.vocabularies()
-        ]
+        counts: Counter[str] = Counter()  # over all floors
+        for state in self._fleet.vocabularies():
+            counts[f"words_{state.channel}_{state.detector_version}"] += state.words
+        words = [Metric(name, count, "1") for name, count in counts.items()]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
         metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(traffic, tracks)]
         return run_of(result, tracks, metrics, dump(self._config), self._config.map, with_local_maps)

@@ -6,8 +6,6 @@ PROTOCOL_VERSION = 2
 FLOOR_VERSION = 3
 """Of a hello that names a floor. All other packets are of version 2, which receivers without floors read."""
 
-MAXIMUM_FLOOR_LENGTH = 16
-
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.recognition import VocabularyState
 from fcslam.errors import ServiceError, StoreError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.records import Channel, Correction, Keyscan, ReasonCode
@@ -156,6 +158,18 @@ def test_viewers_see_the_fleet(mapped):
     assert {(c["robot_i"], c["robot_j"]) for c in accepted} == {("a", "b")}
     assert get(mapped, "closures?status=accepted&limit=3").json() == accepted[1:]
     assert get(mapped, "maps").json() == [{"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5}]
+
+
+def test_viewers_see_the_floors(desk, monkeypatch):
+    vocabularies = tuple(VocabularyState(Channel.LIDAR, "v1", *its, 1) for its in (("", 3), ("2", 4)))
+    monkeypatch.setattr(Fleet, "vocabularies", lambda _: vocabularies)
+    above = [encode(decode(data).on_floor("2")) for data in B]
+    for robot, data in (("a", A), ("b", above)):
+        desk.told(desk.send(robot, data))
+    assert [(found["floor"], found["robots"]) for found in get(desk, "maps").json()] == [("", ["a"]), ("2", ["b"])]
+    assert {robot["robot"]: robot["floor"] for robot in get(desk, "robots").json()} == {"a": "", "b": "2"}
+    assert get(desk, "closures").json() == []
+    assert get(desk, "vocabulary").json() == {"lidar_v1": 7}
 
 
 def test_viewers_get_the_files_of_the_live_run(mapped):

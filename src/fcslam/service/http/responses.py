@@ -82,6 +82,7 @@ class SessionSummary(Settings):
     epoch: int
     packets: int
     map: int | None
+    floor: str = Field(description="floor that it named; empty: none, or not mapped yet")
     path_length_m: float
     keyscans: int
     T_map_base: Pose | None

@@ -13,7 +13,7 @@ from fcslam.cloud.sessions import session_name
 from fcslam.maps.tiles import DEEPEST_ZOOM, finest_zoom, tile_png
 from fcslam.records import ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, ClosureRow, Run
-from fcslam.runs.map_files import resolution_of
+from fcslam.runs.map_files import map_stem, resolution_of
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
     ClosureSummary,
@@ -117,7 +117,7 @@ def map_router(state: ViewerState) -> APIRouter:
     )
     def get_map(k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml)$")]) -> FileResponse:
         """A map: picture, occupancy, and what map_server needs to know of it."""
-        return _file(state, f"{_stem(k)}.{suffix}", MEDIA[suffix])
+        return _file(state, f"{map_stem(k)}.{suffix}", MEDIA[suffix])
 
     @router.get(
         "/maps/{k}/tiles/{z}/{x}/{y}.png",
@@ -127,9 +127,9 @@ def map_router(state: ViewerState) -> APIRouter:
     def get_tile(k: Index, z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)], x: Square, y: Square) -> Response:
         """A square of a map: at zoom z it has 256 m / 2^z; x and y count squares from the origin, y upwards."""
         try:
-            tile = tile_png(_folder_of(state), _stem(k), z, x, y)
+            tile = tile_png(_folder_of(state), map_stem(k), z, x, y)
         except FileNotFoundError as error:
-            raise HTTPException(404, f"there is no {_stem(k)}") from error
+            raise HTTPException(404, f"there is no {map_stem(k)}") from error
         return Response(tile, media_type=MEDIA["png"])
 
     @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON)})
@@ -193,6 +193,7 @@ def _sessions(state: ViewerState, robot: str) -> list[SessionSummary]:
                 epoch=session.epoch,
                 packets=session.next,
                 map=known.map_index if known else None,
+                floor=known.floor if known else "",
                 path_length_m=known.path_length_m if known else 0.0,
                 keyscans=len(known.stamps) if known else 0,
                 T_map_base=known.T_map_base[-1].tolist() if known else None,
@@ -207,12 +208,8 @@ def _sessions(state: ViewerState, robot: str) -> list[SessionSummary]:
 
 
 def _zoom(run: Run, k: int) -> int:
-    description = run.map_files.get(f"{_stem(k)}.yaml")
-    return 0 if description is None else finest_zoom(resolution_of(_stem(k), description.decode(errors="replace")))
-
-
-def _stem(k: int) -> str:
-    return f"map_{k}" if k else "map"
+    description = run.map_files.get(f"{map_stem(k)}.yaml")
+    return 0 if description is None else finest_zoom(resolution_of(map_stem(k), description.decode(errors="replace")))
 
 
 def _closure(closure: ClosureRow) -> ClosureSummary:
