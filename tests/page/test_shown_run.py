@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from contextlib import aclosing
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -18,6 +19,7 @@ from fastapi.routing import iter_route_contexts
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EvaluationError
 from fcslam.mission_file import mission_bytes
+from fcslam.page import viewer
 from fcslam.page.report import ASKED, MOST_TILES, report_html
 from fcslam.page.routes import ASSETS
 from fcslam.page.shown_run import ShownRun
@@ -131,6 +133,29 @@ def test_a_viewer_follows_a_link_to_the_newest_run(run, tmp_path):
         link.unlink()
         link.symlink_to(tmp_path / "2")
         assert shown.sessions("a")[0] == ("a", 0, len(A))
+
+
+def test_a_run_that_is_mapped_again_is_told_and_shown(shown, run, monkeypatch):
+    monkeypatch.setattr(viewer, "LOOK_S", 0.01)
+    state = ReadOnly(shown)
+    tile = "/api/v1/maps/0/tiles/5/0/0.png"
+    before, sessions = ask(shown, tile)[0].content, shown.sessions()
+
+    async def replaced():
+        app = viewer_app(state)
+        async with app.router.lifespan_context(app):
+            await asyncio.sleep(0.1)
+            smaller = {name: t for name, t in run.trajectories.items() if name == "b"}
+            replace(run, trajectories=smaller, map_files=files("map", 20), mission=b"").save(
+                shown.run_folder, force=True
+            )
+            async with aclosing(state.events.watch()) as events:
+                return await anext(events)
+
+    assert asyncio.run(asyncio.wait_for(replaced(), 30.0)).kind == "live"
+    assert (shown.sessions(), shown.packet_counts().arrived) == ([("b", 0, 0)], 0)
+    assert ask(shown, tile)[0].content != before
+    assert len(sessions) == 3
 
 
 class Elements(HTMLParser):

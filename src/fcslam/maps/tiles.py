@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.runs.folder import identity
 from fcslam.runs.map_files import PIXELS, Occupancy, parse_map, pixels_of
 
 WORLD_M = 256.0
@@ -27,7 +28,7 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
     Raises:
         FileNotFoundError: the folder has no map ``stem``.
     """
-    pixels, resolution_m, origin = _grid(folder, stem)
+    pixels, resolution_m, origin = _grid(folder, stem, identity(folder))
     side_m = WORLD_M / 2**zoom
     canvas = np.full((TILE_PX, TILE_PX), PIXELS[Occupancy.UNKNOWN], np.uint8)
     # first and one past the last cell in the tile, per axis (x, y)
@@ -52,8 +53,8 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
 
 
 @lru_cache(maxsize=8)
-def _grid(folder: Path, stem: str) -> tuple[NDArray[np.uint8], float, NDArray[np.float64]]:
-    """Pixels (H, W) with row 0 at the lowest y, resolution in metres, lower left corner (2,). Files never change."""
+def _grid(folder: Path, stem: str, _: tuple[int, int]) -> tuple[NDArray[np.uint8], float, NDArray[np.float64]]:
+    """Pixels (H, W) with row 0 at the lowest y, resolution in metres, lower left corner (2,)."""
     pgm, description = (folder / f"{stem}.pgm").read_bytes(), (folder / f"{stem}.yaml").read_text(encoding="utf-8")
     occupancy = parse_map(stem, pgm, description)
     return pixels_of(occupancy.cells), occupancy.resolution_m, np.array(occupancy.origin_xy)

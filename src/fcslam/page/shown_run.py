@@ -11,7 +11,7 @@ from typing import Self
 
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.mission_file import opened_copy
-from fcslam.runs.folder import MISSION, is_run_folder
+from fcslam.runs.folder import MISSION, identity, is_run_folder
 from fcslam.service.intake import SessionState
 from fcslam.service.mission_store import MissionStore
 from fcslam.service.viewed_mission import PacketCounts, viewed_run
@@ -37,8 +37,8 @@ class ShownRun:
         """
         self._place, self._name = place, name
         self._lock, self._copies = threading.Lock(), ExitStack()
-        self._opened: dict[Path | None, _Opened] = {}
-        """By mission file; None: of run folders without one."""
+        self._opened: dict[tuple[int, int] | None, _Opened] = {}
+        """By the identity of the run folder; None: of all run folders without a mission file."""
         self._open()
 
     def __enter__(self) -> Self:
@@ -84,9 +84,10 @@ class ShownRun:
         """A copy of the mission file of the run folder as it is now."""
         folder = self.run_folder
         mission = folder / MISSION if folder is not None and (folder / MISSION).is_file() else None
+        key = None if mission is None else identity(mission.parent)
         with self._lock:
-            if mission not in self._opened:
+            if key not in self._opened:
                 store = self._copies.enter_context(opened_copy(mission))
                 packets = Counter((envelope.robot, envelope.epoch) for envelope in store.envelopes())
-                self._opened[mission] = _Opened(store, packets)
-            return self._opened[mission]
+                self._opened[key] = _Opened(store, packets)
+            return self._opened[key]

@@ -15,6 +15,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 import fcslam
 from fcslam.page.routes import page_router
+from fcslam.runs.folder import identity
 from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.events import EventStream
@@ -64,12 +65,20 @@ def viewer_app(state: ReadOnly) -> FastAPI:
 
 async def _follow(state: ReadOnly) -> None:
     """Tell of every new run folder."""
-    folder = state.mission.run_folder
+    shown = _newest(state)
     for number in itertools.count(1):
-        while folder == (newest := state.mission.run_folder):
+        while shown == (newest := _newest(state)):
             await asyncio.sleep(LOOK_S)
-        folder = newest
+        shown = newest
         state.events.publish("live", number)
+
+
+def _newest(state: ReadOnly) -> tuple[int, int] | None:
+    """The identity of the run folder as it is now."""
+    folder = state.mission.run_folder
+    with suppress(FileNotFoundError):  # another one is about to replace it
+        return None if folder is None else identity(folder)
+    return None
 
 
 def run_viewer(app: FastAPI, listening: socket.socket) -> None:

@@ -150,6 +150,16 @@ def is_run_folder(path: Path) -> bool:
     return (path / ROBOTS).is_file() and (path / TRAJECTORIES).is_dir()
 
 
+def identity(folder: Path) -> tuple[int, int]:
+    """What tells a run folder from another one that replaces it: no file in a run folder changes.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    found = folder.stat()
+    return found.st_ino, found.st_mtime_ns
+
+
 def open_run(folder: str | os.PathLike[str]) -> Run:
     """Read a run folder back; files are read, never executed.
 

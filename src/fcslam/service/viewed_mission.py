@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from fcslam.runs import Run, open_run
+from fcslam.runs.folder import identity
 from fcslam.service.intake import SessionState
 from fcslam.service.mission_store import MissionStore
 
@@ -29,7 +30,7 @@ class ViewedMission(Protocol):
 
     @property
     def run_folder(self) -> Path | None:
-        """The newest run folder, in which no file ever changes; None: there is none yet."""
+        """The newest run folder; its files never change, but another one may replace it. None: there is none yet."""
 
     @property
     def store(self) -> MissionStore:
@@ -45,11 +46,15 @@ class ViewedMission(Protocol):
         """How far the packets of all robots are."""
 
 
-@lru_cache(maxsize=4)
 def viewed_run(folder: Path) -> Run:
     """The run in a ``run_folder`` of a viewed mission.
 
     Raises:
-        EvaluationError: it is broken.
+        EvaluationError: it is broken, or not there any more.
     """
+    return _read(folder, identity(folder) if folder.exists() else None)
+
+
+@lru_cache(maxsize=4)
+def _read(folder: Path, _: tuple[int, int] | None) -> Run:
     return open_run(folder)
