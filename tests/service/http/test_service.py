@@ -160,7 +160,8 @@ def test_viewers_see_the_fleet(mapped):
     assert get(mapped, "maps").json() == [{"map": 0, "floor": "", "robots": ["a", "b"], "zoom": 5}]
 
 
-def test_viewers_see_the_floors(desk, monkeypatch):
+def test_viewers_see_the_floors(desk, scripted, monkeypatch):
+    scripted()
     vocabularies = tuple(VocabularyState(Channel.LIDAR, "v1", *its, 1) for its in (("", 3), ("2", 4)))
     monkeypatch.setattr(Fleet, "vocabularies", lambda _: vocabularies)
     above = [encode(decode(data).on_floor("2")) for data in B]
