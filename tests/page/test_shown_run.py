@@ -232,6 +232,7 @@ def test_a_browser_shows_a_report_from_a_file(shown, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0)
     elements = Elements(done.stdout)
     assert [text for attributes, text in elements.of("p") if attributes.get("id") == "status"] == ["read-only"]
+    assert [text for _, text in elements.of("title")] == ["fcslam: run"]
     assert [text.strip() for _, text in elements.of("option")] == ["0: a, a+1", "1: b"]
     assert len(elements.of("li")) == 3
 

@@ -43,6 +43,7 @@ async function update(number) {
   trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
   zooms = new Map(maps.map((m) => [m.map, m.zoom]));
   readOnly = counts.read_only; robots = fleet; closures = accepted;
+  document.title = `fcslam: ${counts.mission}`;
   if (number !== version) { version = number; tiles.clear(); }
   at("maps").replaceChildren(...maps.map((m) => new Option(`${m.map}${m.floor && `, floor ${m.floor}`}: ${m.robots.join(", ")}`, m.map, false, m.map === mapIndex)));
   at("robots").replaceChildren(...fleet.map(describe));
