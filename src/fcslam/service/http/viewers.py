@@ -35,6 +35,9 @@ Square = Annotated[int, PathParameter(ge=-MOST, le=MOST)]
 TEXT, JSON = "text/plain", "application/json"
 MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "application/yaml"}
 
+_ROWS = {"type": "array", "items": {"type": "object", "required": ["name", "value", "unit"]}}
+_SETTINGS = {"type": "object"}
+
 
 def fleet_router(state: ViewerState) -> APIRouter:
     """Robots, closures and vocabularies."""
@@ -132,12 +135,14 @@ def map_router(state: ViewerState) -> APIRouter:
             raise HTTPException(404, f"there is no {map_stem(k)}") from error
         return Response(tile, media_type=MEDIA["png"])
 
-    @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON)})
+    @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_ROWS)})
     def get_metrics() -> FileResponse:
         """All metrics with their units."""
         return _file(state, METRICS, JSON)
 
-    @router.get(f"/{CONFIG}", response_class=Response, responses={**refusals(404), 200: content(MEDIA["yaml"])})
+    @router.get(
+        f"/{CONFIG}", response_class=Response, responses={**refusals(404), 200: content(MEDIA["yaml"], model=_SETTINGS)}
+    )
     def get_config() -> FileResponse:
         """The complete configuration."""
         return _file(state, CONFIG, MEDIA["yaml"])
