@@ -4,6 +4,7 @@ import shutil
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,11 @@ import fcslam
 from fcslam.cloud.edits import kind_of
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EditError, SourceError
+from fcslam.mission import MissionCloud
 from fcslam.mission_file import edit_mission, mission_bytes, read_mission
 from fcslam.records import Cut, MapRegion, Pin, RegionUse, Removal, Undo, Veto
 from fcslam.runs import open_run
+from fcslam.sources import write_carmen
 
 pytestmark = pytest.mark.slow
 
@@ -49,6 +52,85 @@ def test_a_mission_goes_on_more_than_once(logs, whole, tmp_path):
     fcslam.map_recordings(logs[1:2], output=tmp_path / "two", onto=tmp_path / "one" / "mission.fcslam")
     fcslam.map_recordings(logs[2:], output=tmp_path / "three", onto=tmp_path / "two")
     assert contents(tmp_path / "three") == contents(whole)
+
+
+@pytest.fixture
+def resumed(monkeypatch):
+    """Whether each mission went on from the state of the earlier one."""
+    answers = []
+
+    def resume(cloud, onto, first, original=MissionCloud.resume):
+        answers.append(original(cloud, onto, first))
+        return answers[-1]
+
+    monkeypatch.setattr(MissionCloud, "resume", resume)
+    return answers
+
+
+def copied(run, folder):
+    return Path(shutil.copytree(run, folder))
+
+
+def test_a_state_saves_work_and_changes_nothing(drawn, logs, begun, resumed, tmp_path):
+    hour_later = tmp_path / "later.clf"
+    write_carmen(hour_later, (replace(scan, stamp=scan.stamp + 3600.0) for scan in drawn.robots[2].scans()))
+    fcslam.map_recordings([*logs[:2], hour_later], output=tmp_path / "whole")
+    fcslam.map_recordings(hour_later, output=tmp_path / "from state", onto=begun)
+    bare = copied(begun, tmp_path / "bare")
+    (bare / "mission.state").unlink()
+    fcslam.map_recordings(hour_later, output=tmp_path / "from packets", onto=bare)
+    assert resumed[1:] == [True, False]
+    assert contents(tmp_path / "from state") == contents(tmp_path / "from packets") == contents(tmp_path / "whole")
+
+
+def test_a_mission_that_is_mapped_again_goes_on_from_its_state(begun, resumed, tmp_path):
+    fcslam.map_recordings([], output=tmp_path / "again", onto=begun)
+    assert resumed == [True]
+    assert contents(tmp_path / "again") == contents(begun)
+
+
+@pytest.mark.parametrize("broken", [lambda state: state[:-1] + b"!", lambda state: state[:40], lambda _: b""])
+def test_a_state_that_somebody_changed_is_not_read(begun, resumed, tmp_path, broken):
+    run = copied(begun, tmp_path / "run")
+    state = run / "mission.state"
+    state.write_bytes(broken(state.read_bytes()))
+    fcslam.map_recordings([], output=tmp_path / "again", onto=run)
+    assert resumed == [False]
+    assert contents(tmp_path / "again") == contents(begun)
+
+
+def test_the_state_of_another_user_is_not_read(begun, resumed, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+    fcslam.map_recordings([], onto=begun)
+    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
+    fcslam.map_recordings([], output=tmp_path / "again", onto=begun)
+    assert resumed == [False, False]
+    assert not (tmp_path / "again" / "mission.state").exists()
+
+
+def test_a_state_counts_only_if_nothing_but_the_packets_changed(logs, begun, resumed, tmp_path):
+    first, second = (path.stem for path in logs[:2])
+    fcslam.map_recordings(logs[2:], onto=begun, vetoes=[Veto(first, second)])
+    fcslam.map_recordings(logs[2:], onto=begun, config=fcslam.MissionConfig(seed=1))
+    edited = copied(begun, tmp_path / "edited")
+    edit_mission(edited, [Veto(first, second)], "anna", 1.0)
+    fcslam.map_recordings(logs[2:], onto=edited)
+    assert resumed == [False, False, False]
+
+
+def test_a_state_does_not_count_for_packets_that_come_before_it(logs, whole, resumed, tmp_path):
+    """The three robots drive at the same time."""
+    fcslam.map_recordings(logs[1:], output=tmp_path / "later")
+    run = fcslam.map_recordings(logs[:1], onto=tmp_path / "later")
+    assert not any(resumed)
+    assert set(run.trajectories) == set(open_run(whole).trajectories)
+
+
+def test_a_state_that_makes_no_sense_is_left_out(begun, caplog):
+    saved = replace(read_mission(begun), state={"cloud": {"fleet": {}, "log": {}}, "traffic": []})
+    run = fcslam.map_recordings([], onto=saved)
+    assert "all packets take effect again" in caplog.text
+    assert run.pose_graph_g2o == open_run(begun).pose_graph_g2o
 
 
 def test_a_robot_that_comes_back_begins_a_new_session(logs, begun, tmp_path):

@@ -5,6 +5,7 @@ sources -> robot (LiDAR SLAM, features) -> packets -> cloud (places -> graph -> 
 
 import heapq
 import itertools
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,16 +24,19 @@ from fcslam.driving import Drive, Leg, continued, on_floor, one_by_one
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.metrics.jumps import JumpLimits
-from fcslam.mission_file import EMPTY, SavedMission, mission_bytes
-from fcslam.records import Edit, Veto
+from fcslam.mission_file import EMPTY, SavedMission, mission_bytes, mission_state_bytes
+from fcslam.records import Channel, Edit, Veto
 from fcslam.robot.frontend import RobotConfig
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
+from fcslam.storage.state_file import State
 from fcslam.wire.checks import check_floor, check_name
-from fcslam.wire.ledger import Counter
-from fcslam.wire.messages import Packet
-from fcslam.wire.packets import SizedPacket, measure
+from fcslam.wire.ledger import Counter, Ledger, Traffic
+from fcslam.wire.messages import Packet, PacketKind
+from fcslam.wire.packets import Label, SizedPacket, measure
+
+_log = logging.getLogger(__name__)
 
 AUTHOR = "fcslam map"
 """The author of vetoes that are given with the recordings."""
@@ -111,13 +115,19 @@ def run_mission(
     _check_vetoes(vetoes, [*onto.packets, *(source.name for source in sources)])
     _check_floors(floors, [source.name for source in sources])
     cloud = MissionCloud(config, onto, vetoes)
-    meter = _Meter(watch, cloud.fleet, [*onto.packets, *(source.name for source in sources)])
+    meter = _Meter(watch, cloud, [*onto.packets, *(source.name for source in sources)])
     with drive(sources, config.robot) as robots:
         new = [
             on_floor(continued(legs, onto.epochs(source.name)), floors.get(source.name, ""))
             for legs, source in zip(robots, sources, strict=True)
         ]
-        streams = [_packets(legs, meter) for legs in (*onto.legs(), *new)]
+        streams = [_packets(legs, meter) for legs in new]
+        first, streams = _first(streams)
+        if cloud.resume(onto, first):
+            for leg in itertools.chain.from_iterable(onto.legs()):
+                meter.count(leg)
+        else:
+            streams += [_packets(legs, meter) for legs in onto.legs()]
         for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
             cloud.apply(sent)
             live(cloud)
@@ -145,6 +155,33 @@ class MissionCloud:
     def fleet(self) -> Fleet:
         """The fleet, for vetoes and counts."""
         return self._cloud.fleet
+
+    def resume(self, onto: SavedMission, first: SizedPacket | None) -> bool:
+        """Take over the state after all packets of an earlier mission, so that they need not be applied again.
+
+        Args:
+            onto: the mission that this cloud began with.
+            first: the first packet of the new ones; None: there are none.
+
+        Returns:
+            Whether there is a state, no setting or edit has changed, and all new packets come later than the old ones.
+        """
+        packets = onto.in_order
+        is_later = not packets or first is None or first.packet.order > packets[-1].packet.order
+        if onto.state is None or not is_later or self._edits != onto.edits or self._settings != onto.config:
+            return False
+        try:
+            config, state = self.config, onto.state["cloud"]
+            cloud = Cloud.restored(config.fleet, config.seed, state, (sent.packet for sent in packets))
+            traffic = {
+                Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(count, size)
+                for robot, kind, channel, count, size in onto.state["traffic"]
+            }
+        except Exception as error:  # a mission must never depend on the state of an earlier one
+            _log.warning("all packets take effect again, as the state of the mission cannot be used: %s", error)
+            return False
+        self._cloud, self._packets, self._traffic = cloud, packets, Counter(Ledger(traffic, Traffic()))
+        return True
 
     def apply(self, sent: SizedPacket) -> list[Packet]:
         """Apply the next packet of a robot; returns the replies to it.
@@ -182,9 +219,18 @@ class MissionCloud:
         tracks = unknown | {name: track for name, track in tracks.items() if name in mapped}
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
-        settings = CloudConfig(seed=self.config.seed, fleet=self.config.fleet, map=self.config.map)
-        mission = mission_bytes(settings, self._edits, self._packets, self._refused, tracks)
-        return replace(run_of(result, tracks, metrics, dump(self.config), self.config.map), mission=mission)
+        mission = mission_bytes(self._settings, self._edits, self._packets, self._refused, tracks)
+        run = run_of(result, tracks, metrics, dump(self.config), self.config.map)
+        return replace(run, mission=mission, state=mission_state_bytes(mission, self._state()))
+
+    @property
+    def _settings(self) -> CloudConfig:
+        return CloudConfig(seed=self.config.seed, fleet=self.config.fleet, map=self.config.map)
+
+    def _state(self) -> State:
+        ledger = self._traffic.ledger()
+        traffic = [[*label, total.count, total.bytes] for label, total in ledger.accepted.items()]
+        return {"cloud": self._cloud.state(), "traffic": traffic}
 
 
 def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
@@ -194,12 +240,20 @@ def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
         yield from leg.packets
 
 
+def _first(streams: Sequence[Iterator[SizedPacket]]) -> tuple[SizedPacket | None, list[Iterator[SizedPacket]]]:
+    """The first packet of all streams, each of which is in order, and the same streams again."""
+    heads = [next(stream, None) for stream in streams]
+    there = [(head, stream) for head, stream in zip(heads, streams, strict=True) if head is not None]
+    first = min((head for head, _ in there), key=lambda head: head.packet.order, default=None)
+    return first, [itertools.chain((head,), stream) for head, stream in there]
+
+
 class _Meter:
     """Counts scans, keyscans and recorded time, and reports the progress."""
 
-    def __init__(self, watch: Watch, fleet: Fleet, robots: Sequence[str]) -> None:
+    def __init__(self, watch: Watch, cloud: MissionCloud, robots: Sequence[str]) -> None:
         self._watch = watch
-        self._fleet = fleet
+        self._cloud = cloud
         self._span: dict[str, tuple[float, float]] = {}
         self._faults: dict[str, Faults] = {}
         self.scans = self.keyscans = 0
@@ -232,7 +286,7 @@ class _Meter:
 
     def report(self, fusing: bool = False) -> None:
         """Report the progress now."""
-        closures = self._fleet.closure_counts()
+        closures = self._cloud.fleet.closure_counts()
         self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing, self._faults.copy()))
 
 

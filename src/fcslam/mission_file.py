@@ -4,11 +4,14 @@ A mission that goes on needs no recording of earlier robots: their packets take 
 """
 
 import fcntl
+import logging
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -18,14 +21,18 @@ from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.driving import Leg
-from fcslam.errors import PacketError, SourceError, StoreError
+from fcslam.errors import InputError, PacketError, SourceError, StoreError
 from fcslam.records import Change, Edit, Undo
-from fcslam.runs.folder import MISSION
+from fcslam.runs.folder import MISSION, STATE
 from fcslam.service.mission_store import CONFIG, MissionStore, StoredPacket, check_mission
 from fcslam.sources.faults import Faults
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing
+from fcslam.storage.own_files import read_own
+from fcslam.storage.state_file import State, code_version, parse_state, state_bytes
 from fcslam.wire.packets import SizedPacket, decode
+
+_log = logging.getLogger(__name__)
 
 _AT_ONCE: Final = 1000
 """Packets that are read at once."""
@@ -43,6 +50,13 @@ class SavedMission:
     """Packets without effect; their numbers are used up."""
     tracks: Mapping[str, Track]
     """The scans of each session whose scans are known, by its name."""
+    state: State | None = None
+    """The state of the cloud after all packets, if this user's program left one beside the file."""
+
+    @property
+    def in_order(self) -> list[SizedPacket]:
+        """All packets in canonical order."""
+        return sorted(chain.from_iterable(self.packets.values()), key=lambda sized: sized.packet.order)
 
     def epochs(self, robot: str) -> int:
         """How many sessions the robot had, counted with those without a packet."""
@@ -71,7 +85,7 @@ def read_mission(path: Path) -> SavedMission:
     path = mission_path(path)
     try:
         with opened_copy(path) as store:
-            return _read(store)
+            return replace(_read(store), state=_state_beside(path))
     except PacketError as error:
         raise SourceError(f"{path}: {error}") from error
     except StoreError as error:
@@ -93,6 +107,28 @@ def opened_copy(path: Path | None) -> Iterator[MissionStore]:
                 shutil.copyfile(path, copy)
         with closing(MissionStore(copy)) as store:
             yield store
+
+
+def mission_state_bytes(mission: bytes, state: State) -> bytes:
+    """The state of the cloud that made a mission file, for ``Run.state``."""
+    return state_bytes(_fits(mission), state)
+
+
+def _state_beside(path: Path) -> State | None:
+    """The state that fits this program and the mission file at ``path``; None if there is none."""
+    place = path.with_name(STATE)
+    data = read_own(place) if path.name == MISSION else None
+    if data is None:
+        return None
+    try:
+        return parse_state(place, data, _fits(path.read_bytes()))
+    except InputError as error:
+        _log.info("%s; all packets take effect again", error)
+        return None
+
+
+def _fits(mission: bytes) -> str:
+    return f"{code_version()} {blake2b(mission, digest_size=16).hexdigest()}"
 
 
 def mission_bytes(

@@ -18,8 +18,8 @@ pytestmark = pytest.mark.slow
 
 
 def contents(folder):
-    """All files of a run, without the mission, whose log of edits only grows."""
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "mission.fcslam")
+    """All files of a run, without the mission, whose log of edits only grows, and what is bound to it."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.stem != "mission")
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 

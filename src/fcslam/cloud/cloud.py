@@ -1,6 +1,10 @@
 """The cloud within one process: packets in, replies out, one map in the end."""
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Self
+
+import numpy as np
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
@@ -9,7 +13,8 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import in_session, session_name
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
-from fcslam.records import Place
+from fcslam.records import Correction, Place, frozen
+from fcslam.storage.state_file import State
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode, encode
 
@@ -25,6 +30,38 @@ class Cloud:
         """The newest that was sent, by session."""
         self._sent = 0
         """How many corrections were sent: the version of the next one."""
+
+    def state(self) -> State:
+        """The state after the packets so far, without these; ``restored`` makes an equal cloud of it."""
+        return {
+            "fleet": self.fleet.state(),
+            "log": self._log.state(),
+            "sent": self._sent,
+            "corrections": {
+                session: {
+                    "sender": [sent.robot, sent.epoch, sent.time],
+                    "correction": [c.version, c.map_index, c.quality],
+                    "T_map_odom": np.array(c.T_map_odom),
+                }
+                for session, sent in self._corrections.items()
+                for c in (sent.correction,)
+            },
+        }
+
+    @classmethod
+    def restored(cls, config: FleetConfig, seed: int, state: State, packets: Iterable[Packet]) -> Self:
+        """The cloud of a ``state`` under the same configuration and seed; ``packets`` are those that it applied."""
+        cloud = cls(config, seed)
+        cloud._packets = {PacketNumber(in_session(packet).robot, packet.sequence): packet for packet in packets}
+        cloud.fleet = Fleet.restored(config, seed, state["fleet"], cloud._packets.__getitem__)
+        cloud._log = PacketLog.restored(state["log"])
+        cloud._sent = state["sent"]
+        for session, kept in state["corrections"].items():
+            robot, epoch, time = kept["sender"]
+            version, map_index, quality = kept["correction"]
+            correction = Correction(robot, version, map_index, frozen(kept["T_map_odom"]), quality)
+            cloud._corrections[session] = SessionCorrection(robot, epoch, time, correction)
+        return cloud
 
     def receive(self, data: bytes) -> list[bytes]:
         """As ``apply``, with encoded packets.

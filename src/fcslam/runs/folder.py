@@ -7,6 +7,7 @@
     metrics.json               [{name, value, unit}]
     config.yaml                the complete configuration of the run
     mission.fcslam             packets, edits and configuration of the mission, with which it can go on
+    mission.state              what this program made of them, so that its user's next run need not apply them again
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
     localization/<robot>.csv   instead of local: of a robot that was localised in a finished map, pose, standard
                                deviations and quality at every laser scan
@@ -40,9 +41,10 @@ from fcslam.runs.tables import (
 )
 from fcslam.runs.trajectories import read_tum, write_tum
 from fcslam.storage.files import replacing_folder
+from fcslam.storage.own_files import write_own
 
 TRAJECTORIES, LOCAL, ROBOTS, CLOSURES = "trajectories", "local", "robots.csv", "closures.csv"
-LOCALIZATION, MISSION = "localization", "mission.fcslam"
+LOCALIZATION, MISSION, STATE = "localization", "mission.fcslam", "mission.state"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
 
 _SAFE_NAME = re.compile(r"\w[\w.+-]*")
@@ -75,6 +77,8 @@ class Run:
     """By robot: every robot's own map. Live results of the service have none, and their folder has no ``local``."""
     mission: bytes = b""
     """The mission file: packets and edits, with which the mission can go on. Live results of the service have none."""
+    state: bytes = b""
+    """The state of the cloud that made it, beside ``mission``; a run that was read has none."""
     localized: Mapping[str, LocalizedPoses] = field(default_factory=dict)
     """By robot: poses in a finished map; ``fcslam.localize`` makes them."""
 
@@ -211,6 +215,8 @@ def _write(run: Run, folder: Path) -> None:
         write_localized(folder / LOCALIZATION / f"{poses.robot}.csv", poses)
     if run.mission:
         (folder / MISSION).write_bytes(run.mission)
+    if run.state:
+        write_own(folder / STATE, run.state)
     write_robots(folder / ROBOTS, run.trajectories.values())
     write_closures(folder / CLOSURES, run.closures)
     (folder / METRICS).write_text(metrics_json(run.metrics.values()), encoding="utf-8")

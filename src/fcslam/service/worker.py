@@ -22,14 +22,12 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import IO, NamedTuple
 
 import cv2
 
-import fcslam
 from fcslam.cloud.edits import in_force
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
@@ -48,7 +46,7 @@ from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.service.supervisor import PROGRESS, READY
 from fcslam.service.warmup import warm_up_fleet
-from fcslam.storage.state_file import read_state, write_state
+from fcslam.storage.state_file import code_version, read_state, write_state
 from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode
@@ -402,16 +400,6 @@ class _Publishing(NamedTuple):
 def _chained(before: bytes, data: bytes) -> bytes:
     """Hash of a sequence of packets, by that of all but the last one."""
     return blake2b(before + data, digest_size=16).digest()
-
-
-@cache
-def code_version() -> str:
-    """Hash of the program: a snapshot fits no other one, because another program may decide otherwise."""
-    root = Path(fcslam.__file__).parent
-    hashed = blake2b(digest_size=16)
-    for path in sorted(root.rglob("*.py")):
-        hashed.update(path.read_bytes())
-    return hashed.hexdigest()
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import zipfile
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +36,18 @@ def write_state(path: Path, fits: str, state: State) -> None:
     Raises:
         OSError: the file cannot be written; the old one is unchanged.
     """
+    data = state_bytes(fits, state)
+    write_file(path, _hash(data) + data)
+
+
+def state_bytes(fits: str, state: State) -> bytes:
+    """The content of a state's file, without a hash."""
     arrays: list[NDArray[Any]] = []
     text = json.dumps({"fits": fits, "state": _without_arrays(state, arrays)})
     content = io.BytesIO()
     named = {str(number): array for number, array in enumerate(arrays)}
     np.savez(content, allow_pickle=False, text=np.frombuffer(text.encode(), np.uint8), **named)
-    data = content.getbuffer()
-    write_file(path, _hash(data) + data)
+    return content.getvalue()
 
 
 def read_state(path: Path, fits: str) -> State | None:
@@ -51,22 +57,43 @@ def read_state(path: Path, fits: str) -> State | None:
         InputError: the file cannot be read, is damaged, or does not fit.
     """
     try:
-        data = memoryview(path.read_bytes())
-        if _hash(data[_HASH_BYTES:]) != data[:_HASH_BYTES]:
-            raise InputError(f"{path}: is damaged")
-        with np.load(io.BytesIO(data[_HASH_BYTES:]), allow_pickle=False) as archive:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error})") from error
+    if _hash(data[_HASH_BYTES:]) != data[:_HASH_BYTES]:
+        raise InputError(f"{path}: is damaged")
+    return parse_state(path, data[_HASH_BYTES:], fits)
+
+
+def parse_state(path: Path, data: bytes, fits: str) -> State:
+    """Read what ``state_bytes`` gave, found at ``path``.
+
+    Raises:
+        InputError: it does not fit, or is something else.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             about = json.loads(archive["text"].tobytes())
             if about["fits"] != fits:
                 raise InputError(f"{path}: is of another version or configuration")
             state: State = _with_arrays(about["state"], archive)
             return state
-    except FileNotFoundError:
-        return None
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())})") from error
 
 
-def _hash(data: memoryview) -> bytes:
+@cache
+def code_version() -> str:
+    """Hash of the program: a state fits no other one, because another program may decide otherwise."""
+    hashed = hashlib.blake2b(digest_size=16)
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        hashed.update(path.read_bytes())
+    return hashed.hexdigest()
+
+
+def _hash(data: bytes) -> bytes:
     return hashlib.blake2b(data, digest_size=_HASH_BYTES).digest()
 
 

@@ -52,9 +52,10 @@ class Ledger:
 class Counter:
     """Counts traffic; ``ledger`` shows it."""
 
-    def __init__(self) -> None:
-        self._accepted: dict[Label, Traffic] = {}
-        self._refused = Traffic()
+    def __init__(self, before: Ledger | None = None) -> None:
+        """``before`` is the traffic so far; None: there was none."""
+        self._accepted: dict[Label, Traffic] = {} if before is None else dict(before.accepted)
+        self._refused = Traffic() if before is None else before.refused
 
     def accept(self, label: Label, size: int) -> None:
         """Count a packet of ``size`` bytes that was accepted."""

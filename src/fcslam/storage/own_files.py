@@ -1,0 +1,58 @@
+"""Files that only the user who wrote them reads again: a keyed hash of the content comes first.
+
+The key is in the user's state folder. So a file that somebody else made or changed is as good as none.
+"""
+
+import hashlib
+import hmac
+import os
+import secrets
+from pathlib import Path
+from typing import Final
+
+from fcslam.storage.files import write_file
+
+_KEY_BYTES: Final = 32
+_HASH_BYTES: Final = 32
+
+
+def write_own(path: Path, data: bytes) -> bool:
+    """Write ``data`` for ``read_own``; False: this user has no folder for a key, and nothing is written.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    key = _key()
+    if key is None:
+        return False
+    write_file(path, _hash(key, data) + data)
+    return True
+
+
+def read_own(path: Path) -> bytes | None:
+    """What this user wrote to ``path``; None if there is nothing, or somebody else wrote or changed it."""
+    key = _key()
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    data = content[_HASH_BYTES:]
+    return data if key is not None and hmac.compare_digest(content[:_HASH_BYTES], _hash(key, data)) else None
+
+
+def _hash(key: bytes, data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=_HASH_BYTES, key=key).digest()
+
+
+def _key() -> bytes | None:
+    """The key of this user, made at the first use; None if there is no place for it."""
+    try:
+        folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "fcslam"
+        path = folder / "key"
+        if not path.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            write_file(path, secrets.token_bytes(_KEY_BYTES), private=True)
+        key = path.read_bytes()
+    except (OSError, RuntimeError):  # no home
+        return None
+    return key if len(key) == _KEY_BYTES else None
