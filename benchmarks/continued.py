@@ -2,8 +2,8 @@
 
     python benchmarks/continued.py [--log intel] [--parts 3] [--repetitions 2]
 
-A recording of the SLAM benchmark is cut into robots as by `--split`. One command maps all of them. Two others map all but
-the last, and then the last one onto that run, once with the state that the first of them left (`mission.state`) and once
+A recording of the SLAM benchmark is cut into robots as by `--split`. One command maps all of them. Two others map all
+but the last, and then the last one onto that run: once with the state that the first left (`mission.state`), and once
 without. CPU is that of the whole command, the least of the repetitions.
 """
 
