@@ -109,7 +109,10 @@ def _legs(source: Source, config: RobotConfig) -> Iterator[Leg]:
 
 
 def on_floor(legs: Iterator[Leg], floor: str) -> Iterator[Leg]:
-    """The legs of a robot whose sessions name a floor."""
+    """The legs of a robot whose sessions name a floor; empty: none."""
+    if not floor:
+        yield from legs
+        return
     for leg in legs:
         packets = (
             measure(sized.packet.on_floor(floor)) if isinstance(sized.packet.body, Hello) else sized

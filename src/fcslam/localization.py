@@ -79,11 +79,12 @@ def _floors(folder: Path) -> dict[int, str]:
 
 def _map_on(floor: str, floors: Mapping[int, str], path: Path) -> tuple[int, str]:
     """Number and floor of the first map on a floor; without ``floor``, on the only one."""
-    named = sorted(set(floors.values()) - {""})
-    if not floor and len(set(floors.values())) > 1:
-        raise SourceError(f"{path}: has maps of several floors ({', '.join(named)}); say which floor the robot is on")
-    if floor and floor not in named:
-        raise SourceError(f"{path}: has no map of floor {floor!r}; its floors: {', '.join(named) or 'none is named'}")
+    known = set(floors.values())
+    listed = ", ".join(its or "one without a name" for its in sorted(known))
+    if not floor and len(known) > 1:
+        raise SourceError(f"{path}: has maps of several floors ({listed}); say which one the robot is on")
+    if floor and floor not in known:
+        raise SourceError(f"{path}: has no map of floor {floor!r}; its floors: {listed}")
     number = min((k for k, its in floors.items() if its == floor or not floor), default=0)
     return number, floors.get(number, "")
 
