@@ -121,9 +121,9 @@ def test_what_is_no_pose_is_refused(building, scans, pose):
 
 
 def test_a_map_that_cannot_be_used_is_refused_in_one_line(building, scans, tmp_path):
-    def refusal(map):
+    def refusal(map, **options):
         with pytest.raises(InputError) as caught:
-            robot_in(map, scans).close()
+            robot_in(map, scans, **options).close()
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
@@ -139,6 +139,10 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(building, scans, tmp_p
     (tmp_path / "wide.pgm").write_bytes(pgm_bytes(wide))
     (tmp_path / "wide.yaml").write_text(map_yaml(wide, "wide.pgm"))
     assert "extends over" in refusal(tmp_path / "wide.yaml")
+    assert "leave the floor out" in refusal(tmp_path / "wide.yaml", floor="2")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "robots.csv").write_text("robot,map,path_length_m,scans,floor\na,0,1,1,two words\n")
+    assert "broken run folder ('two words' is no floor)" in refusal(tmp_path / "run", floor="2")
 
 
 def test_a_mission_file_is_a_map(fleet, tmp_path):

@@ -252,7 +252,7 @@ class MissionStore:
         return Edit(number, author, time_s, content)
 
     def check_named(self, content: Change | Undo) -> None:
-        """Check that the sessions and moments that an edit names are in the mission.
+        """Check that the sessions and moments that an edit names are in the mission, those of a closure on one floor.
 
         Raises:
             EditError: they are not.

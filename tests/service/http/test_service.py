@@ -171,6 +171,12 @@ def test_viewers_see_the_floors(desk, scripted, monkeypatch):
     assert {robot["robot"]: robot["floor"] for robot in get(desk, "robots").json()} == {"a": "", "b": "2"}
     assert get(desk, "closures").json() == []
     assert get(desk, "vocabulary").json() == {"lidar_v1": 7}
+    joined = {
+        "robot_i": "a", "stamp_i": 0.0, "robot_j": "b", "stamp_j": 500.0, "T_i_j": [0, 0, 0], "tolerance": [0.1, 0.1],
+    }  # fmt: skip
+    refused = edit(desk, "closure", joined)
+    assert refused.status_code == 404
+    assert refused.json() == {"error": "a and b are on different floors, which no closure joins"}
 
 
 def test_viewers_get_the_files_of_the_live_run(mapped):
