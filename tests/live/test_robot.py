@@ -344,6 +344,7 @@ def test_a_lift_begins_a_session_on_another_floor(scans, tmp_path):
         robot.change_floor("1")
         robot.change_floor("2")
         poses = drive(robot, scans[half:])
+        assert (robot.status().times_lost, robot.status().localization) == (0, "mapping")
         with pytest.raises(InputError, match="is not 1 to 16"):
             robot.change_floor("the attic")
         robot.finish()

@@ -91,7 +91,7 @@ class LocalizationState(StrEnum):
     """Whether a robot knows its pose in its map."""
 
     MAPPING = "mapping"
-    """It was never lost."""
+    """It was never lost on this floor."""
     LOST = "lost"
     """It maps in a new session, whose transform to the map and to its earlier sessions is not known yet."""
     RELOCALISED = "relocalised"
@@ -123,7 +123,7 @@ class RobotStatus:
     quality: float
     """Quality of the newest correction, in [0, 1]: how well other sessions support the robot's place in the map."""
     times_lost: int
-    """Number of times the robot was lost since it started."""
+    """Number of times the robot was lost since it started or came to its floor."""
     trouble: str | None
     """Why packets do not arrive; None if they do, or if there is no server."""
     catching_up: bool

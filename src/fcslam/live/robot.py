@@ -232,8 +232,9 @@ class Robot(LiveTracker):
             if uplink
             else (WaitingPackets(0, 0), 0, 0, 0, 0)
         )
+        times_lost = self._part - self._first_on_floor(self._part)
         return RobotStatus(
-            self._scans, self._keyscans, *sent, localizer.map_index, localizer.age_s, localizer.quality, self._part,
+            self._scans, self._keyscans, *sent, localizer.map_index, localizer.age_s, localizer.quality, times_lost,
             uplink.trouble if uplink else None, uplink is not None and uplink.is_catching_up, notices,
         )  # fmt: skip
 
@@ -269,7 +270,7 @@ class Robot(LiveTracker):
         return own.closures(self._session(part), self._T_map_own(part))
 
     def trajectory(self) -> RobotTrajectory:
-        """All scans since the robot was last lost; it waits for the worker.
+        """All scans since the robot was last lost or changed its floor; it waits for the worker.
 
         With a map of its own, the poses are corrected by all loop closures so far. Without, all move with the server's
         newest correction.
@@ -454,7 +455,11 @@ class Robot(LiveTracker):
         self._localizers[1].setdefault(part, Localizer(self._clock)).correct(correction)
 
     def _floor(self, part: int) -> str:
-        return self._floors[max(first for first in self._floors if first <= part)]
+        return self._floors[self._first_on_floor(part)]
+
+    def _first_on_floor(self, part: int) -> int:
+        """The part with which the robot came to the floor of this one."""
+        return max(first for first in self._floors if first <= part)
 
     def _localizer(self, part: int) -> Localizer:
         """That of the server as soon as it has corrected this part of the start."""
@@ -506,7 +511,7 @@ class Robot(LiveTracker):
             self._event(EventKind.OFFLINE, f"the robot goes on, and its packets wait: {trouble}")
 
     def _tell_correction(self, before: Correction | None, now: Correction) -> None:
-        if self._part > 0 and now.quality > 0.0 and (before is None or before.quality == 0.0):
+        if self._part not in self._floors and now.quality > 0.0 and (before is None or before.quality == 0.0):
             self._event(EventKind.RELOCALISED, f"relocalised in map {now.map_index}, quality {now.quality:.2f}")
         elif (before is None and self._uplink is not None) or (before and now.map_index != before.map_index):
             self._event(EventKind.JOINED, f"now in map {now.map_index}")
