@@ -49,7 +49,7 @@ def serve(
         ),
     ] = None,
     config: ConfigFile = None,
-    docs: Annotated[bool, typer.Option("--docs", help="Serve the interactive API documentation at /docs.")] = False,
+    docs: Annotated[bool, typer.Option("--docs", help="Describe the REST interface at /docs.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Receive packets of robots, map them, and serve map, trajectories and metrics; Ctrl-C stops the service."""
@@ -57,7 +57,7 @@ def serve(
     import logging
 
     from fcslam.errors import ServiceError
-    from fcslam.page.routes import page_router
+    from fcslam.page.routes import documentation_router, page_router
     from fcslam.service.http.app import create_app
     from fcslam.service.warmup import warm_up_decoding
     from fcslam.storage.files import keep_private
@@ -74,7 +74,8 @@ def serve(
         tell_uncached(notices(quiet))
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
-        server = _server(create_app(state, (page_router(),), docs), tls_certificate, tls_key, client_ca)
+        pages = (page_router(), documentation_router()) if docs else (page_router(),)
+        server = _server(create_app(state, pages), tls_certificate, tls_key, client_ca)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
         shown = f"[{address}]" if ":" in address else address

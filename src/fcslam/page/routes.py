@@ -1,6 +1,6 @@
 """The files of the page. They hold no data of a mission, so nobody needs a token for them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from fastapi import APIRouter
@@ -12,6 +12,12 @@ FILES = {
     "/page.js": ("page.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
 }
+DOCUMENTATION = {
+    "/docs": ("docs.html", "text/html"),
+    "/docs.js": ("docs.js", "text/javascript"),
+    "/docs.css": ("docs.css", "text/css"),
+}
+"""FastAPI's own page would load scripts from another host."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -23,8 +29,17 @@ HEADERS = {
 
 def page_router() -> APIRouter:
     """The page at ``/``, its script and its style."""
+    return _router(FILES)
+
+
+def documentation_router() -> APIRouter:
+    """The REST interface as a page at ``/docs``, which reads ``/openapi.json``."""
+    return _router(DOCUMENTATION)
+
+
+def _router(files: Mapping[str, tuple[str, str]]) -> APIRouter:
     router = APIRouter(include_in_schema=False)
-    for path, (name, media_type) in FILES.items():
+    for path, (name, media_type) in files.items():
         router.add_api_route(path, _sender(name, media_type), methods=["GET"])
     return router
 

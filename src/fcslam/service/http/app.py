@@ -37,7 +37,7 @@ class Service(FastAPI):
         return described
 
 
-def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool = False) -> FastAPI:
+def create_app(state: ServiceState, more: Sequence[APIRouter] = ()) -> FastAPI:
     """The service; ``more`` routers come from rooms that this one does not know. Closes the missions at its end."""
 
     @asynccontextmanager
@@ -50,7 +50,7 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), docs: bool =
     app = Service(
         title="fcslam",
         version=fcslam.__version__,
-        docs_url="/docs" if docs else None,
+        docs_url=None,
         redoc_url=None,
         redirect_slashes=False,  # a redirect repeats whatever Host the request names
         lifespan=lifespan,
