@@ -12,7 +12,7 @@ LARGEST_BYTES = 150_000
 
 
 def test_the_page_is_served_and_forbids_scripts_and_hosts_that_are_not_its_own() -> None:
-    app = FastAPI()
+    app = FastAPI(docs_url=None)
     app.include_router(page_router())
     app.include_router(documentation_router())
 
