@@ -82,9 +82,10 @@ def ask(shown, *paths, method="GET", host="127.0.0.1:80"):
 def test_a_finished_run_answers_as_the_service_does(shown):
     answers = ask(shown, *(f"/api/v1/{path}" for path in (*ASKED, "robots/a", "trajectories/b.tum", "maps/1.yaml")))
     assert [answer.status_code for answer in answers] == [200] * len(answers)
-    fleet, maps, robots, closures, metrics, _, one = (
-        answer.json() if "json" in answer.headers["content-type"] else answer.text for answer in answers[:7]
-    )
+    contents = [answer.json() if "json" in answer.headers["content-type"] else answer.text for answer in answers]
+    told = dict(zip((*ASKED, "robots/a"), contents, strict=False))
+    fleet, maps, robots, metrics, one = (told[path] for path in ("fleet", "maps", "robots", "metrics.json", "robots/a"))
+    closures = told["closures?status=accepted&limit=5000"]
     assert (fleet["read_only"], fleet["packets"], fleet["metrics"]) == (True, len(A), {"error": None})
     assert [(m["map"], m["robots"], m["zoom"]) for m in maps] == [(0, ["a", "a+1"], 5), (1, ["b"], 5)]
     assert [(r["session"], r["packets"], r["map"]) for r in robots] == [("a", len(A), 0), ("a+1", 0, 0), ("b", 0, 1)]
@@ -92,7 +93,11 @@ def test_a_finished_run_answers_as_the_service_does(shown):
     assert [closure["setting"] for closure in closures] == [HOSTILE]
     assert metrics == [{"name": "error", "value": None, "unit": "m"}]
     assert one["sessions"] == robots[:2]
-    assert [edit.author for edit in shown.store.edits()] == ["anna"]
+    assert [(edit["kind"], edit["author"]) for edit in told["edits"]] == [("veto", "anna")]
+    (apart,) = told["separations"]
+    assert (apart["maps"], apart["explanation"]) == (
+        [0, 1], "map 0 (a, a+1) and map 1 (b): no two of their places look alike"
+    )  # fmt: skip
 
 
 def test_every_route_of_viewers_answers_for_a_finished_run(shown):
@@ -233,8 +238,9 @@ def test_a_browser_shows_a_report_from_a_file(shown, tmp_path):
     elements = Elements(done.stdout)
     assert [text for attributes, text in elements.of("p") if attributes.get("id") == "status"] == ["read-only"]
     assert [text for _, text in elements.of("title")] == ["fcslam: run"]
-    assert [text.strip() for _, text in elements.of("option")] == ["0: a, a+1", "1: b"]
-    assert len(elements.of("li")) == 3
+    assert [text.strip() for _, text in elements.of("option")][:2] == ["0: a, a+1", "1: b"]
+    shown_robots = [attributes.get("data-robot") for attributes, _ in elements.of("input")]
+    assert [name for name in shown_robots if name] == ["box a", "box a+1", "box b"]
 
 
 def test_a_report_holds_every_path_that_the_page_names():

@@ -18,11 +18,15 @@ from fcslam.errors import EvaluationError
 from fcslam.maps.tiles import WORLD_M, finest_zoom
 from fcslam.page.routes import ASSETS
 from fcslam.page.viewer import ReadOnly, viewer_app
+from fcslam.records import ClosureStatus
 from fcslam.runs import OccupancyMap
 from fcslam.service.http.app import PREFIX
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 
-ASKED = ("fleet", "maps", "robots", "closures?status=accepted&limit=5000", "metrics.json", "config.yaml")
+ASKED = (
+    "fleet", "maps", "separations", "robots", "edits", "metrics.json", "config.yaml",
+    *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
+)  # fmt: skip
 """What the page asks for, besides events, trajectories and tiles."""
 MOST_TILES = 800
 """Of all maps together: a tile has about 5 kB. Of a larger map, the file holds coarser tiles."""

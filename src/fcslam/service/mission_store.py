@@ -221,6 +221,12 @@ class MissionStore:
         hello: bytes | None = self._database.value(statement, (robot, epoch))
         return hello
 
+    def keyscans_near(self, robot: str, epoch: int, time: float, limit: int) -> list[bytes]:
+        """At most ``limit`` keyscans of a session that it sent nearest to a time, encoded."""
+        where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL"
+        statement = f"SELECT data FROM packets WHERE {where} ORDER BY abs(time - ?) LIMIT ?"
+        return [data for (data,) in self._database.rows(statement, (robot, epoch, PacketKind.KEYSCAN, time, limit))]
+
     def progress(self, applied: int, corrections: Sequence[SessionCorrection]) -> None:
         """Note how many packets took effect; corrections that are news get a new version."""
         with self._database.transaction() as database:

@@ -1,15 +1,17 @@
 // The live map. Tokens go in a header and never in an address, which logs would keep: so events are read with fetch.
 const API = "api/v1/", WORLD_M = 256, TILE_PX = 256, MOST_TILES = 400, RETRY_MS = 2000;
+const LIVE_S = 15; // a robot that was heard so recently is live
+const LISTED = 200; // closures in the list; the newest ones
+const NEAR_M = 5; // closures with both ends so near each other see the same place
+const CLICK_PX = 8; // a click this near a closure selects it
 // as in maps/palette.py
 const COLOURS = ["#0072b2", "#e66100", "#009e73", "#7b4fb5", "#e0a800", "#56b4e9", "#8c564b", "#607d3b"];
 const CLOSURE = { lidar: "#c2185b", camera: "#3d1e8f" };
 const at = (id) => document.getElementById(id);
-const canvas = at("map"), pen = canvas.getContext("2d");
-const tiles = new Map();
-let token = sessionStorage.getItem("token") ?? "";
-let view = null, mapIndex = 0, version = 0, robots = [], closures = [], trails = new Map(), zooms = new Map(), queued = false, readOnly = false;
-const hidden = new Set(); // sessions whose paths are not drawn
 
+// ---- What the service says ----
+
+let token = sessionStorage.getItem("token") ?? "";
 class Refused extends Error {}
 
 // A report holds the responses itself and asks nobody.
@@ -22,56 +24,230 @@ function reported(path) {
   throw new Error(`${path}: not in this report`);
 }
 
-async function ask(path, more = {}) {
+async function ask(path, { method = "GET", body } = {}) {
   if (report) return reported(path);
-  const answer = await fetch(API + path, { ...more, headers: token ? { Authorization: `Bearer ${token}` } : {} });
-  if (answer.status === 401 || answer.status === 403) { at("login").hidden = false; throw new Refused("needs the token of a viewer"); }
-  if (!answer.ok) throw new Error(`${path}: ${answer.status}`);
-  return answer;
+  const headers = { ...(token && { Authorization: `Bearer ${token}` }), ...(body && { "Content-Type": "application/json" }) };
+  const answer = await fetch(API + path, { method, headers, body: body && JSON.stringify(body) });
+  if (answer.ok) return answer;
+  if (answer.status === 401 || (answer.status === 403 && method === "GET")) {
+    at("login").hidden = false;
+    throw new Refused("needs a token that is valid");
+  }
+  throw new Error((await answer.json().catch(() => ({}))).error ?? `${path}: ${answer.status}`);
 }
 const json = async (path) => (await ask(path)).json();
 
+// ---- State ----
+
+let version = 0, release = null, readOnly = false;
+let robots = [], accepted = [], listed = [], selected = null, followed = null;
+let trails = new Map(), zooms = new Map();
+const hidden = new Set(); // sessions whose paths are not drawn
+
 async function trail(name) {
   const lines = (await (await ask(`trajectories/${encodeURIComponent(name)}.tum`)).text()).split("\n");
-  return lines.filter((l) => l && l[0] !== "#").map((l) => l.split(" ").map(Number));
+  return lines.filter((l) => l && l[0] !== "#").map((l) => {
+    const [stamp, x, y, , , , qz, qw] = l.split(" ").map(Number);
+    return [stamp, x, y, 2 * Math.atan2(qz, qw)];
+  });
+}
+
+// Where a robot was at a keyscan: x, y, heading in its map; undefined if nobody knows.
+function pose(name, stamp) {
+  const path = trails.get(name);
+  if (!path?.length) return undefined;
+  let low = 0, high = path.length - 1;
+  while (low < high) { const middle = (low + high) >> 1; if (path[middle][0] < stamp - 1e-6) low = middle + 1; else high = middle; }
+  return path[low].slice(1);
+}
+
+const mapOf = (name) => robots.find((r) => r.session === name)?.map;
+const keyOf = (c) => [c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j].map(encodeURIComponent).join("/");
+const colourOf = (name) => COLOURS[Math.max(0, robots.findIndex((r) => r.session === name)) % COLOURS.length];
+
+// The closure with both ends in the map; `map` is null if they are in different ones.
+function placed(c, maps) {
+  const map = maps.get(c.robot_i), ends = [pose(c.robot_i, c.stamp_i), pose(c.robot_j, c.stamp_j)];
+  return { ...c, ends, map: map === maps.get(c.robot_j) && ends.every(Boolean) ? map ?? null : null };
 }
 
 async function update(number) {
-  const [counts, maps, fleet, accepted] = await Promise.all([json("fleet"), json("maps"), json("robots"), json("closures?status=accepted&limit=5000")]);
+  const counts = await json("fleet");
+  release ??= counts.version;
+  if (counts.version !== release) { at("reload").hidden = false; throw new Error("The service has another version: reload the page."); }
+  const [maps, apart, fleet, closures, edits] = await Promise.all([json("maps"), json("separations"), json("robots"), json("closures?status=accepted&limit=5000"), json("edits")]);
   const seen = fleet.filter((r) => r.T_map_base);
   const paths = await Promise.all(seen.map((r) => trail(r.session)));
   trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
   zooms = new Map(maps.map((m) => [m.map, m.zoom]));
-  readOnly = counts.read_only; robots = fleet; closures = accepted;
-  document.title = `fcslam: ${counts.mission}`;
+  if (!zooms.has(mapIndex)) mapIndex = maps[0]?.map ?? 0;
+  readOnly = counts.read_only; robots = fleet;
+  const of = new Map(fleet.map((r) => [r.session, r.map]));
+  accepted = closures.map((c) => placed(c, of));
   if (number !== version) { version = number; tiles.clear(); }
-  at("maps").replaceChildren(...maps.map((m) => new Option(`${m.map}${m.floor && `, floor ${m.floor}`}: ${m.robots.join(", ")}`, m.map, false, m.map === mapIndex)));
-  at("robots").replaceChildren(...fleet.map(describe));
-  at("closures").textContent = `${accepted.filter((c) => c.robot_i !== c.robot_j).length} between robots, ${accepted.filter((c) => c.robot_i === c.robot_j).length} within`;
+  document.title = `fcslam: ${counts.mission}`;
+  for (const element of document.querySelectorAll(".live")) element.hidden = readOnly;
+  showMaps(maps, apart); showRobots(counts.metrics); showPairs(); showEdits(edits);
+  await refreshClosures();
+  const leader = robots.find((r) => r.session === followed);
+  if (leader?.T_map_base && view) { mapIndex = leader.map; at("maps").value = mapIndex; [view.x, view.y] = leader.T_map_base; }
   if (!view && trails.size) fit();
   redraw();
 }
 
-function describe(robot, i) {
-  const item = document.createElement("li"), label = document.createElement("label"), box = document.createElement("input");
-  const heard = readOnly ? "" : robot.last_heard_s === null ? ", not heard" : `, heard ${robot.last_heard_s.toFixed(0)} s ago`;
-  box.type = "checkbox"; box.checked = !hidden.has(robot.session);
-  box.addEventListener("change", () => { if (box.checked) hidden.delete(robot.session); else hidden.add(robot.session); redraw(); });
-  label.append(box, ` ${robot.session}: ${robot.map === null ? "no map yet" : `map ${robot.map}`}, ${robot.path_length_m.toFixed(0)} m${heard}`); // text: a name is never markup
-  label.style.color = COLOURS[i % COLOURS.length];
-  item.append(label);
-  return item;
+// ---- Panels; texts are set as text, because a name is never markup ----
+
+function element(tag, text = "", more = {}) {
+  const made = Object.assign(document.createElement(tag), more);
+  made.append(text);
+  return made;
 }
+function row(...cells) {
+  const made = document.createElement("tr"), [first, ...others] = cells;
+  made.append(element("th", first, { scope: "row" }), ...others.map((text) => element("td", text)));
+  return made;
+}
+
+// Fills a list only if it changes, so that it stays open, scrolled and focused.
+const filled = new WeakMap();
+function fill(list, content, children) {
+  const text = JSON.stringify(content);
+  if (filled.get(list) === text) return;
+  filled.set(list, text);
+  list.replaceChildren(...children());
+}
+
+function showMaps(maps, apart) {
+  const label = (m) => `${m.map}${m.floor && `, floor ${m.floor}`}: ${m.robots.join(", ")}`;
+  fill(at("maps"), maps, () => maps.map((m) => new Option(label(m), m.map)));
+  at("maps").value = mapIndex;
+  at("separations").replaceChildren(...apart.map((s) => element("li", s.explanation)));
+}
+
+function stateOf(robot) {
+  if (robot.removed) return "removed";
+  const where = robot.map === null ? "no map yet" : `map ${robot.map}${robot.floor && `, floor ${robot.floor}`}`;
+  if (readOnly) return where;
+  if (robot.last_heard_s === null) return `${where}, not heard`;
+  return `${where}, ${robot.last_heard_s < LIVE_S ? "live" : "offline"}, heard ${robot.last_heard_s.toFixed(0)} s ago`;
+}
+
+function showRobots(metrics) {
+  const focus = document.activeElement?.dataset?.robot; // the lists are made anew, and the keyboard stays where it was
+  at("robots").replaceChildren(...robots.map((robot) => {
+    const name = robot.session, item = element("li"), label = element("label"), swatch = element("span", "", { className: "swatch" });
+    const box = element("input", "", { type: "checkbox", checked: !hidden.has(name) });
+    const button = element("button", "Follow", { ariaPressed: String(followed === name), ariaLabel: `Follow ${name}` });
+    const bytes = metrics[`uplink_bytes_${name}`], detectors = Object.entries(robot.detectors).map(([channel, made]) => `${channel}: ${made}`);
+    box.dataset.robot = `box ${name}`; button.dataset.robot = `button ${name}`;
+    box.addEventListener("change", () => { if (box.checked) hidden.delete(name); else hidden.add(name); redraw(); });
+    button.addEventListener("click", () => { followed = followed === name ? null : name; update(version).catch(fail); });
+    swatch.style.background = colourOf(name);
+    label.append(box, swatch, `${name}: ${stateOf(robot)}`);
+    item.append(label, " ", ...(readOnly ? [] : [button]), element("span", [`${robot.path_length_m.toFixed(0)} m`, `${robot.keyscans} keyscans`, ...(bytes ? [`${(bytes / 1000).toFixed(0)} kB sent`] : []), ...detectors].join(", "), { className: "small" }));
+    return item;
+  }));
+  if (focus) document.querySelector(`[data-robot="${CSS.escape(focus)}"]`)?.focus();
+}
+
+function showPairs() {
+  const counts = new Map();
+  for (const c of accepted) { const pair = [c.robot_i, c.robot_j].sort().join(" – "); counts.set(pair, (counts.get(pair) ?? 0) + 1); }
+  at("pairs").replaceChildren(...[...counts].sort((a, b) => b[1] - a[1]).map(([pair, count]) => row(pair, String(count))));
+}
+
+async function refreshClosures() {
+  const state = at("state").value;
+  const of = new Map(robots.map((r) => [r.session, r.map]));
+  listed = state === "accepted" ? accepted : (await json(`closures?status=${state}&limit=5000`)).map((c) => placed(c, of));
+  const newest = listed.slice(-LISTED).reverse();
+  at("closures").textContent = `${listed.length} ${state}, ${listed.filter((c) => c.robot_i !== c.robot_j).length} of them between robots${listed.length > LISTED ? `; the newest ${LISTED} are listed` : ""}`;
+  const label = (c) => `${c.robot_i} – ${c.robot_j}, ${c.channel}, ${c.stamp_i.toFixed(1)} s – ${c.stamp_j.toFixed(1)} s`;
+  fill(at("list"), newest.map(keyOf), () => newest.map((c) => new Option(label(c), keyOf(c))));
+  if (selected) {
+    const now = report ? selected : await json(`closures/${keyOf(selected)}`).catch(() => selected);
+    selected = placed(now, of);
+    showClosure();
+  }
+}
+
+const turn = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
+function difference([x, y, a], [u, v, b]) { // of two poses: the second in the first
+  const c = Math.cos(a), s = Math.sin(a);
+  return [c * (u - x) + s * (v - y), c * (v - y) - s * (u - x), turn(b - a)];
+}
+const distance = (p, q) => Math.hypot(p[0] - q[0], p[1] - q[1]);
+
+function supporting(c) {
+  const close = (a, b) => a.every((end, k) => distance(end, b[k]) < NEAR_M);
+  return accepted.filter((o) => o.map === c.map && keyOf(o) !== keyOf(c) &&
+    ((o.robot_i === c.robot_i && o.robot_j === c.robot_j && close(o.ends, c.ends)) ||
+     (o.robot_i === c.robot_j && o.robot_j === c.robot_i && close([o.ends[1], o.ends[0]], c.ends)))).length;
+}
+
+function showClosure() {
+  const c = selected, rows = [
+    ["Robots", `${c.robot_i} (blue) and ${c.robot_j} (orange)`],
+    ["Keyscans", `${c.stamp_i.toFixed(2)} s and ${c.stamp_j.toFixed(2)} s`],
+    ["Channel", c.channel], ["State", c.status], ["Reason", c.explanation], ["Similarity", c.similarity.toFixed(3)],
+  ];
+  if (c.map === null) rows.push(["Residual", "the ends are in different maps"]);
+  else {
+    const [dx, dy, angle] = difference(c.T_i_j, difference(c.ends[0], c.ends[1]));
+    rows.push(["Residual", `${(1000 * Math.hypot(dx, dy)).toFixed(0)} mm, ${(Math.abs(angle) * 180 / Math.PI).toFixed(2)}°`], ["Supporting", `${supporting(c)} accepted closures with both ends within ${NEAR_M} m`]);
+  }
+  at("facts-of-closure").replaceChildren(...rows.map((cells) => row(...cells)));
+  at("closure").hidden = false;
+  at("list").value = keyOf(c);
+}
+
+async function select(closure) {
+  selected = closure;
+  showClosure();
+  redraw();
+  const overlay = at("overlay"), key = keyOf(closure);
+  overlay.hidden = true;
+  const picture = await ask(`closures/${key}.png`).then((a) => a.blob()).then(createImageBitmap).catch(() => null);
+  if (!picture || keyOf(selected) !== key) return; // a run without scans has no picture
+  overlay.getContext("2d").drawImage(picture, 0, 0);
+  overlay.ariaLabel = `Walls that ${closure.robot_i} and ${closure.robot_j} saw, laid on each other`;
+  overlay.hidden = false;
+}
+
+function showEdits(edits) {
+  const text = (e) => `${e.number}: ${e.kind} ${e.kind === "undo" ? `of ${e.content.number}` : about(e.content)}; ${e.author}, ${new Date(1000 * e.time_s).toLocaleString()}`;
+  fill(at("edits"), [readOnly, edits], () => edits.length ? edits.toReversed().map((e) => {
+    const item = element("li", `${text(e)}${e.undone_by ? `, undone by ${e.undone_by}` : ""} `);
+    if (!readOnly && !e.undone_by && e.kind !== "undo") {
+      const button = element("button", "Undo", { ariaLabel: `Undo edit ${e.number}` });
+      button.addEventListener("click", () => change(`edits/${e.number}/undo`));
+      item.append(button);
+    }
+    return item;
+  }) : [element("li", "none")]);
+}
+const about = (content) => [content.robot_i ?? content.session ?? content.robot, content.robot_j, content.use, content.name, ...(content.stamps ?? []).map((s) => `${s.toFixed(1)} s`)].filter(Boolean).join(" ");
+
+async function change(path, body) {
+  try {
+    const { number, kind } = await (await ask(path, { method: "POST", body })).json();
+    at("message").textContent = `Edit ${number} (${kind}) is stored; the map follows.`;
+    showEdits(await json("edits"));
+  } catch (error) { fail(error); }
+}
+const fail = (error) => { at("message").textContent = error.message; };
 
 async function facts() {
   const [metrics, config] = await Promise.all([json("metrics.json"), ask("config.yaml").then((a) => a.text())]);
   at("config").textContent = config;
-  at("metrics").replaceChildren(...metrics.map(({ name, value, unit }) => {
-    const row = document.createElement("tr");
-    for (const text of [name.replaceAll("_", " "), value === null ? "–" : String(Number(value.toPrecision(4))), unit === "1" ? "" : unit]) row.insertCell().textContent = text;
-    return row;
-  }));
+  at("metrics").replaceChildren(...metrics.map(({ name, value, unit }) =>
+    row(name.replaceAll("_", " "), value === null ? "–" : String(Number(value.toPrecision(4))), unit === "1" ? "" : unit)));
 }
+
+// ---- Map ----
+
+const canvas = at("map"), pen = canvas.getContext("2d"), tiles = new Map();
+let view = null, mapIndex = 0, queued = false;
 
 function fit() {
   const points = robots.filter((r) => r.map === mapIndex).flatMap((r) => trails.get(r.session) ?? []);
@@ -112,52 +288,81 @@ function draw() {
       if (picture) pen.drawImage(picture, ...onScreen(x * side, (y + 1) * side), side * view.scale, side * view.scale);
     }
   pen.globalAlpha = 0.4;
-  for (const c of at("shown").checked ? closures : []) {
-    const ends = [pose(c.robot_i, c.stamp_i), pose(c.robot_j, c.stamp_j)];
-    if (ends.every(Boolean)) line(ends, CLOSURE[c.channel], 1);
-  }
+  if (at("shown").checked) for (const channel of Object.keys(CLOSURE)) lines(accepted.filter((c) => c.channel === channel && c.map === mapIndex).map((c) => c.ends), CLOSURE[channel], 1);
   pen.globalAlpha = 1;
-  robots.forEach((r, i) => {
-    if (r.map !== mapIndex || !r.T_map_base || hidden.has(r.session)) return;
-    const colour = COLOURS[i % COLOURS.length], [x, y, heading] = r.T_map_base, [px, py] = onScreen(x, y);
-    line((trails.get(r.session) ?? []).map((p) => [p[1], p[2]]), colour);
+  for (const robot of robots) {
+    if (robot.map !== mapIndex || !robot.T_map_base || hidden.has(robot.session)) continue;
+    const colour = colourOf(robot.session), [x, y, heading] = robot.T_map_base, [px, py] = onScreen(x, y);
+    lines([(trails.get(robot.session) ?? []).map((p) => [p[1], p[2]])], colour);
     pen.save(); pen.translate(px, py); pen.rotate(-heading); pen.fillStyle = colour;
     pen.beginPath(); pen.moveTo(11, 0); pen.lineTo(-7, 6); pen.lineTo(-7, -6); pen.fill(); pen.restore();
-  });
+  }
+  if (selected) drawSelected();
 }
 
-function line(points, colour, width = 2) {
+function lines(ways, colour, width = 2) {
   pen.strokeStyle = colour; pen.lineWidth = width; pen.beginPath();
-  for (const p of points) pen.lineTo(...onScreen(p[0], p[1]));
+  for (const way of ways) way.forEach(([x, y], k) => (k ? pen.lineTo(...onScreen(x, y)) : pen.moveTo(...onScreen(x, y))));
   pen.stroke();
 }
 
-// Where a robot was at a keyscan; null if it is in another map.
-function pose(name, stamp) {
-  const path = trails.get(name);
-  if (!path?.length || robots.find((r) => r.session === name)?.map !== mapIndex) return null;
-  let low = 0, high = path.length - 1;
-  while (low < high) { const middle = (low + high) >> 1; if (path[middle][0] < stamp - 1e-6) low = middle + 1; else high = middle; }
-  return [path[low][1], path[low][2]];
+function drawSelected() {
+  const here = [selected.robot_i, selected.robot_j].map((name, k) => mapOf(name) === mapIndex && selected.ends[k]);
+  if (selected.map === mapIndex) lines([selected.ends], "#c2185b", 4);
+  for (const end of here.filter(Boolean)) { pen.strokeStyle = "#c2185b"; pen.lineWidth = 3; pen.beginPath(); pen.arc(...onScreen(end[0], end[1]), 7, 0, 2 * Math.PI); pen.stroke(); }
+}
+
+// The accepted closure at a point of the canvas.
+function closureAt(x, y) {
+  if (!view || !at("shown").checked) return undefined;
+  let best = CLICK_PX, found;
+  for (const c of accepted) {
+    if (c.map !== mapIndex) continue;
+    const [[ax, ay], [bx, by]] = c.ends.map((end) => onScreen(end[0], end[1]));
+    const along = Math.max(0, Math.min(1, ((x - ax) * (bx - ax) + (y - ay) * (by - ay)) / ((bx - ax) ** 2 + (by - ay) ** 2 || 1)));
+    const off = Math.hypot(x - ax - along * (bx - ax), y - ay - along * (by - ay));
+    if (off < best) { best = off; found = c; }
+  }
+  return found;
 }
 
 function zoom(factor) { if (view) { view.scale = Math.max(0.1, Math.min(2000, view.scale * factor)); redraw(); } }
-function pan(dx, dy) { if (view) { view.x -= dx / view.scale; view.y += dy / view.scale; redraw(); } }
+function pan(dx, dy) { if (view) { followed = null; view.x -= dx / view.scale; view.y += dy / view.scale; redraw(); } }
 
+// ---- What the user does ----
+
+let pressed = null;
 canvas.addEventListener("wheel", (e) => { e.preventDefault(); zoom(Math.exp(-e.deltaY / 500)); }, { passive: false });
-canvas.addEventListener("pointerdown", (e) => canvas.setPointerCapture(e.pointerId));
+canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); pressed = [e.offsetX, e.offsetY]; });
 canvas.addEventListener("pointermove", (e) => { if (e.buttons) pan(e.movementX, e.movementY); });
+canvas.addEventListener("pointerup", (e) => {
+  const closure = pressed && distance(pressed, [e.offsetX, e.offsetY]) < CLICK_PX && closureAt(e.offsetX, e.offsetY);
+  pressed = null;
+  if (closure) select(closure);
+});
 canvas.addEventListener("keydown", (e) => {
   const keys = { ArrowLeft: () => pan(60, 0), ArrowRight: () => pan(-60, 0), ArrowUp: () => pan(0, 60), ArrowDown: () => pan(0, -60), "+": () => zoom(1.4), "-": () => zoom(1 / 1.4), 0: () => { fit(); redraw(); } };
   if (keys[e.key]) { e.preventDefault(); keys[e.key](); }
 });
-at("maps").addEventListener("change", (e) => { mapIndex = Number(e.target.value); fit(); redraw(); });
-at("login").addEventListener("submit", (e) => { e.preventDefault(); token = at("token").value; sessionStorage.setItem("token", token); at("login").hidden = true; follow(); });
+at("maps").addEventListener("change", (e) => { mapIndex = Number(e.target.value); followed = null; fit(); redraw(); });
 at("shown").addEventListener("change", redraw);
+at("state").addEventListener("change", () => refreshClosures().catch(fail));
+at("list").addEventListener("change", (e) => select(listed.find((c) => keyOf(c) === e.target.value)));
+const named = () => ({ robot_i: selected.robot_i, robot_j: selected.robot_j, stamps: [selected.stamp_i, selected.stamp_j] });
+for (const kind of ["veto", "pin"]) at(kind).addEventListener("click", () => change("edits", { kind, content: named() }));
+at("reload").addEventListener("click", () => location.reload());
 at("facts").addEventListener("toggle", () => { if (at("facts").open) facts().catch(() => {}); });
+at("login").addEventListener("submit", (e) => {
+  e.preventDefault();
+  token = at("token").value; sessionStorage.setItem("token", token);
+  at("login").hidden = true; at("message").textContent = "";
+  follow();
+});
 new ResizeObserver(redraw).observe(canvas);
 
+let attempt = 0; // a new one ends those before it
 async function follow() {
+  const mine = ++attempt;
   try {
     const reader = (await ask("events")).body.pipeThrough(new TextDecoderStream()).getReader();
     await update(version); // what is there already; events tell of changes only
@@ -166,14 +371,17 @@ async function follow() {
     for (;;) {
       const { value, done } = await reader.read();
       if (done) throw new Error("the stream ended");
+      if (mine !== attempt) return;
       const parts = (rest + value).split("\n\n");
       rest = parts.pop();
       const newest = parts.filter((p) => p.startsWith("event: live")).pop();
       if (newest) await update(JSON.parse(newest.slice(newest.indexOf("data: ") + 6)).number);
     }
   } catch (error) {
-    at("status").textContent = error instanceof Refused ? error.message : "no connection; trying again";
-    if (!(error instanceof Refused)) setTimeout(follow, RETRY_MS);
+    if (mine !== attempt) return;
+    if (error instanceof Refused) at("status").textContent = error.message;
+    else if (!at("reload").hidden) at("status").textContent = error.message;
+    else { at("status").textContent = "no connection; trying again"; setTimeout(follow, RETRY_MS); }
   }
 }
 follow();

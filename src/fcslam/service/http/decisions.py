@@ -3,24 +3,23 @@
 import asyncio
 import json
 import shutil
-from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Path, Request
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from fcslam.cloud.edits import kind_of, read_edit, undone
+from fcslam.cloud.edits import read_edit
 from fcslam.config import Settings
 from fcslam.errors import EditError
-from fcslam.records import Change, Edit, Undo
+from fcslam.records import Change, Undo
 from fcslam.service.detectors import LONGEST_FILE_BYTES
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_body, read_json
 from fcslam.service.http.responses import DetectorVersion, EditSummary, Finalized, content, refusals
 from fcslam.service.http.robots import NETWORK
 from fcslam.service.http.state import ServiceState
+from fcslam.service.http.viewers import edit_summary
 
 LOOK_EVERY_S = 0.1
 LEAST_FREE_BYTES = 8 * 2**20
@@ -70,12 +69,6 @@ def decision_router(state: ServiceState) -> APIRouter:
         content = read_edit(new.kind, json.dumps(new.content))
         return await run_in_threadpool(_edit, state, request.state.actor, content)
 
-    @router.get("/edits")
-    def get_edits() -> list[EditSummary]:
-        """All edits, and what undid them."""
-        edits = state.mission.store.edits()
-        return [_summary(edit, undone(edits)) for edit in edits]
-
     @router.post("/edits/{number}/undo", status_code=201, responses=refusals(400, 404, 409))
     async def undo(request: Request, number: EditNumber) -> EditSummary:
         """Undo an edit. A removed session comes back when the worker has applied all packets again."""
@@ -102,12 +95,4 @@ def _edit(state: ServiceState, author: str, content: Change | Undo) -> EditSumma
         mission.store.check_named(content)
     except EditError as error:
         raise HTTPException(404, str(error)) from error
-    return _summary(mission.edit(content, author), {})
-
-
-def _summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:
-    kind, content = kind_of(edit.content), asdict(edit.content)
-    return EditSummary(
-        number=edit.number, kind=kind, content=content, author=edit.author, time_s=edit.time_s,
-        undone_by=gone.get(edit.number),
-    )  # fmt: skip
+    return edit_summary(mission.edit(content, author), {})

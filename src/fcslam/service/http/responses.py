@@ -65,6 +65,7 @@ class FleetSummary(Settings):
     """Counts."""
 
     mission: str
+    version: str = Field(description="of fcslam; a page of another version must be loaded again")
     read_only: bool = Field(description="whether nobody can change the mission here: it is a finished run")
     packets: int
     applied: int = Field(description="packets that took effect")
@@ -90,6 +91,7 @@ class SessionSummary(Settings):
     correction: int = Field(description="version of the newest correction; -1: none")
     quality: float = Field(description="how well other sessions support the pose, in [0, 1]; 0: no support")
     removed: bool = Field(description="whether an administrator removed it, so that its packets have no effect")
+    detectors: dict[Channel, str] = Field(description="version by channel, as its newest hello names them")
     last_heard_s: float | None = Field(description="seconds since the robot's last batch")
 
 
@@ -126,6 +128,15 @@ class MapSummary(Settings):
     floor: str = Field(description="floor that its robots named; empty: none")
     robots: list[str]
     zoom: int = Field(description="of the tiles that show every cell; deeper ones show nothing more")
+
+
+class MapSeparation(Settings):
+    """Two maps that no closure joins."""
+
+    maps: tuple[int, int]
+    candidates: int = Field(description="closures between them that failed verification")
+    verified: int = Field(description="closures between them that passed it, and were not enough")
+    explanation: str = Field(description="the binding reason, with its numbers")
 
 
 class DetectorVersion(Settings):

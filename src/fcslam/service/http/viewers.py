@@ -1,6 +1,8 @@
 """Routes for viewers: the live run as numbers and as files."""
 
 import math
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -8,16 +10,21 @@ from fastapi import APIRouter, HTTPException, Query
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, Response
 
-from fcslam.cloud.edits import in_force, is_removed
+import fcslam
+from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
+from fcslam.errors import EvaluationError
 from fcslam.maps.tiles import DEEPEST_ZOOM, finest_zoom, tile_png
-from fcslam.records import ClosureStatus
-from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, ClosureRow, Run
+from fcslam.records import Channel, ClosureStatus, Edit
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, ClosureRow, Run, separations
 from fcslam.runs.map_files import map_stem, resolution_of
+from fcslam.service.closure_submaps import overlay_png
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
     ClosureSummary,
+    EditSummary,
     FleetSummary,
+    MapSeparation,
     MapSummary,
     RobotSummary,
     SessionSummary,
@@ -26,12 +33,18 @@ from fcslam.service.http.responses import (
 )
 from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
+from fcslam.service.mission_store import MissionStore
 from fcslam.service.viewed_mission import viewed_run
+from fcslam.wire.messages import Hello
+from fcslam.wire.packets import decode
 
 MOST = 2**31 - 1
 """Largest number of a map or tile."""
 Index = Annotated[int, PathParameter(ge=0, le=MOST)]
 Square = Annotated[int, PathParameter(ge=-MOST, le=MOST)]
+Stamp = Annotated[float, PathParameter(allow_inf_nan=False, description="of a keyscan, seconds")]
+KEPT = {"Cache-Control": "private, max-age=60"}
+"""Of what is computed for a request and hardly changes."""
 TEXT, JSON = "text/plain", "application/json"
 MEDIA = {"png": "image/png", "pgm": "image/x-portable-graymap", "yaml": "application/yaml"}
 
@@ -52,6 +65,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
         counts = mission.packet_counts()
         return FleetSummary(
             mission=mission.name,
+            version=fcslam.__version__,
             read_only=state.read_only,
             packets=counts.arrived,
             applied=counts.applied,
@@ -89,6 +103,34 @@ def fleet_router(state: ViewerState) -> APIRouter:
         chosen = [closure for closure in _run_of(state).closures if status in (None, closure.status)]
         return [_closure(closure) for closure in chosen[-limit:]]
 
+    @router.get(
+        "/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}.png",
+        response_class=Response,
+        responses={**refusals(400, 404), 200: content(MEDIA["png"])},
+    )
+    def get_closure_picture(channel: Channel, robot_i: Name, stamp_i: Stamp, robot_j: Name, stamp_j: Stamp) -> Response:
+        """Walls around both ends of a closure, laid on each other as it measured them."""
+        run = _run_of(state)
+        closure = _closure_of(run, channel, robot_i, stamp_i, robot_j, stamp_j)
+        try:
+            picture = overlay_png(state.mission.store, run, closure)
+        except EvaluationError as error:
+            raise HTTPException(404, str(error)) from error
+        return Response(picture, media_type=MEDIA["png"], headers=KEPT)
+
+    @router.get("/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}", responses=refusals(400, 404))
+    def get_closure(
+        channel: Channel, robot_i: Name, stamp_i: Stamp, robot_j: Name, stamp_j: Stamp
+    ) -> ClosureSummary:
+        """One closure as it is now."""
+        return _closure(_closure_of(_run_of(state), channel, robot_i, stamp_i, robot_j, stamp_j))
+
+    @router.get("/edits")
+    def get_edits() -> list[EditSummary]:
+        """All edits, and what undid them."""
+        edits = state.mission.store.edits()
+        return [edit_summary(edit, undone(edits)) for edit in edits]
+
     @router.get("/vocabulary")
     def get_vocabulary() -> dict[str, float]:
         """Words by channel and detector version."""
@@ -113,6 +155,14 @@ def map_router(state: ViewerState) -> APIRouter:
         return [
             MapSummary(map=k, floor=floor, robots=[r.robot for r in robots if r.map_index == k], zoom=_zoom(run, k))
             for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
+        ]
+
+    @router.get("/separations")
+    def get_separations() -> list[MapSeparation]:
+        """Why maps of one floor are separate, for every two of them."""
+        return [
+            MapSeparation(maps=s.maps, candidates=s.candidates, verified=s.verified, explanation=str(s))
+            for s in separations(_run_of(state))
         ]
 
     @router.get(
@@ -162,6 +212,25 @@ def map_router(state: ViewerState) -> APIRouter:
     return router
 
 
+def edit_summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:
+    """An edit; ``gone`` names the edits that undid others (``fcslam.cloud.edits.undone``)."""
+    return EditSummary(
+        number=edit.number, kind=kind_of(edit.content), content=asdict(edit.content), author=edit.author,
+        time_s=edit.time_s, undone_by=gone.get(edit.number),
+    )  # fmt: skip
+
+
+def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
+    """The closure with this channel, robot and stamp of i, robot and stamp of j.
+
+    Refuses (HTTPException 404): there is none.
+    """
+    for c in run.closures:
+        if named == (c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j):
+            return c
+    raise HTTPException(404, "there is no such closure now")
+
+
 def _folder_of(state: ViewerState) -> Path:
     """The run folder as it is now.
 
@@ -206,10 +275,17 @@ def _sessions(state: ViewerState, robot: str) -> list[SessionSummary]:
                 correction=correction.correction.version if correction else -1,
                 quality=correction.correction.quality if correction else 0.0,
                 removed=is_removed(name, changes),
+                detectors=_detectors(store, robot, session.epoch),
                 last_heard_s=state.mission.last_heard_s(robot),
             )
         )
     return sessions
+
+
+def _detectors(store: MissionStore, robot: str, epoch: int) -> dict[Channel, str]:
+    hello = store.newest_hello(robot, epoch)
+    body = None if hello is None else decode(hello).body
+    return dict(body.detector_versions) if isinstance(body, Hello) else {}
 
 
 def _zoom(run: Run, k: int) -> int:
