@@ -119,9 +119,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
         return Response(picture, media_type=MEDIA["png"], headers=KEPT)
 
     @router.get("/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}", responses=refusals(400, 404))
-    def get_closure(
-        channel: Channel, robot_i: Name, stamp_i: Stamp, robot_j: Name, stamp_j: Stamp
-    ) -> ClosureSummary:
+    def get_closure(channel: Channel, robot_i: Name, stamp_i: Stamp, robot_j: Name, stamp_j: Stamp) -> ClosureSummary:
         """One closure as it is now."""
         return _closure(_closure_of(_run_of(state), channel, robot_i, stamp_i, robot_j, stamp_j))
 
