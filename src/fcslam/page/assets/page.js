@@ -88,6 +88,7 @@ async function update(number) {
   document.title = `fcslam: ${counts.mission}`;
   for (const element of document.querySelectorAll(".live")) element.hidden = readOnly;
   showMaps(maps, apart); showRobots(counts.metrics); showPairs(); showEdits(edits);
+  tellChanges({ maps, robots, accepted, edits });
   await refreshClosures();
   const leader = robots.find((r) => r.session === followed);
   if (leader?.T_map_base && view) { mapIndex = leader.map; at("maps").value = mapIndex; [view.x, view.y] = leader.T_map_base; }
@@ -236,6 +237,35 @@ async function change(path, body) {
   } catch (error) { fail(error); }
 }
 const fail = (error) => { at("message").textContent = error.message; };
+
+// ---- What happened since the page was opened ----
+
+const MOST_EVENTS = 200;
+let before = null;
+
+function tellChanges(now) {
+  if (before) {
+    const known = new Map(before.robots.map((r) => [r.session, r])), still = new Set(now.accepted.map(keyOf));
+    for (const robot of now.robots) {
+      const was = known.get(robot.session);
+      if (!was) tell(`${robot.session} begins${robot.epoch ? ", a session after a restart or after being lost" : ""}`);
+      else if (was.map !== null && robot.map !== null && was.map !== robot.map) tell(`${robot.session} is in map ${robot.map} now`);
+      else if (was.quality === 0 && robot.quality > 0) tell(`others confirm where ${robot.session} is`);
+      for (const [channel, made] of Object.entries(robot.detectors)) if (was?.detectors[channel] && was.detectors[channel] !== made) tell(`${robot.session} has another ${channel} detector: ${made}`);
+    }
+    if (now.maps.length < before.maps.length) tell(`maps joined, ${now.maps.length} left`);
+    if (now.maps.length > before.maps.length && before.maps.length) tell(`${now.maps.length} maps now`);
+    const lost = before.accepted.filter((c) => c.robot_i !== c.robot_j && !still.has(keyOf(c))).length;
+    if (lost) tell(`closures between robots no longer accepted: ${lost}`);
+    for (const edit of now.edits.slice(before.edits.length)) tell(`${edit.author}: ${edit.kind}`);
+  }
+  before = now;
+}
+
+function tell(text) {
+  at("events").prepend(element("li", `${new Date().toLocaleTimeString()}: ${text}`));
+  while (at("events").childElementCount > MOST_EVENTS) at("events").lastChild.remove();
+}
 
 async function facts() {
   const [metrics, config] = await Promise.all([json("metrics.json"), ask("config.yaml").then((a) => a.text())]);
