@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.recognition import VocabularyState
 from fcslam.errors import ServiceError, StoreError
 from fcslam.features.detector import BUNDLED_NETWORK
+from fcslam.maps.palette import ROBOTS
 from fcslam.records import Channel, Correction, Keyscan, ReasonCode
 from fcslam.runs import open_run
 from fcslam.service import intake
@@ -293,6 +295,47 @@ def test_edits_of_every_kind_reach_the_result_and_their_undos_leave_no_trace(map
     for number in range(1, 7):
         assert mapped.ask("POST", f"{API}/edits/{number}/undo", "boss").status_code == 201
     assert result()[1] == plain
+
+
+def picture_of(closure):
+    named = (closure[key] for key in ("channel", "robot_i", "stamp_i", "robot_j", "stamp_j"))
+    return "closures/" + "/".join(map(str, named))
+
+
+def test_a_closure_is_shown_with_what_both_robots_saw_until_it_is_gone(mapped):
+    closure = get(mapped, "closures?status=accepted").json()[0]
+    path = picture_of(closure)
+    assert get(mapped, path).json() == closure
+    answer = get(mapped, f"{path}.png")
+    assert answer.headers["content-type"] == "image/png"
+    pixels = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR_RGB)
+    colors = {tuple(color) for color in pixels.reshape(-1, 3).tolist()}
+    # the scripted robots stand at the same place and see the same
+    assert {(255, 255, 255), tuple(ROBOTS[1].to_bytes(3))} <= colors
+    other = picture_of(closure | {"stamp_j": closure["stamp_j"] + 0.25})
+    for wrong, status in (
+        (f"{path}x", 400),
+        (f"{other}.png", 404),
+        (other, 404),
+        (path.replace("lidar", "sonar"), 400),
+    ):
+        assert mapped.ask("GET", f"{API}/{wrong}", "eye").status_code == status
+    edit(mapped, "removal", {"robot": "b"})
+    assert mapped.ask("GET", f"{API}/{path}.png", "eye").status_code == 404
+
+
+def test_a_vetoed_closure_says_so_and_the_maps_come_apart_with_a_reason(mapped):
+    closures = get(mapped, "closures?status=accepted").json()
+    between = [closure for closure in closures if closure["robot_i"] != closure["robot_j"]]
+    assert get(mapped, "separations").json() == []
+    assert edit(mapped, "veto", {"robot_i": "a", "robot_j": "b"}).status_code == 201
+    now = get(mapped, picture_of(between[0])).json()
+    assert (now["reason"], now["explanation"]) == ("vetoed", "vetoed by hand")
+    (apart,) = get(mapped, "separations").json()
+    assert (apart["maps"], apart["verified"]) == ([0, 1], len(between))
+    assert "vetoed by hand" in apart["explanation"]
+    (made,) = get(mapped, "edits").json()
+    assert (made["kind"], made["author"], made["undone_by"]) == ("veto", "boss", None)
 
 
 def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):

@@ -139,13 +139,13 @@ function showRobots(metrics) {
     const name = robot.session, item = element("li"), label = element("label"), swatch = element("span", "", { className: "swatch" });
     const box = element("input", "", { type: "checkbox", checked: !hidden.has(name) });
     const button = element("button", "Follow", { ariaPressed: String(followed === name), ariaLabel: `Follow ${name}` });
-    const bytes = metrics[`uplink_bytes_${name}`], detectors = Object.entries(robot.detectors).map(([channel, made]) => `${channel}: ${made}`);
+    const bytes = robot.epoch ? 0 : metrics[`uplink_bytes_${robot.robot}`], detectors = Object.entries(robot.detectors).map(([channel, made]) => `${channel}: ${made}`);
     box.dataset.robot = `box ${name}`; button.dataset.robot = `button ${name}`;
     box.addEventListener("change", () => { if (box.checked) hidden.delete(name); else hidden.add(name); redraw(); });
     button.addEventListener("click", () => { followed = followed === name ? null : name; update(version).catch(fail); });
     swatch.style.background = colourOf(name);
     label.append(box, swatch, `${name}: ${stateOf(robot)}`);
-    item.append(label, " ", ...(readOnly ? [] : [button]), element("span", [`${robot.path_length_m.toFixed(0)} m`, `${robot.keyscans} keyscans`, ...(bytes ? [`${(bytes / 1000).toFixed(0)} kB sent`] : []), ...detectors].join(", "), { className: "small" }));
+    item.append(label, " ", ...(readOnly ? [] : [button]), element("span", [`${robot.path_length_m.toFixed(0)} m`, `${robot.keyscans} keyscans`, ...(bytes ? [`${(bytes / 1000).toFixed(0)} kB sent in all`] : []), ...detectors].join(", "), { className: "small" }));
     return item;
   }));
   if (focus) document.querySelector(`[data-robot="${CSS.escape(focus)}"]`)?.focus();
