@@ -59,6 +59,18 @@ def test_a_topic_with_an_endless_name(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", KINDS)
+def test_a_scan_in_a_frame_with_an_endless_name_is_no_scan(tmp_path, name):
+    said = drive()
+    endless = scan(max(message.bag_time for message in said) - 0.5, frame="x" * 2000)
+    healthy, damaged = (
+        open_source(save(tmp_path / f"a-{name}", said)),
+        open_source(save(tmp_path / name, [*said, endless])),
+    )
+    assert [one.stamp for one in scans_of(damaged)] == [one.stamp for one in scans_of(healthy)]
+    assert damaged.faults[Fault.BROKEN_MESSAGE].count == 1
+
+
+@pytest.mark.parametrize("name", KINDS)
 def test_an_empty_bag(tmp_path, name):
     assert "the bag has no topics" in refusal(save(tmp_path / name, []))
 

@@ -16,6 +16,7 @@ _COUNT_TOLERANCE = 0.01
 """Share of the ranges by which drivers that round the increment are wrong."""
 _MAX_COORDINATE_M = 1e7
 _LONGEST_FRAME = 255
+"""Characters in the name of a frame, as in that of a topic."""
 _NANOSECONDS = 10**9
 
 
@@ -149,7 +150,7 @@ def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
 def _frame(name: str) -> str:
     """Frame name without the leading slash of ROS 1."""
     if len(name) > _LONGEST_FRAME:
-        raise ValueError("no name of a frame")
+        raise ValueError("the name of a frame is too long")
     return name.lstrip("/")
 
 
