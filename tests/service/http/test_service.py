@@ -1,5 +1,6 @@
 """What the service answers: robots, viewers, administrators; and what it does not let happen."""
 
+import hashlib
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -295,6 +296,26 @@ def test_edits_of_every_kind_reach_the_result_and_their_undos_leave_no_trace(map
     for number in range(1, 7):
         assert mapped.ask("POST", f"{API}/edits/{number}/undo", "boss").status_code == 201
     assert result()[1] == plain
+
+
+def test_who_has_the_first_poses_of_a_trajectory_gets_the_others_unless_those_moved(mapped):
+    path = "trajectories/a.tum"
+    whole = get(mapped, path)
+    text, digest = whole.text, whole.headers["Fcslam-Digest"]
+    assert whole.headers["Fcslam-After"] == "0"
+    again = get(mapped, f"{path}?after={len(text)}&digest={digest}")
+    assert (again.text, again.headers["Fcslam-After"], again.headers["Fcslam-Digest"]) == ("", str(len(text)), digest)
+    first = text[: text.index("\n", 100) + 1]
+    rest = get(mapped, f"{path}?after={len(first)}&digest={hashlib.sha256(first.encode()).hexdigest()}")
+    assert first + rest.text == text
+    for moved in (
+        f"after={len(first)}&digest={digest}",
+        f"after={len(text) + 1}&digest={digest}",
+        f"after={len(text)}",
+    ):
+        assert get(mapped, f"{path}?{moved}").text == text
+    for wrong in ("after=-1", "after=x", "digest=x", f"digest={digest}0"):
+        assert mapped.ask("GET", f"{API}/{path}?{wrong}", "eye").status_code == 400
 
 
 def picture_of(closure):

@@ -44,12 +44,19 @@ let robots = [], accepted = [], listed = [], selected = null, followed = null;
 let trails = new Map(), zooms = new Map();
 const hidden = new Set(); // sessions whose paths are not drawn
 
+// Paths grow, and older poses seldom move: the service sends what follows the bytes that the page has.
+const received = new Map();
 async function trail(name) {
-  const lines = (await (await ask(`trajectories/${encodeURIComponent(name)}.tum`)).text()).split("\n");
-  return lines.filter((l) => l && l[0] !== "#").map((l) => {
+  const path = `trajectories/${encodeURIComponent(name)}.tum`, known = received.get(name);
+  const answer = await ask(known ? `${path}?after=${known.bytes}&digest=${known.digest}` : path);
+  const text = await answer.text(), after = Number(answer.headers.get("Fcslam-After")), digest = answer.headers.get("Fcslam-Digest");
+  const poses = text.split("\n").filter((l) => l && l[0] !== "#").map((l) => {
     const [stamp, x, y, , , , qz, qw] = l.split(" ").map(Number);
     return [stamp, x, y, 2 * Math.atan2(qz, qw)];
   });
+  const all = after ? known.poses.concat(poses) : poses;
+  if (digest) received.set(name, { bytes: after + text.length, digest, poses: all });
+  return all;
 }
 
 // Where a robot was at a keyscan: x, y, heading in its map; undefined if nobody knows.

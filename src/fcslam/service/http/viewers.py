@@ -1,5 +1,6 @@
 """Routes for viewers: the live run as numbers and as files."""
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -198,14 +199,25 @@ def map_router(state: ViewerState) -> APIRouter:
     @router.get("/pose_graph.g2o", response_class=Response, responses={**refusals(404), 200: content(TEXT)})
     def get_pose_graph() -> FileResponse:
         """The pose graph."""
-        return _file(state, POSE_GRAPH)
+        return _file(state, POSE_GRAPH, TEXT)
 
     @router.get(
         "/trajectories/{session}.tum", response_class=Response, responses={**refusals(400, 404), 200: content(TEXT)}
     )
-    def get_trajectory(session: Name) -> FileResponse:
-        """Poses of a session's keyscans in its map."""
-        return _file(state, f"{TRAJECTORIES}/{session}.tum")
+    def get_trajectory(
+        session: Name, after: Annotated[int, Query(ge=0, le=MOST)] = 0,
+        digest: Annotated[str, Query(pattern="^[0-9a-f]{64}$|^$")] = "",
+    ) -> Response:  # fmt: skip
+        """Poses of a session's keyscans in its map.
+
+        Who has the first ``after`` bytes and sends the digest that came with them gets the rest, if they are as they
+        were. ``Fcslam-After`` says how many bytes are left out, ``Fcslam-Digest`` is that of all up to now.
+        """
+        path = _existing(state, f"{TRAJECTORIES}/{session}.tum")
+        poses = path.read_bytes()
+        known = after if after <= len(poses) and digest == hashlib.sha256(poses[:after]).hexdigest() else 0
+        headers = {"Fcslam-After": str(known), "Fcslam-Digest": hashlib.sha256(poses).hexdigest()}
+        return Response(poses[known:], media_type=TEXT, headers=headers)
 
     return router
 
@@ -245,11 +257,19 @@ def _run_of(state: ViewerState) -> Run:
     return Run({}) if folder is None else viewed_run(folder)
 
 
-def _file(state: ViewerState, name: str, media_type: str = TEXT) -> FileResponse:
+def _file(state: ViewerState, name: str, media_type: str) -> FileResponse:
+    return FileResponse(_existing(state, name), media_type=media_type)
+
+
+def _existing(state: ViewerState, name: str) -> Path:
+    """A file of the run folder.
+
+    Refuses (HTTPException 404): there is none.
+    """
     path = _folder_of(state) / name
     if not path.is_file():
         raise HTTPException(404, f"there is no {name}")
-    return FileResponse(path, media_type=media_type)
+    return path
 
 
 def _sessions(state: ViewerState, robot: str) -> list[SessionSummary]:
