@@ -3,10 +3,11 @@ const API = "api/v1/", WORLD_M = 256, TILE_PX = 256, MOST_TILES = 400, RETRY_MS 
 const LIVE_S = 15; // a robot that was heard so recently is live
 const LISTED = 200; // closures in the list; the newest ones
 const NEAR_M = 5; // closures with both ends so near each other see the same place
+const LOOK_MS = 5000; // how often the page asks whether robots are still heard
 const CLICK_PX = 8; // a click this near a closure selects it
 // as in maps/palette.py
 const COLOURS = ["#0072b2", "#e66100", "#009e73", "#7b4fb5", "#e0a800", "#56b4e9", "#8c564b", "#607d3b"];
-const CLOSURE = { lidar: "#c2185b", camera: "#3d1e8f" };
+const REGION = "#6a1b9a", CLOSURE = { lidar: "#c2185b", camera: "#3d1e8f" };
 const at = (id) => document.getElementById(id);
 
 // ---- What the service says ----
@@ -41,7 +42,7 @@ const json = async (path) => (await ask(path)).json();
 
 let version = 0, release = null, readOnly = false;
 let robots = [], accepted = [], listed = [], selected = null, followed = null;
-let trails = new Map(), zooms = new Map();
+let trails = new Map(), zooms = new Map(), regions = [];
 const hidden = new Set(); // sessions whose paths are not drawn
 
 // Paths grow, and older poses seldom move: the service sends what follows the bytes that the page has.
@@ -94,12 +95,13 @@ async function update(number) {
   if (number !== version) { version = number; tiles.clear(); }
   document.title = `fcslam: ${counts.mission}`;
   for (const element of document.querySelectorAll(".live")) element.hidden = readOnly;
-  showMaps(maps, apart); showRobots(counts.metrics); showPairs(); showEdits(edits);
+  regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);
+  showMaps(maps, apart); showRobots(counts); showPairs(); showEdits(edits);
   tellChanges({ maps, robots, accepted, edits });
   await refreshClosures();
   const leader = robots.find((r) => r.session === followed);
   if (leader?.T_map_base && view) { mapIndex = leader.map; at("maps").value = mapIndex; [view.x, view.y] = leader.T_map_base; }
-  if (!view && trails.size) fit();
+  if (!moved && !followed) fit();
   redraw();
 }
 
@@ -140,7 +142,8 @@ function stateOf(robot) {
   return `${where}, ${robot.last_heard_s < LIVE_S ? "live" : "offline"}, heard ${robot.last_heard_s.toFixed(0)} s ago`;
 }
 
-function showRobots(metrics) {
+function showRobots({ metrics, packets, waiting, applied }) {
+  at("load").textContent = `${packets} packets, ${packets - applied} not applied yet, ${waiting} waiting for an earlier one`;
   const focus = document.activeElement?.dataset?.robot; // the lists are made anew, and the keyboard stays where it was
   at("robots").replaceChildren(...robots.map((robot) => {
     const name = robot.session, item = element("li"), label = element("label"), swatch = element("span", "", { className: "swatch" });
@@ -160,8 +163,30 @@ function showRobots(metrics) {
 
 function showPairs() {
   const counts = new Map();
-  for (const c of accepted) { const pair = [c.robot_i, c.robot_j].sort().join(" – "); counts.set(pair, (counts.get(pair) ?? 0) + 1); }
-  at("pairs").replaceChildren(...[...counts].sort((a, b) => b[1] - a[1]).map(([pair, count]) => row(pair, String(count))));
+  for (const c of accepted) { const pair = JSON.stringify([c.robot_i, c.robot_j].sort()); counts.set(pair, (counts.get(pair) ?? 0) + 1); }
+  const sorted = [...counts].sort((a, b) => b[1] - a[1]).map(([pair, count]) => [JSON.parse(pair), count]);
+  at("pairs").replaceChildren(...sorted.map(([pair, count]) => row(pair.join(" – "), String(count))));
+  drawPairs(sorted);
+}
+
+// Robots in a circle, those of a map beside each other; a line is the wider, the more closures two robots share.
+function drawPairs(counts) {
+  const names = [...robots].filter((r) => r.map !== null).sort((a, b) => a.map - b.map).map((r) => r.session), places = new Map();
+  names.forEach((name, k) => { const angle = 2 * Math.PI * k / names.length; places.set(name, [150 + 100 * Math.sin(angle), 110 - 80 * Math.cos(angle)]); });
+  const drawn = [];
+  for (const [[a, b], count] of counts) {
+    if (a === b || !places.has(a) || !places.has(b)) continue;
+    const [[x1, y1], [x2, y2]] = [places.get(a), places.get(b)];
+    drawn.push(shape("line", { x1, y1, x2, y2, "stroke-width": 1 + Math.log2(count) }), shape("text", { x: (x1 + x2) / 2, y: (y1 + y2) / 2 }, count));
+  }
+  for (const [name, [cx, cy]] of places) drawn.push(shape("circle", { cx, cy, r: 7, fill: colourOf(name) }), shape("text", { x: cx, y: cy < 110 ? cy - 12 : cy + 22 }, `${name} (map ${mapOf(name)})`));
+  at("graph").replaceChildren(...drawn);
+}
+function shape(tag, attributes, text = "") {
+  const made = document.createElementNS(at("graph").namespaceURI, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.append(text);
+  return made;
 }
 
 async function refreshClosures() {
@@ -284,7 +309,7 @@ async function facts() {
 // ---- Map ----
 
 const canvas = at("map"), pen = canvas.getContext("2d"), tiles = new Map();
-let view = null, mapIndex = 0, queued = false;
+let view = null, mapIndex = 0, queued = false, moved = false; // until the user moves the map, all of it is shown
 
 function fit() {
   const points = robots.filter((r) => r.map === mapIndex).flatMap((r) => trails.get(r.session) ?? []);
@@ -334,7 +359,21 @@ function draw() {
     pen.save(); pen.translate(px, py); pen.rotate(-heading); pen.fillStyle = colour;
     pen.beginPath(); pen.moveTo(11, 0); pen.lineTo(-7, 6); pen.lineTo(-7, -6); pen.fill(); pen.restore();
   }
+  for (const region of regions) drawRegion(region);
   if (selected) drawSelected();
+}
+
+// Areas and keep-out regions are drawn where the keyscan that they are tied to is now.
+function drawRegion({ use, name, session, stamp, polygon }) {
+  const tied = mapOf(session) === mapIndex && pose(session, stamp);
+  if (!tied) return;
+  const [x, y, heading] = tied, c = Math.cos(heading), s = Math.sin(heading);
+  const corners = polygon.map(([u, v]) => [x + c * u - s * v, y + s * u + c * v]);
+  lines([[...corners, corners[0]]], REGION, 2);
+  pen.globalAlpha = 0.15; pen.fillStyle = REGION; pen.fill();
+  pen.globalAlpha = 1; pen.font = "14px system-ui, sans-serif"; pen.textAlign = "center";
+  const [px, py] = onScreen(...[0, 1].map((k) => corners.reduce((sum, corner) => sum + corner[k], 0) / corners.length));
+  pen.fillText(name || use, px, py);
 }
 
 function lines(ways, colour, width = 2) {
@@ -363,25 +402,44 @@ function closureAt(x, y) {
   return found;
 }
 
-function zoom(factor) { if (view) { view.scale = Math.max(0.1, Math.min(2000, view.scale * factor)); redraw(); } }
-function pan(dx, dy) { if (view) { followed = null; view.x -= dx / view.scale; view.y += dy / view.scale; redraw(); } }
+// Keeps the point of the canvas where it is.
+function zoom(factor, x = canvas.clientWidth / 2, y = canvas.clientHeight / 2) {
+  if (!view) return;
+  const scale = Math.max(0.1, Math.min(2000, view.scale * factor)), shift = 1 / view.scale - 1 / scale;
+  moved = true;
+  view = { x: view.x + (x - canvas.clientWidth / 2) * shift, y: view.y - (y - canvas.clientHeight / 2) * shift, scale };
+  redraw();
+}
+function pan(dx, dy) { if (view) { moved = true; followed = null; view.x -= dx / view.scale; view.y += dy / view.scale; redraw(); } }
 
 // ---- What the user does ----
 
+const fingers = new Map(); // where they and the mouse are, by pointer
 let pressed = null;
-canvas.addEventListener("wheel", (e) => { e.preventDefault(); zoom(Math.exp(-e.deltaY / 500)); }, { passive: false });
-canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); pressed = [e.offsetX, e.offsetY]; });
-canvas.addEventListener("pointermove", (e) => { if (e.buttons) pan(e.movementX, e.movementY); });
+canvas.addEventListener("wheel", (e) => { e.preventDefault(); zoom(Math.exp(-e.deltaY / 500), e.offsetX, e.offsetY); }, { passive: false });
+canvas.addEventListener("pointerdown", (e) => {
+  canvas.setPointerCapture(e.pointerId);
+  fingers.set(e.pointerId, [e.offsetX, e.offsetY]);
+  pressed = fingers.size === 1 ? [e.offsetX, e.offsetY] : null;
+});
+canvas.addEventListener("pointermove", (e) => {
+  const old = fingers.get(e.pointerId), now = [e.offsetX, e.offsetY];
+  if (!old) return;
+  const other = [...fingers].find(([id]) => id !== e.pointerId)?.[1];
+  fingers.set(e.pointerId, now);
+  if (other) zoom(distance(now, other) / Math.max(1, distance(old, other)), ...other);
+  else pan(now[0] - old[0], now[1] - old[1]);
+});
 canvas.addEventListener("pointerup", (e) => {
   const closure = pressed && distance(pressed, [e.offsetX, e.offsetY]) < CLICK_PX && closureAt(e.offsetX, e.offsetY);
-  pressed = null;
   if (closure) select(closure);
 });
+for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (e) => { fingers.delete(e.pointerId); pressed = null; });
 canvas.addEventListener("keydown", (e) => {
-  const keys = { ArrowLeft: () => pan(60, 0), ArrowRight: () => pan(-60, 0), ArrowUp: () => pan(0, 60), ArrowDown: () => pan(0, -60), "+": () => zoom(1.4), "-": () => zoom(1 / 1.4), 0: () => { fit(); redraw(); } };
+  const keys = { ArrowLeft: () => pan(60, 0), ArrowRight: () => pan(-60, 0), ArrowUp: () => pan(0, 60), ArrowDown: () => pan(0, -60), "+": () => zoom(1.4), "-": () => zoom(1 / 1.4), 0: () => { moved = false; fit(); redraw(); } };
   if (keys[e.key]) { e.preventDefault(); keys[e.key](); }
 });
-at("maps").addEventListener("change", (e) => { mapIndex = Number(e.target.value); followed = null; fit(); redraw(); });
+at("maps").addEventListener("change", (e) => { mapIndex = Number(e.target.value); moved = false; followed = null; fit(); redraw(); });
 at("shown").addEventListener("change", redraw);
 at("state").addEventListener("change", () => refreshClosures().catch(fail));
 at("list").addEventListener("change", (e) => select(listed.find((c) => keyOf(c) === e.target.value)));
@@ -396,6 +454,17 @@ at("login").addEventListener("submit", (e) => {
   follow();
 });
 new ResizeObserver(redraw).observe(canvas);
+
+// Silence is no event.
+setInterval(async () => {
+  if (readOnly || document.hidden || !robots.length || at("status").textContent !== "live") return;
+  try {
+    const [counts, fleet] = await Promise.all([json("fleet"), json("robots")]);
+    const heard = new Map(fleet.map((r) => [r.session, r.last_heard_s]));
+    for (const robot of robots) robot.last_heard_s = heard.get(robot.session) ?? null;
+    showRobots(counts);
+  } catch { /* the stream of events says so */ }
+}, LOOK_MS);
 
 let attempt = 0; // a new one ends those before it
 async function follow() {
