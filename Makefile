@@ -15,6 +15,9 @@ APT_GET := $(AS_ROOT) env DEBIAN_FRONTEND=noninteractive apt-get -qq -o Acquire:
 ROS_VENV := .venv-ros
 RCLPY := ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-sensor-msgs==5.5.1 ros-nav-msgs==5.5.1 ros-std-srvs==5.5.1
 ROSPY := python3-rospy python3-roslaunch python3-rosmaster python3-sensor-msgs python3-nav-msgs python3-std-srvs python3-tf2-ros
+# What the tests of the page drive; axe-core looks for faults of accessibility.
+AXE := axe-core@4.14.1
+HAS_BROWSER := $(BIN)/python -c "import playwright, shutil, sys; sys.exit(not shutil.which('chromium'))" 2>/dev/null
 # torch's build for processors is a tenth of the size of the one that PyPI has.
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
@@ -24,7 +27,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/training_fleet.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system test-attack ros-test check bench bench-quick docs proto fuzz lock sbom audit
+.PHONY: help install gl learning demo test test-fast test-system test-attack ros-test browser-test check bench bench-quick docs proto fuzz lock sbom audit
 .DEFAULT_GOAL := help
 
 help:
@@ -35,6 +38,7 @@ help:
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
 	@echo "make fuzz         broken packets, files, requests and messages; SECONDS=60 of each kind"
 	@echo "make ros-test     install a real ROS 2 and ROS 1 as peers of the tests of live robots, if permitted"
+	@echo "make browser-test install a browser for the tests of the page, if permitted"
 	@echo "make check        linter, formatting, types"
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
@@ -97,6 +101,17 @@ ros-test: $(INSTALLED)
 	@$(ROS_VENV)/bin/python -m pip install -qq --disable-pip-version-check $(RCLPY) || echo "No rclpy for this Python."
 	@$(AS_ROOT) true 2>/dev/null && { $(APT_GET) update; $(APT_GET) install --no-install-recommends $(ROSPY); } >/dev/null || \
 	    echo "No roscore. To have it: sudo apt-get install $(ROSPY)"
+
+# Never fails: without a browser the tests of the page are skipped.
+browser-test: $(INSTALLED)
+	@$(HAS_BROWSER) || { \
+	    echo "Installing Chromium and Playwright for the tests of the page."; \
+	    $(PIP) playwright || true; \
+	    $(AS_ROOT) true 2>/dev/null && command -v apt-get >/dev/null && { $(APT_GET) update; $(APT_GET) install --no-install-recommends chromium; } >/dev/null 2>&1 || true; \
+	    $(HAS_BROWSER) || echo "No browser. To have one: sudo apt-get install chromium"; \
+	}
+	@test -e $(VENV)/axe/package/axe.min.js || { mkdir -p $(VENV)/axe && cd $(VENV)/axe && npm pack --silent $(AXE) >/dev/null 2>&1 && \
+	    tar xzf axe-core-*.tgz package/axe.min.js; } || echo "No axe-core from npm, so accessibility is not tested."
 
 fuzz: $(INSTALLED)
 	@folder=$$(mktemp -d) && trap 'rm -r "$$folder"' EXIT && \
