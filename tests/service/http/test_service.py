@@ -318,6 +318,16 @@ def test_who_has_the_first_poses_of_a_trajectory_gets_the_others_unless_those_mo
         assert mapped.ask("GET", f"{API}/{path}?{wrong}", "eye").status_code == 400
 
 
+def test_closures_that_did_not_change_are_not_sent_again(mapped):
+    first = get(mapped, "closures")
+    known = {"If-None-Match": first.headers["ETag"]}
+    again = mapped.ask("GET", f"{API}/closures", "eye", known)
+    assert (again.status_code, again.content) == (304, b"")
+    edit(mapped, "veto", {"robot_i": "a", "robot_j": "b"})
+    changed = mapped.ask("GET", f"{API}/closures", "eye", known)
+    assert (changed.status_code, "vetoed" in changed.text) == (200, True)
+
+
 def picture_of(closure):
     named = (closure[key] for key in ("channel", "robot_i", "stamp_i", "robot_j", "stamp_j"))
     return "closures/" + "/".join(map(str, named))

@@ -92,7 +92,7 @@ async function update(number) {
   readOnly = counts.read_only; robots = fleet;
   const of = new Map(fleet.map((r) => [r.session, r.map]));
   accepted = closures.map((c) => placed(c, of));
-  if (number !== version) { version = number; tiles.clear(); }
+  version = number;
   document.title = `fcslam: ${counts.mission}`;
   for (const element of document.querySelectorAll(".live")) element.hidden = readOnly;
   regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);
@@ -323,15 +323,20 @@ function fit() {
 // metres to pixels of the canvas
 const onScreen = (x, y) => [canvas.clientWidth / 2 + (x - view.x) * view.scale, canvas.clientHeight / 2 - (y - view.y) * view.scale];
 
+// The picture as it was until the new one is there, so that the map does not flicker.
 function tile(z, x, y) {
-  const key = `${version}/${mapIndex}/${z}/${x}/${y}`;
+  const key = `${mapIndex}/${z}/${x}/${y}`, wanted = version;
   if (!tiles.has(key)) {
     if (tiles.size >= MOST_TILES) tiles.delete(tiles.keys().next().value);
-    tiles.set(key, null);
-    ask(`maps/${mapIndex}/tiles/${z}/${x}/${y}.png`).then((a) => a.blob()).then(createImageBitmap)
-      .then((picture) => { if (tiles.has(key)) { tiles.set(key, picture); redraw(); } }).catch(() => tiles.delete(key));
+    tiles.set(key, { picture: null, asked: null });
   }
-  return tiles.get(key);
+  const known = tiles.get(key);
+  if (known.asked !== wanted) {
+    known.asked = wanted;
+    ask(`maps/${key.replace("/", "/tiles/")}.png`).then((a) => a.blob()).then(createImageBitmap)
+      .then((picture) => { if (known.asked === wanted) { known.picture = picture; redraw(); } }).catch(() => { known.asked = null; });
+  }
+  return known.picture;
 }
 
 function redraw() { if (!queued) { queued = true; requestAnimationFrame(draw); } }

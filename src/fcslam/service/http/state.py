@@ -106,7 +106,7 @@ class ServiceState:
             self._note(request, who.name, roles)
             if who.role not in roles:
                 needed = " or ".join(roles)
-                raise HTTPException(403, f"'{who.name}' is a {who.role}; this is for a {needed}")
+                raise HTTPException(403, f"'{who.name}' is a {who.role}; this needs the role {needed}")
             robot = request.path_params.get("robot")
             if who.role is Role.ROBOT and robot not in (None, who.name):
                 raise HTTPException(403, f"robot '{who.name}' does not speak for robot '{robot}'")

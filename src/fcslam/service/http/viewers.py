@@ -1,13 +1,15 @@
 """Routes for viewers: the live run as numbers and as files."""
 
 import hashlib
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Query
+from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, Response
 
@@ -96,13 +98,16 @@ def fleet_router(state: ViewerState) -> APIRouter:
             raise HTTPException(404, f"there is no robot '{robot}'")
         return RobotSummary(robot=robot, sessions=sessions, refused=refused_packets(state.mission.store, robot))
 
-    @router.get("/closures", responses=refusals(400))
+    @router.get("/closures", response_model=list[ClosureSummary], responses=refusals(400))
     def get_closures(
-        status: ClosureStatus | None = None, limit: Annotated[int, Query(ge=1, le=10_000)] = 1000
-    ) -> list[ClosureSummary]:
+        request: Request, status: ClosureStatus | None = None, limit: Annotated[int, Query(ge=1, le=10_000)] = 1000
+    ) -> Response:
         """The newest closures."""
-        chosen = [closure for closure in _run_of(state).closures if status in (None, closure.status)]
-        return [_closure(closure) for closure in chosen[-limit:]]
+        body, tag = _newest_closures(_run_of(state), status, limit)
+        headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+        if request.headers.get("if-none-match") == tag:
+            return Response(status_code=304, headers=headers)
+        return Response(body, media_type=JSON, headers=headers)
 
     @router.get(
         "/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}.png",
@@ -228,6 +233,15 @@ def edit_summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:
         number=edit.number, kind=kind_of(edit.content), content=asdict(edit.content), author=edit.author,
         time_s=edit.time_s, undone_by=gone.get(edit.number),
     )  # fmt: skip
+
+
+@lru_cache(maxsize=8)  # many pages ask for the same
+def _newest_closures(run: Run, status: ClosureStatus | None, limit: int) -> tuple[bytes, str]:
+    """The newest closures as JSON, and an entity tag of it."""
+    chosen = [closure for closure in run.closures if status in (None, closure.status)]
+    summaries = [_closure(closure).model_dump(mode="json") for closure in chosen[-limit:]]
+    body = json.dumps(summaries, allow_nan=False, separators=(",", ":")).encode()
+    return body, f'"{hashlib.sha256(body).hexdigest()}"'
 
 
 def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
