@@ -203,7 +203,7 @@ def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
     for path, answer in zip(paths, ask(shown, *(f"/api/v1/{path}" for path in paths)), strict=True):
         assert responses["texts"][path].splitlines() == answer.text.splitlines() or path == "maps"
     deepest = [path for path in responses["pictures"] if path.startswith("maps/0/tiles/5/")]
-    assert len(deepest) == 4  # 8 m from -3 m and -2 m on, in tiles of 8 m
+    assert len(deepest) == 4  # 8 m from -3 m and -2 m on, in tiles of 16 m
     (tile,) = ask(shown, f"/api/v1/{deepest[0]}")
     assert base64.b64decode(responses["pictures"][deepest[0]]) == tile.content
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from fcslam.runs.folder import identity
 from fcslam.runs.map_files import PIXELS, Occupancy, parse_map, pixels_of
 
-WORLD_M = 256.0
+WORLD_M = 512.0
 """Side of a tile at zoom 0; each zoom halves it."""
-TILE_PX = 256
+TILE_PX = 512
 DEEPEST_ZOOM = 8
 
 
@@ -28,8 +28,11 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
     Raises:
         FileNotFoundError: the folder has no map ``stem``.
     """
-    pixels, resolution_m, origin = _grid(folder, stem, identity(folder))
-    side_m = WORLD_M / 2**zoom
+    version, side_m = identity(folder), WORLD_M / 2**zoom
+    pixels, resolution_m, origin = _grid(folder, stem, version)
+    halvings = max(math.floor(math.log2(side_m / TILE_PX / resolution_m)), 0)
+    if halvings:
+        pixels, resolution_m = _halved(folder, stem, version, halvings), resolution_m * 2**halvings
     canvas = np.full((TILE_PX, TILE_PX), PIXELS[Occupancy.UNKNOWN], np.uint8)
     # first and one past the last cell in the tile, per axis (x, y)
     corner = np.array((column, row)) * side_m - origin
@@ -50,6 +53,16 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
             inside[0].start - bottom : inside[0].stop - bottom, inside[1].start - left : inside[1].stop - left
         ]
     return bytes(cv2.imencode(".png", canvas[::-1])[1])
+
+
+@lru_cache(maxsize=32)
+def _halved(folder: Path, stem: str, version: tuple[int, int], halvings: int) -> NDArray[np.uint8]:
+    """The pixels, each the mean of 2^halvings x 2^halvings; a coarse tile of a large map then reads few."""
+    finer = _halved(folder, stem, version, halvings - 1) if halvings > 1 else _grid(folder, stem, version)[0]
+    height, width = finer.shape
+    even = np.pad(finer, ((0, height % 2), (0, width % 2)), constant_values=PIXELS[Occupancy.UNKNOWN])
+    halved: NDArray[np.uint8] = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return halved
 
 
 @lru_cache(maxsize=8)

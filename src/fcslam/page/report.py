@@ -28,8 +28,8 @@ ASKED = (
     *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
 )  # fmt: skip
 """What the page asks for, besides events, trajectories and tiles."""
-MOST_TILES = 800
-"""Of all maps together: a tile has about 5 kB. Of a larger map, the file holds coarser tiles."""
+MOST_TILES = 200
+"""Of all maps together: a tile has about 15 kB. Of a larger map, the file holds coarser tiles."""
 SCRIPT, STYLE = '<script type="module" src="page.js"></script>', '<link rel="stylesheet" href="page.css">'
 """Elements of the page that the file holds instead."""
 

@@ -213,12 +213,21 @@ def test_tiles_show_what_the_map_shows(mapped):
     fine = get(mapped, "maps/0/tiles/8/0/0.png")
     assert fine.headers["content-type"] == "image/png"
     picture = cv2.imdecode(np.frombuffer(fine.content, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert picture.shape == (256, 256)
+    assert picture.shape == (512, 512)
     far = cv2.imdecode(
         np.frombuffer(get(mapped, "maps/0/tiles/8/5000/-5000.png").content, np.uint8), cv2.IMREAD_GRAYSCALE
     )
     assert set(np.unique(far)) == {205}, "where the map ends nothing is known"
     assert mapped.ask("GET", f"{API}/maps/0/tiles/9/0/0.png", "eye").status_code == 400
+
+
+def test_a_tile_that_did_not_change_is_not_sent_again(mapped):
+    path = f"{API}/maps/0/tiles/5/0/0.png"
+    first = mapped.ask("GET", path, "eye")
+    again = mapped.ask("GET", path, "eye", headers={"If-None-Match": first.headers["ETag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    other = mapped.ask("GET", path, "eye", headers={"If-None-Match": '"of another map"'})
+    assert (other.status_code, other.content) == (200, first.content)
 
 
 def test_a_result_is_a_run_folder(mapped):

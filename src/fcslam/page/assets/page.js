@@ -1,5 +1,5 @@
 // The live map. Tokens go in a header and never in an address, which logs would keep: so events are read with fetch.
-const API = "api/v1/", WORLD_M = 256, TILE_PX = 256, MOST_TILES = 400, RETRY_MS = 2000;
+const API = "api/v1/", WORLD_M = 512, TILE_PX = 512, MOST_TILES = 120, RETRY_MS = 2000;
 const LIVE_S = 15; // a robot that was heard so recently is live
 const LISTED = 200; // closures in the list; the newest ones
 const NEAR_M = 5; // closures with both ends so near each other see the same place
@@ -323,20 +323,18 @@ function fit() {
 // metres to pixels of the canvas
 const onScreen = (x, y) => [canvas.clientWidth / 2 + (x - view.x) * view.scale, canvas.clientHeight / 2 - (y - view.y) * view.scale];
 
-// The picture as it was until the new one is there, so that the map does not flicker.
+// The newest picture of a tile; while another version of the map is on its way, that of the last one.
 function tile(z, x, y) {
-  const key = `${mapIndex}/${z}/${x}/${y}`, wanted = version;
-  if (!tiles.has(key)) {
-    if (tiles.size >= MOST_TILES) tiles.delete(tiles.keys().next().value);
-    tiles.set(key, { picture: null, asked: null });
+  const key = `${mapIndex}/${z}/${x}/${y}`;
+  const kept = tiles.get(key) ?? { picture: null, version: -1 };
+  tiles.delete(key); tiles.set(key, kept); // the last one of all: those that are not drawn leave first
+  if (tiles.size > MOST_TILES) tiles.delete(tiles.keys().next().value);
+  if (kept.version !== version) {
+    const asked = kept.version = version;
+    ask(`maps/${mapIndex}/tiles/${z}/${x}/${y}.png`).then((a) => a.blob()).then(createImageBitmap)
+      .then((picture) => { if (kept.version === asked || !kept.picture) { kept.picture = picture; redraw(); } }).catch(() => { kept.version = -1; });
   }
-  const known = tiles.get(key);
-  if (known.asked !== wanted) {
-    known.asked = wanted;
-    ask(`maps/${key.replace("/", "/tiles/")}.png`).then((a) => a.blob()).then(createImageBitmap)
-      .then((picture) => { if (known.asked === wanted) { known.picture = picture; redraw(); } }).catch(() => { known.asked = null; });
-  }
-  return known.picture;
+  return kept.picture;
 }
 
 function redraw() { if (!queued) { queued = true; requestAnimationFrame(draw); } }

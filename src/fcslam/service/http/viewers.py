@@ -103,11 +103,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
         request: Request, status: ClosureStatus | None = None, limit: Annotated[int, Query(ge=1, le=10_000)] = 1000
     ) -> Response:
         """The newest closures."""
-        body, tag = _newest_closures(_run_of(state), status, limit)
-        headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-        if request.headers.get("if-none-match") == tag:
-            return Response(status_code=304, headers=headers)
-        return Response(body, media_type=JSON, headers=headers)
+        return _if_changed(request, _newest_closures(_run_of(state), status, limit), JSON)
 
     @router.get(
         "/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}.png",
@@ -179,15 +175,21 @@ def map_router(state: ViewerState) -> APIRouter:
     @router.get(
         "/maps/{k}/tiles/{z}/{x}/{y}.png",
         response_class=Response,
-        responses={**refusals(400, 404), 200: content(MEDIA["png"])},
+        responses={**refusals(400, 404), 200: content(MEDIA["png"]), 304: {"description": "as you have it"}},
     )
-    def get_tile(k: Index, z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)], x: Square, y: Square) -> Response:
-        """A square of a map: at zoom z it has 256 m / 2^z; x and y count squares from the origin, y upwards."""
+    def get_tile(
+        request: Request,
+        k: Index,
+        z: Annotated[int, PathParameter(ge=0, le=DEEPEST_ZOOM)],
+        x: Square,
+        y: Square,
+    ) -> Response:
+        """A square of a map: at zoom z it has 512 m / 2^z; x and y count squares from the origin, y upwards."""
         try:
             tile = tile_png(_folder_of(state), map_stem(k), z, x, y)
         except FileNotFoundError as error:
             raise HTTPException(404, f"there is no {map_stem(k)}") from error
-        return Response(tile, media_type=MEDIA["png"])
+        return _if_changed(request, tile, MEDIA["png"])
 
     @router.get(f"/{METRICS}", response_class=Response, responses={**refusals(404), 200: content(JSON, model=_ROWS)})
     def get_metrics() -> FileResponse:
@@ -236,12 +238,20 @@ def edit_summary(edit: Edit, gone: Mapping[int, int]) -> EditSummary:
 
 
 @lru_cache(maxsize=8)  # many pages ask for the same
-def _newest_closures(run: Run, status: ClosureStatus | None, limit: int) -> tuple[bytes, str]:
-    """The newest closures as JSON, and an entity tag of it."""
+def _newest_closures(run: Run, status: ClosureStatus | None, limit: int) -> bytes:
+    """The newest closures as JSON."""
     chosen = [closure for closure in run.closures if status in (None, closure.status)]
     summaries = [_closure(closure).model_dump(mode="json") for closure in chosen[-limit:]]
-    body = json.dumps(summaries, allow_nan=False, separators=(",", ":")).encode()
-    return body, f'"{hashlib.sha256(body).hexdigest()}"'
+    return json.dumps(summaries, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _if_changed(request: Request, body: bytes, media_type: str) -> Response:
+    """An answer whose body is left out if the client says that it has it (RFC 9110, 13.1.2)."""
+    tag = f'"{hashlib.sha256(body).hexdigest()}"'
+    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers=headers)
+    return Response(body, media_type=media_type, headers=headers)
 
 
 def _closure_of(run: Run, *named: Channel | str | float) -> ClosureRow:
