@@ -190,7 +190,7 @@ def test_a_viewer_sees_and_may_not_veto(page, packets, credentials, tmp_path):
         until(page, lambda: page.locator("#list option").count() > 0, "closures")
         page.locator("#list").select_option(index=0)
         page.locator("#veto").click()
-        says(page, "#message", "'eye' is a viewer; this is for a admin")
+        says(page, "#message", "'eye' is a viewer; this needs the role admin")
         with httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {token('eye')}"}) as client:
             assert client.get(f"{API}/edits").json() == []
 
