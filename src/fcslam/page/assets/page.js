@@ -1,5 +1,5 @@
 // The live map. Tokens go in a header and never in an address, which logs would keep: so events are read with fetch.
-const API = "api/v1/", WORLD_M = 512, TILE_PX = 512, MOST_TILES = 120, RETRY_MS = 2000;
+const API = "api/v1/", WORLD_M = 512, TILE_PX = 512, MOST_TILES = 48, RETRY_MS = 2000;
 const LIVE_S = 15; // a robot that was heard so recently is live
 const LISTED = 200; // closures in the list; the newest ones
 const NEAR_M = 5; // closures with both ends so near each other see the same place
