@@ -251,6 +251,7 @@ def simulated(building: int, robots: int, path_length_m: float = 60.0) -> Iterat
 def warm_up() -> None:
     """Load or compile every kernel of robot and cloud."""
     from fcslam.cloud.cloud import Cloud
+    from fcslam.cloud.report import fuse_members
     from fcslam.mission import MissionConfig
     from fcslam.robot.frontend import RobotFrontend
 
@@ -258,7 +259,7 @@ def warm_up() -> None:
     streams = [packets(RobotFrontend(r.name, config.robot), r.scans(), watches) for r in simulated(99, 2, 20.0)]
     cloud = Cloud(config.fleet, config.seed)
     send(itertools.chain(*streams), cloud, watches)
-    cloud.finalize()
+    fuse_members(cloud.finalize().robots, config.map)
 
 
 def packets(robot: Any, scans: Iterable[Any], watches: Watches, is_all: bool = True) -> Iterator[Any]:

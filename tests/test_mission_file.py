@@ -1,5 +1,6 @@
 """A mission that goes on from its file is the mission of all recordings at once, byte for byte."""
 
+import os
 import shutil
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
@@ -97,6 +98,14 @@ def test_a_state_that_somebody_changed_is_not_read(begun, resumed, tmp_path, bro
     fcslam.map_recordings([], output=tmp_path / "again", onto=run)
     assert resumed == [False]
     assert contents(tmp_path / "again") == contents(begun)
+
+
+def test_a_pipe_in_place_of_a_state_is_not_waited_for(begun, resumed, tmp_path):
+    run = copied(begun, tmp_path / "run")
+    (run / "mission.state").unlink()
+    os.mkfifo(run / "mission.state")
+    fcslam.map_recordings([], onto=run)
+    assert resumed == [False]
 
 
 def test_the_state_of_another_user_is_not_read(begun, resumed, tmp_path, monkeypatch):

@@ -117,8 +117,11 @@ def mission_state_bytes(mission: bytes, state: State) -> bytes:
 def _state_beside(path: Path) -> State | None:
     """The state that fits this program and the mission file at ``path``; None if there is none."""
     place = path.with_name(STATE)
-    data = read_own(place) if path.name == MISSION else None
+    if path.name != MISSION or not place.exists():
+        return None
+    data = read_own(place)
     if data is None:
+        _log.info("%s: is not of this user, or was changed; all packets take effect again", place)
         return None
     try:
         return parse_state(place, data, _fits(path.read_bytes()))

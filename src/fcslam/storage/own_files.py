@@ -12,6 +12,8 @@ from typing import Final
 
 from fcslam.storage.files import write_file
 
+MOST_BYTES: Final = 4 * 2**30
+"""A larger file is not read."""
 _KEY_BYTES: Final = 32
 _HASH_BYTES: Final = 32
 
@@ -33,11 +35,13 @@ def read_own(path: Path) -> bytes | None:
     """What this user wrote to ``path``; None if there is nothing, or somebody else wrote or changed it."""
     key = _key()
     try:
+        if key is None or not path.is_file() or path.stat().st_size > MOST_BYTES:  # a pipe would wait for ever
+            return None
         content = path.read_bytes()
     except OSError:
         return None
     data = content[_HASH_BYTES:]
-    return data if key is not None and hmac.compare_digest(content[:_HASH_BYTES], _hash(key, data)) else None
+    return data if hmac.compare_digest(content[:_HASH_BYTES], _hash(key, data)) else None
 
 
 def _hash(key: bytes, data: bytes) -> bytes:

@@ -8,6 +8,7 @@ import io
 import json
 import zipfile
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ State = dict[str, Any]
 _ARRAY = ""
 """The only key of a dictionary that stands for an array, with its number as its value; no name is empty."""
 _HASH_BYTES = 32
+_LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "opencv-python-headless")
 
 
 def write_state(path: Path, fits: str, state: State) -> None:
@@ -86,8 +88,9 @@ def parse_state(path: Path, data: bytes, fits: str) -> State:
 
 @cache
 def code_version() -> str:
-    """Hash of the program: a state fits no other one, because another program may decide otherwise."""
-    hashed = hashlib.blake2b(digest_size=16)
+    """Hash of the program and of the libraries that it computes with: others may decide otherwise, so a state fits no
+    other one."""
+    hashed = hashlib.blake2b(" ".join(map(version, _LIBRARIES)).encode(), digest_size=16)
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         hashed.update(path.read_bytes())
     return hashed.hexdigest()
