@@ -328,7 +328,6 @@ function tile(z, x, y) {
   const key = `${mapIndex}/${z}/${x}/${y}`;
   const kept = tiles.get(key) ?? { picture: null, version: -1 };
   tiles.delete(key); tiles.set(key, kept); // the last one of all: those that are not drawn leave first
-  if (tiles.size > MOST_TILES) tiles.delete(tiles.keys().next().value);
   if (kept.version !== version) {
     const asked = kept.version = version;
     ask(`maps/${mapIndex}/tiles/${z}/${x}/${y}.png`).then((a) => a.blob()).then(createImageBitmap)
@@ -347,11 +346,15 @@ function draw() {
   pen.clearRect(0, 0, w, h);
   if (!view) return;
   const z = Math.max(0, Math.min(zooms.get(mapIndex) ?? 0, Math.round(Math.log2(view.scale * WORLD_M / TILE_PX)))), side = WORLD_M / 2 ** z;
+  let drawn = 0;
   for (let x = Math.floor((view.x - w / 2 / view.scale) / side); x * side < view.x + w / 2 / view.scale; x++)
     for (let y = Math.floor((view.y - h / 2 / view.scale) / side); y * side < view.y + h / 2 / view.scale; y++) {
+      drawn++;
       const picture = tile(z, x, y);
       if (picture) pen.drawImage(picture, ...onScreen(x * side, (y + 1) * side), side * view.scale, side * view.scale);
     }
+  // A tile in view stays, or each drawing would ask for it again.
+  for (const key of tiles.keys()) { if (tiles.size <= Math.max(MOST_TILES, drawn)) break; tiles.delete(key); }
   pen.globalAlpha = 0.4;
   if (at("shown").checked) for (const channel of Object.keys(CLOSURE)) lines(accepted.filter((c) => c.channel === channel && c.map === mapIndex).map((c) => c.ends), CLOSURE[channel], 1);
   pen.globalAlpha = 1;
@@ -408,7 +411,8 @@ function closureAt(x, y) {
 // Keeps the point of the canvas where it is.
 function zoom(factor, x = canvas.clientWidth / 2, y = canvas.clientHeight / 2) {
   if (!view) return;
-  const scale = Math.max(0.1, Math.min(2000, view.scale * factor)), shift = 1 / view.scale - 1 / scale;
+  const widest = Math.sqrt(canvas.clientWidth * canvas.clientHeight / MOST_TILES) / WORLD_M; // so many tiles fill the canvas
+  const scale = Math.max(Math.min(widest, view.scale), Math.min(2000, view.scale * factor)), shift = 1 / view.scale - 1 / scale;
   moved = true;
   view = { x: view.x + (x - canvas.clientWidth / 2) * shift, y: view.y - (y - canvas.clientHeight / 2) * shift, scale };
   redraw();
@@ -472,8 +476,9 @@ setInterval(async () => {
 let attempt = 0; // a new one ends those before it
 async function follow() {
   const mine = ++attempt;
+  let reader;
   try {
-    const reader = (await ask("events")).body.pipeThrough(new TextDecoderStream()).getReader();
+    reader = (await ask("events")).body.pipeThrough(new TextDecoderStream()).getReader();
     await update(version); // what is there already; events tell of changes only
     at("status").textContent = readOnly ? "read-only" : "live";
     let rest = "";
@@ -491,6 +496,8 @@ async function follow() {
     if (error instanceof Refused) at("status").textContent = error.message;
     else if (!at("reload").hidden) at("status").textContent = error.message;
     else { at("status").textContent = "no connection; trying again"; setTimeout(follow, RETRY_MS); }
+  } finally {
+    reader?.cancel().catch(() => {}); // a browser opens six connections to a host, and each stream holds one
   }
 }
 follow();
