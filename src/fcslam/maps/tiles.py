@@ -1,7 +1,9 @@
 """Square tiles of a map as pictures, for viewers that show parts of it."""
 
 import math
-from functools import lru_cache
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,6 +17,8 @@ WORLD_M = 512.0
 """Side of a tile at zoom 0; each zoom halves it."""
 TILE_PX = 512
 DEEPEST_ZOOM = 8
+KEPT_BYTES = 256_000_000
+"""Of maps in memory; the one that was asked for last stays, however large it is."""
 
 
 def finest_zoom(resolution_m: float) -> int:
@@ -28,11 +32,10 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
     Raises:
         FileNotFoundError: the folder has no map ``stem``.
     """
-    version, side_m = identity(folder), WORLD_M / 2**zoom
-    pixels, resolution_m, origin = _grid(folder, stem, version)
-    halvings = max(math.floor(math.log2(side_m / TILE_PX / resolution_m)), 0)
-    if halvings:
-        pixels, resolution_m = _halved(folder, stem, version, halvings), resolution_m * 2**halvings
+    side_m = WORLD_M / 2**zoom
+    pyramid = _pyramid(folder, stem)
+    halvings = max(math.floor(math.log2(side_m / TILE_PX / pyramid.resolution_m)), 0)
+    pixels, resolution_m, origin = pyramid.levels[halvings], pyramid.resolution_m * 2**halvings, pyramid.origin
     canvas = np.full((TILE_PX, TILE_PX), PIXELS[Occupancy.UNKNOWN], np.uint8)
     # first and one past the last cell in the tile, per axis (x, y)
     corner = np.array((column, row)) * side_m - origin
@@ -55,19 +58,45 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
     return bytes(cv2.imencode(".png", canvas[::-1])[1])
 
 
-@lru_cache(maxsize=32)
-def _halved(folder: Path, stem: str, version: tuple[int, int], halvings: int) -> NDArray[np.uint8]:
-    """The pixels, each the mean of 2^halvings x 2^halvings; a coarse tile of a large map then reads few."""
-    finer = _halved(folder, stem, version, halvings - 1) if halvings > 1 else _grid(folder, stem, version)[0]
-    height, width = finer.shape
-    even = np.pad(finer, ((0, height % 2), (0, width % 2)), constant_values=PIXELS[Occupancy.UNKNOWN])
-    halved: NDArray[np.uint8] = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return halved
+@dataclass(frozen=True, eq=False)
+class _Pyramid:
+    """A map and coarser copies of it; a coarse tile of a large map then reads few pixels."""
+
+    levels: list[NDArray[np.uint8]]
+    """Pixels (H, W) with row 0 at the lowest y. Each level has half as many per side as the one before, their means."""
+    resolution_m: float
+    """Of the first level."""
+    origin: NDArray[np.float64]
+    """Lower left corner, (2,), metres."""
 
 
-@lru_cache(maxsize=8)
-def _grid(folder: Path, stem: str, _: tuple[int, int]) -> tuple[NDArray[np.uint8], float, NDArray[np.float64]]:
-    """Pixels (H, W) with row 0 at the lowest y, resolution in metres, lower left corner (2,)."""
+_lock = threading.Lock()
+"""Many tiles are asked for at once: one request reads the map, the others wait for it."""
+_kept: OrderedDict[tuple[Path, str, tuple[int, int]], _Pyramid] = OrderedDict()
+"""The one that was asked for last is the last."""
+
+
+def _pyramid(folder: Path, stem: str) -> _Pyramid:
+    key = (folder, stem, identity(folder))
+    with _lock:
+        found = _kept.pop(key) if key in _kept else _read(folder, stem)
+        _kept[key] = found
+        while len(_kept) > 1 and sum(level.nbytes for one in _kept.values() for level in one.levels) > KEPT_BYTES:
+            _kept.popitem(last=False)
+    return found
+
+
+def _read(folder: Path, stem: str) -> _Pyramid:
     pgm, description = (folder / f"{stem}.pgm").read_bytes(), (folder / f"{stem}.yaml").read_text(encoding="utf-8")
     occupancy = parse_map(stem, pgm, description)
-    return pixels_of(occupancy.cells), occupancy.resolution_m, np.array(occupancy.origin_xy)
+    levels = [pixels_of(occupancy.cells)]
+    for _ in range(math.floor(math.log2(max(WORLD_M / TILE_PX / occupancy.resolution_m, 1.0)))):
+        levels.append(_halved(levels[-1]))
+    return _Pyramid(levels, occupancy.resolution_m, np.array(occupancy.origin_xy))
+
+
+def _halved(finer: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = finer.shape
+    even = np.pad(finer, ((0, height % 2), (0, width % 2)), constant_values=PIXELS[Occupancy.UNKNOWN])
+    coarser: NDArray[np.uint8] = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return coarser
