@@ -41,6 +41,8 @@ class Script:
     j: KeyscanId
     T_i_j: np.ndarray
     informative: bool = True
+    similarity: float | None = None
+    """Set: words alone say that it is the same place."""
 
 
 class ScriptedMatcher:
@@ -70,7 +72,13 @@ class ScriptedMatcher:
     def match(self, place, predicted, is_unaligned) -> list[PlaceMatch]:
         self.predictions[place.id] = dict(predicted)
         found = [line for line in self.script if line.j == place.id]
-        return [PlaceMatch(s.i, s.j, Channel.LIDAR, 0.5, verified(s), predicted=not is_unaligned(s.i)) for s in found]
+        return [matched(line, predicted=not is_unaligned(line.i)) for line in found]
+
+
+def matched(line: Script, predicted: bool) -> PlaceMatch:
+    if line.similarity is not None:
+        return PlaceMatch.similar(line.i, line.j, Channel.LIDAR, line.similarity, delta=0.85)
+    return PlaceMatch.verified(line.i, line.j, Channel.LIDAR, 0.5, verified(line), predicted)
 
 
 def verified(line: Script) -> Verification:

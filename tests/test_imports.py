@@ -20,6 +20,7 @@ ROOMS = [
     "processes",
     "records",
     "config",
+    "presets",
     "geometry",
     "metrics",
     "storage",

@@ -23,8 +23,8 @@ class Settings(BaseModel):
 SettingsType = TypeVar("SettingsType", bound=Settings)
 
 
-def load(kind: type[SettingsType], path: Path) -> SettingsType:
-    """Read a YAML file over the defaults of ``kind``.
+def load(kind: type[SettingsType], path: Path, over: SettingsType | None = None) -> SettingsType:
+    """Read a YAML file over the settings ``over``; None: the defaults of ``kind``.
 
     Raises:
         ConfigError: the file cannot be read, is not a mapping, or has an unknown key or a wrong value.
@@ -39,7 +39,16 @@ def load(kind: type[SettingsType], path: Path) -> SettingsType:
         content = {}
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: expected a mapping of keys; `fcslam config dump` prints a complete one")
-    return parse(kind, content, str(path))
+    return parse(kind, content, str(path)) if over is None else changed(over, content, str(path))
+
+
+def changed(settings: SettingsType, content: dict[str, Any], where: str) -> SettingsType:
+    """The settings with the keys of ``content`` changed, checked as a whole; ``where`` names its origin in messages.
+
+    Raises:
+        ConfigError: as of ``parse``.
+    """
+    return parse(type(settings), _merged(settings.model_dump(), content), where)
 
 
 def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> SettingsType:
@@ -55,9 +64,20 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
         key = one_line(".".join(str(part) for part in first["loc"]))
         if first["type"] == "extra_forbidden":
             raise ConfigError(f"{where}: unknown key '{key}'{_nearest(kind, first['loc'])}") from error
+        if first["type"] == "value_error" and isinstance(first["input"], dict):  # keys that do not fit each other
+            raise ConfigError(f"{where}: {key}: {first['ctx']['error']}") from error
         raise ConfigError(
             f"{where}: {key}: {one_line(first['msg'])} (given: {one_line(repr(first['input']))})"
         ) from error
+
+
+def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """``base`` with the keys of ``changes``; nested mappings are merged key by key."""
+    merged = dict(base)
+    for key, value in changes.items():
+        nested = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = _merged(base[key], value) if nested else value
+    return merged
 
 
 def dump(settings: Settings) -> str:

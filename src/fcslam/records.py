@@ -262,6 +262,7 @@ class ReasonCode(StrEnum):
     FITS_JOINT_MAP = "fits_joint_map"
     IN_CLUSTER = "in_dominant_cluster"
     FITS_JOINT_GRAPH = "fits_joint_graph"
+    SIMILAR = "similar"
     MATCHED_POINT = "matched_point"
     NOT_ENOUGH_EXPLAINED = "not_enough_explained"
     IN_FREE_SPACE = "in_free_space"
@@ -294,6 +295,7 @@ _REASON_TEXT = {
     ReasonCode.FITS_JOINT_MAP: "fits the joint map: {value} m off, less than {limit}",
     ReasonCode.IN_CLUSTER: "in the dominant cluster of {value} closures",
     ReasonCode.FITS_JOINT_GRAPH: "fits the joint graph",
+    ReasonCode.SIMILAR: "the similarity of the words is {value}, {limit} needed",
     ReasonCode.MATCHED_POINT: "one of {value} matched points of the rigid fusion",
     ReasonCode.NOT_ENOUGH_EXPLAINED: "a share of {value} of the points lies on a surface, {limit} needed",
     ReasonCode.IN_FREE_SPACE: "a share of {value} of the points lies in free space, {limit} allowed",

@@ -13,7 +13,9 @@ from pydantic import Field
 
 from fcslam import __version__, cli
 from fcslam.cli import main
-from fcslam.config import Settings
+from fcslam.config import Settings, load
+from fcslam.mission import MissionConfig
+from fcslam.presets import Preset
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, RobotTrajectory, Run, open_run
 
@@ -55,6 +57,14 @@ def test_config_dump_prints_the_mission_configuration(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "fcslam.mission", mission)
     assert main(["config", "dump"]) == 0
     assert capsys.readouterr().out == "# of everything random\nseed: 7\n"
+
+
+def test_config_dump_of_a_preset_is_a_configuration_file(capsys, tmp_path):
+    file = tmp_path / "paper.yaml"
+    assert main(["config", "dump", "--preset", "paper"]) == 0
+    file.write_text(capsys.readouterr().out)
+    assert load(MissionConfig, file) == load(MissionConfig, Preset.PAPER.file)
+    assert load(MissionConfig, file) != MissionConfig()
 
 
 def test_relations_table(run_and_relations, capsys, tmp_path):

@@ -359,6 +359,21 @@ def test_fusion_is_one_of_three_and_leaves_nothing_to_do_for_no_fuse(tmp_path, l
     assert yaml.safe_load((run / "config.yaml").read_text())["fleet"]["fusion"] == "two_point"
 
 
+def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log, capsys):
+    run, file = tmp_path / "run", tmp_path / "own.yaml"
+    file.write_text("fleet: {matcher: {delta: 1.5}}")
+    assert run_map(log, "--preset", "paper", "--config", file, "--output", run) == 0
+    fleet = yaml.safe_load((run / "config.yaml").read_text())["fleet"]
+    assert (fleet["matcher"]["decision"], fleet["matcher"]["delta"]) == ("similarity", 1.5)
+    assert (fleet["fusion"], fleet["matcher"]["vocabulary"]["strategy"]) == ("two_point", "rebuild")
+    capsys.readouterr()
+    assert run_map(log, "--preset", "paper", "--fusion", "joint", "--output", tmp_path / "other") == 2
+    assert capsys.readouterr().err.splitlines() == [
+        "fcslam: the command line: fleet: matcher.decision similarity measures no transform, which the joint "
+        "graph needs; set fusion to two_point or n_point"
+    ]
+
+
 def test_splits_that_cannot_be_are_refused(tmp_path, log, capsys):
     other = save(tmp_path / "other.log", drive(40))
     run = tmp_path / "run"

@@ -14,7 +14,7 @@ LINES = [Script(KeyscanId(i, k), KeyscanId(j, k), np.zeros(3)) for k, (i, j) in 
 
 
 def found(line, **changed):
-    return PlaceMatch(line.i, line.j, Channel.LIDAR, 0.5, replace(verified(line), **changed), predicted=False)
+    return PlaceMatch.verified(line.i, line.j, Channel.LIDAR, 0.5, replace(verified(line), **changed), predicted=False)
 
 
 def test_ties_are_what_is_accepted_between_a_robot_and_others_the_newest_first():

@@ -104,14 +104,14 @@ def test_only_a_rival_that_could_join_two_maps_contests_the_cluster(rivals, cont
 def test_the_ledger_books_what_geometry_says():
     ledger = ClosureLog()
     (line,) = closures(("a", POSES), ("b", POSES), [(3, 4)])
-    confirmed = ledger.add(PlaceMatch(line.i, line.j, Channel.CAMERA, 0.4, verified(line), predicted=False))
+    confirmed = ledger.add(PlaceMatch.verified(line.i, line.j, Channel.CAMERA, 0.4, verified(line), predicted=False))
     assert confirmed.closure.status is ClosureStatus.VERIFIED
     assert ledger.evidence("a", "b") == ledger.evidence("b", "a") == [confirmed]
     unconfirmed = replace(verified(line), strict=False)
-    doubtful = ledger.add(PlaceMatch(line.i, line.j, Channel.LIDAR, 0.4, unconfirmed, False))
+    doubtful = ledger.add(PlaceMatch.verified(line.i, line.j, Channel.LIDAR, 0.4, unconfirmed, False))
     assert doubtful.closure.status is ClosureStatus.CANDIDATE
     assert (confirmed.closure.channel, doubtful.closure.channel) == (Channel.CAMERA, Channel.LIDAR)
-    predicted = ledger.add(PlaceMatch(line.i, line.j, Channel.CAMERA, 0.4, unconfirmed, True))
+    predicted = ledger.add(PlaceMatch.verified(line.i, line.j, Channel.CAMERA, 0.4, unconfirmed, True))
     assert predicted.closure.status is ClosureStatus.VERIFIED, "the loose gate counts where a map is shared"
     ledger.add_local(motion("a", 1, 9, np.array([1.0, 0.0, 0.0])), edge=8)
     assert ledger.evidence("a", "b") == [confirmed], "what the joint map predicted is no evidence for it"

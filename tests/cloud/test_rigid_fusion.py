@@ -47,7 +47,7 @@ def ledger_of(*scripts, turned=()):
     ledger = ClosureLog()
     for number, line in enumerate(line for script in scripts for line in script):
         told = replace(line, i=line.j, j=line.i, T_i_j=se2.inverse(line.T_i_j)) if number in turned else line
-        ledger.add(PlaceMatch(told.i, told.j, Channel.LIDAR, 0.5, verified(told), predicted=False))
+        ledger.add(PlaceMatch.verified(told.i, told.j, Channel.LIDAR, 0.5, verified(told), predicted=False))
     return ledger
 
 
@@ -156,9 +156,31 @@ def test_two_matches_join_what_the_joint_graph_leaves_apart(scripted, strategy):
     assert map_of(feed(scripted(script, fusion=strategy), two_robots()).finalize()) == {"a": 0, "b": 0}
 
 
+def by_words(meetings):
+    return [replace(line, similarity=0.5) for line in closures(A, B, meetings, shift=ALIAS)]
+
+
 @rigid
-def test_a_veto_takes_a_match_away(scripted, strategy):
-    cloud = scripted(closures(A, B, MEETINGS[:2]), fusion=strategy)
+def test_words_alone_make_the_two_positions_one(scripted, strategy):
+    """No transform is measured: that of the script would turn the map."""
+    result = feed(scripted(by_words(MEETINGS), fusion=strategy), two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 0}
+    assert error_m(result) < 1e-3
+
+
+def test_words_alone_are_no_evidence_for_the_joint_graph(scripted):
+    """The joint graph is that of the robots without their matches; a true script joins them."""
+    result = feed(scripted(by_words(MEETINGS)), two_robots()).finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    assert not any(edge.robust for edge in result.graph.edges)
+    assert map_of(feed(scripted(closures(A, B, MEETINGS)), two_robots()).finalize()) == {"a": 0, "b": 0}
+
+
+@rigid
+@pytest.mark.parametrize("similarity", [None, 0.5])
+def test_a_veto_takes_a_match_away(scripted, strategy, similarity):
+    script = [replace(line, similarity=similarity) for line in closures(A, B, MEETINGS[:2])]
+    cloud = scripted(script, fusion=strategy)
     cloud.fleet.edit([Veto("a", "b", (8.0, LATER + 8.0))])
     result = feed(cloud, two_robots()).finalize()
     assert map_of(result) == {"a": 0, "b": 1}

@@ -3,6 +3,7 @@
 import typer
 
 from fcslam.cli.examples import examples
+from fcslam.cli.mission_options import PresetName, mission_config
 
 _DUMP = "fcslam config dump > mission.yaml"
 
@@ -14,10 +15,15 @@ def config() -> None:
     """Print the configuration of a mission."""
 
 
-@app.command(epilog=examples(_DUMP, "fcslam map robot1.bag robot2.bag --config mission.yaml"))
-def dump() -> None:
-    """Print the complete default configuration as YAML. A comment above each key explains it."""
+@app.command(
+    epilog=examples(
+        _DUMP,
+        "fcslam map robot1.bag robot2.bag --config mission.yaml",
+        "fcslam config dump --preset paper > paper.yaml",
+    )
+)
+def dump(preset: PresetName = None) -> None:
+    """Print a complete configuration as YAML, the default one or a preset. A comment above each key explains it."""
     from fcslam.config import dump as as_yaml
-    from fcslam.mission import MissionConfig
 
-    typer.echo(as_yaml(MissionConfig()), nl=False)
+    typer.echo(as_yaml(mission_config(None, preset=preset)), nl=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.mission_options import ConfigFile, Fusion, MissionSeed, NoFuse, mission_config
+from fcslam.cli.mission_options import ConfigFile, Fusion, MissionSeed, NoFuse, PresetName, mission_config
 from fcslam.cli.options import Force, Quiet, output_option
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
@@ -79,6 +79,7 @@ def map_recordings(
         ),
     ] = None,
     config: ConfigFile = None,
+    preset: PresetName = None,
     scan_topic: ScanTopic = None,
     odom_topic: OdomTopic = None,
     camera_topic: CameraTopic = None,
@@ -101,7 +102,7 @@ def map_recordings(
         output = output or new_folder(RUNS)
         prepare_output(output, force)
         earlier = None if onto is None else read_mission(onto)
-        settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier))
+        settings = mission_config(config, seed, no_fuse, fusion, continued_config(earlier), preset)
         vetoes = read_vetoes(veto) if veto else ()
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose)
         if not logs and earlier is None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cloud.fusion_strategy import FusionStrategy
+from fcslam.presets import Preset
 
 if TYPE_CHECKING:
     from fcslam.mission import MissionConfig
@@ -15,6 +16,15 @@ _FROM_CONFIG = "that of the configuration"
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", "-c", help="Configuration file (YAML); `fcslam config dump` prints the default one."),
+]
+PresetName = Annotated[
+    Preset | None,
+    typer.Option(
+        "--preset",
+        help="Named configuration. paper: FC-SLAM to the letter; words alone decide, a new vocabulary at every place, "
+        "rigid maps. Keys of --config count before it.",
+        show_default="none",
+    ),
 ]
 MissionSeed = Annotated[
     int | None, typer.Option("--seed", min=0, help="Seed of all random draws.", show_default=_FROM_CONFIG)
@@ -36,21 +46,24 @@ def mission_config(
     no_fuse: bool = False,
     fusion: FusionStrategy | None = None,
     default: "MissionConfig | None" = None,
+    preset: Preset | None = None,
 ) -> "MissionConfig":
-    """The configuration in ``file``, or else the default one, with the changes of the command line.
+    """The configuration in ``file`` over the preset, or else the default one, with the changes of the command line.
 
     Raises:
-        ConfigError: the file cannot be read or is invalid, or ``fusion`` is given together with ``no_fuse``.
+        ConfigError: the file cannot be read or is invalid, or options of the command line do not fit the rest.
     """
-    from fcslam.config import load
+    from fcslam.config import changed, load
     from fcslam.errors import ConfigError
     from fcslam.mission import MissionConfig
 
-    config = (default or MissionConfig()) if file is None else load(MissionConfig, file)
-    if seed is not None:
-        config = config.model_copy(update={"seed": seed})
+    config = default if default is not None and file is None and preset is None else MissionConfig()
+    for chosen in (None if preset is None else preset.file, file):
+        config = config if chosen is None else load(MissionConfig, chosen, over=config)
     if no_fuse and fusion is not None:
         raise ConfigError("--no-fuse fuses no maps, so --fusion has no effect; give only one of them")
-    changes: dict[str, object] = {"join_maps": False} if no_fuse else {}
-    changes |= {"fusion": fusion} if fusion is not None else {}
-    return config.model_copy(update={"fleet": config.fleet.model_copy(update=changes)})
+    fleet: dict[str, object] = {"join_maps": False} if no_fuse else {}
+    fleet |= {"fusion": fusion} if fusion is not None else {}
+    changes: dict[str, object] = {"fleet": fleet} if fleet else {}
+    changes |= {"seed": seed} if seed is not None else {}
+    return changed(config, changes, "the command line")

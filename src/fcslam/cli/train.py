@@ -82,12 +82,12 @@ def train(
 
 
 def _settings(config: Path | None, quick: bool, given: dict[str, Any]) -> "TrainingSettings":
-    from fcslam.config import load, parse
+    from fcslam.config import changed, load
     from fcslam.learning.settings import TrainingSettings
 
     base = TrainingSettings() if config is None else load(TrainingSettings, config)
     changes = (QUICK if quick else {}) | {name: value for name, value in given.items() if value is not None}
-    return parse(TrainingSettings, base.model_dump() | changes, "the command line")
+    return changed(base, changes, "the command line")
 
 
 def _watch(display: "ProgressDisplay", console: "Console") -> "StageCallback":

@@ -20,8 +20,8 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import State
 
-VERIFICATION = "fleet.matcher.verification"
-"""Section of the configuration that holds the thresholds of the cloud's verification."""
+MATCHER = "fleet.matcher"
+"""Section of the configuration that holds the thresholds of place matching."""
 
 
 @dataclass(slots=True, eq=False)
@@ -42,6 +42,11 @@ class ClosureEntry:
     def is_certain(self) -> bool:
         """Whether it counts whatever the other evidence says."""
         return self.pinned and not self.vetoed
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether geometry measured T_i_j; if not, words alone say that both are the same place."""
+        return bool(self.closure.information.any())
 
     @property
     def is_between(self) -> bool:
@@ -84,8 +89,8 @@ class ClosureLog:
         """Add a match, as verified or, if its verification failed, as a candidate."""
         status = ClosureStatus.VERIFIED if match.M else ClosureStatus.CANDIDATE
         closure = LoopClosure(
-            match.i, match.j, match.channel, match.similarity, frozen(match.check.T_a_b),
-            frozen(match.check.information), status, match.reason.under(VERIFICATION), match.check.informative,
+            match.i, match.j, match.channel, match.similarity, frozen(match.T_i_j), frozen(match.information), status,
+            match.reason.under(MATCHER), match.informative,
         )  # fmt: skip
         return self._add(ClosureEntry(closure, independent=not match.predicted))
 
@@ -153,7 +158,10 @@ class ClosureLog:
         return [
             entry
             for entry in self._between.get(frozenset((a, b)), ())
-            if entry.independent and not entry.vetoed and entry.closure.status is not ClosureStatus.CANDIDATE
+            if entry.independent
+            and entry.is_measured
+            and not entry.vetoed
+            and entry.closure.status is not ClosureStatus.CANDIDATE
         ]
 
     def ties_at(self, place: KeyscanId) -> Iterator[ClosureEntry]:

@@ -31,7 +31,7 @@ class CorrectionQuality:
             fits = self._fits(match)
             # An unpredicted match that neither fits nor is verified is most often an alias.
             if match.i.robot in robots and (fits or match.predicted or match.M):
-                share = match.check.worse.explained if fits else 0.0
+                share = match.explained if fits else 0.0
                 for session in (match.i.robot, match.j.robot):
                     shares[session] = max(share, shares.get(session, 0.0))
         self._share |= shares
@@ -52,5 +52,5 @@ class CorrectionQuality:
         return self._share.get(session, 0.0) * (1.0 - 0.5**count)
 
     def _fits(self, match: PlaceMatch) -> bool:
-        off = self._graph.innovation(match.i, match.j, match.check.T_a_b)
+        off = self._graph.innovation(match.i, match.j, match.T_i_j)
         return bool(np.hypot(off[0], off[1]) <= self._off_m and abs(off[2]) <= self._off_rad)

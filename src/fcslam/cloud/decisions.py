@@ -96,7 +96,8 @@ class ClosureDecisions:
         entries = [self.closures.add(match) for match in matches if not self.closures.confirms(match)]
         for entry in entries:
             self._mark(entry)
-        undecided = [entry for entry in entries if not entry.vetoed and not self._accept_if_consistent(entry)]
+        usable = [entry for entry in entries if entry.is_measured and not entry.vetoed]
+        undecided = [entry for entry in usable if not self._accept_if_consistent(entry)]
         for other in dict.fromkeys(entry.closure.i.robot for entry in undecided):
             between = [entry for entry in undecided if entry.closure.i.robot == other]
             # A pair decided just before may have joined these two as well.

@@ -120,7 +120,7 @@ class PlaceRecognition:
         return self._matchers[key]
 
     def _forget(self, place: Place) -> None:
-        """DetectorUpdate what only a place needs that is never compared again."""
+        """Release what only a place needs that is never compared again."""
         self._places[self._key(place), place.id.robot].remove(place.id)
         self._submaps.drop(place)
         self._sessions.release(place)

@@ -36,7 +36,8 @@ def reevaluate(
 
     No earlier estimate, join or decision plays a part: a closure that joined two maps and is outvoted now is revoked.
     """
-    entries = [e for e in closures if e.is_certain or e.closure.status is not ClosureStatus.CANDIDATE]
+    measured = (entry for entry in closures if entry.is_measured)
+    entries = [e for e in measured if e.is_certain or e.closure.status is not ClosureStatus.CANDIDATE]
     _enter(graph, (entry for entry in entries if entry.edge is None))
     robots = list(graph.robots())
 

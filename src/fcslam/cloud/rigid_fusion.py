@@ -7,6 +7,7 @@ squares sense. Both are here to be compared with the joint graph.
 
 The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
 closure is more precise: the matched point is the position of its keyscan j, and ``T_i_j`` gives it in the other map.
+Where words alone decide, no ``T_i_j`` is measured; it is zero, and the two positions are one as in the paper.
 """
 
 from collections.abc import Mapping, Sequence
@@ -121,8 +122,10 @@ def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], fra
 
 def _closure(entry: ClosureEntry, used: Mapping[ClosureEntry, Reason]) -> LoopClosure:
     """The closure with its final status."""
-    if not _is_valid(entry):
+    if not entry.is_between or entry.closure.status is ClosureStatus.CANDIDATE:
         return entry.closure
+    if entry.vetoed:
+        return replace(entry.closure, status=ClosureStatus.REVOKED, reason=Reason(ReasonCode.VETOED))
     reason = used.get(entry)
     if reason is None:
         return replace(entry.closure, status=ClosureStatus.VERIFIED, reason=Reason(ReasonCode.UNUSED))

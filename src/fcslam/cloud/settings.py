@@ -1,13 +1,15 @@
 """The settings of the cloud; a mission stores them, so that its result can be computed again from its packets."""
 
-from pydantic import Field
+from typing import Self
+
+from pydantic import Field, model_validator
 
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.config import Settings
 from fcslam.graph.consistency import ConsistencySettings
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.places.matcher import MatcherConfig
+from fcslam.places.matcher import MatchDecision, MatcherConfig
 
 
 class FleetConfig(Settings):
@@ -61,6 +63,15 @@ class FleetConfig(Settings):
     consistency: ConsistencySettings = Field(
         default=ConsistencySettings(), description="pairwise consistency of closures, and the rule for joining maps"
     )
+
+    @model_validator(mode="after")
+    def _words_measure_no_transform(self) -> Self:
+        if self.matcher.decision is MatchDecision.SIMILARITY and self.fusion is FusionStrategy.JOINT:
+            raise ValueError(
+                "matcher.decision similarity measures no transform, which the joint graph needs; "
+                "set fusion to two_point or n_point"
+            )
+        return self
 
 
 class CloudConfig(Settings):

@@ -12,8 +12,6 @@ from torch.nn import functional as F
 from fcslam.features.dense import CELL_PX
 from fcslam.learning.network import cell_log_probabilities
 
-ROUNDING = 0.01
-"""Keeps the gradient of the square root finite where two codes are equal."""
 AGREEMENT_WINDOW_PX = 16
 """Side of the windows in which keypoint maps are compared."""
 _FAR = 1e4
@@ -30,10 +28,11 @@ def binary_activation(logits: Tensor) -> Tensor:
     return soft + ((logits >= 0).to(soft.dtype) - soft).detach()
 
 
-def code_distances(a: Tensor, b: Tensor, rounding: float = ROUNDING) -> Tensor:
+def code_distances(a: Tensor, b: Tensor, rounding: float) -> Tensor:
     """Eq. (3): Euclidean distances of codes (..., N, D) and (..., M, D) of zeros and ones, shape (..., N, M).
 
-    It is the root of the Hamming distance. ``rounding`` is added under the root; it is 0 in the paper.
+    It is the root of the Hamming distance. ``rounding`` is added under the root, because the gradient of the root is
+    infinite where two codes are equal; the paper has 0.
     """
     hamming = a.square().sum(-1)[..., :, None] + b.square().sum(-1)[..., None, :] - 2.0 * a @ b.transpose(-1, -2)
     return (hamming.clamp(min=0.0) + rounding).sqrt()

@@ -62,10 +62,11 @@ def objective(
     first, second = logits.chunk(2)
     candidates = negatives(batch.points, batch.valid)
     codes = losses.binary_activation(first), losses.binary_activation(second)
+    distances = losses.code_distances(*codes, weights.rounding)
     margin = weights.margin * (0.3 + 0.7 * progress)
     points = (maps.point_logits.float(), batch.targets, batch.seen)
     parts = {
-        "triplet": losses.triplet_loss(losses.code_distances(*codes), candidates, batch.valid, margin),
+        "triplet": losses.triplet_loss(distances, candidates, batch.valid, margin),
         "contrastive": losses.contrastive_loss(
             torch.tanh(first), torch.tanh(second), candidates, batch.valid, weights.temperature
         ),

@@ -20,6 +20,12 @@ class LossSettings(Settings):
         ge=0.0,
         description="margin of the triplet loss at the end of training, to which it rises; 0 as in the paper",
     )
+    rounding: float = Field(
+        default=0.01,
+        gt=0.0,
+        description="added under the root of eq. (3), whose gradient is infinite where two codes are equal; the paper "
+        "has 0",
+    )
     contrastive: float = Field(
         default=1.0, ge=0.0, description="weight of the InfoNCE loss of the descriptors before they become binary"
     )

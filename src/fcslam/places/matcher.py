@@ -2,12 +2,13 @@
 
 Candidates are all places while the fleet is small, and those that the vocabulary retrieves once it is large. Between
 robots in one map, candidates are the places that the map predicts to be near. Each candidate gives a rigid motion, and
-the overlap of the two submaps under this motion decides.
+the overlap of the two submaps under this motion decides. To the letter of the paper, the similarity alone decides.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from enum import StrEnum
+from typing import NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -21,16 +22,38 @@ from fcslam.places.index import PlaceIndex
 from fcslam.places.motions import Motion, MotionConfig, propose_motions
 from fcslam.places.persistence import index_state, restored_index
 from fcslam.places.query_result import QueryResult
+from fcslam.places.similarity import PAPER_SCALE
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, frozen
+from fcslam.records import Channel, FloatArray, KeyscanId, Place, Reason, ReasonCode, frozen
 from fcslam.storage.state_file import State
 
 NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
 
 
+class MatchDecision(StrEnum):
+    """What decides whether two places are the same."""
+
+    GEOMETRY = "geometry"
+    """The overlap of their submaps."""
+    SIMILARITY = "similarity"
+    """Their similarity alone: Algorithm 1, lines 14-17."""
+
+
 class MatcherConfig(Settings):
     """Place matching."""
 
+    decision: MatchDecision = Field(
+        default=MatchDecision.GEOMETRY,
+        description="what decides whether two places are the same. geometry: the overlap of their submaps; similarity: "
+        "at least delta (Algorithm 1 of FC-SLAM), for fleet.fusion two_point and n_point only",
+    )
+    delta: float = Field(
+        default=0.85,
+        ge=0.0,
+        le=PAPER_SCALE,
+        description="least similarity of the same place on the scale of eq. (4), where it is 4 for a place with "
+        "itself, decision similarity (delta of Algorithm 1)",
+    )
     small_fleet: int = Field(
         default=150,
         ge=0,
@@ -82,19 +105,43 @@ class PlaceMatch:
     channel: Channel
     similarity: float
     """In [0, 1], by the place index; before the first vocabulary, the share of matching descriptors if it is known."""
-    check: Verification
+    M: bool
+    """The matching flag M_ij of FC-SLAM: whether both are the same place."""
+    reason: Reason
+    """Why it is no match, or what the match lacks."""
+    T_i_j: FloatArray
+    """Shape (3,), metres and radians."""
+    information: FloatArray
+    """Shape (3, 3), as of ``Verification``; all zero if no geometry measured ``T_i_j``."""
+    informative: bool
+    """Whether geometry fixes the pose in every direction."""
+    explained: float
+    """Share of the points in known area that lie on a surface, of the worse direction."""
     predicted: bool
     """Whether the robots were in one map already and it predicted this pair."""
 
-    @property
-    def M(self) -> bool:
-        """The matching flag M_ij of FC-SLAM: whether both are the same place."""
-        return self.check.loose if self.predicted else self.check.strict
+    @classmethod
+    def verified(
+        cls, i: KeyscanId, j: KeyscanId, channel: Channel, similarity: float, check: Verification, predicted: bool
+    ) -> Self:
+        """What geometry decided; a predicted pair needs less."""
+        return cls(
+            i, j, channel, similarity,
+            M=check.loose if predicted else check.strict,
+            reason=(check.loose_reason if predicted else check.reason).under("verification"),
+            T_i_j=check.T_a_b, information=check.information, informative=check.informative,
+            explained=check.worse.explained, predicted=predicted,
+        )  # fmt: skip
 
-    @property
-    def reason(self) -> Reason:
-        """Why it is no match, or what the match lacks."""
-        return self.check.loose_reason if self.predicted else self.check.reason
+    @classmethod
+    def similar(cls, i: KeyscanId, j: KeyscanId, channel: Channel, similarity: float, delta: float) -> Self:
+        """What the words decided (Algorithm 1, lines 14-17). The paper takes both poses for one."""
+        score = PAPER_SCALE * similarity
+        return cls(
+            i, j, channel, similarity, M=score >= delta, reason=Reason(ReasonCode.SIMILAR, score, delta, "delta"),
+            T_i_j=frozen(np.zeros(3)), information=frozen(np.zeros((3, 3))), informative=False, explained=0.0,
+            predicted=False,
+        )  # fmt: skip
 
 
 class _Comparison(NamedTuple):
@@ -167,16 +214,37 @@ class PlaceMatcher:
         """
         comparable = bool(predicted) or any(is_unaligned(i) for i in self._places)
         result = self._query(place) if comparable else QueryResult[KeyscanId]()  # Algorithm 1, lines 11-13
+        if self._config.decision is MatchDecision.SIMILARITY:
+            matches = self._similar(place, result, is_unaligned)
+        else:
+            matches = self._verified(self._comparisons(place, result, predicted, is_unaligned), place, result)
+        self._places[place.id] = place
+        self._backlog.append(place)
+        self._forget_oldest()
+        return matches
+
+    def _similar(
+        self, place: Place, result: QueryResult[KeyscanId], is_unaligned: Callable[[KeyscanId], bool]
+    ) -> list[PlaceMatch]:
+        """The places with M_ij = 1, the most similar first."""
+        found = result.best(len(self._places), is_unaligned)
+        matches = [PlaceMatch.similar(f.id, place.id, place.channel, f.similarity, self._config.delta) for f in found]
+        return [match for match in matches if match.M]
+
+    def _comparisons(
+        self,
+        place: Place,
+        result: QueryResult[KeyscanId],
+        predicted: Mapping[KeyscanId, FloatArray],
+        is_unaligned: Callable[[KeyscanId], bool],
+    ) -> list[_Comparison]:
+        """What geometry is to verify."""
         kept = {i: T_i_j for i, T_i_j in predicted.items() if i in self._places}
         near = [self._near(i, place, T_i_j) for i, T_i_j in kept.items()]
         lookalikes = self._lookalikes(place.id.robot, result, predicted, is_unaligned)
         others = (*self._candidates(result, is_unaligned), *lookalikes)
         far = [_far(i, propose_motions(self._places[i], place, self._config.motions)) for i in others]
-        matches = self._verified([*near, *far], place, result)
-        self._places[place.id] = place
-        self._backlog.append(place)
-        self._forget_oldest()
-        return matches
+        return [*near, *far]
 
     def state(self) -> State:
         """What ``restore`` needs."""
@@ -288,7 +356,7 @@ class PlaceMatcher:
                 best = max(found, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
                 similarity = result.similarity_of(comparison.i, comparison.share)
                 matches.append(
-                    PlaceMatch(comparison.i, place.id, place.channel, similarity, best, comparison.predicted)
+                    PlaceMatch.verified(comparison.i, place.id, place.channel, similarity, best, comparison.predicted)
                 )
         return matches
 

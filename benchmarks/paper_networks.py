@@ -1,0 +1,98 @@
+"""The paper's network and losses beside ours: four trainings with the same images, labels and processor time.
+
+    FCSLAM_DATA=/path/to/data python benchmarks/paper_networks.py --training networks
+
+The encoders are that of the paper (vgg) and the default one (light). The losses are eqs. (1)-(3) alone, and all of ours
+but distillation. The paper does not say how its detector learns keypoints: both have the cross entropy, on the same
+labels, which are the keypoints of the detector that comes with fcslam and Harris's corners. Each training takes the
+same processor time on one thread. The folder --training keeps what is done; the same command continues.
+
+Validation: pairs of held-out images, as at the end of `fcslam train`. `benchmarks/homography.py` evaluates the networks
+on other scenes.
+"""
+
+import csv
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import common
+import numpy as np
+import yaml
+
+from fcslam.features.detector import OnnxConfig, OnnxDetector
+from fcslam.learning.images import find_images, is_usable, read_image
+
+IMAGES = ("bsds500", "camvid", "coco_subset", "kodak24", "openimages_doors", "sun_hays80", "urban100")
+"""Folders of images; none holds a scene that a detector is evaluated on."""
+STEP_S = {"vgg": 2.3, "light": 0.4}
+"""Seconds of a step on one core."""
+PAPER = {"margin": 0.0, "rounding": 1e-6, "contrastive": 0.0, "distillation": 0.0, "balance": 0.0, "agreement": 0.0}
+LOSSES = {"eqs. (1)-(3)": PAPER, "ours": {"distillation": 0.0}}
+COLUMNS = {
+    "encoder": "",
+    "losses": "",
+    "steps": "d",
+    "CPU, min": ".1f",
+    "measure on held-out images": "",
+    "value": ".3f",
+}
+
+
+def main() -> None:
+    parser = common.options(__doc__ or "")
+    parser.add_argument("--training", type=Path, required=True, help="folder of the trainings")
+    parser.add_argument("--minutes", type=float, default=25.0, help="of one core for each training")
+    parser.add_argument("--encoders", nargs="+", choices=STEP_S, default=list(STEP_S), help="encoders")
+    parser.add_argument("--losses", nargs="+", choices=LOSSES, default=list(LOSSES), help="losses")
+    chosen = parser.parse_args()
+    report = common.Report(__file__, __doc__ or "", chosen)
+    folder = common.recordings(*IMAGES, kind="vision")
+    roots = [folder / name for name in IMAGES]
+    teacher = chosen.training / "teacher"
+    label(roots, teacher)
+    kept = common.Kept(chosen.training / "kept.jsonl")
+    rows: list[tuple] = []
+    for encoder in chosen.encoders:
+        for losses in chosen.losses:
+            key = (encoder, losses, chosen.minutes)
+            rows += kept.rows(key, lambda key=key: train(roots, teacher, chosen.training, *key))
+    report.table("Trainings", COLUMNS, rows)
+    report.write()
+
+
+def label(roots: Iterable[Path], teacher: Path) -> None:
+    """Write the keypoints of the bundled detector for each image, as `fcslam train --teacher` reads them."""
+    detector = OnnxDetector(OnnxConfig())
+    for file in find_images(list(roots)):
+        target = teacher / f"{file.name}.npz"
+        image = None if target.exists() else read_image(file.path)
+        if image is None or not is_usable(image):
+            continue
+        found = detector.detect(image)
+        bits = np.unpackbits(found.descriptors, axis=1).astype(np.float16)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(target, keypoints=found.keypoints_px, scores=found.scores, descriptors=bits)
+
+
+def train(
+    roots: Iterable[Path], teacher: Path, folder: Path, encoder: str, losses: str, minutes: float
+) -> Iterator[tuple]:
+    """One training; yields a row for each measure of its last validation."""
+    run = folder / f"{encoder}-{'paper' if losses != 'ours' else 'ours'}"
+    steps = round(60.0 * minutes / STEP_S[encoder])
+    settings = folder / f"{run.name}.yaml"
+    settings.write_text(yaml.safe_dump({"loss": LOSSES[losses]}), encoding="utf-8")
+    cost = common.run_fcslam(
+        "train", *roots, "--encoder", encoder, "--steps", steps, "--config", settings, "--teacher", teacher,
+        "--device", "cpu", "--output", run, environment={"OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    last: dict[str, float] = {}
+    with (run / "joint" / "progress.csv").open(encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            last[line["name"]] = float(line["value"])
+    for name, value in last.items():
+        yield encoder, losses, steps, cost.cpu_s / 60.0, name, value
+
+
+if __name__ == "__main__":
+    main()
