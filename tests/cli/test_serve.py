@@ -245,6 +245,20 @@ def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets,
         ]  # fmt: skip
 
 
+@pytest.mark.attack
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "status"), [((), 421), (("--insecure",), 200)])
+def test_a_service_without_tokens_answers_to_no_other_name(tmp_path, options, status):
+    """As when a web page points its own name to 127.0.0.1."""
+    service = Service(tmp_path / "data", *options)
+    try:
+        assert httpx.get(f"{service.url}{API}/robots").status_code == 200
+        page = httpx.get(f"{service.url}{API}/robots", headers={"Host": "evil.example"})
+        assert page.status_code == status
+    finally:
+        service.stop()
+
+
 @pytest.mark.system
 def test_behind_tls_with_tokens_a_robot_is_itself_alone(tmp_path, packets, credentials):
     mine = in_order(p for p in packets if p.robot == "robot_1")[:40]
@@ -283,8 +297,9 @@ def test_tokens_are_read_again_at_sighup(credentials, tmp_path):
         return httpx.get(f"{service.url}{API}/robots", headers=as_boss, timeout=30.0).status_code
 
     entries = yaml.safe_load(tokens.read_text())["tokens"]
-    others = [entry for entry in entries if entry["name"] != "boss"]
-    ended = [*others, {**entries[-1], "expires": "2020-01-01T00:00:00Z"}]
+    (boss,) = (entry for entry in entries if entry["name"] == "boss")
+    others = [entry for entry in entries if entry is not boss]
+    ended = [*others, {**boss, "expires": "2020-01-01T00:00:00Z"}]
     try:
         assert hang_up(yaml.safe_dump({"tokens": entries})) == 200
         assert hang_up("tokens: [") == 200, "those of before stay"

@@ -123,7 +123,7 @@ def test_nobody_changes_a_shown_run_or_reads_it_by_another_name_of_this_machine(
     (page,) = ask(shown, "/")
     assert page.status_code == 200
     (page,) = ask(shown, "/", host="attacker.example")
-    assert page.status_code == 400
+    assert page.status_code == 421
     assert {path: path.stat().st_mtime_ns for path in shown.run_folder.rglob("*")} == before
 
 

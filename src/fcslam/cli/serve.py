@@ -62,7 +62,8 @@ def serve(
     from fcslam.service.warmup import warm_up_decoding
     from fcslam.storage.files import keep_private
 
-    if tokens is None and client_ca is None and not insecure and not _is_loopback(host):
+    is_open = tokens is None and client_ca is None and not insecure
+    if is_open and not _is_loopback(host):
         raise ServiceError(f"everybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
     _check_tls(tls_certificate, tls_key, client_ca)
     keep_private()
@@ -75,7 +76,7 @@ def serve(
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
         pages = (page_router(), documentation_router()) if docs else (page_router(),)
-        server = _server(create_app(state, pages), tls_certificate, tls_key, client_ca)
+        server = _server(create_app(state, pages, local_names=is_open), tls_certificate, tls_key, client_ca)
         scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
         mission = state.mission.folder.name
         shown = f"[{address}]" if ":" in address else address

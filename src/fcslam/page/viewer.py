@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 import uvicorn
 from fastapi import FastAPI
 from fastapi.params import Depends as Dependency
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 import fcslam
 from fcslam.page.routes import page_router
@@ -19,11 +18,10 @@ from fcslam.runs.folder import identity
 from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.events import EventStream
+from fcslam.service.http.local_names import LocalNames
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.viewed_mission import ViewedMission
 
-HOSTS = ("127.0.0.1", "localhost")
-"""Names by which a browser may ask. Other ones are of web pages whose host was pointed to this machine, to read it."""
 LOOK_S = 0.2
 """Between two looks for a new run folder."""
 LAST_ANSWERS_S = 1
@@ -59,7 +57,7 @@ def viewer_app(state: ReadOnly) -> FastAPI:
     for make in VIEWER_ROUTERS:
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(page_router())
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=list(HOSTS))
+    app.add_middleware(LocalNames)
     return app
 
 

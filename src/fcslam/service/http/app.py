@@ -11,6 +11,7 @@ import fcslam
 from fcslam.service.http.decisions import decision_router
 from fcslam.service.http.event_stream import event_router
 from fcslam.service.http.limits import CONTENT
+from fcslam.service.http.local_names import LocalNames
 from fcslam.service.http.missions import file_router, mission_router
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
@@ -37,8 +38,11 @@ class Service(FastAPI):
         return described
 
 
-def create_app(state: ServiceState, more: Sequence[APIRouter] = ()) -> FastAPI:
-    """The service; ``more`` routers come from rooms that this one does not know. Closes the missions at its end."""
+def create_app(state: ServiceState, more: Sequence[APIRouter] = (), local_names: bool = False) -> FastAPI:
+    """The service; ``more`` routers come from rooms that this one does not know. Closes the missions at its end.
+
+    With ``local_names``, it refuses requests that do not name the machine by an address or as localhost.
+    """
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -61,6 +65,8 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = ()) -> FastAPI:
     app.include_router(operations_router(state))
     for router in more:
         app.include_router(router)
+    if local_names:
+        app.add_middleware(LocalNames)
     app.add_middleware(_Watch, state=state)
     return app
 

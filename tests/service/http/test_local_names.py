@@ -1,0 +1,37 @@
+"""A web page whose name points to this machine is no name of this machine."""
+
+import asyncio
+
+import httpx
+import pytest
+
+from fcslam.service.http.local_names import LocalNames, is_local_name
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost", "localhost:8340", "127.0.0.1:80", "[::1]:8340", "192.168.1.7", "[fe80::1]"]
+)
+def test_addresses_and_localhost_are_local(host):
+    assert is_local_name(host)
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["", "evil.example", "localhost.evil.example", "127.0.0.1.evil.example:80", "[::1", "a@b:c", "localhost@evil"],
+)
+def test_other_names_are_not(host):
+    assert not is_local_name(host)
+
+
+@pytest.mark.parametrize(("host", "status"), [("localhost:1", 204), ("evil.example", 421)])
+def test_they_get_no_further(host, status):
+    async def app(scope, receive, send):
+        await send({"type": "http.response.start", "status": 204, "headers": []})
+        await send({"type": "http.response.body"})
+
+    async def ask():
+        transport = httpx.ASGITransport(app=LocalNames(app))
+        async with httpx.AsyncClient(transport=transport, base_url=f"http://{host}") as client:
+            return await client.get("/")
+
+    assert asyncio.run(ask()).status_code == status
