@@ -68,14 +68,14 @@ def test_no_zoom_is_finer_than_the_cells():
 @pytest.fixture
 def read(monkeypatch):
     """The stems of the maps that were read, and no map in memory before."""
-    stems, parse = [], tiles.parse_map
+    stems, parse = [], tiles.parse_image
 
     def parsed(stem, *files):
         stems.append(stem)
         time.sleep(0.05)
         return parse(stem, *files)
 
-    monkeypatch.setattr(tiles, "parse_map", parsed)
+    monkeypatch.setattr(tiles, "parse_image", parsed)
     monkeypatch.setattr(tiles, "_kept", type(tiles._kept)())
     return stems
 

@@ -73,8 +73,8 @@ def _run_folder(run: Path, console: "Console") -> Iterator[Path]:
     Raises:
         InputError: there is no run, it is too large, or it is damaged.
     """
+    from fcslam.runs import open_run
     from fcslam.runs.folder import is_run_folder
-    from fcslam.service.viewed_mission import viewed_run
 
     if run.is_file():
         with _mapped(run, console) as folder:
@@ -82,7 +82,7 @@ def _run_folder(run: Path, console: "Console") -> Iterator[Path]:
         return
     if is_run_folder(run):
         _check_size(run)
-    _ = viewed_run(run.resolve()).maps  # refuses a damaged run, and what is none
+    _ = open_run(run).maps  # refuses a damaged run, and what is none
     yield run
 
 

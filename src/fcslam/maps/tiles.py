@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.runs.folder import identity
-from fcslam.runs.map_files import PIXELS, Occupancy, parse_map, pixels_of
+from fcslam.runs.map_files import PIXELS, Occupancy, parse_image, pixels_of
 
 WORLD_M = 512.0
 """Side of a tile at zoom 0; each zoom halves it."""
@@ -88,15 +88,17 @@ def _pyramid(folder: Path, stem: str) -> _Pyramid:
 
 def _read(folder: Path, stem: str) -> _Pyramid:
     pgm, description = (folder / f"{stem}.pgm").read_bytes(), (folder / f"{stem}.yaml").read_text(encoding="utf-8")
-    occupancy = parse_map(stem, pgm, description)
-    levels = [pixels_of(occupancy.cells)]
-    for _ in range(math.floor(math.log2(max(WORLD_M / TILE_PX / occupancy.resolution_m, 1.0)))):
+    image = parse_image(stem, pgm, description)
+    levels: list[NDArray[np.uint8]] = [cv2.LUT(image.pixels, pixels_of(image.meaning))]
+    for _ in range(math.floor(math.log2(max(WORLD_M / TILE_PX / image.resolution_m, 1.0)))):
         levels.append(_halved(levels[-1]))
-    return _Pyramid(levels, occupancy.resolution_m, np.array(occupancy.origin_xy))
+    return _Pyramid(levels, image.resolution_m, np.array(image.origin_xy))
 
 
 def _halved(finer: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height, width = finer.shape
-    even = np.pad(finer, ((0, height % 2), (0, width % 2)), constant_values=PIXELS[Occupancy.UNKNOWN])
+    even = finer
+    if height % 2 or width % 2:
+        even = np.pad(finer, ((0, height % 2), (0, width % 2)), constant_values=PIXELS[Occupancy.UNKNOWN])
     coarser: NDArray[np.uint8] = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     return coarser

@@ -19,9 +19,9 @@ from fcslam.maps.tiles import WORLD_M, finest_zoom
 from fcslam.page.routes import ASSETS
 from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.records import ClosureStatus
-from fcslam.runs import OccupancyMap
+from fcslam.runs import OccupancyMap, open_run
 from fcslam.service.http.app import PREFIX
-from fcslam.service.viewed_mission import ViewedMission, viewed_run
+from fcslam.service.viewed_mission import ViewedMission
 
 ASKED = (
     "fleet", "maps", "separations", "robots", "edits", "metrics.json", "config.yaml",
@@ -46,7 +46,7 @@ def report_html(mission: ViewedMission) -> str:
 
 
 def _maps(mission: ViewedMission) -> dict[int, OccupancyMap]:
-    return {} if mission.run_folder is None else dict(viewed_run(mission.run_folder).maps)
+    return {} if mission.run_folder is None else dict(open_run(mission.run_folder).maps)
 
 
 async def _responses(app: FastAPI, maps: dict[int, OccupancyMap]) -> dict[str, dict[str, str]]:

@@ -164,8 +164,12 @@ def identity(folder: Path) -> tuple[int, int]:
     return found.st_ino, found.st_mtime_ns
 
 
-def open_run(folder: str | os.PathLike[str]) -> Run:
+def open_run(folder: str | os.PathLike[str], maps: bool = True) -> Run:
     """Read a run folder back; files are read, never executed.
+
+    Args:
+        folder: the run folder.
+        maps: read the maps and the mission file too, which may be large.
 
     Raises:
         EvaluationError: ``folder`` is no run folder, or a file of it is missing or broken.
@@ -176,16 +180,16 @@ def open_run(folder: str | os.PathLike[str]) -> Run:
             f"{path}: no run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one"
         )
     try:
-        maps = read_robots(path / ROBOTS)
+        robots = read_robots(path / ROBOTS)
         return Run(
-            trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in maps.items()},
+            trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()},
             closures=read_closures(path / CLOSURES),
             metrics=read_metrics(path / METRICS),
             config_yaml=(path / CONFIG).read_text(encoding="utf-8"),
             pose_graph_g2o=(path / POSE_GRAPH).read_text(encoding="utf-8"),
-            map_files={file.name: file.read_bytes() for file in sorted(path.glob("map*.*"))},
-            local_maps=_read_local_maps(path / LOCAL, maps),
-            mission=(path / MISSION).read_bytes() if (path / MISSION).exists() else b"",
+            map_files={file.name: file.read_bytes() for file in sorted(path.glob("map*.*")) if maps},
+            local_maps=_read_local_maps(path / LOCAL, robots) if maps else {},
+            mission=(path / MISSION).read_bytes() if maps and (path / MISSION).exists() else b"",
             localized={file.stem: read_localized(file) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
     except (OSError, ValueError, csv.Error) as error:

@@ -83,6 +83,26 @@ def map_yaml(occupancy: OccupancyMap, image: str) -> str:
     return text
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MapImage:
+    """The image of a map, and what its pixels mean."""
+
+    pixels: NDArray[np.uint8]
+    """Shape (H, W), row 0 at the lowest y; a view of the file's content."""
+    meaning: NDArray[np.uint8]
+    """``Occupancy`` by pixel, shape (256,)."""
+    resolution_m: float
+    origin_xy: tuple[float, float]
+
+
+def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
+    """As ``parse_map``, without a copy of the image, which may be large."""
+    try:
+        return _image(pgm, description)
+    except ValueError as error:
+        raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
+
+
 def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
     """Read back what ``pgm_bytes`` and ``map_yaml`` wrote; also what map_server saves in the mode trinary.
 
@@ -95,10 +115,10 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
         EvaluationError: the image is no binary PGM of its stated size, or the description is incomplete, contains a
             number that is out of range, or rotates or negates the image.
     """
-    try:
-        return _parsed(pgm, description)
-    except ValueError as error:
-        raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
+    image = parse_image(name, pgm, description)
+    # Bytes by bytes: an index array would take eight times as much memory as the image.
+    cells = np.frombuffer(image.pixels.tobytes().translate(image.meaning.tobytes()), np.uint8)
+    return OccupancyMap(frozen(cells.reshape(image.pixels.shape), np.uint8), image.resolution_m, image.origin_xy)
 
 
 def resolution_of(name: str, description: str) -> float:
@@ -109,7 +129,7 @@ def resolution_of(name: str, description: str) -> float:
         raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
 
 
-def _parsed(pgm: bytes, description: str) -> OccupancyMap:
+def _image(pgm: bytes, description: str) -> MapImage:
     header = _PGM_HEADER.match(pgm)
     if header is None:
         raise ValueError("the image is not a binary PGM of 8 bits")
@@ -121,9 +141,8 @@ def _parsed(pgm: bytes, description: str) -> OccupancyMap:
     known = np.full(256, Occupancy.UNKNOWN, np.uint8)
     known[occupancy < free_threshold] = Occupancy.FREE
     known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
-    # Bytes by bytes: an index array would take eight times as much memory as the image.
-    cells = np.frombuffer(pgm[header.end() :].translate(known.tobytes()), np.uint8).reshape(height, width)
-    return OccupancyMap(frozen(cells[::-1], np.uint8), resolution_m, origin_xy)
+    pixels = np.frombuffer(pgm, np.uint8, offset=header.end()).reshape(height, width)
+    return MapImage(frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy)
 
 
 def _described(description: str) -> tuple[float, tuple[float, float], float, float]:

@@ -47,7 +47,7 @@ class ViewedMission(Protocol):
 
 
 def viewed_run(folder: Path) -> Run:
-    """The run in a ``run_folder`` of a viewed mission.
+    """The run in a ``run_folder`` of a viewed mission, without its maps.
 
     Raises:
         EvaluationError: it is broken, or not there any more.
@@ -57,4 +57,4 @@ def viewed_run(folder: Path) -> Run:
 
 @lru_cache(maxsize=4)
 def _read(folder: Path, _: tuple[int, int] | None) -> Run:
-    return open_run(folder)
+    return open_run(folder, maps=False)

@@ -150,10 +150,9 @@ def map_router(state: ViewerState) -> APIRouter:
     @router.get("/maps")
     def get_maps() -> list[MapSummary]:
         """The robots of each map."""
-        run = _run_of(state)
-        robots = run.trajectories.values()
+        robots, folder = _run_of(state).trajectories.values(), state.mission.run_folder
         return [
-            MapSummary(map=k, floor=floor, robots=[r.robot for r in robots if r.map_index == k], zoom=_zoom(run, k))
+            MapSummary(map=k, floor=floor, robots=[r.robot for r in robots if r.map_index == k], zoom=_zoom(folder, k))
             for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
         ]
 
@@ -330,9 +329,12 @@ def _detectors(store: MissionStore, robot: str, epoch: int) -> dict[Channel, str
     return dict(body.detector_versions) if isinstance(body, Hello) else {}
 
 
-def _zoom(run: Run, k: int) -> int:
-    description = run.map_files.get(f"{map_stem(k)}.yaml")
-    return 0 if description is None else finest_zoom(resolution_of(map_stem(k), description.decode(errors="replace")))
+def _zoom(folder: Path | None, k: int) -> int:
+    """The finest zoom of a map; 0 if there is no map yet."""
+    description = None if folder is None else folder / f"{map_stem(k)}.yaml"
+    if description is None or not description.exists():
+        return 0
+    return finest_zoom(resolution_of(map_stem(k), description.read_text(encoding="utf-8", errors="replace")))
 
 
 def _closure(closure: ClosureRow) -> ClosureSummary:
