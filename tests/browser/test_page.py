@@ -87,6 +87,20 @@ def painted(page):
     )
 
 
+def coloured(page):
+    """Pixels of the map's canvas that are not grey: paths, robots and closures."""
+    return page.evaluate(
+        """() => {
+            const canvas = document.getElementById("map"), pen = canvas.getContext("2d");
+            const pixels = pen.getImageData(0, 0, canvas.width, canvas.height).data;
+            let count = 0;
+            for (let k = 0; k < pixels.length; k += 4)
+                count += pixels[k] !== pixels[k + 1] || pixels[k] !== pixels[k + 2];
+            return count;
+        }"""
+    )
+
+
 @pytest.fixture(scope="module")
 def mapped(packets, tmp_path_factory):
     """A service that anybody may change, with three robots in one map."""
@@ -133,6 +147,12 @@ def test_a_veto_separates_maps_and_its_undo_joins_them_again(page, packets, tmp_
                 "the veto",
             )
         assert page.locator("#separations li").count() == 1
+        pictures = page.locator("#previews button")
+        assert pictures.count() == 2
+        for number in (1, 0):
+            pictures.nth(number).click()
+            assert page.locator("#maps").input_value() == str(number)
+            assert pictures.nth(number).get_attribute("aria-pressed") == "true"
         for number in range(1, vetoes + 1):
             page.get_by_role("button", name=f"Undo edit {number}", exact=True).click()
         until(page, lambda: options(page, "#maps") == ["0: robot_1, robot_2"], "one map again")
@@ -148,6 +168,22 @@ def test_a_closure_is_selected_on_the_map_and_shows_both_submaps(page, mapped):
             break
     says(page, "#facts-of-closure", "Similarity")
     playwright.expect(page.locator("#overlay")).to_be_visible(timeout=WAIT_MS)
+
+
+def test_the_past_of_a_mission_is_shown(page, mapped):
+    page.goto(mapped.url)
+    until(page, lambda: page.locator("#list option").count() > 0 and painted(page) >= 3, "the map")
+    page.wait_for_timeout(1000)
+    now = coloured(page)
+    page.locator("#moment").fill("10")
+    told = re.search(r"(\d+) of (\d+) keyscans, (\d+) of (\d+) closures", page.locator("#until").inner_text())
+    shown, total, closures, accepted = map(int, told.groups())
+    assert shown == -(-total // 100)
+    assert closures < accepted
+    until(page, lambda: coloured(page) < now / 4, "paths that end in the past")
+    page.locator("#moment").fill("1000")
+    says(page, "#until", "now")
+    until(page, lambda: coloured(page) == now, "the paths of now")
 
 
 def test_the_page_recovers_when_the_service_is_killed_and_comes_back(page, packets, tmp_path):

@@ -4,7 +4,7 @@ import math
 import re
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import yaml
@@ -20,6 +20,10 @@ FREE_THRESHOLD: Final = 0.196
 
 _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*([1-9]\d{0,6})\s+([1-9]\d{0,6})\s+255\s")
 """Width, height; other programs write a comment after the first line."""
+
+
+HEADER_BYTES: Final = 4096
+"""Of an image: comments that are longer are not read."""
 
 
 class Occupancy(IntEnum):
@@ -95,6 +99,14 @@ class MapImage:
     origin_xy: tuple[float, float]
 
 
+class MapArea(NamedTuple):
+    """What a map covers."""
+
+    resolution_m: float
+    extent_m: tuple[float, float, float, float]
+    """Lowest x and y, highest x and y."""
+
+
 def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
     """As ``parse_map``, without a copy of the image, which may be large."""
     try:
@@ -121,28 +133,38 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
     return OccupancyMap(frozen(cells.reshape(image.pixels.shape), np.uint8), image.resolution_m, image.origin_xy)
 
 
-def resolution_of(name: str, description: str) -> float:
-    """The side of a cell in metres, by the content of the YAML file; ``name`` and errors as for ``parse_map``."""
+def area_of(name: str, header: bytes, description: str) -> MapArea:
+    """What a map covers, by the first ``HEADER_BYTES`` of its image and the content of the YAML file.
+
+    ``name`` and errors as for ``parse_map``.
+    """
     try:
-        return _described(description)[0]
+        width, height, _ = _size(header)
+        resolution_m, (x, y), *_ = _described(description)
     except ValueError as error:
         raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
+    return MapArea(resolution_m, (x, y, x + width * resolution_m, y + height * resolution_m))
 
 
 def _image(pgm: bytes, description: str) -> MapImage:
-    header = _PGM_HEADER.match(pgm)
-    if header is None:
-        raise ValueError("the image is not a binary PGM of 8 bits")
-    width, height = map(int, header.groups())
-    if len(pgm) - header.end() != width * height:
-        raise ValueError(f"the image has {len(pgm) - header.end()} pixels, not {width} x {height}")
+    width, height, begin = _size(pgm)
+    if len(pgm) - begin != width * height:
+        raise ValueError(f"the image has {len(pgm) - begin} pixels, not {width} x {height}")
     resolution_m, origin_xy, occupied_threshold, free_threshold = _described(description)
     occupancy = (255 - np.arange(256)) / 255.0
     known = np.full(256, Occupancy.UNKNOWN, np.uint8)
     known[occupancy < free_threshold] = Occupancy.FREE
     known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
-    pixels = np.frombuffer(pgm, np.uint8, offset=header.end()).reshape(height, width)
+    pixels = np.frombuffer(pgm, np.uint8, offset=begin).reshape(height, width)
     return MapImage(frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy)
+
+
+def _size(pgm: bytes) -> tuple[int, int, int]:
+    """Width and height of the image, and where its pixels begin."""
+    header = _PGM_HEADER.match(pgm)
+    if header is None:
+        raise ValueError("the image is not a binary PGM of 8 bits")
+    return int(header[1]), int(header[2]), header.end()
 
 
 def _described(description: str) -> tuple[float, tuple[float, float], float, float]:

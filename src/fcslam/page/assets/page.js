@@ -42,7 +42,8 @@ const json = async (path) => (await ask(path)).json();
 
 let version = 0, release = null, readOnly = false;
 let robots = [], accepted = [], listed = [], selected = null, followed = null;
-let trails = new Map(), zooms = new Map(), regions = [];
+let trails = new Map(), maps = [], regions = [];
+let until = Infinity; // the moment that paths and closures are shown of
 const hidden = new Set(); // sessions whose paths are not drawn
 
 // Paths grow, and older poses seldom move: the service sends what follows the bytes that the page has.
@@ -83,12 +84,12 @@ async function update(number) {
   const counts = await json("fleet");
   release ??= counts.version;
   if (counts.version !== release) { at("reload").hidden = false; throw new Error("The service has another version: reload the page."); }
-  const [maps, apart, fleet, closures, edits] = await Promise.all([json("maps"), json("separations"), json("robots"), json("closures?status=accepted&limit=5000"), json("edits")]);
+  const [now, apart, fleet, closures, edits] = await Promise.all([json("maps"), json("separations"), json("robots"), json("closures?status=accepted&limit=5000"), json("edits")]);
   const seen = fleet.filter((r) => r.T_map_base);
   const paths = await Promise.all(seen.map((r) => trail(r.session)));
   trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
-  zooms = new Map(maps.map((m) => [m.map, m.zoom]));
-  if (!zooms.has(mapIndex)) mapIndex = maps[0]?.map ?? 0;
+  maps = now;
+  if (!maps.some((m) => m.map === mapIndex)) mapIndex = maps[0]?.map ?? 0;
   readOnly = counts.read_only; robots = fleet;
   const of = new Map(fleet.map((r) => [r.session, r.map]));
   accepted = closures.map((c) => placed(c, of));
@@ -96,11 +97,11 @@ async function update(number) {
   document.title = `fcslam: ${counts.mission}`;
   for (const element of document.querySelectorAll(".live")) element.hidden = readOnly;
   regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);
-  showMaps(maps, apart); showRobots(counts); showPairs(); showEdits(edits);
+  showMaps(apart); showRobots(counts); showPairs(); showEdits(edits);
   tellChanges({ maps, robots, accepted, edits });
   await refreshClosures();
   const leader = robots.find((r) => r.session === followed);
-  if (leader?.T_map_base && view) { mapIndex = leader.map; at("maps").value = mapIndex; [view.x, view.y] = leader.T_map_base; }
+  if (leader?.T_map_base && view) { openMap(leader.map); [view.x, view.y] = leader.T_map_base; }
   if (!moved && !followed) fit();
   redraw();
 }
@@ -127,16 +128,26 @@ function fill(list, content, children) {
   list.replaceChildren(...children());
 }
 
-function showMaps(maps, apart) {
+function showMaps(apart) {
   const label = (m) => `${m.map}${m.floor && `, floor ${m.floor}`}: ${m.robots.join(", ")}`;
-  fill(at("maps"), maps, () => maps.map((m) => new Option(label(m), m.map)));
-  at("maps").value = mapIndex;
+  fill(at("maps"), maps.map(label), () => maps.map((m) => new Option(label(m), m.map)));
+  at("previews").hidden = maps.length < 2;
+  fill(at("previews"), maps.map(label), () => maps.map((m) => {
+    const button = element("button", element("canvas", "", { width: 280, height: 200 }), { title: label(m) });
+    button.dataset.map = m.map;
+    button.append(`map ${m.map}`);
+    button.addEventListener("click", () => choose(m.map));
+    return button;
+  }));
+  openMap(mapIndex);
   at("separations").replaceChildren(...apart.map((s) => element("li", s.explanation)));
 }
 
 function stateOf(robot) {
   if (robot.removed) return "removed";
-  const where = robot.map === null ? "no map yet" : `map ${robot.map}${robot.floor && `, floor ${robot.floor}`}`;
+  const confirmed = robot.quality > 0 ? `, others confirm its pose (quality ${(100 * robot.quality).toFixed(0)} %)` : "";
+  const where = robot.map === null ? "no map yet" : `map ${robot.map}${robot.floor && `, floor ${robot.floor}`}${confirmed}`;
+  if (robots.some((r) => r.robot === robot.robot && r.epoch > robot.epoch)) return `${where}, ended: the robot was lost or started again`;
   if (readOnly) return where;
   if (robot.last_heard_s === null) return `${where}, not heard`;
   return `${where}, ${robot.last_heard_s < LIVE_S ? "live" : "offline"}, heard ${robot.last_heard_s.toFixed(0)} s ago`;
@@ -311,29 +322,70 @@ async function facts() {
 const canvas = at("map"), pen = canvas.getContext("2d"), tiles = new Map();
 let view = null, mapIndex = 0, queued = false, moved = false; // until the user moves the map, all of it is shown
 
-function fit() {
-  const points = robots.filter((r) => r.map === mapIndex).flatMap((r) => trails.get(r.session) ?? []);
-  if (!points.length) return;
+// The view of all paths of a map; undefined if there are none.
+function whole(index, width, height) {
   const low = [Infinity, Infinity], high = [-Infinity, -Infinity];
-  for (const p of points) for (const k of [0, 1]) { low[k] = Math.min(low[k], p[1 + k]); high[k] = Math.max(high[k], p[1 + k]); }
-  const scale = Math.min(canvas.clientWidth / (high[0] - low[0] + 10), canvas.clientHeight / (high[1] - low[1] + 10));
-  view = { x: (low[0] + high[0]) / 2, y: (low[1] + high[1]) / 2, scale };
+  for (const robot of robots) for (const p of robot.map === index ? trails.get(robot.session) ?? [] : [])
+    for (const k of [0, 1]) { low[k] = Math.min(low[k], p[1 + k]); high[k] = Math.max(high[k], p[1 + k]); }
+  if (low[0] > high[0]) return undefined;
+  const scale = Math.min(width / (high[0] - low[0] + 10), height / (high[1] - low[1] + 10));
+  return { x: (low[0] + high[0]) / 2, y: (low[1] + high[1]) / 2, scale };
 }
+function fit() { view = whole(mapIndex, canvas.clientWidth, canvas.clientHeight) ?? view; }
+function openMap(index) {
+  mapIndex = index;
+  at("maps").value = index;
+  for (const button of at("previews").children) button.ariaPressed = String(Number(button.dataset.map) === index);
+}
+function choose(index) { openMap(index); moved = false; followed = null; fit(); redraw(); }
+
+// Until the moment: the poses of a path, and whether a closure was possible.
+const pathOf = (name) => (trails.get(name) ?? []).filter((p) => p[0] <= until);
+const isPast = (c) => Math.max(c.stamp_i, c.stamp_j) <= until;
 
 // metres to pixels of the canvas
 const onScreen = (x, y) => [canvas.clientWidth / 2 + (x - view.x) * view.scale, canvas.clientHeight / 2 - (y - view.y) * view.scale];
 
 // The newest picture of a tile; while another version of the map is on its way, that of the last one.
-function tile(z, x, y) {
-  const key = `${mapIndex}/${z}/${x}/${y}`;
+function tile(index, z, x, y) {
+  const key = `${index}/${z}/${x}/${y}`;
   const kept = tiles.get(key) ?? { picture: null, version: -1 };
   tiles.delete(key); tiles.set(key, kept); // the last one of all: those that are not drawn leave first
   if (kept.version !== version) {
     const asked = kept.version = version;
-    ask(`maps/${mapIndex}/tiles/${z}/${x}/${y}.png`).then((a) => a.blob()).then(createImageBitmap)
-      .then((picture) => { if (kept.version === asked || !kept.picture) { kept.picture = picture; redraw(); } }).catch(() => { kept.version = -1; });
+    ask(`maps/${index}/tiles/${z}/${x}/${y}.png`).then((a) => a.blob()).then(createImageBitmap)
+      .then((picture) => { if (kept.version === asked || !kept.picture) { kept.picture = picture; redraw(); } })
+      .catch(() => { if (!report) setTimeout(() => { kept.version = -1; redraw(); }, RETRY_MS); }); // a report has no more of them
   }
   return kept.picture;
+}
+
+// Draws the tiles of a map that are in a view; returns their number.
+function drawTiles(pen, index, { x, y, scale }, w, h) {
+  const map = maps.find((m) => m.map === index);
+  if (!map?.extent) return 0;
+  const z = Math.max(0, Math.min(map.zoom, Math.round(Math.log2(scale * WORLD_M / TILE_PX)))), side = WORLD_M / 2 ** z;
+  const seen = [x - w / 2 / scale, y - h / 2 / scale, x + w / 2 / scale, y + h / 2 / scale];
+  const low = [0, 1].map((k) => Math.floor(Math.max(seen[k], map.extent[k]) / side)), high = [2, 3].map((k) => Math.min(seen[k], map.extent[k]));
+  let drawn = 0;
+  for (let u = low[0]; u * side < high[0]; u++)
+    for (let v = low[1]; v * side < high[1]; v++) {
+      drawn++;
+      const picture = tile(index, z, u, v);
+      if (picture) pen.drawImage(picture, w / 2 + (u * side - x) * scale, h / 2 - ((v + 1) * side - y) * scale, side * scale, side * scale);
+    }
+  return drawn;
+}
+
+// Small pictures of all maps, if there are several; returns the number of their tiles.
+function drawPreviews() {
+  let drawn = 0;
+  if (!at("previews").hidden) for (const button of at("previews").children) {
+    const small = button.firstChild, brush = small.getContext("2d"), index = Number(button.dataset.map), all = whole(index, small.width, small.height);
+    brush.clearRect(0, 0, small.width, small.height);
+    if (all) drawn += drawTiles(brush, index, all, small.width, small.height);
+  }
+  return drawn;
 }
 
 function redraw() { if (!queued) { queued = true; requestAnimationFrame(draw); } }
@@ -345,23 +397,18 @@ function draw() {
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, w, h);
   if (!view) return;
-  const z = Math.max(0, Math.min(zooms.get(mapIndex) ?? 0, Math.round(Math.log2(view.scale * WORLD_M / TILE_PX)))), side = WORLD_M / 2 ** z;
-  let drawn = 0;
-  for (let x = Math.floor((view.x - w / 2 / view.scale) / side); x * side < view.x + w / 2 / view.scale; x++)
-    for (let y = Math.floor((view.y - h / 2 / view.scale) / side); y * side < view.y + h / 2 / view.scale; y++) {
-      drawn++;
-      const picture = tile(z, x, y);
-      if (picture) pen.drawImage(picture, ...onScreen(x * side, (y + 1) * side), side * view.scale, side * view.scale);
-    }
+  const drawn = drawPreviews() + drawTiles(pen, mapIndex, view, w, h);
   // A tile in view stays, or each drawing would ask for it again.
   for (const key of tiles.keys()) { if (tiles.size <= Math.max(MOST_TILES, drawn)) break; tiles.delete(key); }
   pen.globalAlpha = 0.4;
-  if (at("shown").checked) for (const channel of Object.keys(CLOSURE)) lines(accepted.filter((c) => c.channel === channel && c.map === mapIndex).map((c) => c.ends), CLOSURE[channel], 1);
+  if (at("shown").checked) for (const channel of Object.keys(CLOSURE)) lines(accepted.filter((c) => c.channel === channel && c.map === mapIndex && isPast(c)).map((c) => c.ends), CLOSURE[channel], 1);
   pen.globalAlpha = 1;
   for (const robot of robots) {
     if (robot.map !== mapIndex || !robot.T_map_base || hidden.has(robot.session)) continue;
-    const colour = colourOf(robot.session), [x, y, heading] = robot.T_map_base, [px, py] = onScreen(x, y);
-    lines([(trails.get(robot.session) ?? []).map((p) => [p[1], p[2]])], colour);
+    const colour = colourOf(robot.session), path = pathOf(robot.session);
+    if (!path.length) continue;
+    const [x, y, heading] = until === Infinity ? robot.T_map_base : path.at(-1).slice(1), [px, py] = onScreen(x, y);
+    lines([path.map((p) => [p[1], p[2]])], colour);
     pen.save(); pen.translate(px, py); pen.rotate(-heading); pen.fillStyle = colour;
     pen.beginPath(); pen.moveTo(11, 0); pen.lineTo(-7, 6); pen.lineTo(-7, -6); pen.fill(); pen.restore();
   }
@@ -399,7 +446,7 @@ function closureAt(x, y) {
   if (!view || !at("shown").checked) return undefined;
   let best = CLICK_PX, found;
   for (const c of accepted) {
-    if (c.map !== mapIndex) continue;
+    if (c.map !== mapIndex || !isPast(c)) continue;
     const [[ax, ay], [bx, by]] = c.ends.map((end) => onScreen(end[0], end[1]));
     const along = Math.max(0, Math.min(1, ((x - ax) * (bx - ax) + (y - ay) * (by - ay)) / ((bx - ax) ** 2 + (by - ay) ** 2 || 1)));
     const off = Math.hypot(x - ax - along * (bx - ax), y - ay - along * (by - ay));
@@ -446,7 +493,16 @@ canvas.addEventListener("keydown", (e) => {
   const keys = { ArrowLeft: () => pan(60, 0), ArrowRight: () => pan(-60, 0), ArrowUp: () => pan(0, 60), ArrowDown: () => pan(0, -60), "+": () => zoom(1.4), "-": () => zoom(1 / 1.4), 0: () => { moved = false; fit(); redraw(); } };
   if (keys[e.key]) { e.preventDefault(); keys[e.key](); }
 });
-at("maps").addEventListener("change", (e) => { mapIndex = Number(e.target.value); moved = false; followed = null; fit(); redraw(); });
+at("maps").addEventListener("change", (e) => choose(Number(e.target.value)));
+// Each step of the slider passes equally many keyscans: robots may drive days apart.
+at("moment").addEventListener("input", (e) => {
+  const stamps = [...trails.values()].flatMap((path) => path.map((p) => p[0])).sort((a, b) => a - b), share = e.target.value / e.target.max;
+  const count = Math.ceil(share * stamps.length);
+  until = share === 1 || !stamps.length ? Infinity : stamps[Math.max(0, count - 1)];
+  e.target.ariaValueText = until === Infinity ? "now" : `${until.toFixed(1)} s`;
+  at("until").textContent = until === Infinity ? "Paths and closures are those of now." : `Until ${until.toFixed(1)} s: ${count} of ${stamps.length} keyscans, ${accepted.filter(isPast).length} of ${accepted.length} closures.`;
+  redraw();
+});
 at("shown").addEventListener("change", redraw);
 at("state").addEventListener("change", () => refreshClosures().catch(fail));
 at("list").addEventListener("change", (e) => select(listed.find((c) => keyOf(c) === e.target.value)));

@@ -128,6 +128,9 @@ class MapSummary(Settings):
     floor: str = Field(description="floor that its robots named; empty: none")
     robots: list[str]
     zoom: int = Field(description="of the tiles that show every cell; deeper ones show nothing more")
+    extent: tuple[float, float, float, float] | None = Field(
+        description="lowest x and y, highest x and y that the map covers, in metres; null before there is a map"
+    )
 
 
 class MapSeparation(Settings):

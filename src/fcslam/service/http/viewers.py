@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi import Path as PathParameter
@@ -20,7 +20,7 @@ from fcslam.errors import EvaluationError
 from fcslam.maps.tiles import DEEPEST_ZOOM, finest_zoom, tile_png
 from fcslam.records import Channel, ClosureStatus, Edit
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES, ClosureRow, Run, separations
-from fcslam.runs.map_files import map_stem, resolution_of
+from fcslam.runs.map_files import HEADER_BYTES, area_of, map_stem
 from fcslam.service.closure_submaps import overlay_png
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.responses import (
@@ -152,7 +152,9 @@ def map_router(state: ViewerState) -> APIRouter:
         """The robots of each map."""
         robots, folder = _run_of(state).trajectories.values(), state.mission.run_folder
         return [
-            MapSummary(map=k, floor=floor, robots=[r.robot for r in robots if r.map_index == k], zoom=_zoom(folder, k))
+            MapSummary(
+                map=k, floor=floor, robots=[r.robot for r in robots if r.map_index == k], **_tiling(folder, map_stem(k))
+            )
             for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
         ]
 
@@ -329,12 +331,14 @@ def _detectors(store: MissionStore, robot: str, epoch: int) -> dict[Channel, str
     return dict(body.detector_versions) if isinstance(body, Hello) else {}
 
 
-def _zoom(folder: Path | None, k: int) -> int:
-    """The finest zoom of a map; 0 if there is no map yet."""
-    description = None if folder is None else folder / f"{map_stem(k)}.yaml"
-    if description is None or not description.exists():
-        return 0
-    return finest_zoom(resolution_of(map_stem(k), description.read_text(encoding="utf-8", errors="replace")))
+def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:
+    """Zoom and extent of a map as in ``MapSummary``."""
+    if folder is None or not (folder / f"{stem}.yaml").exists():
+        return {"zoom": 0, "extent": None}
+    with (folder / f"{stem}.pgm").open("rb") as image:
+        header = image.read(HEADER_BYTES)
+    area = area_of(stem, header, (folder / f"{stem}.yaml").read_text(encoding="utf-8", errors="replace"))
+    return {"zoom": finest_zoom(area.resolution_m), "extent": area.extent_m}
 
 
 def _closure(closure: ClosureRow) -> ClosureSummary:
