@@ -152,18 +152,30 @@ def part(folder: Path, log: str, work: Path) -> tuple:
 
 
 def wean_hall(folder: Path, work: Path) -> Iterable[tuple]:
-    paths = {Path(log).name.split(".")[0]: folder / log for log in WEAN_HALL}
-    together = fcslam.map_recordings(paths)
-    for name, path in paths.items():
-        others = fcslam.map_recordings({n: p for n, p in paths.items() if n != name}, output=work / f"without-{name}")
-        run, _ = localized(sources.open_source(path), work / f"without-{name}")
-        common_robot = next(n for n in paths if n != name)
-        T_map_all = align(*(r.trajectories[common_robot].T_map_base for r in (others, together)))
-        truth = together.trajectories[name]
-        moved = se2.compose(T_map_all, truth.T_map_base[np.searchsorted(truth.stamps, run.trajectories[name].stamps)])
-        off = np.hypot(*(moved - run.trajectories[name].T_map_base)[:, :2].T)
-        largest = off.max(initial=0.0)
-        yield name, *found(run), truth.path_length_m, float(np.median(off)), largest, int((off > WRONG_M).sum())
+    recordings = [sources.open_source(folder / log) for log in WEAN_HALL]
+    together = fcslam.map_recordings(recordings)
+    for own in recordings:
+        run, off = in_map_of_others(recordings, own, together, work)
+        believed = np.hypot(*off[run.localized[own.name].is_localized, :2].T)
+        largest, wrong = believed.max(initial=0.0), int((believed > WRONG_M).sum())
+        driven_m = together.trajectories[own.name].path_length_m
+        yield own.name, *found(run), driven_m, float(np.median(believed)), largest, wrong
+
+
+def in_map_of_others(
+    recordings: Sequence[sources.Source], own: sources.Source, together: Run, work: Path
+) -> tuple[Run, FloatArray]:
+    """A robot localised in the map of the others, and how far each scan is from its pose in the map of all, (N, 3).
+
+    The map of all is moved onto that of the others by a robot that is in both.
+    """
+    others = [recording for recording in recordings if recording.name != own.name]
+    mapped = fcslam.map_recordings(others, output=work / f"without-{own.name}")
+    run, _ = localized(own, work / f"without-{own.name}")
+    T_map_all = align(*(each.trajectories[others[0].name].T_map_base for each in (mapped, together)))
+    poses, truth = run.localized[own.name], together.trajectories[own.name]
+    moved = se2.compose(T_map_all, truth.T_map_base[np.searchsorted(truth.stamps, poses.stamps)])
+    return run, se2.between(moved, poses.T_map_base)
 
 
 def strangers(folder: Path, logs: Sequence[str], mapped: str, work: Path) -> Iterable[tuple]:
