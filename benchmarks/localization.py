@@ -12,7 +12,8 @@ map of all five runs, moved onto that map by a robot that is in both.
 
 **Carried away**: a simulated robot is put down at least 10 m away and turned by at least 30 degrees; its wheels never
 notice. The map is that of three other robots. After each fix the robot must be within 0.5 m of the truth; "believed
-wrongly" counts the metres that it drove from then on until it noticed that it is elsewhere.
+wrongly" counts the metres that it drove from then on until it noticed that it is elsewhere; "in known area" those where
+the map knows at least half of the walls in its sight. Who drives in unknown area only cannot be found.
 
 Without FCSLAM_DATA only the last part runs. Seeds below 100 chose the settings.
 """
@@ -41,6 +42,7 @@ from fcslam.localization import read_map
 from fcslam.metrics.trajectory import align
 from fcslam.records import FloatArray, LaserScan, SensorRecord
 from fcslam.runs import LocalizedPoses, Run
+from fcslam.runs.map_files import Occupancy, OccupancyMap
 from fcslam.simulation.options import Building
 from fcslam.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.sources.faults import Faults
@@ -57,8 +59,13 @@ PARTS = {"log": "", **FOUND, "relations, m": ".4f", "deg": ".3f", "largest, m": 
          "of a core at 10 Hz": ".4f"}  # fmt: skip
 WEAN = {"run": "", **FOUND, "driven, m": ".1f", "off, median, m": ".3f", "largest, m": ".3f", "wrong": ".0f"}
 OTHERS = {"log": "", "map": "", "scans": ",.0f", "fixes": ".0f", "CPU, s": ".1f"}
+BEHIND_M = 0.1
+"""Walls are looked up this far before them: a return may lie just behind its wall."""
+KNOWN_SHARE, ENOUGH_M = 0.5, 10.0
+"""Share of the walls in sight that the map knows in known area, and how far a robot drives there to be found."""
 CARRIED = {"building": "", "seed": "", "fixed before": "", "noticed after, m": ".1f", "found": "",
-           "found after, m": ".1f", "off, m": ".3f", "believed wrongly, m": ".1f", "wrong fixes": ".0f"}  # fmt: skip
+           "found after, m": ".1f", "off, m": ".3f", "believed wrongly, m": ".1f", "wrong fixes": ".0f",
+           "driven, m": ".1f", "in known area, m": ".1f"}  # fmt: skip
 
 
 def main() -> None:
@@ -202,6 +209,7 @@ class Carried(NamedTuple):
     moment: int
     """Number of the first scan at the other place."""
     T_building_map: FloatArray
+    occupancy: OccupancyMap
 
 
 def carry_away(building: str, seed: int) -> Carried | None:
@@ -215,20 +223,22 @@ def carry_away(building: str, seed: int) -> Carried | None:
     run = fcslam.map_recordings([Scans(drives[k].name, drives[k].scans) for k in MAPPING])
     first = run.trajectories[drives[0].name]
     T_building_map = align(drives[0].truth(first.stamps), first.T_map_base)
-    poses = localized(Scans(drive.name, drive.scans), run.maps[first.map_index])[0].localized[drive.name]
-    return Carried(poses, drive, moment, T_building_map)
+    occupancy = run.maps[first.map_index]
+    poses = localized(Scans(drive.name, drive.scans), occupancy)[0].localized[drive.name]
+    return Carried(poses, drive, moment, T_building_map, occupancy)
 
 
 def carried_away(building: str, seed: int) -> Iterable[tuple]:
     carried = carry_away(building, seed)
     if carried is not None:
-        yield building, seed, *verdict(*carried)
+        yield building, seed, *outcome(carried)
 
 
-def verdict(poses: LocalizedPoses, drive: Drive, moment: int, T_building_map: FloatArray) -> tuple:
-    """What the robot believed before and after it was carried away with scan ``moment``."""
+def outcome(carried: Carried) -> tuple:
+    """What the robot believed before and after it was carried away."""
+    poses, drive, moment = carried.poses, carried.drive, carried.moment
     known = poses.is_localized
-    off_m = np.hypot(*(se2.compose(T_building_map, poses.T_map_base) - drive.truth(poses.stamps))[:, :2].T)
+    off_m = np.hypot(*(se2.compose(carried.T_building_map, poses.T_map_base) - drive.truth(poses.stamps))[:, :2].T)
     step_m = np.append(0.0, np.hypot(*np.diff(drive.T_building_base[:, :2], axis=0).T))
     step_m[moment] = 0.0
     driven_m = np.cumsum(step_m)
@@ -242,7 +252,22 @@ def verdict(poses: LocalizedPoses, drive: Drive, moment: int, T_building_map: Fl
     off = float(np.median(off_m[right])) if len(right) else np.nan
     wrongly = float(step_m[since & known & (off_m > WRONG_M)].sum())
     before = "yes" if known[:moment].any() else "no"
-    return before, noticed_m, "yes" if len(right) else "no", found_m, off, wrongly, wrong_fixes
+    known_m = sum(step_m[k] for k in np.flatnonzero(since) if known_share(carried, k) >= KNOWN_SHARE)
+    is_found = "yes" if len(right) else "no"
+    return before, noticed_m, is_found, found_m, off, wrongly, wrong_fixes, step_m[since].sum(), known_m
+
+
+def known_share(carried: Carried, number: int) -> float:
+    """Share of the returns of a scan that lie on cells that the map knows."""
+    scan, occupancy = carried.drive.scans[number], carried.occupancy
+    T_map_base = se2.compose(se2.inverse(carried.T_building_map), carried.drive.T_building_base[number])
+    x, y, heading = se2.compose(T_map_base, np.array(scan.laser.T_base_laser))
+    seen = (scan.ranges_m > 0.0) & (scan.ranges_m < scan.laser.max_range_m)
+    reach_m, angles = scan.ranges_m[seen] - BEHIND_M, heading + scan.laser.angles_rad()[seen]
+    ends = np.column_stack((x + reach_m * np.cos(angles), y + reach_m * np.sin(angles)))
+    column, row = np.floor((ends - occupancy.origin_xy) / occupancy.resolution_m).astype(np.int64).T
+    inside = (row >= 0) & (column >= 0) & (row < occupancy.cells.shape[0]) & (column < occupancy.cells.shape[1])
+    return float((occupancy.cells[row[inside], column[inside]] != Occupancy.UNKNOWN).sum() / max(1, len(ends)))
 
 
 def summary(rows: Sequence[tuple]) -> Iterator[tuple[str, float]]:
@@ -250,6 +275,9 @@ def summary(rows: Sequence[tuple]) -> Iterator[tuple[str, float]]:
     yield "carried away", len(some)
     yield "localised before", sum(row["fixed before"] == "yes" for row in some)
     yield "found again", sum(row["found"] == "yes" for row in some)
+    able = [row for row in some if row["in known area, m"] >= ENOUGH_M]
+    yield f"at least {ENOUGH_M:.0f} m in known area", len(able)
+    yield "of these found again", sum(row["found"] == "yes" for row in able)
     yield "wrong fixes", sum(row["wrong fixes"] for row in some)
     for name in ("noticed after, m", "found after, m", "off, m", "believed wrongly, m"):
         values = np.array([row[name] for row in some], dtype=np.float64)
