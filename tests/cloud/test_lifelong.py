@@ -1,14 +1,17 @@
 """A robot that comes back again and again: what is forgotten, what never is, and that the map does not suffer."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from fcslam.cloud import submaps
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.lidar.submap import PackedSubmap, Submap
 from fcslam.maps.fusion import fuse
 from fcslam.metrics.grid import LabelledGrid, grid_agreement
 from fcslam.metrics.trajectory import align, position_errors
@@ -90,6 +93,16 @@ def test_the_result_is_a_function_of_the_set_of_packets_whatever_was_forgotten(f
         result = feed(Cloud(ONE_A_SQUARE, 0), arrived).finalize()
         assert fingerprint(result) == fingerprint(expected)
         assert [[k.id for k in robot.keyscans] for robot in result.robots] == kept
+
+
+def test_packed_submaps_change_nothing_and_few_are_not_packed(forgetful, packets, monkeypatch):
+    monkeypatch.setattr(submaps, "READY", 2)
+    cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
+    cache = cloud.fleet._recognition._submaps
+    kinds = Counter(type(entry.submap) for entry in cache._entries.values())
+    assert kinds[Submap] == len(cache._ready) == 2
+    assert kinds[PackedSubmap] > 2
+    assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
 
 
 def test_poses_and_stamps_of_all_keyscans_stay(forgetful, sessions):

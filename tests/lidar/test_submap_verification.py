@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Agreement, agreement, build_submap, self_violation
+from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Agreement, PackedSubmap, agreement, build_submap, self_violation
 from fcslam.lidar.verification import VerificationConfig, _information_of_inverse, _shortfall, verify
 from fcslam.records import Reason, ReasonCode
 from tests.lidar.worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
@@ -239,3 +239,20 @@ def test_information_of_the_inverse_pose(pose):
     spread = np.cov((se2.inverse(drawn) - se2.inverse(pose)).T)
     expected = np.linalg.inv(_information_of_inverse(information, np.array(pose)))
     assert np.allclose(spread, expected, rtol=0.1, atol=0.05 * np.abs(expected).max())
+
+
+def test_a_packed_submap_is_unpacked_as_it_was(same_room):
+    (submap, _), (other, _) = same_room
+    unpacked = PackedSubmap(submap).unpack()
+    pairs = [
+        *zip(submap.field.arrays, unpacked.field.arrays, strict=True),
+        (submap.free.cells, unpacked.free.cells),
+        (submap.surface.points, unpacked.surface.points),
+    ]
+    for before, after in pairs:
+        assert after.dtype == before.dtype
+        assert after.flags.writeable  # compiled code would be compiled once more
+        assert np.array_equal(after, before)
+    before, after = (verify(one, other, np.zeros(3), CONFIG) for one in (submap, unpacked))
+    assert np.array_equal(after.T_a_b, before.T_a_b)
+    assert np.array_equal(after.information, before.information)

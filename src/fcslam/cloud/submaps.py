@@ -1,22 +1,28 @@
 """Submaps of places, built from keyscans on demand and cached."""
 
 from dataclasses import dataclass
+from typing import Final
 
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.lidar.scan import PointScan, point_scan
-from fcslam.lidar.submap import Submap, build_submap, self_violation
+from fcslam.lidar.submap import PackedSubmap, Submap, build_submap, self_violation
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
+
+READY: Final = 100
+"""Submaps that are kept as they are; those that were used before them are packed."""
 
 
 @dataclass(slots=True)
 class _Entry:
-    """What is known of the submap around a place."""
+    """What is known of the submap around a place; None until it is asked for."""
 
-    submap: Submap
+    submap: Submap | PackedSubmap | None = None
     noise: float | None = None
-    """None until it is asked for."""
+
+
+_Key = tuple[KeyscanId, Channel]
 
 
 class SubmapCache:
@@ -26,11 +32,24 @@ class SubmapCache:
         self._sessions = sessions
         self._graph = graph
         self._capacity = capacity
-        self._entries: dict[tuple[KeyscanId, Channel], _Entry] = {}
+        self._entries: dict[_Key, _Entry] = {}
+        self._ready: dict[_Key, _Entry] = {}
+        """Those that are not packed. In both, the one used last is the last."""
 
     def of(self, place: Place) -> Submap:
         """The submap around a place, in its keyscan's frame, by the robot's own motions."""
-        return self._entry(place).submap
+        entry, key = self._entry(place), (place.id, place.channel)
+        submap = entry.submap
+        if submap is None:
+            submap = build_submap(self._scans(place))
+        elif isinstance(submap, PackedSubmap):
+            submap = submap.unpack()
+        entry.submap = submap
+        self._ready.pop(key, None)
+        self._ready[key] = entry
+        if len(self._ready) > READY:
+            self._pack(next(iter(self._ready)))
+        return submap
 
     def noise_of(self, place: Place) -> float:
         """How much the submap around a place contradicts itself (``self_violation``)."""
@@ -41,17 +60,26 @@ class SubmapCache:
 
     def drop(self, place: Place) -> None:
         """Drop the submap around a place from the cache."""
-        self._entries.pop((place.id, place.channel), None)
+        self._drop((place.id, place.channel))
 
     def _entry(self, place: Place) -> _Entry:
         key = (place.id, place.channel)
         entry = self._entries.pop(key, None)
         if entry is None:
-            entry = _Entry(build_submap(self._scans(place)))
+            entry = _Entry()
             if len(self._entries) >= self._capacity:
-                del self._entries[next(iter(self._entries))]
-        self._entries[key] = entry  # newest last
+                self._drop(next(iter(self._entries)))
+        self._entries[key] = entry
         return entry
+
+    def _drop(self, key: _Key) -> None:
+        self._entries.pop(key, None)
+        self._ready.pop(key, None)
+
+    def _pack(self, key: _Key) -> None:
+        entry = self._ready.pop(key)
+        assert isinstance(entry.submap, Submap), "it is ready"
+        entry.submap = PackedSubmap(entry.submap)
 
     def _scans(self, place: Place) -> list[tuple[PointScan, FloatArray]]:
         """The scans around a place, and their poses (3,) in its keyscan's base."""

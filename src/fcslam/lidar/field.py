@@ -5,7 +5,7 @@ tiles stores in each cell the nearest surfel, so the distance to the map is exac
 look-up. Tiles exist only near surfaces: memory follows what was seen, not the range squared.
 """
 
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ MEAN_OVER: Final = 30.0
 TABLE: Final = 512
 """Tiles along one side of the field: 409.6 m, more than any submap with any laser."""
 EMPTY: Final = -1
+MERGED: Final = 4
+"""Columns of a surfel that later ones serve to merge returns."""
 MOST_SURFELS: Final = 32767
 """Largest number of labels: 1.6 km of walls. Later returns are merged into surfels or left out."""
 
@@ -46,7 +48,9 @@ class FieldArrays(NamedTuple):
     labels: NDArray[np.int16]
     """Nearest surfel of each cell of each stored tile, or EMPTY; shape (tiles, TILE, TILE)."""
     surfels: FloatArray
-    """x, y, normal x, normal y, number of returns, whether all of them were solitary; shape (capacity, 6)."""
+    """x, y, normal x, normal y, number of returns, whether all of them were solitary; shape (capacity, 6).
+
+    A compact field has the first four only: it takes no more returns."""
     used: NDArray[np.int64]
     """Tiles and surfels in use, shape (2,)."""
 
@@ -62,6 +66,13 @@ class SurfelField:
             surfels=np.zeros((1024, 6)),
             used=np.zeros(2, np.int64),
         )
+
+    @classmethod
+    def of(cls, arrays: FieldArrays) -> Self:
+        """The field with these arrays."""
+        field = cls.__new__(cls)
+        field.arrays = arrays
+        return field
 
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
         """Add a scan taken at ``T_field_base``, shape (3,), metres and radians; drop returns outside the table."""
@@ -82,7 +93,7 @@ class SurfelField:
 
     @property
     def solitary(self) -> NDArray[np.bool_]:
-        """Surfels all of whose returns were solitary, shape (N,)."""
+        """Surfels all of whose returns were solitary, shape (N,); of a field that is not compact."""
         solitary: NDArray[np.bool_] = self.arrays.surfels[: self.arrays.used[1], 5] > 0.0
         return solitary
 
@@ -92,7 +103,7 @@ class SurfelField:
         return labels
 
     def compact(self) -> None:
-        """Free unused storage of a complete field."""
+        """Free unused storage of a complete field, which takes no more scans."""
         corner, table, labels, surfels, used = self.arrays
         rows, columns = np.nonzero(table != EMPTY)
         if not len(rows):
@@ -102,7 +113,7 @@ class SurfelField:
             corner=corner + TILE * CELL_M * np.array((first[1], first[0]), dtype=np.float64),
             table=table[first[0] : last[0], first[1] : last[1]].copy(),
             labels=labels[: max(1, used[0])].copy(),
-            surfels=surfels[: max(1, used[1])].copy(),
+            surfels=surfels[: max(1, used[1]), :MERGED].copy(),
             used=used,
         )
 

@@ -47,9 +47,9 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
     field.insert(surface, np.zeros(3))
     if field.arrays.used[1] == MOST_SURFELS:
         raise SourceError(f"{name}: has too many walls; at most {0.05e-3 * MOST_SURFELS:.1f} km can be used")
+    surfels = spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
     field.compact()
-    surfels = PointScan(field.points, field.normals, field.solitary, np.zeros(2))
-    return Submap(field, spaced(surfels), _free_space(occupancy))
+    return Submap(field, surfels, _free_space(occupancy))
 
 
 def _surface(occupancy: OccupancyMap) -> PointScan:
