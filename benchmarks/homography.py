@@ -30,7 +30,7 @@ BASELINE, LOGITS = "orb", "-logits"
 SHARE = ".3f"
 REPEATABILITY = {"": "s", "illumination": SHARE, "viewpoint": SHARE, "all": "s", "localisation, px": ".2f",
                  "ms 320x240": ".1f", "ms 640x480": ".1f"}  # fmt: skip
-MATCHING = {"": "s", "NMS": "d", "i, e=3": SHARE, "v, e=3": SHARE, "e=1": SHARE, "e=3": "s", "e=5": SHARE,
+MATCHING = {"": "s", "NMS": "d", "i, e=3": SHARE, "v, e=3": SHARE, "e=1": SHARE, "e=2": SHARE, "e=3": "s", "e=5": SHARE,
             "MMA@1": SHARE, "MMA@3": "s", "MMA@5": SHARE, "matching score": SHARE,
             "MMA@3 above ORB": "s"}  # fmt: skip
 BITS = {"": "s", "NMS": "d", "e=1": "s", "e=3": "s", "e=5": "s", "MMA@1": "s", "MMA@3": "s", "matching score": "s"}
@@ -83,7 +83,7 @@ def _matching(measured: HomographyReport) -> Iterator[tuple[object, ...]]:
                 name,
                 nms_px,
                 *(mean(pairs, correct, kind) for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT)),
-                mean(pairs, f"homography_1px_nms{nms_px}"),
+                *(mean(pairs, f"homography_{px}px_nms{nms_px}") for px in (1, 2)),
                 _shown(interval(pairs, correct, SEED)),
                 mean(pairs, f"homography_5px_nms{nms_px}"),
                 mean(pairs, f"accuracy_1px_nms{nms_px}"),

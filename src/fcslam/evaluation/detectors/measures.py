@@ -12,7 +12,7 @@ from fcslam.evaluation.detectors.scenes import SceneKind
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.records import FloatArray
 
-CORRECT_CORNERS_PX = (1, 3, 5)
+CORRECT_CORNERS_PX = (1, 2, 3, 5)
 """Thresholds of the corner error of a correct homography."""
 
 Measures = Mapping[str, float]

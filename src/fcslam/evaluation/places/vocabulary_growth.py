@@ -144,23 +144,16 @@ def grow_vocabulary(
     seed: int,
     watch: Callable[[], None] = lambda: None,
 ) -> Growth:
-    """Add the places in whole batches and measure after each; ``watch`` is called after each batch.
-
-    The strategy ``rebuild`` trains at every place, but only the last tree of a batch is used. Only that tree is trained
-    here, and the time of the batch is 40 times its time.
-    """
-    every = {Strategy.REBUILD: BATCH, Strategy.WINDOWED: WINDOW_BATCHES * BATCH}.get(strategy, config.rebuild_every)
-    grown = Strategy.WINDOWED if strategy is Strategy.REBUILD else strategy
-    # Places count from 0: with this L, every training happens at the last place of a batch.
-    timing = {"strategy": grown, "train_batch": BATCH - 2, "rebuild_every": every}
+    """Add the places in whole batches and measure after each; ``watch`` is called after each batch."""
+    # Places count from 0: with this L, the first training happens at the last place of the first batch.
+    timing = {"strategy": strategy, "train_batch": BATCH - 2, "rebuild_every": WINDOW_BATCHES * BATCH}
     index: PlaceIndex[str] = PlaceIndex(config.model_copy(update=timing), np.random.default_rng(seed))
     updates = len(arrivals) // BATCH
     _compile(index, arrivals[0].descriptors)
     words, seconds = np.zeros(updates), np.zeros(updates)
     similarities = np.zeros((updates, len(groups), 1 + DISTRACTORS))
     for update in range(updates):
-        took = [_timed_add(index, place) for place in arrivals[update * BATCH : (update + 1) * BATCH]]
-        seconds[update] = BATCH * took[-1] if strategy is Strategy.REBUILD else sum(took)
+        seconds[update] = sum(_timed_add(index, place) for place in arrivals[update * BATCH : (update + 1) * BATCH])
         words[update] = index.word_count
         for g, group in enumerate(groups):
             target = index.bag(group.target)
