@@ -1,11 +1,12 @@
-"""The paper's network and losses beside ours: four trainings with the same images, labels and processor time.
+"""The paper's network and losses beside ours: trainings with the same images, labels and processor time.
 
     FCSLAM_DATA=/path/to/data python benchmarks/paper_networks.py --training networks
 
-The encoders are that of the paper (vgg) and the default one (light). The losses are eqs. (1)-(3) alone, and all of ours
-but distillation. The paper does not say how its detector learns keypoints: both have the cross entropy, on the same
-labels, which are the keypoints of the detector that comes with fcslam and Harris's corners. Each training takes the
-same processor time on one thread. The folder --training keeps what is done; the same command continues.
+The encoders are that of the paper (vgg) and the default one (light). The losses are eqs. (1)-(3) alone with the hardest
+negative (paper) or with all of them (paper-all), as the paper does not say which; and all of ours but distillation.
+The paper does not say how its detector learns keypoints: all have the cross entropy, on the same labels, which are the
+keypoints of the detector that comes with fcslam and Harris's corners. Each training takes the same processor time on
+one thread. The folder --training keeps what is done; the same command continues.
 
 Validation: pairs of held-out images, as at the end of `fcslam train`. `benchmarks/homography.py` evaluates the networks
 on other scenes.
@@ -27,7 +28,12 @@ IMAGES = ("bsds500", "camvid", "coco_subset", "kodak24", "openimages_doors", "su
 STEP_S = {"vgg": 2.3, "light": 0.4}
 """Seconds of a step on one core."""
 PAPER = {"margin": 0.0, "rounding": 1e-6, "contrastive": 0.0, "distillation": 0.0, "balance": 0.0, "agreement": 0.0}
-LOSSES = {"eqs. (1)-(3)": PAPER, "ours": {"distillation": 0.0}}
+LOSSES = {
+    "paper": PAPER,
+    "paper-all": {**PAPER, "negatives": "all"},
+    "ours": {"distillation": 0.0},
+}
+"""Eqs. (1)-(3) alone, with the hardest negative or with all of them, as the paper does not say which; and ours."""
 COLUMNS = {
     "encoder": "",
     "losses": "",
@@ -78,7 +84,7 @@ def train(
     roots: Iterable[Path], teacher: Path, folder: Path, encoder: str, losses: str, minutes: float
 ) -> Iterator[tuple]:
     """One training; yields a row for each measure of its last validation."""
-    run = folder / f"{encoder}-{'paper' if losses != 'ours' else 'ours'}"
+    run = folder / f"{encoder}-{losses}"
     steps = round(60.0 * minutes / STEP_S[encoder])
     settings = folder / f"{run.name}.yaml"
     settings.write_text(yaml.safe_dump({"loss": LOSSES[losses]}), encoding="utf-8")

@@ -66,7 +66,7 @@ def objective(
     margin = weights.margin * (0.3 + 0.7 * progress)
     points = (maps.point_logits.float(), batch.targets, batch.seen)
     parts = {
-        "triplet": losses.triplet_loss(distances, candidates, batch.valid, margin),
+        "triplet": losses.triplet_loss(distances, candidates, batch.valid, margin, weights.negatives),
         "contrastive": losses.contrastive_loss(
             torch.tanh(first), torch.tanh(second), candidates, batch.valid, weights.temperature
         ),

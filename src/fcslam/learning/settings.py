@@ -7,6 +7,7 @@ from pydantic import Field
 from fcslam.config import Settings
 
 Encoder = Literal["light", "vgg"]
+Negatives = Literal["hardest", "all"]
 
 
 class LossSettings(Settings):
@@ -19,6 +20,10 @@ class LossSettings(Settings):
         default=1.0,
         ge=0.0,
         description="margin of the triplet loss at the end of training, to which it rises; 0 as in the paper",
+    )
+    negatives: Negatives = Field(
+        default="hardest",
+        description="negatives of the triplet loss: the hardest one of a pair, or all; the paper does not say",
     )
     rounding: float = Field(
         default=0.01,
