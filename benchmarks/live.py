@@ -1,6 +1,6 @@
 """Many robots at once, at real time, on one service: how long it takes to take a packet in, and until it has effect.
 
-    python benchmarks/live.py [--robots 20] [--path 30]
+    python benchmarks/live.py [--robots 20] [--path 30] [--page]
 
 A simulated fleet (LiDAR, 360 beams at 10 Hz) is run through the robots' front ends beforehand. Then each robot's
 packets go to `fcslam serve` at the moments at which the robot had them, over a connection of its own, from one process
@@ -20,11 +20,14 @@ CPU: user and system of each, all threads; the sender's is that of the robots' s
 import asyncio
 import gc
 import os
+import shutil
 import sqlite3
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -83,6 +86,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=ROBOTS)
     parser.add_argument("--path", type=float, default=PATH_M, help="of each robot, m")
     parser.add_argument("--seed", type=int, default=1, help="of the fleet")
+    parser.add_argument("--page", action="store_true", help="a browser shows the page meanwhile (make browser-test)")
     parser.add_argument("--in-step", action="store_true", help="all robots begin in the same millisecond")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
@@ -91,7 +95,9 @@ def main() -> None:
     agendas = {robot.name: _agenda(robot, begin_s) for robot, begin_s in zip(robots, begins_s, strict=True)}
     gc.collect()
     gc.freeze()  # the sender's own pauses are not the service's
-    with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (server, port):
+    with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (server, port), ExitStack() as opened:
+        if chosen.page:
+            opened.enter_context(_page(f"http://127.0.0.1:{port}/"))
         began_s = time.process_time()
         mission = Path(place) / "cloud" / "missions" / FIRST / "mission.sqlite"
         answers, looks = asyncio.run(_play(agendas, f"http://127.0.0.1:{port}", mission))
@@ -123,6 +129,23 @@ def main() -> None:
         f"{closures:.0f} accepted closures between robots, {maps:.0f} map(s) in the end."
     )
     report.write()
+
+
+@contextmanager
+def _page(address: str) -> Iterator[None]:
+    """Chromium shows the page."""
+    command = [shutil.which("chromium") or sys.exit("needs Chromium; make browser-test"), "--headless", "--no-sandbox",
+               "--disable-gpu", "--remote-debugging-port=0", "--window-size=1200,900", address]  # fmt: skip
+    with (
+        tempfile.TemporaryDirectory() as profile,
+        subprocess.Popen(
+            [*command, f"--user-data-dir={profile}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        ) as browser,
+    ):
+        try:
+            yield
+        finally:
+            browser.terminate()
 
 
 def _simulated(count: int, path_m: float, seed: int) -> list[SimulatedRobot]:

@@ -8,10 +8,10 @@ Chromium runs without a window and draws in software, on the machine of the serv
 - First map: from opening the address until a tile of the map is drawn. The service has the sample logs, three robots.
 - Update: from the event that tells of a new live map until the page has its robots and closures. Robots drive
   meanwhile, at four times real time.
-- Frames: 20 robots of 600 poses and 5,000 closures between them, from a server that makes them up. Ten times a second
-  it tells that the robots have moved, and the map is dragged all the time.
+- Frames: 20 robots of 600 poses and 5,000 closures between them on a map, from a server that makes them up. Ten times
+  a second it tells that the robots have moved, and the map is dragged all the time.
 - Square kilometre: 20,000 x 20,000 cells of 5 cm. Requests for tiles of the whole view; the longest frame while the map
-  is zoomed and dragged; memory of the page's script, and of the process that answers.
+  is zoomed and dragged; memory of the page's script, of its process, and of the process that answers.
 """
 
 import json
@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import common
+import cv2
 import httpx
 import numpy as np
 import processes
@@ -37,6 +38,8 @@ from fcslam.page.routes import ASSETS, FILES
 LOGS = Path(__file__).parents[1] / "examples" / "logs"
 ROBOTS, POSES, CLOSURES = 20, 600, 5000
 CELLS = 20_000
+EXTENT = [-100.0, -100.0, 100.0, 100.0]
+"""Of the map below 20 robots."""
 SIZE = {"width": 1200, "height": 900}
 PAINTED = """() => {
     const canvas = document.getElementById("map"), pen = canvas.getContext("2d");
@@ -147,9 +150,11 @@ def frames(browser: Any, seconds: float) -> list[tuple[str, float, str]]:
         "robots": names, "maps": 1, "metrics": {},
     }  # fmt: skip
     fixed = {
-        "fleet": fleet, "maps": [{"map": 0, "floor": "", "robots": names, "zoom": 0}], "separations": [], "edits": [],
-        "closures": closures,
+        "fleet": fleet, "maps": [{"map": 0, "floor": "", "robots": names, "zoom": 3, "extent": EXTENT}],
+        "separations": [], "edits": [], "closures": closures,
     }  # fmt: skip
+
+    floor = bytes(cv2.imencode(".png", np.kron(rng.choice([0, 205, 254], (64, 64)), np.ones((8, 8))))[1])
 
     def robots() -> list[dict[str, Any]]:
         row = int(10.0 * time.monotonic()) % POSES
@@ -174,6 +179,8 @@ def frames(browser: Any, seconds: float) -> list[tuple[str, float, str]]:
                         time.sleep(0.1)
             elif path.startswith("/api/v1/trajectories/"):
                 self.answer(tum[path.split("/")[-1].split(".")[0]].encode(), "text/plain")
+            elif "/tiles/" in path:
+                self.answer(floor, "image/png")
             elif path == "/api/v1/robots":
                 self.answer(json.dumps(robots()).encode(), "application/json")
             elif (name := path.removeprefix("/api/v1/")) in fixed:
@@ -256,16 +263,31 @@ def square_kilometre(browser: Any, place: Path, seconds: float) -> list[tuple[st
         gaps = np.diff(dragged(page, seconds))
         page.context.new_cdp_session(page).send("HeapProfiler.collectGarbage")  # of this script's own looking
         heap_mb = page.evaluate("performance.memory.usedJSHeapSize") / 1e6
-        status = Path(f"/proc/{process.pid}/status").read_text()
-        peak_mb = int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1e3
+        renderer_mb = max(peak_mb(pid) for pid in renderers())
+        service_mb = peak_mb(process.pid)
         page.close()
     return [
         ("square kilometre, first tile", first_s, "s"),
         ("square kilometre, tiles of the whole view", whole, "1"),
         ("square kilometre, longest frame", float(gaps.max()), "ms"),
         ("square kilometre, memory of the script", heap_mb, "MB"),
-        ("square kilometre, memory of the service", peak_mb, "MB"),
+        ("square kilometre, memory of the page, pictures and browser code included", renderer_mb, "MB"),
+        ("square kilometre, memory of the service", service_mb, "MB"),
     ]
+
+
+def peak_mb(pid: int) -> float:
+    """The largest resident set of a process."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1e3
+
+
+def renderers() -> Iterator[int]:
+    """Chromium's processes that hold pages."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if b"--type=renderer" in (folder / "cmdline").read_bytes():
+                yield int(folder.name)
 
 
 if __name__ == "__main__":

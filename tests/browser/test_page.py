@@ -186,6 +186,20 @@ def test_the_past_of_a_mission_is_shown(page, mapped):
     until(page, lambda: coloured(page) == now, "the paths of now")
 
 
+def test_rounds_of_a_federated_training_are_drawn(page, tmp_path):
+    head = "round,version,released,robots,left_out,loss_triplet,mma_3px"
+    (tmp_path / "rounds.csv").write_text(f"{head}\n1,a,0,anna | bob,,0.5,0.25\n2,b,1,anna,bob: too late,0.25,0.375\n")
+    with closing(Service(tmp_path / "data", "--learning", str(tmp_path))) as service:
+        page.goto(service.url)
+        page.get_by_text("Federated training").click()
+        says(page, "#learned", "2 rounds, 1 released")
+        assert page.locator("#curves polyline").count() == 2
+        assert page.locator("#curves circle").count() == 2
+        assert page.locator("#rounds tr").first.locator("th, td").all_inner_texts() == [
+            "2, released", "0.375", "anna", "bob: too late"
+        ]  # fmt: skip
+
+
 def test_the_page_recovers_when_the_service_is_killed_and_comes_back(page, packets, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

@@ -49,6 +49,13 @@ def serve(
         ),
     ] = None,
     config: ConfigFile = None,
+    learning: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Output folder of `fcslam federate serve` on this machine; the page shows its rounds.",
+        ),
+    ] = None,
     docs: Annotated[bool, typer.Option("--docs", help="Describe the REST interface at /docs.")] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -70,7 +77,7 @@ def serve(
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with listen(host, port) as listening:
         authenticator = _authenticator(tokens, client_ca)
-        state = _state(data, authenticator, _cloud_config(config))
+        state = _state(data, authenticator, _cloud_config(config), learning)
         _reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()
@@ -141,7 +148,7 @@ def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
     signal.signal(signal.SIGHUP, reload)
 
 
-def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig") -> "ServiceState":
+def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", learning: Path | None) -> "ServiceState":
     import time
 
     from fcslam.service.audit_log import AuditLog
@@ -156,7 +163,7 @@ def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig") ->
         data, config, time.monotonic, time.time, lambda folder: Supervisor(folder, time.monotonic, events.publish)
     )
     audit = AuditLog(data / "audit.jsonl", time.time)
-    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit)
+    return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, learning)
 
 
 def _cloud_config(file: Path | None) -> "CloudConfig":

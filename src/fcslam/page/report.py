@@ -24,7 +24,7 @@ from fcslam.service.http.app import PREFIX
 from fcslam.service.viewed_mission import ViewedMission
 
 ASKED = (
-    "fleet", "maps", "separations", "robots", "edits", "metrics.json", "config.yaml",
+    "fleet", "maps", "separations", "robots", "edits", "learning", "metrics.json", "config.yaml",
     *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
 )  # fmt: skip
 """What the page asks for, besides events, trajectories and tiles."""

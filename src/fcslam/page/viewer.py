@@ -35,6 +35,7 @@ class ReadOnly:
     mission: ViewedMission
     events: EventStream = field(default_factory=EventStream)
     read_only: bool = True
+    learning: None = None
 
     def require(self, *_: Role) -> list[Dependency]:
         """Nothing."""

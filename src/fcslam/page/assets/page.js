@@ -100,6 +100,7 @@ async function update(number) {
   showMaps(apart); showRobots(counts); showPairs(); showEdits(edits);
   tellChanges({ maps, robots, accepted, edits });
   await refreshClosures();
+  if (at("learning").open) showLearning();
   const leader = robots.find((r) => r.session === followed);
   if (leader?.T_map_base && view) { openMap(leader.map); [view.x, view.y] = leader.T_map_base; }
   if (!moved && !followed) fit();
@@ -317,6 +318,28 @@ async function facts() {
     row(name.replaceAll("_", " "), value === null ? "–" : String(Number(value.toPrecision(4))), unit === "1" ? "" : unit)));
 }
 
+// Curves of losses, each over its largest value, and of measures; a dot is a round whose detector was released.
+async function showLearning() {
+  const rounds = await json("learning").catch(() => []);
+  at("learned").textContent = rounds.length ? `${rounds.length} rounds, ${rounds.filter((r) => r.released).length} released` : "No training is connected: fcslam serve --learning FOLDER";
+  const names = [...new Set(rounds.flatMap((r) => [...Object.keys(r.losses), ...Object.keys(r.measures)]))];
+  const drawn = [], across = (k) => 5 + 290 * k / Math.max(1, rounds.length - 1);
+  names.forEach((name, n) => {
+    const values = rounds.map((r) => r.losses[name] ?? r.measures[name]), top = rounds[0].losses[name] === undefined ? 1 : Math.max(...values.filter((v) => v !== undefined)) || 1;
+    const points = values.flatMap((v, k) => (v === undefined ? [] : [[across(k), 145 - 140 * v / top, rounds[k].released]])), colour = COLOURS[n % COLOURS.length];
+    drawn.push(shape("polyline", { points: points.map(([x, y]) => `${x},${y}`).join(" "), fill: "none", stroke: colour }));
+    for (const [cx, cy, released] of points) if (released) drawn.push(shape("circle", { cx, cy, r: 3, fill: colour }));
+  });
+  at("curves").replaceChildren(...drawn);
+  at("legend").replaceChildren(...names.map((name, n) => {
+    const swatch = element("span", "", { className: "swatch" }), item = element("li", swatch);
+    swatch.style.background = COLOURS[n % COLOURS.length];
+    item.append(rounds[0].losses[name] === undefined ? name.replaceAll("_", " ") : `${name}: loss, over its largest value`);
+    return item;
+  }));
+  at("rounds").replaceChildren(...rounds.toReversed().map((r) => row(`${r.round}${r.released ? ", released" : ""}`, r.measures.mma_3px?.toFixed(3) ?? "–", r.robots.join(", "), r.left_out)));
+}
+
 // ---- Map ----
 
 const canvas = at("map"), pen = canvas.getContext("2d"), tiles = new Map();
@@ -510,6 +533,7 @@ const named = () => ({ robot_i: selected.robot_i, robot_j: selected.robot_j, sta
 for (const kind of ["veto", "pin"]) at(kind).addEventListener("click", () => change("edits", { kind, content: named() }));
 at("reload").addEventListener("click", () => location.reload());
 at("facts").addEventListener("toggle", () => { if (at("facts").open) facts().catch(() => {}); });
+at("learning").addEventListener("toggle", () => { if (at("learning").open) showLearning(); });
 at("login").addEventListener("submit", (e) => {
   e.preventDefault();
   token = at("token").value; sessionStorage.setItem("token", token);

@@ -133,6 +133,20 @@ class MapSummary(Settings):
     )
 
 
+class LearningRound(Settings):
+    """A round of the federated training of the detector."""
+
+    round: int
+    version: str = Field(description="detector after the round")
+    released: bool = Field(description="whether it was the best so far, so robots get it")
+    robots: list[str] = Field(description="whose updates counted")
+    left_out: str = Field(description="whose did not, and why")
+    losses: dict[str, float]
+    measures: dict[str, float] = Field(
+        description="on held-out images, in [0, 1]; empty if the round was not evaluated"
+    )
+
+
 class MapSeparation(Settings):
     """Two maps that no closure joins."""
 

@@ -4,6 +4,7 @@ import asyncio
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 from fastapi import Depends, HTTPException, Request, Security
@@ -44,6 +45,10 @@ class ViewerState(Protocol):
     def read_only(self) -> bool:
         """Whether nobody can change the mission here, whoever asks."""
 
+    @property
+    def learning(self) -> Path | None:
+        """Output folder of the federated training that viewers see; None without one."""
+
     def require(self, *roles: Role) -> list[Dependency]:
         """Dependencies of a route that only these roles may ask."""
 
@@ -57,6 +62,8 @@ class ServiceState:
     rate: RateLimit
     events: EventStream
     audit: AuditLog
+    learning: Path | None = None
+    """Output folder of a federated training, for viewers."""
     measures: ServiceMetrics = field(default_factory=ServiceMetrics)
     unknown: TokenBuckets = field(default_factory=lambda: TokenBuckets(time.monotonic, UNKNOWN_PER_S, UNKNOWN_BURST))
     """Requests of those who have no known token, all together; requests with one never wait for them."""

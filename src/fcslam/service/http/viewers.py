@@ -27,6 +27,7 @@ from fcslam.service.http.responses import (
     ClosureSummary,
     EditSummary,
     FleetSummary,
+    LearningRound,
     MapSeparation,
     MapSummary,
     RobotSummary,
@@ -36,6 +37,7 @@ from fcslam.service.http.responses import (
 )
 from fcslam.service.http.robots import Name, refused_packets
 from fcslam.service.http.state import ViewerState
+from fcslam.service.learning_rounds import read_rounds
 from fcslam.service.mission_store import MissionStore
 from fcslam.service.viewed_mission import viewed_run
 from fcslam.wire.messages import Hello
@@ -130,6 +132,11 @@ def fleet_router(state: ViewerState) -> APIRouter:
         """All edits, and what undid them."""
         edits = state.mission.store.edits()
         return [edit_summary(edit, undone(edits)) for edit in edits]
+
+    @router.get("/learning")
+    def get_learning() -> list[LearningRound]:
+        """The rounds of the federated training, oldest first; none if the service knows of no training."""
+        return [] if state.learning is None else read_rounds(state.learning)
 
     @router.get("/vocabulary")
     def get_vocabulary() -> dict[str, float]:

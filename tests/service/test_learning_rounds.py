@@ -1,0 +1,41 @@
+"""The table of rounds that `fcslam federate` writes, read for the page."""
+
+import pytest
+
+from fcslam.errors import EvaluationError
+from fcslam.federated.history import ROUNDS_FILE, RoundReport, write_rows
+from fcslam.service import learning_rounds
+from fcslam.service.learning_rounds import MOST_ROUNDS, read_rounds
+
+
+def test_the_table_of_a_training_is_read(tmp_path):
+    first = RoundReport(
+        1, "light-a", ("anna", "bob"), {"cleo": "too late"}, {"triplet": 0.5}, {"mma_3px": 0.25}, 0.4, released=True
+    )
+    second = RoundReport(2, "light-b", ("bob",), losses={"triplet": float("nan")})
+    assert learning_rounds.ROUNDS_FILE == ROUNDS_FILE
+    write_rows(tmp_path / ROUNDS_FILE, [first.row(), second.row()])
+    one, two = read_rounds(tmp_path)
+    assert (one.round, one.version, one.released, one.robots) == (1, "light-a", True, ["anna", "bob"])
+    assert one.left_out == "cleo: too late"
+    assert (one.losses, one.measures) == ({"triplet": 0.5}, {"mma_3px": 0.25})
+    assert (two.released, two.robots, two.losses, two.measures) == (False, ["bob"], {}, {})
+
+
+def test_before_the_first_round_there_is_none(tmp_path):
+    assert read_rounds(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "content", [b"round,version\n1,a\n", b"round,version,released,robots,left_out\nx,a,1,r,\n", b"\xff\xfe"]
+)
+def test_a_damaged_table_is_refused(tmp_path, content):
+    (tmp_path / ROUNDS_FILE).write_bytes(content)
+    with pytest.raises(EvaluationError, match="no table of rounds"):
+        read_rounds(tmp_path)
+
+
+def test_a_table_without_end_is_cut(tmp_path):
+    head, line = "round,version,released,robots,left_out", "1,a,0,r,"
+    (tmp_path / ROUNDS_FILE).write_text("\n".join([head, *[line] * (MOST_ROUNDS + 5)]))
+    assert len(read_rounds(tmp_path)) == MOST_ROUNDS
