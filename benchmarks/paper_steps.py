@@ -1,10 +1,11 @@
 """From the paper's system to the default one, one change at a time: what does each change gain?
 
-    python benchmarks/paper_steps.py --vgg VGG.onnx
+    python benchmarks/paper_steps.py --paper VGG.onnx --vgg VGG.onnx --keep steps.jsonl
 
 The first row is `fcslam map --preset paper`. Each row below changes one thing and keeps it. Three robots with LiDAR and
 camera drive 60 m each in a simulated building from unknown starts; the seeds were not used while settings were chosen.
-Without --vgg, the first row is left out and the second one is the start.
+--paper is a network with the paper's encoder that was trained with eqs. (1)-(3), --vgg the same encoder with our losses
+(`benchmarks/paper_networks.py` trains both); without them, their rows are left out.
 
 Robots send their packets once for each detector and choice of places. The cloud then applies the same packets with the
 settings of each row (`fcslam map --onto`), so all rows have the same LiDAR SLAM. CPU is that of this second command.
@@ -28,7 +29,7 @@ from fcslam.metrics.bootstrap import mean_interval
 from fcslam.presets import Preset
 
 CASES = ("default", "corridor", "default, other light")
-VGG, LIGHT, BOTH = "vgg, camera", "light, camera", "light, LiDAR and camera"
+PAPER, VGG, LIGHT, BOTH = "paper's network, camera", "vgg, camera", "light, camera", "light, LiDAR and camera"
 """What robots send: detector and places."""
 
 
@@ -41,7 +42,8 @@ class Step(NamedTuple):
 
 
 STEPS = (
-    Step("the paper", VGG, {}),
+    Step("the paper", PAPER, {}),
+    Step("eqs. (1)-(3) -> our losses", VGG, {}),
     Step("VGG -> light network", LIGHT, {}),
     Step("delta -> geometric verification", LIGHT, {"decision": "geometry", "small_fleet": 0}),
     Step("rebuild -> incremental", LIGHT, {"vocabulary": {"strategy": "incremental"}}),
@@ -60,49 +62,53 @@ def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=CASES, help="kinds of fleet")
     parser.add_argument("--seeds", nargs="+", type=int, default=simulated_fleet.SEEDS, help="of the fleets")
-    parser.add_argument("--vgg", type=Path, help="the network of the first row")
+    parser.add_argument("--paper", type=Path, help="the network of the first row")
+    parser.add_argument("--vgg", type=Path, help="the network of the second row")
     parser.add_argument("--keep", type=Path, help="file that keeps finished fleets; the same one resumes")
     chosen = parser.parse_args()
     kept = common.Kept(chosen.keep)
     report = common.Report(__file__, __doc__, chosen)
-    steps = STEPS if chosen.vgg else STEPS[1:]
+    networks = {PAPER: chosen.paper, VGG: chosen.vgg}
+    steps = [step for step in STEPS if networks.get(step.sends, step) is not None]
     rows: list[tuple] = []
     for seed in chosen.seeds:
         for case in chosen.cases:
-            vgg = "" if chosen.vgg is None else str(chosen.vgg.resolve())
-            rows += kept.rows((case, seed, vgg), lambda case=case, seed=seed: fleet_rows(case, seed, chosen.vgg, steps))
+            for sends in dict.fromkeys(step.sends for step in steps):
+                network = networks.get(sends)
+                key = (case, seed, sends, str(network and network.resolve()))
+                rows += kept.rows(key, lambda fleet=(case, seed, sends), network=network: fleet_rows(*fleet, network))
     for case in chosen.cases:
         report.table(f"Means: {case}", {"step": "", **dict.fromkeys(MEASURES, "")}, means(rows, case, steps))
     report.table("Fleets", COLUMNS, rows)
     report.write()
 
 
-def fleet_rows(case: str, seed: int, vgg: Path | None, steps: Sequence[Step]) -> Iterator[tuple]:
-    """One recorded fleet under every step."""
+def fleet_rows(case: str, seed: int, sends: str, network: Path | None) -> Iterator[tuple]:
+    """One recorded fleet under every step whose robots send this."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         arguments = simulated_fleet.CASES[case][0]
         fleet = common.simulated(folder / "fleet", "--robots", simulated_fleet.ROBOTS, "--seed", seed, *arguments)
-        sent = {kind: folder / kind for kind in dict.fromkeys(step.sends for step in steps)}
-        for kind, run in sent.items():
-            settings = settings_file(folder / "robots.yaml", {"robot": robot_settings(kind, vgg)})
-            common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--config", settings, "--output", run)
-        for settings, step in zip(cloud_settings(steps), steps, strict=True):
+        settings = settings_file(folder / "robots.yaml", {"robot": robot_settings(sends, network)})
+        common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--config", settings, "--output", folder / "sent")
+        for step, cloud in cloud_settings():
+            if step.sends != sends:
+                continue
             run, result = folder / "run", folder / "result.json"
-            file = settings_file(folder / "cloud.yaml", {"fleet": settings})
-            cost = common.run_fcslam("map", "--onto", sent[step.sends], "--config", file, "--output", run, "--force")
+            file = settings_file(folder / "cloud.yaml", {"fleet": cloud})
+            cost = common.run_fcslam("map", "--onto", folder / "sent", "--config", file, "--output", run, "--force")
             common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result)
             yield case, seed, step.name, *measures(simulated_fleet.read(result), cost)
 
 
-def robot_settings(kind: str, vgg: Path | None) -> dict[str, object]:
-    settings: dict[str, object] = {"channels": ["lidar", "camera"] if kind == BOTH else ["camera"]}
-    if kind == VGG:
-        settings["views"] = {"onnx": {"weights": str(vgg)}}
+def robot_settings(sends: str, network: Path | None) -> dict[str, object]:
+    settings: dict[str, object] = {"channels": ["lidar", "camera"] if sends == BOTH else ["camera"]}
+    if network is not None:
+        settings["views"] = {"onnx": {"weights": str(network.resolve())}}
     return settings
 
 
-def cloud_settings(steps: Sequence[Step]) -> Iterator[dict[str, object]]:
+def cloud_settings() -> Iterator[tuple[Step, dict[str, object]]]:
     """The settings of the cloud at each step: the preset, then one change after the other."""
     fleet = yaml.safe_load(Preset.PAPER.file.read_text(encoding="utf-8"))["fleet"]
     for step in STEPS:
@@ -111,8 +117,7 @@ def cloud_settings(steps: Sequence[Step]) -> Iterator[dict[str, object]]:
             fleet["fusion"] = changes.pop("fusion")
         vocabulary = {**fleet["matcher"]["vocabulary"], **changes.pop("vocabulary", {})}
         fleet["matcher"] = {**fleet["matcher"], **changes, "vocabulary": vocabulary}
-        if step in steps:
-            yield fleet
+        yield step, fleet
 
 
 def settings_file(path: Path, content: dict[str, object]) -> Path:
