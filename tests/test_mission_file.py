@@ -16,7 +16,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EditError, SourceError
 from fcslam.mission import MissionCloud
 from fcslam.mission_file import edit_mission, mission_bytes, read_mission
-from fcslam.records import Cut, MapRegion, Pin, RegionUse, Removal, Undo, Veto
+from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, RegionUse, Removal, Undo, Veto
 from fcslam.runs import open_run
 from fcslam.sources import write_carmen
 
@@ -246,6 +246,7 @@ def test_a_truncated_mission_file_is_refused_and_stays_as_it_is(tmp_path, share)
     "wrong",
     [
         Removal("zoe"), Removal("ben", 1), Veto("anna", "zoe"), Pin("anna", "ben", (1000.0, 5000.0)), Undo(1), Undo(9),
+        FloorLabel("zoe", "2"), FloorLabel("ben", "no floor"),
         Cut("ben", 2.0, 1.0), MapRegion(RegionUse.ERASE, "", "ben", 1000.0, ((0.0, 0.0), (1.0, 0.0))),
     ],
     ids=str,
@@ -257,6 +258,16 @@ def test_a_wrong_edit_leaves_the_file_as_it_was(tmp_path, wrong):
         edit_mission(mission, [Removal("ben"), wrong], "me", 0.0)
     assert "\n" not in str(refused.value)
     assert mission.read_bytes() == GOLDEN.read_bytes()
+
+
+def test_no_closure_by_hand_is_made_between_floors_that_users_named(tmp_path):
+    mission = tmp_path / "mission.fcslam"
+    shutil.copy(GOLDEN, mission)
+    edit_mission(mission, [FloorLabel("ben", "2")], "me", 0.0)
+    made = ManualClosure("anna", 1000.0, "ben", 1000.0, (0.0, 0.0, 0.0), (0.1, 0.1))
+    with pytest.raises(EditError, match="different floors"):
+        edit_mission(mission, [made], "me", 0.0)
+    edit_mission(mission, [FloorLabel("anna", "2"), made], "me", 0.0)
 
 
 def test_two_people_who_edit_at_once_lose_nothing(tmp_path):

@@ -474,6 +474,15 @@ class MapRegion:
 
 
 @dataclass(frozen=True, slots=True)
+class FloorLabel:
+    """A user's statement which floor a session is on, whatever it named. Of several, the last one counts."""
+
+    session: str
+    floor: str
+    """1 to 16 letters, digits and ``. _ + -``."""
+
+
+@dataclass(frozen=True, slots=True)
 class Undo:
     """A user's statement that an earlier edit is not in force any more."""
 
@@ -481,7 +490,7 @@ class Undo:
     """Of the edit."""
 
 
-Change = Veto | Removal | Cut | Pin | ManualClosure | Placement | MapRegion
+Change = Veto | Removal | Cut | Pin | ManualClosure | Placement | MapRegion | FloorLabel
 """What an edit changes about a mission."""
 
 

@@ -15,6 +15,7 @@ from fcslam.geometry import se2
 from fcslam.records import (
     Cut,
     Edit,
+    FloorLabel,
     ManualClosure,
     MapRegion,
     Pin,
@@ -25,6 +26,7 @@ from fcslam.records import (
     Veto,
 )
 from fcslam.storage.state_file import read_state, write_state
+from fcslam.wire.messages import Hello
 from tests.scripted import ALIAS, closures, rectangle, stream
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 
@@ -36,6 +38,7 @@ CONTENTS = [
     Pin("a", "b", (1.0, 2.0)),
     ManualClosure("a", 1.0, "b", 2.0, (0.0, 1.0, 2.0), (0.1, 0.1)), Placement("a", 1.0, (0.0, 1.0, 2.0)),
     MapRegion(RegionUse.KEEP_OUT, "stairs", "a", 1.0, ((0.0, 0.0), (1.0, 0.0), (1.0, 1.5))), Undo(7),
+    FloorLabel("a+1", "-1"),
 ]  # fmt: skip
 SQUARE = '"polygon": [[0, 0], [1, 0], [1, 1]]'
 T = '"stamp_i": 1, "T_i_j": [0, 0, 0]'
@@ -62,6 +65,7 @@ def test_an_edit_survives_as_text(content):
         ("closure", f'{{"robot_i": "a", "robot_j": "a", "stamp_j": 1, {T}, "tolerance": [1, 1]}}'),
         ("placement", '{"session": "a", "stamp": 1, "pose": [1e9, 0, 0]}'),
         ("region", '{"use": "erase", "name": "", "session": "a", "stamp": 1, "polygon": [[0, 0], [1, 0]]}'),
+        ("floor", '{"session": "a", "floor": ""}'), ("floor", '{"session": "a", "floor": "seventeen-letters"}'),
         ("region", f'{{"use": "burn", "name": "", "session": "a", "stamp": 1, {SQUARE}}}'),
         ("region", f'{{"use": "area", "name": "{101 * "x"}", "session": "a", "stamp": 1, {SQUARE}}}'),
     ],
@@ -196,6 +200,34 @@ def test_an_edit_counts_whenever_it_is_made_and_its_undo_leaves_no_trace(packets
             assert told(cloud.finalize()) == before
     assert results[0] == results[1] == results[2]
     assert results[0] != before
+
+
+@pytest.mark.slow
+def test_a_floor_by_hand_counts_as_one_that_the_robot_named(packets):
+    closure, _, _ = a_first_closure(feed(Cloud(FleetConfig(), 0), packets))
+    session = closure.j.robot
+    cloud = Cloud(FleetConfig(), 0)
+    cloud.fleet.edit([FloorLabel(session, "2")])
+    result = feed(cloud, packets).finalize()
+    own = next(robot for robot in result.robots if robot.robot == session)
+    assert {robot.robot: robot.floor for robot in result.robots if robot.map_index == own.map_index} == {session: "2"}
+    named = [
+        replace(packet, body=replace(packet.body, floor="2"))
+        if packet.robot == session and isinstance(packet.body, Hello)
+        else packet
+        for packet in packets
+    ]
+    assert told(result) == told(feed(Cloud(FleetConfig(), 0), named).finalize())
+    with pytest.raises(ValueError, match="floor"):
+        cloud.fleet.edit([])
+
+
+def test_no_closure_by_hand_joins_floors(scripted):
+    made = ManualClosure("a", 10.2, "b", 1020.0, (1.0, 2.0, 0.5), (0.1, 0.05))
+    for label, maps in (("2", {"a": 0, "b": 1}), ("1", {"a": 0, "b": 0})):
+        cloud = scripted()
+        cloud.fleet.edit([FloorLabel("a", "1"), FloorLabel("b", "3"), FloorLabel("b", label), made])
+        assert map_of(feed(cloud, TWO).finalize()) == maps
 
 
 TWO = [*stream(*A, start_s=0.0), *stream(*B, start_s=1000.0)]

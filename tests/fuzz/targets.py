@@ -20,6 +20,7 @@ from fcslam.localization import read_map
 from fcslam.mission import MissionConfig
 from fcslam.records import (
     Cut,
+    FloorLabel,
     LaserModel,
     LaserScan,
     ManualClosure,
@@ -53,6 +54,7 @@ EDITS = (
     Removal("a"), Undo(1), Veto("a", "a", (1.0, 5.0)), Pin("a", "a", (1.0, 5.0)), Cut("a", 2.0, 3.0),
     ManualClosure("a", 1.0, "a", 6.0, (0.5, 0.0, 0.1), (0.1, 0.1)), Placement("a", 1.0, (1.0, 2.0, 0.5)),
     MapRegion(RegionUse.ERASE, "", "a", 1.0, CORNERS), MapRegion(RegionUse.AREA, "Room 1", "a", 1.0, CORNERS),
+    FloorLabel("a", "2"),
 )  # fmt: skip
 """Edits of every kind."""
 LONGEST_REASON = 2000

@@ -14,7 +14,7 @@ import pytest
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.mission import MissionConfig, run_mission
-from fcslam.records import ClosureStatus, Place, Removal, Undo, Veto
+from fcslam.records import ClosureStatus, FloorLabel, Place, Removal, Undo, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service import worker as worker_module
@@ -473,10 +473,10 @@ def content(run):
 
 
 @pytest.mark.parametrize("restarts", [False, True])
-@pytest.mark.parametrize("change", [Removal("b"), Removal("b", 0), Veto("a", "b")], ids=str)
+@pytest.mark.parametrize("change", [Removal("b"), Removal("b", 0), Veto("a", "b"), FloorLabel("b", "2")], ids=str)
 def test_an_edit_and_its_undo_leave_what_would_have_been_without_them(cloud, tmp_path, change, restarts):
     packets, others = two_robots(), [packet for packet in two_robots() if packet.robot == "a"]
-    if isinstance(change, Veto):
+    if not isinstance(change, Removal):
         others = None
     expected = {}
     for name, sent_ in (("with", packets), ("without", others)):
@@ -500,12 +500,16 @@ def test_an_edit_and_its_undo_leave_what_would_have_been_without_them(cloud, tmp
     if isinstance(change, Removal):
         assert set(open_run(cloud.folder.live).trajectories) == {"a"}
         assert content(run) == expected["without"]
+    elif isinstance(change, FloorLabel):  # the script of matches does not heed floors
+        assert {name: robot.floor for name, robot in run.trajectories.items()} == {"a": "", "b": "2"}
     else:
         assert {t.map_index for t in run.trajectories.values()} == {0, 1}
     cloud.store.edit(Undo(edit.number), "boss", 0.0)
     if restarts:
         cloud.restart()
-    assert content(cloud.finalize()) == expected["with"]
+    run = cloud.finalize()
+    assert content(run) == expected["with"]
+    assert {robot.floor for robot in run.trajectories.values()} == {""}
     cloud.now += 1000.0
     cloud.work()
     live = open_run(cloud.folder.live)

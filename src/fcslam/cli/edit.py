@@ -166,6 +166,20 @@ def remove(
         _append(mission, Cut(session, *_bounded(stretch)), author)
 
 
+@app.command(context_settings=_NEGATIVE, epilog=examples("fcslam edit floor runs/building anna+1 2"))
+def floor(
+    mission: Mission,
+    session: Session,
+    name: Annotated[str, typer.Argument(metavar="FLOOR", help="1 to 16 letters, digits and . _ + -")],
+    *,
+    author: Author = None,
+) -> None:
+    """Say which floor a session is on, whatever it named. It leaves the maps of other floors."""
+    from fcslam.records import FloorLabel
+
+    _append(mission, FloorLabel(session, name), author)
+
+
 @app.command(
     context_settings=_NEGATIVE,
     epilog=examples(

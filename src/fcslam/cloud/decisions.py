@@ -206,6 +206,7 @@ class ClosureDecisions:
             if change not in entered
             and {change.robot_i, change.robot_j} <= present
             and not any(is_removed(session, self._changes) for session in (change.robot_i, change.robot_j))
+            and self._sessions.floor(change.robot_i) == self._sessions.floor(change.robot_j)
             and len(set(self._ends(change))) == 2
             and (final or all(self._has_passed(session, stamp) for session, stamp in stamps_of(change)))
         ]

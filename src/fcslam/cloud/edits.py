@@ -4,7 +4,7 @@ An undo is final: whoever regrets it makes the edit again.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict
 from itertools import chain
 from math import isfinite
@@ -17,10 +17,12 @@ from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.config import one_line
 from fcslam.errors import EditError
 from fcslam.records import (
+    FLOOR,
     NAME,
     Change,
     Cut,
     Edit,
+    FloorLabel,
     ManualClosure,
     MapRegion,
     Pin,
@@ -49,6 +51,7 @@ _KINDS: Final[dict[str, type[Change | Undo]]] = {
     "closure": ManualClosure,
     "placement": Placement,
     "region": MapRegion,
+    "floor": FloorLabel,
     "undo": Undo,
 }
 _READERS: Final[dict[str, TypeAdapter[Change | Undo]]] = {kind: TypeAdapter(type_) for kind, type_ in _KINDS.items()}
@@ -91,6 +94,17 @@ def is_cut(session: str, stamp: float, changes: Iterable[Change]) -> bool:
     return any(isinstance(change, Cut) and change.covers(session, stamp) for change in changes)
 
 
+def floors(changes: Iterable[Change]) -> dict[str, str]:
+    """The floors that users gave to sessions, by session."""
+    return {change.session: change.floor for change in changes if isinstance(change, FloorLabel)}
+
+
+def needs_new_fleet(before: Collection[Change], now: Collection[Change]) -> bool:
+    """Whether these changes act on packets that took effect: a removed session comes back, or one changes its floor."""
+    back = {change for change in before if isinstance(change, Removal)} - set(now)
+    return bool(back) or floors(before) != floors(now)
+
+
 def sessions_of(content: Change | Undo) -> tuple[str, ...]:
     """The sessions, or the robot, that an edit names."""
     match content:
@@ -98,7 +112,7 @@ def sessions_of(content: Change | Undo) -> tuple[str, ...]:
             return content.robot_i, content.robot_j
         case Removal():
             return (content.robot,)
-        case Cut() | Placement() | MapRegion():
+        case Cut() | Placement() | MapRegion() | FloorLabel():
             return (content.session,)
         case Undo():
             return ()
@@ -168,6 +182,8 @@ def check_edit(content: Change | Undo) -> None:
             _check_coordinates(content.pose[:2])
         case MapRegion():
             _check_region(content)
+        case FloorLabel() if not FLOOR.fullmatch(content.floor):
+            raise EditError(f"floor '{content.floor[:LONGEST_NAME]}' is not 1 to 16 of A-Z a-z 0-9 . _ + -")
 
 
 def _check_closure(closure: ManualClosure) -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 from fcslam.cloud.claims import check_constraint, check_submap, with_least_noise
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
-from fcslam.cloud.edits import is_removed
+from fcslam.cloud.edits import floors, is_removed, needs_new_fleet
 from fcslam.cloud.fusion_strategy import FusionStrategy
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
@@ -35,7 +35,6 @@ from fcslam.records import (
     KeyscanId,
     ManualClosure,
     Place,
-    Removal,
     frozen,
 )
 from fcslam.storage.state_file import State
@@ -132,6 +131,7 @@ class Fleet:
         fleet._sessions.restore(state["sessions"])
         fleet._graph.restore(state["graph"])
         fleet._decisions.restore(state["decisions"])
+        fleet._sessions.name_floors(floors(fleet._decisions.changes))
         fleet._recognition.restore(state["recognition"])
         fleet._quality.restore(state["quality"])
         fleet._needs_replay = state["needs_replay"]
@@ -143,11 +143,11 @@ class Fleet:
         A removed session leaves the estimate and is compared with nothing, but stays in memory.
 
         Raises:
-            ValueError: a removal is not in force any more; only a new fleet can apply its packets.
+            ValueError: a removed session comes back or one changes its floor; only a new fleet can apply its packets.
         """
-        removals = {change for change in self._decisions.changes if isinstance(change, Removal)}
-        if not removals <= set(changes):
-            raise ValueError("a removed session cannot come back")
+        if self._sessions.robots and needs_new_fleet(self._decisions.changes, changes):
+            raise ValueError("a removed session cannot come back, and none can change its floor")
+        self._sessions.name_floors(floors(changes))
         removed = [session for session in self._sessions.robots if is_removed(session, changes)]
         # A closure by hand comes after all others, in this fleet perhaps before some.
         made = bool(self._sessions.robots) and any(isinstance(change, ManualClosure) for change in changes)

@@ -29,6 +29,8 @@ class SessionStore:
         self._limits = limits
         self._read = read
         self._hellos: dict[str, Hello] = {}
+        self._floors: Mapping[str, str] = {}
+        """Those that users gave to sessions."""
         self._hello_sequences: dict[str, int] = {}
         """Number of the packet of the newest hello."""
         self._stamps: dict[str, list[float]] = {}
@@ -185,9 +187,13 @@ class SessionStore:
         """What the robot describes places with now; nothing before its hello."""
         return self._hellos[robot].detector_versions if robot in self._hellos else {}
 
+    def name_floors(self, floors: Mapping[str, str]) -> None:
+        """Take over the floors that users gave, by session."""
+        self._floors = dict(floors)
+
     def floor(self, robot: str) -> str:
-        """Floor that the robot named; empty if it named none."""
-        return self._hellos[robot].floor
+        """Floor that a user gave to the session, or else the one that it named; empty if there is none."""
+        return self._floors.get(robot, self._hellos[robot].floor)
 
     def lasers(self, robot: str) -> tuple[LaserModel, ...]:
         """The lasers that the robot announced."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fcslam.cloud.edits import check_undo, edit_json, kind_of, read_edit, sessions_of, stamps_of
+from fcslam.cloud.edits import check_undo, edit_json, floors, in_force, kind_of, read_edit, sessions_of, stamps_of
 from fcslam.cloud.replies import SessionCorrection, is_news
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
@@ -282,7 +282,8 @@ class MissionStore:
             first, last = spans[name]
             if not first - NEARBY_S <= stamp <= last + NEARBY_S:
                 raise EditError(f"{name} has no scan at {stamp:.3f} s; its scans are from {first:.3f} to {last:.3f} s")
-        if isinstance(content, ManualClosure) and len({self._floor(name) for name in named}) > 1:
+        given = floors(in_force(self.edits()))
+        if isinstance(content, ManualClosure) and len({given.get(name, self._floor(name)) for name in named}) > 1:
             raise EditError(f"{' and '.join(named)} are on different floors, which no closure joins")
 
     def _floor(self, session: str) -> str:

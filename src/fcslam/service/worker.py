@@ -28,7 +28,7 @@ from typing import IO, NamedTuple
 
 import cv2
 
-from fcslam.cloud.edits import in_force
+from fcslam.cloud.edits import in_force, needs_new_fleet
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import SessionCorrection
@@ -39,7 +39,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.processes import Background, Start, start_copy
-from fcslam.records import Edit, Removal
+from fcslam.records import Edit
 from fcslam.runs import Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.mission_folder import MissionFolder
@@ -136,7 +136,7 @@ class Worker:
             return False
         before, now = in_force(self._edits), in_force([*self._edits, *edits])
         self._edits += edits
-        if {change for change in before if isinstance(change, Removal)} - set(now):
+        if needs_new_fleet(before, now):
             self._start_over()
         self._fleet.edit(now)
         self._published, self._reported = -1, min(self._reported, max(self._applied, self._resumed_at) - 1)
@@ -149,7 +149,7 @@ class Worker:
         return self._edits[-1].number if self._edits else 0
 
     def _start_over(self) -> None:
-        """Apply all packets again, as a worker without a snapshot does: a removed session comes back."""
+        """Apply all packets again, as a worker without a snapshot does: edits may change what they did."""
         self._resumed_at = max(self._resumed_at, self._applied)
         self._written = 0
         self._ready.clear()

@@ -31,7 +31,7 @@ EditNumber = Annotated[int, Path(ge=1, le=2**31 - 1)]
 class NewEdit(Settings):
     """An edit: what changes about the mission from now on."""
 
-    kind: Literal["veto", "removal", "cut", "pin", "closure", "placement", "region"]
+    kind: Literal["veto", "removal", "cut", "pin", "closure", "placement", "region", "floor"]
     content: dict[str, Any] = Field(description="what it names, as `GET /edits` shows it; docs/deploy.md has examples")
 
 
@@ -71,7 +71,7 @@ def decision_router(state: ServiceState) -> APIRouter:
 
     @router.post("/edits/{number}/undo", status_code=201, responses=refusals(400, 404, 409))
     async def undo(request: Request, number: EditNumber) -> EditSummary:
-        """Undo an edit. A removed session comes back when the worker has applied all packets again."""
+        """Undo an edit. Removals and floors are undone when the worker has applied all packets again."""
         return await run_in_threadpool(_edit, state, request.state.actor, Undo(number))
 
     @router.post(
