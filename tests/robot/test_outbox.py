@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -334,3 +335,23 @@ def test_a_damaged_byte_in_a_closed_outbox_is_mended_and_more_is_told(path, at):
     path.write_bytes(content)
     with pytest.raises(StateError, match="damaged"):
         Outbox(path, "alice", LIMIT)
+
+
+@pytest.mark.parametrize("damaged", [2, 3])
+def test_a_damaged_packet_is_told_by_its_number_after_a_kill(path, damaged):
+    """A killed process leaves no seals of the pages; each waiting packet has its digest."""
+    outbox = Outbox(path, "alice", LIMIT)
+    outbox.begin("r", resume=False)
+    outbox.put(said(k, body) for k, body in enumerate([HELLO, *[KEYSCAN] * 4]))
+    outbox.synchronize({})
+    outbox.acknowledge(0, 1)
+    outbox.close()
+    for seals in path.parent.glob("*.seals"):
+        seals.unlink()
+    with closing(sqlite3.connect(path)) as file, file:
+        (data,) = file.execute("SELECT data FROM packets WHERE ordinal = ?", (damaged,)).fetchone()
+        flipped = bytes([*data[:-3], data[-3] ^ 4, *data[-2:]])
+        file.execute("UPDATE packets SET data = ? WHERE ordinal = ?", (flipped, damaged))
+    with pytest.raises(StateError, match=f"packet {damaged} of epoch 0 is damaged") as told:
+        Outbox(path, "alice", LIMIT)
+    assert "\n" not in str(told.value)

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fcslam.errors import StateError, StoreError
+from fcslam.errors import PacketError, StateError, StoreError
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.storage.database import Database
 from fcslam.storage.recovery import mend_pages
@@ -78,8 +78,8 @@ class Outbox:
         """Open the file at ``path``, or create it.
 
         Raises:
-            StateError: the file belongs to another robot, is open in another process, is not an outbox, or cannot be
-                written.
+            StateError: the file belongs to another robot, is open in another process, is not an outbox, cannot be
+                written, or holds a damaged packet that waits.
         """
         self._path = path
         self._limit_bytes = limit_bytes
@@ -96,6 +96,7 @@ class Outbox:
             with self._transaction() as connection:
                 self.waiting = WaitingPackets(*_count(connection, _IS_WAITING))
                 """Packets that are not confirmed yet, of all sessions."""
+            self._check_waiting()
         except StateError:
             self.close()
             raise
@@ -107,6 +108,23 @@ class Outbox:
             raise StateError(f"{error}; give another --state, or a copy of this one") from error
         if kept is not None:
             _log.warning("%s: a damaged byte is mended; the file as it was found is in %s", self._path, kept)
+
+    def _check_waiting(self) -> None:
+        """Compare the waiting packets with their digests: after a kill, the file has no seals of its pages."""
+        question = (
+            "SELECT epoch, part, ordinal, sequence, digest, data FROM packets JOIN sessions USING (epoch) "
+            f"WHERE {_IS_WAITING} ORDER BY epoch, sequence"
+        )
+        for epoch, part, ordinal, sequence, digest, data in self._rows(question):
+            try:
+                whole = _digest(readdress(data, part, ordinal)) == digest
+            except PacketError:
+                whole = False
+            if not whole:
+                raise StateError(
+                    f"{self._path}: packet {sequence} of epoch {epoch} is damaged; the cloud has what was sent before "
+                    "it, and what waits after it needs it: give another --state"
+                )
 
     def close(self) -> None:
         """Close the file; waiting packets stay in it."""
@@ -175,7 +193,7 @@ class Outbox:
             for packet in packets:
                 epoch = self._epoch_of(connection, packet.epoch)
                 data = encode(packet)
-                digest = hashlib.blake2b(data, digest_size=8).digest()
+                digest = _digest(data)
                 if self._is_known(connection, epoch, packet.sequence, digest):
                     continue
                 crowded = self.waiting.bytes >= PLACES_SHARE * self._limit_bytes
@@ -362,6 +380,10 @@ class Outbox:
             reason = str(error.__cause__)
             reason = "another process runs on it" if reason == "database is locked" else reason
             raise StateError(f"{self._path}: cannot be used: {reason}") from error
+
+
+def _digest(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=8).digest()
 
 
 def _insert(
