@@ -91,6 +91,7 @@ def fleet_rows(case: str, seed: int, sends: str, network: Path | None) -> Iterat
         fleet = common.simulated(folder / "fleet", "--robots", simulated_fleet.ROBOTS, "--seed", seed, *arguments)
         settings = settings_file(folder / "robots.yaml", {"robot": robot_settings(sends, network)})
         common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--config", settings, "--output", folder / "sent")
+        (folder / "sent" / "mission.state").unlink()  # the step with its settings would begin at the end
         for step, cloud in cloud_settings():
             if step.sends != sends:
                 continue
