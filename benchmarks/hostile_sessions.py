@@ -49,7 +49,8 @@ CRASH = "exception:"
 INTERLEAVED = 8
 """Of so many sets, one comes between the honest packets."""
 COLUMNS = {"attack": "", "sets": ",", "refused packets": ",", "joined": ",", "bars broken": ",",
-           "moved 90 %, mm": ".1f", "moved most, mm": ".1f", "slowest, s": ".1f"}  # fmt: skip
+           "moved 90 %, mm": ".1f", "moved most, mm": ".1f", "removed again": ",", "left most, mm": ".1f",
+           "slowest, s": ".1f"}  # fmt: skip
 BROKEN = {"set": "", "attack": "", "what broke": ""}
 NAMED = {"attack on intel": "", "robots in a map with the attacker": "", "moved most, mm": ".1f",
          "honest closures lost": ",", "CPU, s": ".1f"}  # fmt: skip
@@ -92,6 +93,8 @@ class Outcome(NamedTuple):
     """Whether a hostile session shares a map with an honest robot."""
     moved_m: float
     """Largest distance of an honest keyscan from where it is without them."""
+    left_m: float | None
+    """The same after the sessions were removed again; None if they were not."""
     broken: str
     """The bars that it broke."""
     cpu_s: float
@@ -99,10 +102,11 @@ class Outcome(NamedTuple):
 
 def summary(name: str, rows: Sequence[Outcome]) -> tuple[Any, ...]:
     moved = [1e3 * row.moved_m for row in rows] or [0.0]
+    left = [1e3 * row.left_m for row in rows if row.left_m is not None]
     return (
         name, len(rows), sum(row.refused for row in rows), sum(row.joined for row in rows),
-        sum(bool(row.broken) for row in rows), float(np.quantile(moved, 0.9)), max(moved),
-        max((row.cpu_s for row in rows), default=0.0),
+        sum(bool(row.broken) for row in rows), float(np.quantile(moved, 0.9)), max(moved), len(left),
+        max(left, default=0.0), max((row.cpu_s for row in rows), default=0.0),
     )  # fmt: skip
 
 
@@ -128,27 +132,27 @@ class Mission:
         attack = list(ATTACKS)[number % len(ATTACKS)]
         hostile = self._sessions(attack, rng)
         began = time.process_time()
-        refused, joined, moved_m, broken = 0, False, 0.0, ""
+        refused, joined, moved_m, left_m, broken = 0, False, 0.0, None, ""
         try:
             if number // len(ATTACKS) % INTERLEAVED == 0:
                 found, evicted, refused = self._between(hostile)
             else:
-                (found, refused), evicted = self._after(hostile), self.alone
-            joined, moved_m, broken = self._judge(found, evicted)
+                (found, refused), evicted = self._after(hostile), None
+            joined, moved_m, left_m, broken = self._judge(found, evicted)
         except Exception as error:  # whatever it is, it would have ended the worker
             broken = f"{CRASH} {type(error).__name__}: {error}"[:200]
-        return [Outcome(number, attack, refused, joined, moved_m, broken, time.process_time() - began)]
+        return [Outcome(number, attack, refused, joined, moved_m, left_m, broken, time.process_time() - began)]
 
-    def _judge(self, found: FleetResult, evicted: FleetResult) -> tuple[bool, float, str]:
+    def _judge(self, found: FleetResult, evicted: FleetResult | None) -> tuple[bool, float, float | None, str]:
         honest = {stream[0].robot for stream in self.streams}
         maps = {robot.robot: robot.map_index for robot in found.robots}
         joined = not {maps[name] for name in honest}.isdisjoint(maps[name] for name in maps if name not in honest)
         moved_m, separated = moved(found, self.alone, honest)
-        left_m, still_separated = moved(evicted, self.alone, honest)
+        left_m, still_separated = (None, False) if evicted is None else moved(evicted, self.alone, honest)
         broken = ["honest robots separated"] * separated
         broken += [f"moved by {1e3 * moved_m:.1f} mm"] * (moved_m > BEFORE_M)
-        broken += ["removed, and not as before"] * (still_separated or left_m > AFTER_M)
-        return joined, moved_m, "; ".join(broken)
+        broken += ["removed, and not as before"] * (still_separated or (left_m or 0.0) > AFTER_M)
+        return joined, moved_m, left_m, "; ".join(broken)
 
     def _after(self, hostile: Stream) -> tuple[FleetResult, int]:
         """The result with hostile sessions that come last, and how many of their packets are refused."""
