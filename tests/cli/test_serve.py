@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import ssl
@@ -58,11 +59,12 @@ def test_only_robots_have_certificates_of_their_own(credentials):
     assert {path.stem for path in (credentials / "robots").glob("*.pem")} == {"robot_1", "robot_2", "robot_3"}
 
 
-def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials):
-    before = {name: (credentials / name).read_bytes() for name in ("ca.pem", "ca.key", "tokens/boss")}
-    assert main(["certificates", "-o", str(credentials), "--robot", "new", "--robot", "robot_1"]) == 0
-    assert {name: (credentials / name).read_bytes() for name in before} == before
-    names = [entry["name"] for entry in yaml.safe_load((credentials / "tokens.yaml").read_text())["tokens"]]
+def test_once_more_keeps_what_is_there_and_adds_what_is_new(credentials, tmp_path):
+    mine = shutil.copytree(credentials, tmp_path / "credentials")  # the other tests share theirs
+    before = {name: (mine / name).read_bytes() for name in ("ca.pem", "ca.key", "tokens/boss")}
+    assert main(["certificates", "-o", str(mine), "--robot", "new", "--robot", "robot_1"]) == 0
+    assert {name: (mine / name).read_bytes() for name in before} == before
+    names = [entry["name"] for entry in yaml.safe_load((mine / "tokens.yaml").read_text())["tokens"]]
     assert names == ["robot_1", "robot_2", "robot_3", "boss", "new"]
 
 
