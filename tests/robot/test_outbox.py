@@ -1,6 +1,7 @@
 """The outbox forgets what the cloud has, and nothing else, whatever happens to its process."""
 
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -11,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -337,8 +338,8 @@ def test_a_damaged_byte_in_a_closed_outbox_is_mended_and_more_is_told(path, at):
         Outbox(path, "alice", LIMIT)
 
 
-@pytest.mark.parametrize("damaged", [2, 3])
-def test_a_damaged_packet_is_told_by_its_number_after_a_kill(path, damaged):
+@pytest.mark.parametrize(("damaged", "by"), [(2, 4), (2, 6), (3, 255)])
+def test_a_damaged_packet_is_told_by_its_number_after_a_kill(path, damaged, by, caplog):
     """A killed process leaves no seals of the pages; each waiting packet has its digest."""
     outbox = Outbox(path, "alice", LIMIT)
     outbox.begin("r", resume=False)
@@ -350,8 +351,92 @@ def test_a_damaged_packet_is_told_by_its_number_after_a_kill(path, damaged):
         seals.unlink()
     with closing(sqlite3.connect(path)) as file, file:
         (data,) = file.execute("SELECT data FROM packets WHERE ordinal = ?", (damaged,)).fetchone()
-        flipped = bytes([*data[:-3], data[-3] ^ 4, *data[-2:]])
-        file.execute("UPDATE packets SET data = ? WHERE ordinal = ?", (flipped, damaged))
+        changed = bytes([*data[:-3], data[-3] ^ by, *data[-2:]])
+        file.execute("UPDATE packets SET data = ? WHERE ordinal = ?", (changed, damaged))
+    if by == 4:
+        with closing(Outbox(path, "alice", LIMIT)) as mended:
+            assert mended.packet(0, damaged) == data
+        assert f"a bit of packet {damaged} of epoch 0 was damaged" in caplog.text
+        return
     with pytest.raises(StateError, match=f"packet {damaged} of epoch 0 is damaged") as told:
         Outbox(path, "alice", LIMIT)
     assert "\n" not in str(told.value)
+
+
+LOG = "outbox.sqlite-wal"
+FRAME = 4096 + 24
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    """The files of a killed process that put 31 packets."""
+    folder, copied = tmp_path_factory.mktemp("killed"), tmp_path_factory.mktemp("copied")
+    outbox = Outbox(folder / "outbox.sqlite", "alice", LIMIT)
+    outbox.begin("r", resume=False)
+    outbox.synchronize({})
+    for k in range(31):
+        outbox.put([said(k, [KEYSCAN, LIDAR_PLACE][k % 2])])
+    for name in ("outbox.sqlite", LOG):
+        shutil.copy(folder / name, copied)
+    outbox.close()
+    return copied
+
+
+def flipped(killed, tmp_path, *bits):
+    """A copy of the files, with damaged bits in the log."""
+    folder = Path(shutil.copytree(killed, tmp_path / "state"))
+    log = bytearray((folder / LOG).read_bytes())
+    for at, bit in bits:
+        log[at] ^= 1 << bit
+    (folder / LOG).write_bytes(log)
+    return folder / "outbox.sqlite"
+
+
+PLACES_IN_LOG = {"magic": 3, "salt of the log": 18, "sum of the log": 29, "page number": 32 + 3, "size": 32 + 7,
+                 "salt": 32 + 5 * FRAME + 9, "sum": 32 + 5 * FRAME + 20, "page": 32 + 5 * FRAME + 24,
+                 "end of a page": 32 + 6 * FRAME - 1}  # fmt: skip
+
+
+@pytest.mark.parametrize("at", PLACES_IN_LOG.values(), ids=PLACES_IN_LOG)
+def test_a_damaged_bit_in_the_log_of_a_killed_robot_is_mended(killed, tmp_path, caplog, at):
+    """SQLite leaves out what is behind it, without an error."""
+    path = flipped(killed, tmp_path, (at, 2))
+    damaged = (path.parent / LOG).read_bytes()
+    with closing(Outbox(path, "alice", LIMIT)) as outbox:
+        assert len(drain(outbox)) == 31
+    assert "mended" in caplog.text
+    assert (path.parent / "damaged" / "1" / LOG).read_bytes() == damaged
+
+
+@settings(max_examples=40)
+@given(data=st.data())
+def test_no_damaged_bit_after_a_kill_loses_a_packet(killed, data):
+    size = (killed / LOG).stat().st_size
+    frames = data.draw(st.sets(st.integers(0, (size - 32) // FRAME - 1), min_size=1, max_size=3))
+    bits = [
+        (32 + frame * FRAME + data.draw(st.integers(0, FRAME - 1)), data.draw(st.integers(0, 7))) for frame in frames
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        path = flipped(killed, Path(folder), *bits)
+        with closing(Outbox(path, "alice", LIMIT)) as outbox:
+            assert len(drain(outbox)) == 31
+
+
+def test_more_damage_in_the_log_is_told_and_nothing_is_changed(killed, tmp_path):
+    at = 32 + 5 * FRAME + 1000
+    path = flipped(killed, tmp_path, (at, 1), (at + 40, 5), (at + 80, 7))
+    before = (path.parent / LOG).read_bytes()
+    with pytest.raises(StateError, match="write-ahead log are damaged; give another --state") as told:
+        Outbox(path, "alice", LIMIT)
+    assert "\n" not in str(told.value)
+    assert (path.parent / LOG).read_bytes() == before
+
+
+def test_a_frame_that_was_being_written_is_no_damage(killed, tmp_path, caplog):
+    """A kill between the header and the page of the last frame."""
+    path = Path(shutil.copytree(killed, tmp_path / "state")) / "outbox.sqlite"
+    log = (path.parent / LOG).read_bytes()
+    (path.parent / LOG).write_bytes(log[:-4096] + bytes(4096))
+    with closing(Outbox(path, "alice", LIMIT)) as outbox:
+        assert len(drain(outbox)) == 30
+    assert "mended" not in caplog.text

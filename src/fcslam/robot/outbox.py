@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from fcslam.errors import PacketError, StateError, StoreError
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.storage.database import Database
+from fcslam.storage.log_repair import mend_log
 from fcslam.storage.recovery import mend_pages
 from fcslam.wire.batches import LENGTH
 from fcslam.wire.limits import MAXIMUM_EPOCH
@@ -103,28 +104,34 @@ class Outbox:
 
     def _mend(self) -> None:
         try:
-            kept = mend_pages(self._path)
+            kept = mend_pages(self._path) or mend_log(self._path)
         except StoreError as error:
             raise StateError(f"{error}; give another --state, or a copy of this one") from error
         if kept is not None:
             _log.warning("%s: a damaged byte is mended; the file as it was found is in %s", self._path, kept)
 
     def _check_waiting(self) -> None:
-        """Compare the waiting packets with their digests: after a kill, the file has no seals of its pages."""
+        """Compare the waiting packets with their digests, and mend those in which one bit is wrong.
+
+        After a kill, the file has no seals of its pages.
+        """
         question = (
             "SELECT epoch, part, ordinal, sequence, digest, data FROM packets JOIN sessions USING (epoch) "
             f"WHERE {_IS_WAITING} ORDER BY epoch, sequence"
         )
         for epoch, part, ordinal, sequence, digest, data in self._rows(question):
-            try:
-                whole = _digest(readdress(data, part, ordinal)) == digest
-            except PacketError:
-                whole = False
-            if not whole:
+            if _is_whole(data, part, ordinal, digest):
+                continue
+            mended = next((tried for tried in _bit_flips(data) if _is_whole(tried, part, ordinal, digest)), None)
+            if mended is None:
                 raise StateError(
                     f"{self._path}: packet {sequence} of epoch {epoch} is damaged; the cloud has what was sent before "
                     "it, and what waits after it needs it: give another --state"
                 )
+            with self._transaction() as connection:
+                which = "WHERE epoch = ? AND ordinal = ?"
+                connection.execute(f"UPDATE packets SET data = ? {which}", (mended, epoch, ordinal))
+            _log.warning("%s: a bit of packet %d of epoch %d was damaged, and is mended", self._path, sequence, epoch)
 
     def close(self) -> None:
         """Close the file; waiting packets stay in it."""
@@ -384,6 +391,24 @@ class Outbox:
 
 def _digest(data: bytes) -> bytes:
     return hashlib.blake2b(data, digest_size=8).digest()
+
+
+def _is_whole(data: bytes, part: int, ordinal: int, digest: bytes) -> bool:
+    """Whether a packet as it is sent is the one that the front end made."""
+    try:
+        return _digest(readdress(data, part, ordinal)) == digest
+    except PacketError:
+        return False
+
+
+def _bit_flips(data: bytes) -> Iterator[bytes]:
+    """All that differ from ``data`` by one bit."""
+    tried = bytearray(data)
+    for at in range(len(tried)):
+        for bit in range(8):
+            tried[at] ^= 1 << bit
+            yield bytes(tried)
+            tried[at] ^= 1 << bit
 
 
 def _insert(
