@@ -137,7 +137,7 @@ def _seen(run: Run, mission: SavedMission, map_index: int, folder: Path) -> _See
                 continue
             if isinstance(packet.body, Hello):
                 lasers[packet.robot] = packet.body.lasers
-            elif isinstance(packet.body, Keyscan):
+            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
                 keyscans.append(packet.body)
     stamps = {name: np.argsort(robot.stamps, kind="stable") for name, robot in members.items()}
     for keyscan in keyscans:

@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.edits import in_force
@@ -25,8 +26,10 @@ from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.metrics.jumps import JumpLimits
 from fcslam.mission_file import EMPTY, SavedMission, mission_bytes, mission_state_bytes
+from fcslam.places.matcher import MatchDecision
 from fcslam.records import Channel, Edit, Veto
 from fcslam.robot.frontend import RobotConfig
+from fcslam.robot.words import Sends
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
@@ -50,6 +53,15 @@ class MissionConfig(Settings):
     fleet: FleetConfig = Field(default=FleetConfig(), description="settings of the cloud")
     map: OccupancyConfig = Field(default=OccupancyConfig(), description="the occupancy grid")
     jumps: JumpLimits = Field(default=JumpLimits(), description="limits of motion beyond which `fcslam map` warns")
+
+    @model_validator(mode="after")
+    def _words_do_not_show_geometry(self) -> Self:
+        if self.robot.sends is Sends.WORDS and self.fleet.matcher.decision is not MatchDecision.SIMILARITY:
+            raise ValueError(
+                "robot.sends words leaves no ranges to verify places with; set fleet.matcher.decision to similarity "
+                "and fleet.fusion to two_point, or give --preset paper"
+            )
+        return self
 
 
 @dataclass(frozen=True, slots=True)

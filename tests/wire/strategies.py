@@ -13,7 +13,9 @@ from fcslam.records import (
     Keyscan,
     KeyscanId,
     LaserModel,
+    MapTile,
     Place,
+    WordPlace,
 )
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
@@ -85,6 +87,26 @@ def places(draw, robot):
 
 
 @st.composite
+def word_places(draw, robot):
+    place = draw(places(robot))
+    count = len(place.keypoints)
+    most = draw(st.sampled_from([0, 1, 4095, 65535]))
+    words = draw(hnp.arrays(np.uint16, count, elements=st.integers(0, most)))
+    span = place.id, place.channel, place.detector_version, place.first, place.last
+    return WordPlace(*span, place.keypoints, words)
+
+
+@st.composite
+def map_tiles(draw, robot):
+    """Cells that are all alike, in blocks, or noise."""
+    block = draw(st.sampled_from([1, 16, 256]))
+    cells = np.random.default_rng(draw(st.integers(0, 9))).integers(0, 3, (256 // block, 256 // block), np.uint8)
+    number = st.integers(-(2**15), 2**15)
+    large = np.kron(cells, np.ones((block, block), np.uint8))
+    return MapTile(robot, draw(st.floats(0.001, 10.0)), draw(number), draw(number), large)
+
+
+@st.composite
 def constraints(draw, robot):
     j = draw(st.integers(1, 2**31 - 1))
     i = draw(st.integers(0, j - 1))
@@ -98,28 +120,36 @@ def detector_files():
 
 @st.composite
 def keyscans(draw, identities, stamps):
-    ranges = draw(codes().map(dequantise))
+    ranges = draw(codes().map(dequantise) | st.just(np.zeros(0, np.float32)))
     laser = draw(lasers())
-    beams = draw(st.none() | st.just(laser.beams._replace(beam_count=len(ranges))))
+    beams = draw(st.none() | st.just(laser.beams._replace(beam_count=len(ranges)))) if len(ranges) else None
     return Keyscan(draw(identities), draw(stamps), ranges, draw(st.integers(0, 7)), beams)
 
 
+@st.composite
+def hellos(draw, robot, epoch):
+    versions = draw(st.dictionaries(st.sampled_from(Channel), NAMES))
+    digests = st.binary(min_size=32, max_size=32)
+    return Hello(
+        robot,
+        epoch,
+        draw(st.lists(lasers(), min_size=1, max_size=8).map(tuple)),
+        versions,
+        draw(st.from_regex(r"([A-Za-z0-9._+-]{1,16})?", fullmatch=True)),
+        {channel: draw(digests) for channel in versions if draw(st.booleans())},
+    )
+
+
 def bodies(robot, epoch, time):
-    versions = st.dictionaries(st.sampled_from(Channel), NAMES)
     stamps = st.floats(max_value=time, allow_nan=False, allow_infinity=False)
     identity = st.builds(KeyscanId, st.just(robot), NUMBERS)
     return st.one_of(
-        st.builds(
-            Hello,
-            st.just(robot),
-            st.just(epoch),
-            st.lists(lasers(), min_size=1, max_size=8).map(tuple),
-            versions,
-            st.from_regex(r"([A-Za-z0-9._+-]{1,16})?", fullmatch=True),
-        ),
+        hellos(robot, epoch),
         keyscans(identity, stamps),
         constraints(robot),
         places(robot),
+        word_places(robot),
+        map_tiles(robot),
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),
         st.builds(Acknowledgement, st.just(robot), EPOCHS, SEQUENCES),
         st.builds(DetectorUpdate, st.just(robot), detector_files()),

@@ -16,10 +16,11 @@ def test_every_message_is_told_with_its_direction():
     told = {message.name: message for message in disclosures()}
     assert list(told) == ["every packet", *PacketKind]
     assert (told["place"].direction, told["correction"].direction) == ("robot to cloud", "cloud to robot")
-    assert [field.name for field in told["hello"].fields][-4:] == [
+    assert [field.name for field in told["hello"].fields][-5:] == [
         "detectors",
         "detectors.channel",
         "detectors.version",
+        "detectors.vocabulary",
         "floor",
     ]
     (information,) = (field for field in told["constraint"].fields if field.name == "information")

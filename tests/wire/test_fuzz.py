@@ -84,6 +84,7 @@ def values(field):
         field.TYPE_DOUBLE: st.floats() | st.floats(-3.0, 3.0),
         field.TYPE_FLOAT: st.floats(width=32) | st.floats(0.5, 1.5, width=32),
         field.TYPE_UINT32: st.integers(0, 3) | st.integers(0, 2**32 - 1),
+        field.TYPE_SINT32: st.integers(-3, 3) | st.integers(-(2**31), 2**31 - 1),
         field.TYPE_UINT64: st.integers(0, 3) | st.integers(0, 2**64 - 1),
         field.TYPE_ENUM: st.integers(0, 2) | st.integers(-(2**31), 2**31 - 1),
         field.TYPE_STRING: st.sampled_from(["alice", "orb-1"]) | st.text(max_size=70),

@@ -24,6 +24,7 @@ from tests.wire.examples import (
     HELLO,
     KEYSCAN,
     LIDAR_PLACE,
+    VARIED_KEYSCAN,
     packet,
     same,
 )
@@ -82,7 +83,7 @@ REFUSED_BODIES = [
     (replace(KEYSCAN, id=KeyscanId("alice", 2**31)), "number"),
     (replace(KEYSCAN, stamp=NAN), "stamp is not finite"),
     (replace(KEYSCAN, stamp=1042.75), "later than"),
-    (replace(KEYSCAN, ranges_m=np.zeros(0, np.float32)), "0 ranges"),
+    (replace(VARIED_KEYSCAN, ranges_m=np.zeros(0, np.float32)), "0 ranges of 14 beams"),
     (replace(KEYSCAN, ranges_m=np.zeros(4097, np.float32)), "4097 ranges"),
     (replace(KEYSCAN, ranges_m=np.zeros((2, 2), np.float32)), "shape"),
     (replace(KEYSCAN, ranges_m=np.array([1.001], np.float32)), "not quantised"),
@@ -241,7 +242,7 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
 @pytest.mark.parametrize(
     ("name", "fields", "reason"),
     [
-        ("hello", {"version": 0}, "version 0 is unknown, this side speaks versions 2 and 3"),
+        ("hello", {"version": 0}, "version 0 is unknown, this side speaks versions 2 to 4"),
         ("hello", {"version": 3}, "version 3 of a packet of version 2"),
         ("keyscan", {"version": 3}, "version 3 of a packet of version 2"),
         ("floor_hello", {"version": 2}, "version 2 of a packet of version 3"),
@@ -273,7 +274,7 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
         ("keyscan", {"ranges": b"\x01\x02\x03\x00"}, "cut off or goes on"),
         ("keyscan", {"count": 4097, "ranges": bytes(2 * 4097)}, "4097, at most 4096"),
         ("keyscan", {"count": 2**32 - 1}, "at most 4096"),
-        ("keyscan", {"count": 0, "ranges": b""}, "0 ranges"),
+        ("keyscan", {"count": 0, "ranges": b""}, "version 2 of a packet of version 4"),
         ("keyscan", {"ranges": pack_ranges(np.full(14, 5, np.uint16)) + b"x"}, "goes on"),
         ("keyscan", {"laser": 8}, "laser is 8"),
         ("keyscan", {"laser": 2**32 - 1}, "laser is"),

@@ -27,6 +27,7 @@ NUMBERS = {
     FieldDescriptor.TYPE_UINT32,
     FieldDescriptor.TYPE_UINT64,
     FieldDescriptor.TYPE_ENUM,
+    FieldDescriptor.TYPE_SINT32,
 }
 LONGEST = {
     "Packet.robot": 64,
@@ -37,6 +38,11 @@ LONGEST = {
     "Keyscan.ranges": 2 * 4096,
     "Place.keypoints": 6 * 2048,
     "Place.descriptors": 32 * 2048,
+    "Detector.vocabulary": 32,
+    "WordPlace.detector_version": 64,
+    "WordPlace.keypoints": 6 * 2048,
+    "WordPlace.words": 2 * 2048,
+    "MapTile.cells": 16384,
     "Hello.lasers": 8,
     "Hello.detectors": 2,
     "Hello.floor": 16,
@@ -112,7 +118,9 @@ def test_no_field_of_bytes_takes_an_image(name, image):
     noise = np.random.default_rng(0).integers(0, 256, 160 * 120, np.uint8).tobytes()
     data = noise if image == "raw" else b"\xff\xd8\xff\xe0" + noise[:6000]
     message = pb.Packet.FromString(filled(name, 0))
-    setattr(getattr(message, message.WhichOneof("body")), name.partition(".")[2], data)
+    body = getattr(message, message.WhichOneof("body"))
+    kind, _, field_name = name.partition(".")
+    setattr(body if body.DESCRIPTOR.name == kind else body.detectors[0], field_name, data)
     with pytest.raises(PacketError):
         decode(message.SerializeToString())
 

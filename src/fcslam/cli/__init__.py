@@ -23,6 +23,7 @@ from fcslam.cli import (
     simulate,
     tokens,
     train,
+    vocabulary,
 )
 from fcslam.cli import changes as changed
 from fcslam.cli import convert as conversion
@@ -122,6 +123,10 @@ app.command(
     "certificates",
     epilog=examples("fcslam certificates --host cloud.local --robot robot1 --admin boss"),
 )(certificates.certificates)
+app.command(
+    "vocabulary",
+    epilog=examples("fcslam vocabulary runs/building -o building.words"),
+)(vocabulary.vocabulary)
 app.command("warm-up", epilog=examples("fcslam warm-up"))(warming.warm_up)
 app.add_typer(edit.app, name="edit")
 app.add_typer(federate.app, name="federate")

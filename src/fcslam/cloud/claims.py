@@ -1,6 +1,7 @@
 """What a robot may claim: bounds that no robot with a 2D LiDAR exceeds, so that none can exhaust or bend a mission."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,8 @@ from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import least_sigmas
 from fcslam.lidar.verification import VerificationConfig
-from fcslam.records import Constraint, ConstraintKind, FloatArray, Place, frozen
+from fcslam.records import Constraint, ConstraintKind, FloatArray, MapTile, Place, frozen
+from fcslam.wire.limits import TILE_CELLS
 
 _ROUNDING = 1.01
 """Information is sent in single precision, and standard deviations are compared by its diagonal."""
@@ -31,6 +33,11 @@ class ClaimLimits(Settings):
         default=100.0, gt=0, description="largest distance of a keyscan from the anchor of its submap [m]"
     )
     submap_keyscans: int = Field(default=2000, gt=0, description="largest number of keyscans in a submap")
+    map_tiles: int = Field(
+        default=1200,
+        gt=0,
+        description="largest number of tiles, 256 by 256 cells each, of the box around a session's own map",
+    )
     sigma_m: float = Field(
         default=0.001, gt=0, description="least standard deviation of a position that a robot measures [m]"
     )
@@ -104,6 +111,27 @@ def check_distance(T_odom_base: FloatArray, robot: str, limits: ClaimLimits) -> 
         raise PacketError(
             f"{robot}: is {distance_m:.4g} m off its start, at most {limits.distance_m:g} m (fleet.claims)"
         )
+
+
+def check_tile(tile: MapTile, earlier: Mapping[tuple[int, int], MapTile], limits: ClaimLimits) -> None:
+    """Check the next tile of a robot's own map; ``earlier`` ones are by their column and row.
+
+    Raises:
+        PacketError: it was sent before, has another resolution, or there are too many, or it is too far away.
+    """
+    name = f"{tile.robot}: map tile ({tile.column}, {tile.row})"
+    if (tile.column, tile.row) in earlier:
+        raise PacketError(f"{name} was sent before")
+    if any(other.resolution_m != tile.resolution_m for other in earlier.values()):
+        raise PacketError(f"{name} has another resolution than those before")
+    columns, rows = np.ptp([(tile.column, tile.row), *earlier], axis=0) + 1
+    if columns * rows > limits.map_tiles:
+        raise PacketError(
+            f"{name} makes the map {columns} by {rows} tiles large, at most {limits.map_tiles} tiles (fleet.claims)"
+        )
+    distance_m = math.hypot(tile.column, tile.row) * TILE_CELLS * tile.resolution_m
+    if not distance_m <= limits.distance_m:
+        raise PacketError(f"{name} is {distance_m:.4g} m off, at most {limits.distance_m:g} m (fleet.claims)")
 
 
 def check_submap(place: Place, poses: FloatArray, limits: ClaimLimits) -> None:

@@ -13,7 +13,7 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import in_session, session_name
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
-from fcslam.records import Correction, Place, frozen
+from fcslam.records import Correction, Place, WordPlace, frozen
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode, encode
@@ -105,7 +105,7 @@ class Cloud:
 
     def _replies(self, packet: Packet, session: str) -> list[Packet]:
         robot, epoch = packet.robot, packet.epoch
-        news = self._corrected(packet, session) if isinstance(packet.body, Place) else None
+        news = self._corrected(packet, session) if isinstance(packet.body, Place | WordPlace) else None
         known = -1 if news is None else news.correction.version - 1
         state = ReplyState({epoch: self._log.next_sequence(session)}, news)
         return replies(robot, state, known, {})

@@ -21,6 +21,7 @@ from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig
+from fcslam.cloud.shared_words import SharedWords
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
@@ -34,7 +35,9 @@ from fcslam.records import (
     Keyscan,
     KeyscanId,
     ManualClosure,
+    MapTile,
     Place,
+    WordPlace,
     frozen,
 )
 from fcslam.storage.state_file import State
@@ -60,10 +63,14 @@ class Fleet:
             seed: of the random generator.
             verify_pairs: verifies pairs of submaps, here or on a pool; the result is the same.
             read: gives stored packets by their numbers, for ``restored``.
+
+        Raises:
+            InputError: a vocabulary of the settings cannot be read.
         """
         self._config = config
         self._verify_pairs = verify_pairs
         self._seed = seed
+        self._words = SharedWords(config)
         self._sessions = SessionStore(config.claims, read)
         self._graph = JointGraph()
         self._decisions = ClosureDecisions(config, self._sessions, self._graph)
@@ -90,6 +97,7 @@ class Fleet:
             return
         match packet.body:
             case Hello() as hello:
+                self._words.check_hello(hello)
                 self._sessions.add_hello(hello, packet.sequence)
             case Keyscan() as keyscan:
                 self._add_keyscan(keyscan, packet.sequence)
@@ -101,9 +109,11 @@ class Fleet:
                 check_constraint(closure, self._config.claims.closure_m, self._config.claims)
                 self._decisions.add_local(with_least_noise(closure, self._config.matcher.verification))
             case Place() as place:
-                self._check_submap(place)
-                self._sessions.add_place(place)
-                self._add_place(place)  # place recognition and map fusion
+                self._place(place)
+            case WordPlace() as place:
+                self._place(self._words.place(place, self._sessions.vocabularies(place.id.robot)))
+            case MapTile() as tile:
+                self._sessions.add_tile(tile, packet.sequence)
             case Correction() | Acknowledgement() | DetectorUpdate():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
 
@@ -245,10 +255,16 @@ class Fleet:
         return Correction(session, self._decisions.version, indices[session], T_map_odom, quality)
 
     def _add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:
+        self._words.check_keyscan(keyscan)
         self._sessions.add_keyscan(keyscan, sequence)
         if keyscan.id.number == 0:
             self._graph.start(keyscan.id.robot)
             self._decisions.start_map(keyscan.id.robot)
+
+    def _place(self, place: Place) -> None:
+        self._check_submap(place)
+        self._sessions.add_place(place)
+        self._add_place(place)  # place recognition and map fusion
 
     def _check_submap(self, place: Place) -> None:
         robot = place.id.robot

@@ -14,7 +14,7 @@ from fcslam.geometry import se2
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.drawing import DrawnClosure, map_png
-from fcslam.maps.fusion import fuse
+from fcslam.maps.fusion import fuse, laid_together
 from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure, frozen
 from fcslam.runs import ClosureRow, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.runs.map_files import OccupancyMap, map_stem, map_yaml, pgm_bytes
@@ -112,7 +112,9 @@ def _link_metrics(link: str, traffic: Mapping[str, Traffic], tracks: Mapping[str
 
 def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> LocalMap:
     """The robot's own map, made without other robots."""
-    fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.lasers}, grid)
+    fused = robot.own_map or fuse(
+        robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.lasers}, grid
+    )
     name = f"{robot.robot}.pgm"
     return LocalMap(
         robot.robot,
@@ -158,7 +160,9 @@ def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> Occup
     """One map of robots that share it."""
     keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
     poses: FloatArray = np.concatenate([robot.T_map_base[robot.numbers()] for robot in members])
-    return fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid)
+    fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid)
+    own = [(robot.own_map, robot.T_map_local) for robot in members if robot.own_map is not None]
+    return laid_together([(fused, np.zeros(3)), *own], grid.maximum_cells) if own else fused
 
 
 def _drawn_closures(result: FleetResult) -> dict[int, list[DrawnClosure]]:

@@ -25,6 +25,7 @@ from fcslam.records import (
     Reason,
     frozen,
 )
+from fcslam.runs.map_files import OccupancyMap
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,13 @@ class MappedRobot:
     """As the robot announced them."""
     floor: str = ""
     """Floor that the session named; empty: none."""
+    own_map: OccupancyMap | None = None
+    """The map that it sent, in its own frame, if its ranges stay on the robot."""
+
+    @property
+    def T_map_local(self) -> FloatArray:
+        """Pose of its own map in its map, shape (3,), metres and radians."""
+        return se2.compose(self.T_map_base[0], se2.inverse(self.T_local_base[0]))
 
     def numbers(self) -> NDArray[np.int64]:
         """Rows of ``keyscans`` in stamps and poses, ascending."""
@@ -114,6 +122,7 @@ def conclude(
             fusion.T_local_base[robot],
             sessions.lasers(robot),
             sessions.floor(robot),
+            sessions.own_map(robot),
         )
         for robot in names
     )

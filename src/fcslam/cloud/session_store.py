@@ -5,17 +5,19 @@ from typing import TypeVar
 
 import numpy as np
 
-from fcslam.cloud.claims import ClaimLimits, check_constraint, check_distance
+from fcslam.cloud.claims import ClaimLimits, check_constraint, check_distance, check_tile
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.sessions import in_session
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.geometry.beams import misfit
-from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, Place, frozen
+from fcslam.maps.fusion import joined_tiles
+from fcslam.records import Channel, Constraint, FloatArray, Keyscan, KeyscanId, LaserModel, MapTile, Place, frozen
+from fcslam.runs.map_files import OccupancyMap
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Hello, Packet
 
-_Body = TypeVar("_Body", Hello, Keyscan)
+_Body = TypeVar("_Body", Hello, Keyscan, MapTile)
 
 
 class SessionStore:
@@ -49,6 +51,10 @@ class SessionStore:
         """Pose of the newest connected keyscan, by the motions alone, shape (3,)."""
         self._announced: dict[str, set[tuple[Channel, str]]] = {}
         """Channels and detector versions of all hellos."""
+        self._tiles: dict[str, dict[tuple[int, int], MapTile]] = {}
+        """Of the session's own map, by column and row."""
+        self._tile_sequences: dict[str, list[int]] = {}
+        """Numbers of their packets."""
         self._places: set[tuple[KeyscanId, Channel, str]] = set()
         """Keyscan, channel and detector version of every place."""
 
@@ -131,6 +137,22 @@ class SessionStore:
             raise PacketError(f"{robot}: {place.channel} place {number} was described before")
         self._places.add(described)
 
+    def add_tile(self, tile: MapTile, sequence: int) -> None:
+        """A tile of the session's own map; ``sequence`` is the number of its packet.
+
+        Raises:
+            PacketError: the session has no keyscan, or no robot has such a map.
+        """
+        self.require(KeyscanId(tile.robot, 0))
+        earlier = self._tiles.get(tile.robot, {})
+        check_tile(tile, earlier, self._limits)
+        self._tiles[tile.robot] = {**earlier, (tile.column, tile.row): tile}
+        self._tile_sequences.setdefault(tile.robot, []).append(sequence)
+
+    def own_map(self, robot: str) -> OccupancyMap | None:
+        """The map that the session sent, in its own frame; None if it sent none."""
+        return joined_tiles(self._tiles[robot].values()) if robot in self._tiles else None
+
     def require(self, *ids: KeyscanId) -> None:
         """Check that the keyscans are there.
 
@@ -158,11 +180,13 @@ class SessionStore:
                 self._keyscans[robot][number] = None
 
     def keyscans(self, robot: str, first: int = 0, last: int | None = None) -> tuple[Keyscan, ...]:
-        """Connected keyscans first to last (inclusive) of a robot, without released ones."""
+        """Connected keyscans first to last (inclusive) of a robot, without released ones and those
+        whose ranges stay on the robot."""
         end = self._connected[robot] if last is None else last + 1
         for number in range(first, end):
             self._read_keyscan(robot, number)
-        return tuple(keyscan for keyscan in self._keyscans[robot][first:end] if isinstance(keyscan, Keyscan))
+        kept = (keyscan for keyscan in self._keyscans[robot][first:end] if isinstance(keyscan, Keyscan))
+        return tuple(keyscan for keyscan in kept if len(keyscan.ranges_m))
 
     def read_ahead(self, most: int) -> bool:
         """Read at most so many of the keyscans that ``restore`` named; False: all are read."""
@@ -191,6 +215,10 @@ class SessionStore:
         """Take over the floors that users gave, by session."""
         self._floors = dict(floors)
 
+    def vocabularies(self, robot: str) -> Mapping[Channel, bytes]:
+        """Digests of the vocabularies of the words that the robot sends now; nothing before its hello."""
+        return self._hellos[robot].vocabularies if robot in self._hellos else {}
+
     def floor(self, robot: str) -> str:
         """Floor that a user gave to the session, or else the one that it named; empty if there is none."""
         return self._floors.get(robot, self._hellos[robot].floor)
@@ -206,6 +234,7 @@ class SessionStore:
             "hellos": dict(self._hello_sequences),
             "announced": {robot: sorted(announced) for robot, announced in self._announced.items()},
             "places": sorted(self._places),
+            "tiles": dict(self._tile_sequences),
             "keyscans": {
                 robot: {
                     "stamps": np.array(self._stamps[robot]),
@@ -233,6 +262,10 @@ class SessionStore:
             held = zip(self._sequences[robot], kept["held"].tolist(), strict=True)
             self._keyscans[robot] = [sequence if is_held else None for sequence, is_held in held]
             self._unread += [KeyscanId(robot, number) for number in np.flatnonzero(kept["held"]).tolist()]
+        self._tile_sequences = state["tiles"]
+        for robot, sequences in self._tile_sequences.items():
+            tiles = (self._stored(PacketNumber(robot, sequence), MapTile) for sequence in sequences)
+            self._tiles[robot] = {(tile.column, tile.row): tile for tile in tiles}
         self._connected = dict(zip(state["robots"], state["connected"], strict=True))
         self._T_odom_base = {robot: frozen(pose) for robot, pose in state["T_odom_base"].items()}
 
@@ -251,6 +284,8 @@ class SessionStore:
         robot, lasers = keyscan.id.robot, self.lasers(keyscan.id.robot)
         if keyscan.laser >= len(lasers):
             raise PacketError(f"{robot}: a keyscan of laser {keyscan.laser}, {len(lasers)} announced")
+        if not len(keyscan.ranges_m):
+            return
         announced = lasers[keyscan.laser]
         reason = None if keyscan.beams is None else misfit(keyscan.beams, announced.beams)
         if reason is not None:

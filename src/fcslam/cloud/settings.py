@@ -1,5 +1,6 @@
 """The settings of the cloud; a mission stores them, so that its result can be computed again from its packets."""
 
+from pathlib import Path
 from typing import Self
 
 from pydantic import Field, model_validator
@@ -61,6 +62,11 @@ class FleetConfig(Settings):
     )
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
+    vocabularies: tuple[Path, ...] = Field(
+        default=(),
+        description="files of the vocabularies that robots may send words of, as `fcslam vocabulary` writes them; "
+        "others are refused",
+    )
     consistency: ConsistencySettings = Field(
         default=ConsistencySettings(), description="pairwise consistency of closures, and the rule for joining maps"
     )

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig
 from fcslam.lidar.backend import FinishedSubmap, LidarBackend
@@ -17,10 +16,11 @@ from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
 from fcslam.records import CameraImage, Channel, DetectorFile, KeyscanId, LaserModel, LaserScan, Place
 from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
+from fcslam.robot.words import SendingConfig, Sends, WordSender, without_ranges
 from fcslam.wire.messages import Body, Hello
 
 
-class SessionConfig(Settings):
+class SessionConfig(SendingConfig):
     """Settings of everything that turns sensor records into packets."""
 
     lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM of one robot")
@@ -76,23 +76,34 @@ class RobotBackend:
     """Handles the inputs of one robot, session after session. The epoch is the number of the session, from 0."""
 
     def __init__(self, robot: str, config: SessionConfig) -> None:
-        """Load the detector of camera images.
+        """Load the detector of camera images and, if the robot sends words, their vocabulary.
 
         Raises:
-            FeatureError: the detector is a network whose weights cannot be used.
+            FeatureError: the detector is a network whose weights cannot be used, or there are no words for it.
+            InputError: the file of the vocabulary cannot be read.
         """
         self._robot = robot
         self._config = config
         self._view_extractor = ViewExtractor(config.views)
+        self._words = WordSender(config.words) if config.sends is Sends.WORDS else None
         self._session = _Session(robot, 0, self._view_extractor, config)
+        if self._words is not None:
+            self._words.check(self._session.detector_versions)
 
     def process(self, input: BackendInput) -> list[Body]:
         """Handle the next input; returns what the robot sends because of it.
 
         Raises:
             FeatureError: the file of a new detector is not the announced one, cannot be used, or describes a channel
-                that this robot does not use; nothing has changed.
+                that this robot does not use, or for whose descriptors it has no words; nothing has changed.
         """
+        bodies = self._process(input)
+        if self._words is None:
+            return bodies
+        sent = self._words.convert(bodies)
+        return [*sent, *self._words.end_session()] if isinstance(input, SessionEnd) else sent
+
+    def _process(self, input: BackendInput) -> list[Body]:
         match input:
             case NewKeyscan():
                 return self._session.add(input)
@@ -110,6 +121,8 @@ class RobotBackend:
     def _set_detector(self, file: DetectorFile, path: Path) -> None:
         if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
             raise FeatureError(f"{file.version}: describes {file.channel} places; this robot takes none for those")
+        if self._words is not None:
+            self._words.check({file.channel: file.version})
         if file.version != self._view_extractor.detector_version:
             self._view_extractor.set_detector(file, path)
 
@@ -195,13 +208,18 @@ class _Session:
             view.descriptors,
         )  # fmt: skip
 
-    def _hello(self) -> Hello:
+    @property
+    def detector_versions(self) -> dict[Channel, str]:
+        """Of the channels in use."""
         versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
-        chosen = {channel: versions[channel] for channel in self._config.channels}
-        return Hello(self._robot, self.epoch, self._lasers, chosen)
+        return {channel: versions[channel] for channel in self._config.channels}
+
+    def _hello(self) -> Hello:
+        return Hello(self._robot, self.epoch, self._lasers, self.detector_versions)
 
 
-def essential(input: NewKeyscan) -> list[Body]:
-    """What the map cannot do without: the keyscan and its odometry."""
-    keyscan = input.keyscan
-    return [keyscan.record] if keyscan.odometry is None else [keyscan.record, keyscan.odometry]
+def essential(input: NewKeyscan, sends: Sends = Sends.DESCRIPTORS) -> list[Body]:
+    """What the pose graph cannot do without: the keyscan and its odometry."""
+    keyscan, odometry = input.keyscan.record, input.keyscan.odometry
+    record = without_ranges(keyscan) if sends is Sends.WORDS else keyscan
+    return [record] if odometry is None else [record, odometry]

@@ -280,8 +280,8 @@ class RobotFrontend:
             return []
         lasers, last = done.input.lasers, self._hello
         is_known = last is not None and last.lasers == lasers
-        hello = Hello(self.robot, done.epoch, lasers, {} if last is None else last.detector_versions)
-        return [*([] if is_known else [hello]), *essential(done.input)]
+        hello = Hello(self.robot, done.epoch, lasers, {}) if last is None else replace(last, lasers=lasers)
+        return [*([] if is_known else [hello]), *essential(done.input, self._config.sends)]
 
 
 def _newest(pose: ScanPose, tracking: TrackingResult, is_deferred: bool) -> NewestScan:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fcslam.errors import PacketError, StateError, StoreError
-from fcslam.records import Channel, DetectorFile, Place
+from fcslam.records import Channel, DetectorFile, Place, WordPlace
 from fcslam.storage.database import Database
 from fcslam.storage.log_repair import mend_log
 from fcslam.storage.recovery import mend_pages
@@ -204,7 +204,7 @@ class Outbox:
                 if self._is_known(connection, epoch, packet.sequence, digest):
                     continue
                 crowded = self.waiting.bytes >= PLACES_SHARE * self._limit_bytes
-                if crowded and isinstance(packet.body, Place):
+                if crowded and isinstance(packet.body, Place | WordPlace):
                     _insert(connection, epoch, packet.sequence, digest, None, None)
                     dropped += 1
                     continue

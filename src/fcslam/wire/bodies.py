@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import Message
+from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
 from fcslam.records import (
@@ -21,7 +22,9 @@ from fcslam.records import (
     Keyscan,
     KeyscanId,
     LaserModel,
+    MapTile,
     Place,
+    WordPlace,
     frozen,
 )
 from fcslam.wire import fcslam_pb2 as pb
@@ -38,12 +41,16 @@ from fcslam.wire.quantisation import (
 from fcslam.wire.streams import (
     KeypointCodes,
     ascending,
+    pack_cells,
     pack_descriptors,
     pack_keypoints,
     pack_ranges,
+    pack_words,
+    unpack_cells,
     unpack_descriptors,
     unpack_keypoints,
     unpack_ranges,
+    unpack_words,
 )
 
 _CHANNELS = {Channel.LIDAR: pb.CHANNEL_LIDAR, Channel.CAMERA: pb.CHANNEL_CAMERA}
@@ -59,7 +66,11 @@ def _write_hello(hello: Hello) -> pb.Hello:
     return pb.Hello(
         lasers=map(_write_laser, hello.lasers),
         detectors=[
-            pb.Detector(channel=code, version=hello.detector_versions[channel])
+            pb.Detector(
+                channel=code,
+                version=hello.detector_versions[channel],
+                vocabulary=hello.vocabularies.get(channel, b""),
+            )
             for channel, code in _CHANNELS.items()
             if channel in hello.detector_versions
         ],
@@ -73,8 +84,13 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
     codes = [detector.channel for detector in message.detectors]
     if codes != sorted(set(codes)):
         raise PacketError("hello: detectors are not in ascending order of their channels")
-    versions = {read_channel(detector.channel): detector.version for detector in message.detectors}
-    return Hello(envelope.robot, envelope.epoch, lasers, MappingProxyType(versions), message.floor)
+    channels = [read_channel(code) for code in codes]
+    versions = {channel: each.version for channel, each in zip(channels, message.detectors, strict=True)}
+    words = {channel: each.vocabulary for channel, each in zip(channels, message.detectors, strict=True)}
+    vocabularies = MappingProxyType({channel: digest for channel, digest in words.items() if digest})
+    return Hello(
+        envelope.robot, envelope.epoch, lasers, MappingProxyType(versions), message.floor, vocabularies
+    )  # fmt: skip
 
 
 def _write_laser(laser: LaserModel) -> pb.Laser:
@@ -180,6 +196,56 @@ def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
     )
 
 
+def _write_word_place(place: WordPlace) -> pb.WordPlace:
+    codes, words = _words_in_order(place)
+    return pb.WordPlace(
+        number=place.id.number,
+        channel=_CHANNELS[place.channel],
+        detector_version=place.detector_version,
+        first=place.first,
+        last=place.last,
+        count=len(codes),
+        keypoints=pack_keypoints(codes),
+        words=pack_words(words),
+    )
+
+
+def _words_in_order(place: WordPlace) -> tuple[KeypointCodes, NDArray[np.uint16]]:
+    """Keypoints in ascending order, as they are sent, and their words."""
+    codes = quantise_keypoints(place.keypoints)
+    order = ascending(codes)
+    return codes[order], place.words[order]
+
+
+def _round_word_place(place: WordPlace) -> WordPlace:
+    codes, words = _words_in_order(place)
+    return replace(place, keypoints=dequantise_keypoints(codes), words=frozen(words, np.uint16))
+
+
+def _read_word_place(message: pb.WordPlace, envelope: pb.Packet) -> WordPlace:
+    _check_at_most(message.count, MAXIMUM_KEYPOINTS, "word place: keypoints")
+    channel = read_channel(message.channel)
+    codes = unpack_keypoints(message.keypoints, message.count, KEYPOINT_AXES[channel])
+    return WordPlace(
+        KeyscanId(envelope.robot, message.number),
+        channel,
+        message.detector_version,
+        message.first,
+        message.last,
+        dequantise_keypoints(codes),
+        frozen(unpack_words(message.words, message.count), np.uint16),
+    )
+
+
+def _write_map_tile(tile: MapTile) -> pb.MapTile:
+    return pb.MapTile(resolution_m=tile.resolution_m, column=tile.column, row=tile.row, cells=pack_cells(tile.cells))
+
+
+def _read_map_tile(message: pb.MapTile, envelope: pb.Packet) -> MapTile:
+    cells = frozen(unpack_cells(message.cells), np.uint8)
+    return MapTile(envelope.robot, message.resolution_m, message.column, message.row, cells)
+
+
 def _check_at_most(count: int, most: int, what: str) -> None:
     """Refuse a count before memory is allocated for it."""
     if count > most:
@@ -261,6 +327,8 @@ CODECS = {
     PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan),
     PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint, _round_constraint),
     PacketKind.PLACE: Codec(Place, _write_place, _read_place, _round_place),
+    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _round_word_place),
+    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),

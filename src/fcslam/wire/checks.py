@@ -19,8 +19,11 @@ from fcslam.records import (
     FloatArray,
     Keyscan,
     LaserModel,
+    MapTile,
     Place,
+    WordPlace,
 )
+from fcslam.runs.map_files import Occupancy
 from fcslam.wire.limits import (
     DIGEST_BYTES,
     KEYPOINT_AXES,
@@ -33,9 +36,13 @@ from fcslam.wire.limits import (
     MAXIMUM_LASERS,
     MAXIMUM_NETWORK_BYTES,
     MAXIMUM_NUMBER,
+    MAXIMUM_RESOLUTION_M,
     MAXIMUM_SEQUENCE,
+    MAXIMUM_TILE,
     MINIMUM_CORRELATION_EIGENVALUE,
     MINIMUM_INFORMATION,
+    MINIMUM_RESOLUTION_M,
+    TILE_CELLS,
 )
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
@@ -66,7 +73,7 @@ def check_name(name: str, what: str) -> None:
 
 
 def _robot_of(body: Body) -> str:
-    return body.id.robot if isinstance(body, Keyscan | Place) else body.robot
+    return body.id.robot if isinstance(body, Keyscan | Place | WordPlace) else body.robot
 
 
 def _check_hello(hello: Hello, packet: Packet) -> None:
@@ -79,6 +86,10 @@ def _check_hello(hello: Hello, packet: Packet) -> None:
         check_name(version, f"hello: detector version of {channel}")
     if hello.floor:
         check_floor(hello.floor)
+    for channel, digest in hello.vocabularies.items():
+        _require(channel in hello.detector_versions, f"hello: a vocabulary of {channel}, which has no detector")
+        sized = len(digest) == DIGEST_BYTES
+        _require(sized, f"hello: vocabulary of {channel} has {len(digest)} bytes, not {DIGEST_BYTES}")
 
 
 def check_floor(floor: str) -> None:
@@ -112,7 +123,7 @@ def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
     _require(keyscan.stamp <= packet.time, "keyscan: stamp is later than the packet's time")
     ranges = keyscan.ranges_m
     _require(ranges.ndim == 1, f"keyscan: ranges have shape {ranges.shape}, not (N,)")
-    _require(0 < len(ranges) <= MAXIMUM_BEAMS, f"keyscan: {len(ranges)} ranges, not in 1..{MAXIMUM_BEAMS}")
+    _require(len(ranges) <= MAXIMUM_BEAMS, f"keyscan: {len(ranges)} ranges, at most {MAXIMUM_BEAMS}")
     if not np.array_equal(ranges, dequantise(quantise(ranges))):
         raise PacketError("keyscan: ranges are not quantised; work with dequantise(quantise(ranges_m))")
     _check_count(keyscan.laser, "keyscan: laser", MAXIMUM_LASERS - 1)
@@ -156,6 +167,29 @@ def _exceeds(limit: float, xy: float, xt: float, yt: float) -> bool:
 
 
 def _check_place(place: Place, _: Packet) -> None:
+    _check_described(place)
+    _check_shape(place.descriptors, (len(place.keypoints), CODE_BYTES), "place: descriptors")
+    _require(place.descriptors.dtype == np.uint8, f"place: descriptors are {place.descriptors.dtype}, not bytes")
+
+
+def _check_word_place(place: WordPlace, _: Packet) -> None:
+    _check_described(place)
+    _check_shape(place.words, (len(place.keypoints),), "place: words")
+    _require(place.words.dtype == np.uint16, f"place: words are {place.words.dtype}, not 16-bit numbers")
+
+
+def _check_map_tile(tile: MapTile, _: Packet) -> None:
+    sized = MINIMUM_RESOLUTION_M <= tile.resolution_m <= MAXIMUM_RESOLUTION_M
+    bounds = f"{MINIMUM_RESOLUTION_M:g}..{MAXIMUM_RESOLUTION_M:g}"
+    _require(sized, f"map tile: a resolution of {tile.resolution_m} m, not in {bounds}")
+    within = abs(tile.column) <= MAXIMUM_TILE and abs(tile.row) <= MAXIMUM_TILE
+    _require(within, f"map tile: ({tile.column}, {tile.row}) is not within {MAXIMUM_TILE} tiles")
+    _check_shape(tile.cells, (TILE_CELLS, TILE_CELLS), "map tile: cells")
+    _require(tile.cells.dtype == np.uint8, f"map tile: cells are {tile.cells.dtype}, not bytes")
+    _require(int(tile.cells.max()) <= Occupancy.OCCUPIED, "map tile: a cell is neither unknown, free nor occupied")
+
+
+def _check_described(place: Place | WordPlace) -> None:
     _check_count(place.id.number, "place: number", MAXIMUM_NUMBER)
     _check_count(place.first, "place: first", MAXIMUM_NUMBER)
     _check_count(place.last, "place: last", MAXIMUM_NUMBER)
@@ -166,8 +200,6 @@ def _check_place(place: Place, _: Packet) -> None:
     count = len(place.keypoints)
     _require(count <= MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {MAXIMUM_KEYPOINTS}")
     _check_shape(place.keypoints, (count, KEYPOINT_AXES[place.channel]), "place: keypoints")
-    _check_shape(place.descriptors, (count, CODE_BYTES), "place: descriptors")
-    _require(place.descriptors.dtype == np.uint8, f"place: descriptors are {place.descriptors.dtype}, not bytes")
     within = bool((np.abs(place.keypoints) <= MAXIMUM_KEYPOINT_M).all())
     _require(within, f"place: a keypoint is not within {MAXIMUM_KEYPOINT_M:g} m")
 
@@ -200,6 +232,8 @@ _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     Keyscan: _check_keyscan,
     Constraint: _check_constraint,
     Place: _check_place,
+    WordPlace: _check_word_place,
+    MapTile: _check_map_tile,
     Correction: _check_correction,
     Acknowledgement: _check_acknowledgement,
     DetectorUpdate: _check_detector_update,

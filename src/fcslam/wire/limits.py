@@ -1,10 +1,12 @@
-"""All limits of the format, versions 2 and 3. Packets beyond a limit are neither written nor read."""
+"""All limits of the format, versions 2 to 4. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
 PROTOCOL_VERSION = 2
 FLOOR_VERSION = 3
 """Of a hello that names a floor. All other packets are of version 2, which receivers without floors read."""
+WORDS_VERSION = 4
+"""Of what only a robot sends that sends words in place of descriptors."""
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
@@ -25,6 +27,18 @@ MAXIMUM_KEYPOINTS = 2048
 KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
 """Coordinates of a keypoint; a camera sees how high it is, too."""
 BYTES_PER_AXIS = 2
+
+MAXIMUM_WORDS = 65536
+"""Words of a vocabulary that robots and cloud share."""
+BYTES_PER_WORD = 2
+
+TILE_CELLS = 256
+"""Cells along each side of a map tile."""
+BYTES_PER_TILE = TILE_CELLS * TILE_CELLS // 4
+MAXIMUM_TILE = 2**15
+"""Number of a tile along an axis; at 5 cm it is 400 km away."""
+MINIMUM_RESOLUTION_M = 0.001
+MAXIMUM_RESOLUTION_M = 10.0
 
 MAXIMUM_NETWORK_BYTES = 64 * 1024 * 1024
 """Largest file of a detector; present ones have 0.5 to 5 MB."""

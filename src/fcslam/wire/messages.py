@@ -1,10 +1,20 @@
 """A packet: one record in the envelope that orders and addresses it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from fcslam.records import Channel, Constraint, Correction, DetectorFile, Keyscan, LaserModel, Place
+from fcslam.records import (
+    Channel,
+    Constraint,
+    Correction,
+    DetectorFile,
+    Keyscan,
+    LaserModel,
+    MapTile,
+    Place,
+    WordPlace,
+)
 
 
 class PacketKind(StrEnum):
@@ -14,12 +24,23 @@ class PacketKind(StrEnum):
     KEYSCAN = "keyscan"
     CONSTRAINT = "constraint"
     PLACE = "place"
+    WORD_PLACE = "word_place"
+    MAP_TILE = "map_tile"
     CORRECTION = "correction"
     ACKNOWLEDGEMENT = "acknowledgement"
     DETECTOR_UPDATE = "detector_update"
 
 
-UPLINK = frozenset({PacketKind.HELLO, PacketKind.KEYSCAN, PacketKind.CONSTRAINT, PacketKind.PLACE})
+UPLINK = frozenset(
+    {
+        PacketKind.HELLO,
+        PacketKind.KEYSCAN,
+        PacketKind.CONSTRAINT,
+        PacketKind.PLACE,
+        PacketKind.WORD_PLACE,
+        PacketKind.MAP_TILE,
+    }
+)
 """Kinds that robots send; the cloud sends the others."""
 
 
@@ -34,6 +55,8 @@ class Hello:
     detector_versions: Mapping[Channel, str]
     floor: str = ""
     """Floor of the building that the session maps, the same in all hellos of an epoch; empty: not named."""
+    vocabularies: Mapping[Channel, bytes] = field(default_factory=dict)
+    """SHA-256 of the vocabulary of each channel whose places are sent as words; of some of ``detector_versions``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +78,7 @@ class DetectorUpdate:
     file: DetectorFile
 
 
-Body = Hello | Keyscan | Constraint | Place | Correction | Acknowledgement | DetectorUpdate
+Body = Hello | Keyscan | Constraint | Place | WordPlace | MapTile | Correction | Acknowledgement | DetectorUpdate
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,15 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Channel, Place
+from fcslam.records import CODE_BYTES, Channel, Keyscan, MapTile, Place, WordPlace
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
 from fcslam.wire.checks import check, check_name
 from fcslam.wire.limits import (
     BYTES_PER_AXIS,
     BYTES_PER_RANGE,
+    BYTES_PER_TILE,
+    BYTES_PER_WORD,
     FLOOR_VERSION,
     KEYPOINT_AXES,
     MAXIMUM_BEAMS,
@@ -21,10 +23,11 @@ from fcslam.wire.limits import (
     MAXIMUM_PACKET_BYTES,
     MAXIMUM_SEQUENCE,
     PROTOCOL_VERSION,
+    WORDS_VERSION,
 )
 from fcslam.wire.messages import Body, Hello, Packet, PacketKind
 
-_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION)
+_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION)
 
 
 class Label(NamedTuple):
@@ -72,7 +75,7 @@ class SizedPacket(NamedTuple):
         """By which its traffic is counted."""
         body = self.packet.body
         kind, _ = CODEC_OF_TYPE[type(body)]
-        return Label(self.packet.robot, kind, body.channel if isinstance(body, Place) else None)
+        return Label(self.packet.robot, kind, body.channel if isinstance(body, Place | WordPlace) else None)
 
 
 def measure(packet: Packet) -> SizedPacket:
@@ -120,7 +123,8 @@ def read_label(data: bytes) -> Label:
     """
     message, kind = _parse(data)
     check_name(message.robot, "robot")
-    return Label(message.robot, kind, read_channel(message.place.channel) if kind is PacketKind.PLACE else None)
+    described = kind in (PacketKind.PLACE, PacketKind.WORD_PLACE)
+    return Label(message.robot, kind, read_channel(getattr(message, kind).channel) if described else None)
 
 
 def unpacked_size(data: bytes) -> int:
@@ -138,6 +142,11 @@ def unpacked_size(data: bytes) -> int:
     if kind is PacketKind.PLACE:
         axes = max(KEYPOINT_AXES.values())
         return len(data) + (BYTES_PER_AXIS * axes + CODE_BYTES) * min(message.place.count, MAXIMUM_KEYPOINTS)
+    if kind is PacketKind.WORD_PLACE:
+        axes = max(KEYPOINT_AXES.values())
+        return len(data) + (BYTES_PER_AXIS * axes + BYTES_PER_WORD) * min(message.word_place.count, MAXIMUM_KEYPOINTS)
+    if kind is PacketKind.MAP_TILE:
+        return len(data) + BYTES_PER_TILE
     return len(data)
 
 
@@ -155,7 +164,17 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
 
 
 def _version(body: Body) -> int:
-    return FLOOR_VERSION if isinstance(body, Hello) and body.floor else PROTOCOL_VERSION
+    match body:
+        case WordPlace() | MapTile():
+            return WORDS_VERSION
+        case Keyscan(ranges_m=ranges_m) if not len(ranges_m):
+            return WORDS_VERSION
+        case Hello(vocabularies=vocabularies) if vocabularies:
+            return WORDS_VERSION
+        case Hello(floor=floor) if floor:
+            return FLOOR_VERSION
+        case _:
+            return PROTOCOL_VERSION
 
 
 def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
@@ -167,7 +186,7 @@ def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
     except DecodeError as error:
         raise PacketError("not a protobuf message of a packet") from error
     if message.version not in _VERSIONS:
-        known = " and ".join(map(str, _VERSIONS))
+        known = f"{_VERSIONS[0]} to {_VERSIONS[-1]}"
         raise PacketError(f"version {message.version} is unknown, this side speaks versions {known}")
     message.DiscardUnknownFields()
     if message.ByteSize() != len(data):

@@ -1,4 +1,4 @@
-"""Lossless streams of ranges, keypoints and descriptors, by entropy coding.
+"""Lossless streams of ranges, keypoints, descriptors, words and map cells, by entropy coding.
 
 A stream is coded if that is shorter than the plain bytes. The receiver tells the two apart by the length, because it
 knows how many numbers to expect. No stream can hold more numbers.
@@ -17,6 +17,7 @@ from fcslam.wire.entropy import (
     CONTEXTS_OF_NUMBER,
     Bytes,
     Coder,
+    code_bit,
     code_learnt,
     code_number,
     code_signed,
@@ -26,16 +27,23 @@ from fcslam.wire.entropy import (
     writer,
     written,
 )
-from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_RANGE
+from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_RANGE, BYTES_PER_TILE, BYTES_PER_WORD, TILE_CELLS
 from fcslam.wire.prediction import PROBABILITIES, code_descriptors, sums_of
 
 RangeCodes = NDArray[np.uint16]
 KeypointCodes = NDArray[np.int16]
+Words = NDArray[np.uint16]
 
 _APART: Final = 2
 """Keypoints this many steps apart along x, or more, share one set of contexts for y and z."""
 _MOST_AXES: Final = 3
 _REFUSED: Final = -1
+_LEARNT_BITS: Final = 4
+"""The first bits of a word are learnt: numbers of similar words begin alike. A place has too few words for more."""
+_STATES: Final = 3
+"""Of a cell: unknown, free, occupied."""
+_NEIGHBOURS: Final = _STATES**5
+"""States of the five cells before a cell that are nearest to it."""
 
 
 def pack_ranges(codes: RangeCodes) -> bytes:
@@ -110,6 +118,50 @@ def unpack_descriptors(data: bytes, keypoints: KeypointCodes, channel: Channel) 
     return np.packbits(bits, axis=1)
 
 
+def pack_words(words: Words) -> bytes:
+    """Encode words (N,)."""
+    return _pack(words.astype("<u2").tobytes(), _code_words, words.astype(np.int64))
+
+
+def unpack_words(data: bytes, count: int) -> Words:
+    """Inverse of ``pack_words``: ``count`` words, shape (count,).
+
+    Raises:
+        PacketError: ``data`` is not a stream of ``count`` words.
+    """
+    if len(data) == BYTES_PER_WORD * count:
+        return np.frombuffer(data, "<u2").astype(np.uint16)
+    codes = np.zeros(count, np.int64)
+    _unpack(data, BYTES_PER_WORD * count, "place: words", _code_words, codes)
+    if codes.max(initial=0) > np.iinfo(np.uint16).max:
+        raise PacketError("place: a word is no 16-bit number")
+    words: Words = codes.astype(np.uint16)
+    if pack_words(words) != data:
+        raise PacketError("place: words have more bits than the largest")
+    return words
+
+
+def pack_cells(cells: NDArray[np.uint8]) -> bytes:
+    """Encode the cells of a map tile (256, 256): 0 unknown, 1 free, 2 occupied."""
+    fours = cells.reshape(-1, 4)
+    plain = (fours << np.arange(0, 8, 2, dtype=np.uint8)).sum(axis=1, dtype=np.uint8).tobytes()
+    return _pack(plain, _code_cells, cells.astype(np.int64))
+
+
+def unpack_cells(data: bytes) -> NDArray[np.uint8]:
+    """Inverse of ``pack_cells``: shape (256, 256).
+
+    Raises:
+        PacketError: ``data`` is not a stream of a tile's cells.
+    """
+    if len(data) == BYTES_PER_TILE:
+        fours = np.frombuffer(data, np.uint8)[:, None] >> np.arange(0, 8, 2, dtype=np.uint8)
+        return (fours & np.uint8(3)).astype(np.uint8).reshape(TILE_CELLS, TILE_CELLS)
+    cells = np.zeros((TILE_CELLS, TILE_CELLS), np.int64)
+    _unpack(data, BYTES_PER_TILE, "map tile: cells", _code_cells, cells)
+    return cells.astype(np.uint8)
+
+
 def _expectation(keypoints: KeypointCodes, channel: Channel) -> tuple[NDArray[Any], ...]:
     return (keypoints.astype(np.int64), *sums_of(channel), PROBABILITIES)
 
@@ -165,6 +217,51 @@ def _code_keypoints(coder: Coder, data: Bytes, codes: NDArray[np.int64]) -> Code
             step = (codes[k, axis] - codes[k - 1, axis]) // grid[axis]
             coder, step = code_signed(coder, data, model, context, step)
             codes[k, axis] = codes[k - 1, axis] + step * grid[axis]
+    return coder
+
+
+@njit(nogil=True)
+def _code_words(coder: Coder, data: Bytes, words: NDArray[np.int64]) -> Coder:
+    """Code the number of bits of the largest word, then every word with as many, from the highest."""
+    model = fresh_model(CONTEXTS_OF_NUMBER + (1 << _LEARNT_BITS))
+    bits, largest = 0, np.int64(0)
+    for word in words:
+        largest = max(largest, word)
+    while largest >> bits:
+        bits += 1
+    if len(words) > 0:
+        coder, bits = code_number(coder, data, model, 0, bits)
+    for k in range(len(words)):
+        word = np.int64(1)
+        for digit in range(bits - 1, -1, -1):
+            bit = int(words[k] >> digit & 1)
+            if bits - digit <= _LEARNT_BITS:
+                coder, bit = code_learnt(coder, data, model, CONTEXTS_OF_NUMBER + word, bit)
+            else:
+                coder, bit = code_bit(coder, data, 32768, bit)
+            word = word << 1 | bit
+        words[k] = word - (np.int64(1) << bits)
+    return coder
+
+
+@njit(nogil=True)
+def _code_cells(coder: Coder, data: Bytes, cells: NDArray[np.int64]) -> Coder:
+    """Code each cell, row by row, in the context of two cells to the left and three in the row before."""
+    model = fresh_model(2 * _NEIGHBOURS)
+    height, width = cells.shape
+    for row in range(height):
+        for column in range(width):
+            context = 0
+            for up, left in ((0, 1), (0, 2), (1, 1), (1, 0), (1, -1)):
+                context *= _STATES
+                if row >= up and 0 <= column - left < width:
+                    context += cells[row - up, column - left]
+            cell = cells[row, column]
+            coder, known = code_learnt(coder, data, model, 2 * context, int(cell > 0))
+            occupied = 0
+            if known:
+                coder, occupied = code_learnt(coder, data, model, 2 * context + 1, int(cell > 1))
+            cells[row, column] = known + occupied
     return coder
 
 
