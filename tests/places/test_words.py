@@ -58,7 +58,7 @@ def test_training_depends_on_the_codes_and_the_seed_alone(vocabulary):
 
 
 def test_the_version_is_the_digest_of_the_content(vocabulary):
-    content = b"fcslam words 1\nlidar\ntest-1\n" + vocabulary.centres.tobytes()
+    content = b"words 1\nlidar\ntest-1\n" + vocabulary.centres.tobytes()
     assert vocabulary.digest == hashlib.sha256(content).digest()
     others = [
         WordVocabulary(Channel.CAMERA, "test-1", vocabulary.centres),

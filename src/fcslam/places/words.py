@@ -42,7 +42,7 @@ class WordVocabulary:
     @cached_property
     def digest(self) -> bytes:
         """Version: SHA-256 of channel, detector version and centres."""
-        name = f"fcslam words 1\n{self.channel}\n{self.detector_version}\n".encode("ascii")
+        name = f"words 1\n{self.channel}\n{self.detector_version}\n".encode("ascii")
         return hashlib.sha256(name + self.centres.tobytes()).digest()
 
     def words(self, descriptors: Codes) -> NDArray[np.uint16]:
