@@ -48,10 +48,11 @@ LOADED = 2
 SHOWN = 1, 2, 5, 10, 15
 """Sessions after which the map is compared with the truth, besides the last."""
 TRACE_M = 0.15
-GROWTH = {"sessions": "", "packets": ",", "memory, MB": ".1f", "process, MB": ".0f", "places": ",", "keyscans held": ",", "of": ",",
-          "closures": ",", "s a place": ".3f", "s a solve": ".3f", "s for 1,000 packets": ".1f", "s to draw": ".2f",
-          "maps": "", "RMSE, m": ".3f", "F1": ".3f", "F1, all beams the same": ".3f", "F1 of what was seen": ".3f",
-          "traces": ",", "traces, all beams the same": ","}  # fmt: skip
+GROWTH = {"sessions": "", "packets": ",", "memory, MB": ".1f", "process, MB": ".0f", "places": ",",
+          "keyscans held": ",", "of": ",", "closures": ",", "s a place": ".3f", "s a solve": ".3f",
+          "s for 1,000 packets": ".1f", "s to draw": ".2f", "maps": "", "RMSE, m": ".3f", "F1": ".3f",
+          "F1, all beams the same": ".3f", "F1 of what was seen": ".3f", "traces": ",",
+          "traces, all beams the same": ","}  # fmt: skip
 
 
 def main() -> None:
