@@ -107,7 +107,7 @@ def test_a_robot_is_localised_in_the_map_of_its_floor(mapped):
     for place in (whole, whole / "mission.fcslam"):
         for floor, expected in zip("12", maps, strict=True):
             assert np.array_equal(read_map(place, floor).cells, expected.cells)
-        with pytest.raises(SourceError, match=r"has maps of several floors \(1, 2\); say which one"):
+        with pytest.raises(SourceError, match=r"has maps of several floors \(1, 2\); name that of the robot"):
             read_map(place)
         with pytest.raises(SourceError, match="has no map of floor '3'; its floors: 1, 2"):
             read_map(place, "3")

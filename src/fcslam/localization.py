@@ -82,7 +82,7 @@ def _map_on(floor: str, floors: Mapping[int, str], path: Path) -> tuple[int, str
     known = set(floors.values())
     listed = ", ".join(its or "one without a name" for its in sorted(known))
     if not floor and len(known) > 1:
-        raise SourceError(f"{path}: has maps of several floors ({listed}); say which one the robot is on, as with --floor 2")
+        raise SourceError(f"{path}: has maps of several floors ({listed}); name that of the robot (--floor)")
     if floor and floor not in known:
         raise SourceError(f"{path}: has no map of floor {floor!r}; its floors: {listed}")
     number = min((k for k, its in floors.items() if its == floor or not floor), default=0)
