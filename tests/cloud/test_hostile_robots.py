@@ -9,6 +9,8 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
+from fcslam.geometry import se2
+from fcslam.geometry.alignment import n_point_alignment
 from fcslam.records import ClosureStatus, Constraint, Keyscan, KeyscanId, Place, ReasonCode, frozen
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
@@ -55,6 +57,11 @@ def honest():
 
 
 @pytest.fixture(scope="module")
+def alone(honest):
+    return fed(honest).finalize()
+
+
+@pytest.fixture(scope="module")
 def packets(honest):
     copied = [packet for packet in honest if packet.robot == "robot_2"]
     return in_order([*honest, *scaled(copied, "evil", 1.02)])
@@ -71,8 +78,8 @@ def between(result, *, evil):
     return [closure for closure in found if ("evil" in (closure.i.robot, closure.j.robot)) is evil]
 
 
-def test_a_scaled_copy_gets_a_map_of_its_own(honest, attacked):
-    alone, found = fed(honest).finalize(), attacked.finalize()
+def test_a_scaled_copy_gets_a_map_of_its_own(alone, attacked):
+    found = attacked.finalize()
     assert map_of(alone) == {"robot_1": 0, "robot_2": 0, "robot_3": 0}
     assert map_of(found) == map_of(alone) | {"evil": 1}
     now, then = ({robot.robot: robot.T_map_base for robot in result.robots} for result in (found, alone))
@@ -84,6 +91,18 @@ def test_a_scaled_copy_gets_a_map_of_its_own(honest, attacked):
     reasons = {closure.reason.code for closure in between(found, evil=True)}
     assert ReasonCode.PATHS_CONTRADICT in reasons
     assert reasons <= {ReasonCode.PATHS_CONTRADICT, ReasonCode.SEPARATED}
+
+
+@pytest.mark.parametrize("scale", [1.01, 0.985])
+def test_a_copy_at_a_slightly_false_scale_moves_others_by_centimetres(honest, alone, scale):
+    """It contradicts nobody by more than honest robots contradict each other."""
+    copied = [packet for packet in honest if packet.robot == "robot_2"]
+    found = fed(in_order([*honest, *scaled(copied, "evil", scale)])).finalize()
+    assert map_of(found) == map_of(alone) | {"evil": 0}
+    now, then = ({robot.robot: robot.T_map_base for robot in result.robots} for result in (found, alone))
+    xy, wanted = (np.concatenate([those[name][:, :2] for name in then]) for those in (now, then))
+    moved_m = np.hypot(*(se2.transform(n_point_alignment(wanted, xy), xy) - wanted).T).max()
+    assert 0.01 < moved_m < 0.06
 
 
 def test_a_restored_fleet_keeps_robots_apart(packets, attacked):
