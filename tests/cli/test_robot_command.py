@@ -46,6 +46,7 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     assert len(read_tum(state / "trajectory.tum")[0]) == scans
     assert keyscans == sum(type(packet.body).__name__ == "Keyscan" for packet in stored)
     assert "connected" in err
+    assert (state / "outbox.sqlite").stat().st_mode & 0o077 == 0
     assert main(["robot", str(log), "--server", cloud.url, "--state", str(state), "--resume"]) == 0
     assert len(cloud.cloud.stored) == len(stored), "nothing twice"
     assert main(["robot", str(log), "--server", cloud.url, "--state", str(state), "--name", "bob"]) == 2

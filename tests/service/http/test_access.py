@@ -80,6 +80,17 @@ def test_who_has_no_right_gets_nothing_and_changes_nothing(desk, routes, who):
     assert content(desk) == before
 
 
+def test_a_stranger_gets_no_data(desk):
+    """Only whether the service is ready, and what requests it knows."""
+    interface = desk.ask("GET", "/openapi.json").json()
+    assert interface["info"]["title"] == "fcslam"
+    desk.told(desk.send("a", A[:9]))
+    answers = {path: desk.ask("GET", path) for path in sorted(OPEN)}
+    assert {answer.status_code for answer in answers.values()} == {200}
+    assert answers["/healthz"].json().keys() | answers["/readyz"].json().keys() == {"status", "backlog"}
+    assert answers["/openapi.json"].json() == interface, "whatever robots sent"
+
+
 def test_nothing_is_read_of_a_body_before_it_is_known_who_sends_it(desk, routes):
     async def receive():
         raise AssertionError("the body is read")
