@@ -23,6 +23,27 @@ def test_images_of_all_folders_are_found_under_their_names(tmp_path):
     assert names == ["x/0.JPG", "x/a/1.png", "y/1.png"]
 
 
+def test_reading_ends_with_the_last_image_that_is_wanted(tmp_path):
+    pytest.importorskip("torch", reason="needs fcslam[train]")
+    from fcslam.learning.settings import TrainingSettings
+    from fcslam.learning.stages import read_labelled_images
+
+    write(tmp_path / "x" / "0.png", textured(0)[:20, :20])
+    for seed in range(1, 6):
+        write(tmp_path / "x" / f"{seed}.png", textured(seed))
+    files, looked_at, settings = find_images([tmp_path / "x"]), [], TrainingSettings(label_copies=0)
+
+    def read(most):
+        found = read_labelled_images(
+            files, tmp_path / "labels", settings, None, None, lambda _stage, status: looked_at.append(status.step), most
+        )
+        return len(found.train), found.skipped
+
+    assert read(2) == (2, 1)
+    assert looked_at == [1, 2, 3]
+    assert read(None) == (5, 1)
+
+
 def test_folders_of_one_name_with_the_same_files_are_refused(tmp_path):
     for place in ("here", "there"):
         write(tmp_path / place / "photos" / "1.png", textured(1))

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 QUICK = {"steps": 40, "shape_steps": 30, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Settings of ``--quick``: every stage runs, none long enough to learn much."""
+QUICK_IMAGES = 4
+"""Images of ``--quick``: labelling one, and finding the ranges of int8 with it, takes vgg some seconds."""
 FIGURES = ("repeatability", "mma_3px", "shift_repeatability")
 
 
@@ -70,7 +72,15 @@ def train(
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {output}") as display:
         watch = _watch(display, console)
-        network, found = train_detector(images, output, settings, compute_budget(device, quick), teacher, watch)
+        network, found = train_detector(
+            images,
+            output,
+            settings,
+            compute_budget(device, quick),
+            teacher,
+            watch,
+            QUICK_IMAGES if quick else None,
+        )
     files = write_training_artifacts(network, output, settings, found, teacher)
     for file in files:
         typer.echo(str(file))

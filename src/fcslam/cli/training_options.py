@@ -17,6 +17,9 @@ TrainingSeed = Annotated[
 Device = Annotated[str, typer.Option(help="cpu or cuda; auto uses cuda if there is one.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to see that everything works.")]
 
+QUICK_VALIDATION_PAIRS = 2
+"""A validation of vgg on all pairs takes half a minute."""
+
 
 def require_training_libraries(*others: str, extra: str = "train") -> None:
     """Raise TrainingError if a library that training needs, or one of ``others``, is missing."""
@@ -45,5 +48,8 @@ def compute_budget(device: str, quick: bool = False) -> "ExecutionOptions":
     except (RuntimeError, AssertionError) as error:
         raise TrainingError(f"--device {device}: cannot be used ({error}); give cpu") from error
     threads = 1 if device == "cpu" else max((os.cpu_count() or 2) - 1, 1)
-    every = 20 if quick else 500
-    return ExecutionOptions(device=device, threads=threads, validate_every=every, log_every=every if quick else 50)
+    if quick:
+        return ExecutionOptions(
+            device=device, threads=threads, validate_every=20, validation_pairs=QUICK_VALIDATION_PAIRS, log_every=20
+        )
+    return ExecutionOptions(device=device, threads=threads)

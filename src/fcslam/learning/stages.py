@@ -82,8 +82,9 @@ def train_detector(
     options: ExecutionOptions,
     teacher: Path | None,
     on_progress: StageCallback,
+    most_images: int | None = None,
 ) -> tuple[KeypointNetwork, TrainingImages]:
-    """Train on every image below ``roots``.
+    """Train on the images below ``roots``.
 
     Args:
         roots: folders of images.
@@ -92,6 +93,7 @@ def train_detector(
         options: where and how to compute.
         teacher: folder of a teacher's files; None without a teacher.
         on_progress: called after every step.
+        most_images: train on the first ones alone; None for all.
 
     Returns:
         The trained network, and the images that it was trained on.
@@ -107,7 +109,7 @@ def train_detector(
     if teacher is None:
         first = train_on_shapes(folder / "shapes", settings, options, on_progress)
         start, detector = first.state_dict(), keypoint_response(first, torch.device(options.device))
-    images = read_labelled_images(files, folder / "labels", settings, detector, teacher, on_progress)
+    images = read_labelled_images(files, folder / "labels", settings, detector, teacher, on_progress, most_images)
     run = TrainingRun(settings, "joint", _created(folder / "joint"), options, start)
     return run.train(
         images.train, images.held_out, _teacher_bits(images.train, settings.seed), partial(on_progress, "joint")
@@ -121,6 +123,7 @@ def read_labelled_images(
     detector: Callable[[GreyImage], Response] | None,
     teacher: Path | None,
     on_progress: StageCallback,
+    most: int | None = None,
 ) -> TrainingImages:
     """Read images, and label those that have no labels in ``cache`` yet.
 
@@ -131,6 +134,7 @@ def read_labelled_images(
         detector: gives the response by which images are labelled, beside Harris's measure; None for that alone.
         teacher: folder of a teacher's files, whose keypoints replace the detector's; None without a teacher.
         on_progress: called after every image.
+        most: usable images to train on; reading ends with the last of them. None for all.
 
     Raises:
         TrainingError: too few images are usable, or a teacher's file is missing or broken.
@@ -138,6 +142,7 @@ def read_labelled_images(
     """
     train: list[TrainingExample] = []
     held_out: list[TrainingExample] = []
+    skipped = 0
     for index, file in enumerate(files):
         image = read_image(file.path)
         if image is not None and is_usable(image):
@@ -146,13 +151,17 @@ def read_labelled_images(
             (held_out if is_held_out(file.name) else train).append(
                 TrainingExample(image, _labels(image, place, settings, detector, teacher_of_image), teacher_of_image)
             )
+        else:
+            skipped += 1
         on_progress("labels", TrainingProgress(index + 1, len(files), {}))
+        if len(train) == most:
+            break
     if len(train) < FEWEST_IMAGES:
         raise TrainingError(
             f"only {len(train)} of {len(files)} image files can be trained on: the others are no images, "
             "smaller than 96 px or have too few corners; give more images"
         )
-    return TrainingImages(train, held_out or train[:1], len(files) - len(train) - len(held_out))
+    return TrainingImages(train, held_out or train[:1], skipped)
 
 
 def _labels(

@@ -52,6 +52,8 @@ class ExecutionOptions:
     """Steps between two validations."""
     checkpoint_every_s: float = 120.0
     """Time between two checkpoints."""
+    validation_pairs: int = VALIDATION_PAIRS
+    """Most pairs of held-out images in a validation."""
     log_every: int = 50
     """Steps between two rows of losses in the log."""
     threads: int = 1
@@ -120,7 +122,7 @@ class TrainingRun:
         """
         self._resume()
         bits = None if bits is None else bits.to(self.device)
-        views = validation_pairs(held_out)
+        views = validation_pairs(held_out, self.options.validation_pairs)
         metrics: dict[str, float] = {}
         warnings: tuple[str, ...] = ()
         for step, batch in batch_stream(
@@ -218,11 +220,12 @@ def trained_network(path: Path) -> KeypointNetwork:
     return network
 
 
-def validation_pairs(held_out: Sequence[TrainingExample]) -> list[ViewPair]:
-    """Pairs of views of held-out images, spread over all of them; always the same."""
+def validation_pairs(held_out: Sequence[TrainingExample], most: int = VALIDATION_PAIRS) -> list[ViewPair]:
+    """At most ``most`` pairs of views of held-out images, spread over all of them; always the same."""
     pairs = []
-    for index in range(min(VALIDATION_PAIRS, len(held_out))):
+    count = min(most, len(held_out))
+    for index in range(count):
         rng = np.random.default_rng([VALIDATION_SEED, index])
-        example = held_out[index * len(held_out) // min(VALIDATION_PAIRS, len(held_out))]
+        example = held_out[index * len(held_out) // count]
         pairs.append(draw_pair(example, VALIDATION_VIEW, VALIDATION_POINTS, 0, rng))
     return pairs
