@@ -1,9 +1,11 @@
 """Missions of one service: begun, opened, brought in, whatever the disk says."""
 
+import os
+
 import pytest
 
-from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import StoreError
+from fcslam.cloud.settings import CloudConfig, FleetConfig
+from fcslam.errors import ServiceError, StoreError
 from fcslam.service.missions import Missions
 
 
@@ -48,6 +50,20 @@ def test_a_mission_that_cannot_be_opened_leaves_no_worker_and_the_other_one_open
     missions.open("next")
     assert missions.open_mission.folder.name == "next"
     assert [worker.stopped for worker in workers] == [True, True, False]
+
+
+@pytest.mark.parametrize("kind", ["missing", "pipe", "folder"])
+def test_a_mission_whose_vocabulary_is_no_file_is_refused_by_name(tmp_path, kind):
+    path = tmp_path / "building.words"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    launched = []
+    config = CloudConfig(fleet=FleetConfig(vocabularies=(path,)))
+    with pytest.raises(ServiceError, match=r"mission 'mission': .*building\.words"):
+        Missions(tmp_path / "data", config, lambda: 0.0, lambda: 1e9, launched.append)
+    assert launched == []
 
 
 def test_what_was_left_half_done_is_swept_away_and_the_rest_is_not(tmp_path):

@@ -104,6 +104,8 @@ def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:
         InputError: the file cannot be read, or is not one.
     """
     try:
+        if not path.is_file():  # a pipe would be waited for
+            raise ValueError("no such file" if not path.exists() else "not a file")
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError(f"more than {_MOST_BYTES} bytes")
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import IO
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import ServiceError, StoreError
+from fcslam.cloud.shared_words import SharedWords
+from fcslam.errors import InputError, ServiceError, StoreError
 from fcslam.records import Change, Edit, Undo
 from fcslam.service.detectors import STAGING, DetectorStore
 from fcslam.service.intake import Intake, SessionState
@@ -42,13 +43,19 @@ class OpenMission:
         """Check and open the mission's file; ``config`` is that of a new mission.
 
         Raises:
+            ServiceError: a vocabulary that its settings name cannot be read.
             StoreError: the file cannot be used, or what determines the map is lost.
         """
         self.folder = folder
         _check_file(folder)
         self.store = MissionStore(folder.store)
-        limits = self.store.configure(config).fleet.claims
-        self.intake = Intake(self.store, clock, wall_clock, detectors.announced, limits)
+        settings = self.store.configure(config).fleet
+        try:
+            SharedWords(settings)  # without them, every worker would end at its start
+        except InputError as error:
+            self.store.close()
+            raise ServiceError(f"mission '{folder.name}': {error}") from error
+        self.intake = Intake(self.store, clock, wall_clock, detectors.announced, settings.claims)
         self.worker = launch(folder)
         self._wall_clock = wall_clock
 
@@ -126,10 +133,14 @@ class Missions:
         self.root = root
         self._config, self._clock, self._wall_clock, self._launch = config, clock, wall_clock, launch
         self._lock = _locked(root)
-        _sweep(root)
-        self.detectors = DetectorStore(root / "detectors")
-        named = self._open_file.read_text(encoding="utf-8").strip() if self._open_file.exists() else FIRST
-        self.open_mission = self._opened(named)
+        try:
+            _sweep(root)
+            self.detectors = DetectorStore(root / "detectors")
+            named = self._open_file.read_text(encoding="utf-8").strip() if self._open_file.exists() else FIRST
+            self.open_mission = self._opened(named)
+        except BaseException:
+            self._lock.close()
+            raise
 
     @property
     def names(self) -> list[str]:
