@@ -1,7 +1,12 @@
 """Why maps of a run are apart: the binding reason with its numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from fcslam.cloud.settings import FleetConfig
+from fcslam.config import dump
+from fcslam.mission import MissionConfig
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
 from fcslam.runs import ClosureRow, RobotTrajectory, Run, separations
 
@@ -34,6 +39,13 @@ def test_the_closest_candidate_speaks_where_nothing_was_verified():
     (found,) = separations(run_of({"a": 0, "b": 1}, *(("b", "a", ClosureStatus.CANDIDATE, why) for why in reasons)))
     assert found.reason == reasons[2]
     assert "3 candidates, none verified: 238 points lie on a surface, 250 needed (count)" in str(found)
+
+
+def test_maps_that_were_not_to_be_joined_need_no_reason():
+    run = run_of({"a": 0, "b": 1})
+    for joins, count in ((True, 1), (False, 0)):
+        config = dump(MissionConfig(fleet=FleetConfig(join_maps=joins)))
+        assert len(separations(replace(run, config_yaml=config))) == count
 
 
 def test_maps_of_several_robots_take_the_strongest_pair():

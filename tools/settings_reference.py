@@ -59,6 +59,8 @@ fcslam map robot1.clf robot2.clf -o runs/building --config mission.yaml
 - A file needs only the keys that you change. Missing keys have their default values.
 - An unknown key or a value out of range is an error. The message names the nearest known key.
 - Every run folder contains the complete configuration of the run, `config.yaml`.
+- `fcslam map --preset paper` begins with [the paper's settings](paper.md) in place of the defaults. The keys of
+  `--config` count before them.
 - In Python, `fcslam.map_recordings(..., config={"map": {"resolution_m": 0.1}})` takes the same keys.
 
 A key path such as `map.resolution_m` stands for nested keys:

@@ -18,6 +18,10 @@ _GATES = (
 """Tests of verification in their order: a candidate that fails a later one came closer."""
 
 
+_JOINS_NONE = "\n  join_maps: false\n"
+"""Line of the configuration ``fleet.join_maps``, as ``fcslam.config.dump`` writes it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Separation:
     """Two maps that no closure joins."""
@@ -42,7 +46,9 @@ class Separation:
 
 
 def separations(run: Run) -> list[Separation]:
-    """One record for every two maps of one floor, in the order of their numbers."""
+    """One record for every two maps of one floor, in the order of their numbers; none if no maps were to be joined."""
+    if _JOINS_NONE in run.config_yaml:
+        return []
     members: dict[int, list[str]] = defaultdict(list)
     for trajectory in run.trajectories.values():
         members[trajectory.map_index].append(trajectory.robot)
