@@ -178,10 +178,11 @@ def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, tim
     path = mission_path(path)
     try:
         with _exclusively(path), opened_copy(path) as store:
-            for content in contents:
+            edits = []
+            for content in contents:  # in the copy: one may rest on those before it
                 check_edit(content)
                 store.check_named(content)
-            edits = [store.edit(content, author, time_s) for content in contents]
+                edits.append(store.edit(content, author, time_s))
             with replacing(path) as unfinished:
                 store.export(unfinished)
         return edits
