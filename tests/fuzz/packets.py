@@ -145,6 +145,8 @@ def set_field(rng: random.Random, part: Message, chosen: Any) -> None:
         value = rng.randbytes(rng.choice((0, 1, 2, 31, 32, 33, 300, 5000)))
     elif chosen.type == kinds.TYPE_UINT64:
         value = rng.choice(INTERESTING)
+    elif chosen.type == kinds.TYPE_SINT32:
+        value = rng.choice(INTERESTING) % 2**32 - 2**31
     else:
         value = rng.choice(INTERESTING) % (2**31 if chosen.type == kinds.TYPE_ENUM else 2**32)
     if chosen.is_repeated:
