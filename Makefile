@@ -1,5 +1,6 @@
 # Everything runs from .venv; the first target that needs it creates it.
-PYTHON ?= python3.11
+PYTHON ?= $(or $(shell for version in 3.11 3.12 3.13; do \
+    python$$version -c "import ensurepip, venv" 2>/dev/null && { echo python$$version; break; }; done),no-python-of-3.11-to-3.13)
 EXTRAS ?= dev
 VENV := .venv
 BIN := $(VENV)/bin
@@ -21,6 +22,7 @@ HAS_BROWSER := $(BIN)/python -c "import playwright, shutil, sys; sys.exit(not sh
 # torch's build for processors is a tenth of the size of the one that PyPI has.
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+HAS_MKDOCS := $(BIN)/python -c "import material, mkdocs, mkdocstrings_handlers.python" 2>/dev/null
 HAS_LEARNING := $(BIN)/python -c "import flwr, onnx, torch" 2>/dev/null
 # One worker per core. Workers share cores, so a library that starts its own threads gains nothing and slows the others.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
@@ -48,14 +50,14 @@ help:
 	@echo "make lock         write requirements.txt: what a service and a robot install, with hashes"
 	@echo "make sbom         write sbom.json, the software bill of materials of requirements.txt (CycloneDX)"
 	@echo "make audit        look for known vulnerabilities of requirements.txt; needs the Internet"
-	@echo "make docs         write docs/settings.md, the reference of all settings"
+	@echo "make docs         write the reference pages from the code, and the documentation to site/"
 	@echo "make proto        generate the Python code of the wire format"
 
 install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@echo "Installing fcslam[$(EXTRAS)] into $(VENV); the first time takes about two minutes."
-	@$(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -m venv $(VENV) || { echo "Install Python 3.11, 3.12 or 3.13 with its venv, or name one: make install PYTHON=..."; exit 1; }
 	@$(PIP) -e ".[$(EXTRAS)]"
 	@find src -name '*.nb[ic]' -delete  # compiled code that names classes by where they were
 	@$(BIN)/fcslam warm-up
@@ -129,7 +131,11 @@ bench-quick: $(INSTALLED)
 	@$(BIN)/python benchmarks/quick.py
 
 docs: $(INSTALLED)
+	@$(HAS_MKDOCS) || $(PIP) -e ".[$(EXTRAS),docs]"
 	@$(BIN)/python tools/settings_reference.py
+	@$(BIN)/python tools/reference_pages.py
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+	@echo "To read it with search: python3 -m http.server --directory site, then open http://127.0.0.1:8000"
 
 # constraints.txt says the versions; this adds the hashes.
 lock: $(INSTALLED)

@@ -1,10 +1,11 @@
-"""The threat model, put to the test: each line of `docs/security.md`, and what its tests find.
+"""The threat model, put to the test: each line of `docs/develop/security.md`, and what its tests find.
 
     python benchmarks/attacks.py
 
-The script reads the tables of `docs/security.md` and runs the tests that their lines name, then all other tests with
-the marker `attack`. A try is one test with one set of parameters. It succeeds for the attacker if the test fails. The
-script fails if an attack succeeds or if a line has no try, for example without Flower. All servers listen on loopback.
+The script reads the tables of `docs/develop/security.md` and runs the tests that their lines name, then all other
+tests with the marker `attack`. A try is one test with one set of parameters. It succeeds for the attacker
+if the test fails. The script fails if an attack succeeds or if a line has no try, for example without Flower. All
+servers listen on loopback.
 """
 
 import re
@@ -18,7 +19,7 @@ from xml.etree import ElementTree
 
 import common
 
-PAGE = common.REPOSITORY / "docs" / "security.md"
+PAGE = common.REPOSITORY / "docs" / "develop" / "security.md"
 TEST = re.compile(r"`(test_\w+)`")
 DEFINITION = re.compile(r"^def (test_\w+)\(", re.MULTILINE)
 COLUMNS = {"line": "", "tests": "", "tries": "", "succeeded": "", "not run": ""}

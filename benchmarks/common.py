@@ -176,14 +176,14 @@ class Kept:
         self._lock = threading.Lock()
         lines = path.read_text(encoding="utf-8").splitlines() if path is not None and path.exists() else []
         found = [json.loads(line) for line in lines]
-        self._rows = {tuple(entry["key"]): entry["rows"] for entry in found if entry["commit"] == _commit()}
+        self._rows = {tuple(entry["key"]): entry["rows"] for entry in found if entry["commit"] == commit()}
 
     def rows(self, key: tuple, compute: Callable[[], Iterable[tuple]]) -> list[tuple]:
         """The rows of ``key``: kept, or computed and kept now."""
         if key not in self._rows:
             self._rows[key] = list(compute())
             if self._path is not None:
-                entry = {"commit": _commit(), "key": key, "rows": self._rows[key]}
+                entry = {"commit": commit(), "key": key, "rows": self._rows[key]}
                 with self._lock, self._path.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(entry) + "\n")
         return [tuple(row) for row in self._rows[key]]
@@ -196,7 +196,7 @@ def machine() -> dict[str, str]:
     return {
         "machine": f"{_cpu_model()}, {os.cpu_count()} cores, load average {busy} before",
         "versions": ", ".join(
-            [f"fcslam {fcslam.__version__} ({_commit()})", f"python {platform.python_version()}", *packages]
+            [f"fcslam {fcslam.__version__} ({commit()})", f"python {platform.python_version()}", *packages]
         ),
     }
 
@@ -210,7 +210,8 @@ def _cpu_model() -> str:
     return models[0] if models else platform.processor() or platform.machine()
 
 
-def _commit() -> str:
+def commit() -> str:
+    """The commit of the code, with `-dirty` if files differ from it."""
     command = ["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty", "--exclude=*"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

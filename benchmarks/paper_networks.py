@@ -6,7 +6,8 @@ The encoders are that of the paper (vgg) and the default one (light). The losses
 negative (paper) or with all of them (paper-all), as the paper does not say which; and all of ours but distillation.
 The paper does not say how its detector learns keypoints: all have the cross entropy, on the same labels, which are the
 keypoints of the detector that comes with fcslam and Harris's corners. Each training takes the same processor time on
-one thread. The folder --training keeps what is done; the same command continues.
+one thread; with the paper's losses, --collapsing-minutes may be fewer, as its codes collapse soon. The folder
+--training keeps what is done; the same command continues.
 
 Validation: pairs of held-out images, as at the end of `fcslam train`. `benchmarks/homography.py` evaluates the networks
 on other scenes.
@@ -48,6 +49,7 @@ def main() -> None:
     parser = common.options(__doc__ or "")
     parser.add_argument("--training", type=Path, required=True, help="folder of the trainings")
     parser.add_argument("--minutes", type=float, default=25.0, help="of one core for each training")
+    parser.add_argument("--collapsing-minutes", type=float, help="of those with the paper's losses [as the others]")
     parser.add_argument("--encoders", nargs="+", choices=STEP_S, default=list(STEP_S), help="encoders")
     parser.add_argument("--losses", nargs="+", choices=LOSSES, default=list(LOSSES), help="losses")
     chosen = parser.parse_args()
@@ -60,7 +62,8 @@ def main() -> None:
     rows: list[tuple] = []
     for encoder in chosen.encoders:
         for losses in chosen.losses:
-            key = (encoder, losses, chosen.minutes)
+            minutes = chosen.minutes if losses == "ours" else chosen.collapsing_minutes or chosen.minutes
+            key = (encoder, losses, minutes)
             rows += kept.rows(key, lambda key=key: train(roots, teacher, chosen.training, *key))
     report.table("Trainings", COLUMNS, rows)
     report.write()
@@ -85,6 +88,11 @@ def train(
 ) -> Iterator[tuple]:
     """One training; yields a row for each measure of its last validation."""
     run = folder / f"{encoder}-{losses}"
+    labels = run / "labels"
+    if not labels.exists():  # those of all trainings are equal
+        run.mkdir(parents=True, exist_ok=True)
+        (folder / "labels").mkdir(exist_ok=True)
+        labels.symlink_to((folder / "labels").resolve())
     steps = round(60.0 * minutes / STEP_S[encoder])
     settings = folder / f"{run.name}.yaml"
     settings.write_text(yaml.safe_dump({"loss": LOSSES[losses]}), encoding="utf-8")

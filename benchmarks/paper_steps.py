@@ -15,6 +15,7 @@ places for one, so its matches are right only if the robots stood at one spot. R
 correct verified closures find. Intervals: 95 %, bootstrap over seeds.
 """
 
+import itertools
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -65,30 +66,32 @@ def main() -> None:
     parser.add_argument("--paper", type=Path, help="the network of the first row")
     parser.add_argument("--vgg", type=Path, help="the network of the second row")
     parser.add_argument("--keep", type=Path, help="file that keeps finished fleets; the same one resumes")
+    parser.add_argument("--fleets", type=Path, help="folder that keeps the recordings [they are deleted]")
     chosen = parser.parse_args()
     kept = common.Kept(chosen.keep)
     report = common.Report(__file__, __doc__, chosen)
     networks = {PAPER: chosen.paper, VGG: chosen.vgg}
     steps = [step for step in STEPS if networks.get(step.sends, step) is not None]
     rows: list[tuple] = []
-    for seed in chosen.seeds:
-        for case in chosen.cases:
+    with tempfile.TemporaryDirectory() as place:
+        for seed, case in itertools.product(chosen.seeds, chosen.cases):
+            folder = (chosen.fleets or Path(place)) / f"{case}-{seed}"
             for sends in dict.fromkeys(step.sends for step in steps):
                 network = networks.get(sends)
                 key = (case, seed, sends, str(network and network.resolve()))
-                rows += kept.rows(key, lambda fleet=(case, seed, sends), network=network: fleet_rows(*fleet, network))
+                fleet = (folder, case, seed, sends, network)
+                rows += kept.rows(key, lambda fleet=fleet: fleet_rows(*fleet))
     for case in chosen.cases:
         report.table(f"Means: {case}", {"step": "", **dict.fromkeys(MEASURES, "")}, means(rows, case, steps))
     report.table("Fleets", COLUMNS, rows)
     report.write()
 
 
-def fleet_rows(case: str, seed: int, sends: str, network: Path | None) -> Iterator[tuple]:
-    """One recorded fleet under every step whose robots send this."""
+def fleet_rows(fleet: Path, case: str, seed: int, sends: str, network: Path | None) -> Iterator[tuple]:
+    """One fleet, recorded into the folder ``fleet``, under every step whose robots send this."""
+    common.simulated(fleet, "--robots", simulated_fleet.ROBOTS, "--seed", seed, *simulated_fleet.CASES[case][0])
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        arguments = simulated_fleet.CASES[case][0]
-        fleet = common.simulated(folder / "fleet", "--robots", simulated_fleet.ROBOTS, "--seed", seed, *arguments)
         settings = settings_file(folder / "robots.yaml", {"robot": robot_settings(sends, network)})
         common.run_fcslam("map", *sorted(fleet.glob("robot_*")), "--config", settings, "--output", folder / "sent")
         (folder / "sent" / "mission.state").unlink()  # the step with its settings would begin at the end

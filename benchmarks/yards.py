@@ -3,11 +3,11 @@
     python benchmarks/yards.py
     python benchmarks/yards.py --seeds 1 2 --odometry good
 
-Trees, hedges, parked cars, glass, slopes and open ground (docs/simulation.md). Five scanners take turns over the seeds,
-and drives of 300 to 750 m come back to their start. Errors are of positions at all scans after alignment (SE(2), least
-squares): their mean is the ATE here. A slip is an error of the motion over 1 s, or from scan to scan if that is longer.
-A closure is wrong if it is off by more than 0.5 m or 10 deg. A robot that believes itself lost begins a new session;
-"apart" is the share of scans of sessions that end in another map than most.
+Trees, hedges, parked cars, glass, slopes and open ground (docs/howto/simulation.md). Five scanners take turns over the
+seeds, and drives of 300 to 750 m come back to their start. Errors are of positions at all scans after alignment
+(SE(2), least squares): their mean is the ATE here. A slip is an error of the motion over 1 s, or from scan to
+scan if that is longer. A closure is wrong if it is off by more than 0.5 m or 10 deg. A robot that believes itself
+lost begins a new session; "apart" is the share of scans of sessions that end in another map than most.
 
 Passed: an ATE of at most 0.20 m, no slip over 0.5 m, nothing apart; the script fails otherwise.
 """

@@ -26,7 +26,7 @@ SIMULATED = frozenset({"drawn", "packets", "logs"})
 """Fixtures that simulate and map a fleet: what uses one of them is slow."""
 
 
-SECURITY = Path(__file__).parents[1] / "docs" / "security.md"
+SECURITY = Path(__file__).parents[1] / "docs" / "develop" / "security.md"
 THREATS = frozenset(re.findall(r"`(test_\w+)`", SECURITY.read_text(encoding="utf-8")))
 """The tests that the page on security names: they play an attacker."""
 

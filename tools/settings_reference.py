@@ -1,4 +1,4 @@
-"""Write docs/settings.md, the reference of all settings, from the settings themselves.
+"""Write docs/reference/settings*.md, the reference of all settings, from the settings themselves.
 
     make docs
 
@@ -8,7 +8,7 @@ the description of the field in the code.
 
 import sys
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
@@ -21,9 +21,11 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.config import Settings
 from fcslam.federated.settings import FederatedSettings
 from fcslam.learning.settings import TrainingSettings
+from fcslam.lidar.frontend import LidarConfig
 from fcslam.mission import MissionConfig
+from fcslam.robot.frontend import RobotConfig
 
-PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
+FOLDER = Path(__file__).parents[1] / "docs" / "reference"
 
 UNITS = {
     "rad_m": "rad/m",
@@ -44,8 +46,8 @@ NO_UNIT = "-"
 HEAD = """\
 # Settings
 
-With this page you find the setting that you want to change, its default value and its effect. `make docs` writes the
-page from the code.
+With these pages you find the setting that you want to change, its default value and its effect. `make docs` writes the
+pages from the code.
 
 ## How to set them
 
@@ -59,8 +61,8 @@ fcslam map robot1.clf robot2.clf -o runs/building --config mission.yaml
 - A file needs only the keys that you change. Missing keys have their default values.
 - An unknown key or a value out of range is an error. The message names the nearest known key.
 - Every run folder contains the complete configuration of the run, `config.yaml`.
-- `fcslam map --preset paper` begins with [the paper's settings](paper.md) in place of the defaults. The keys of
-  `--config` count before them.
+- `fcslam map --preset paper` begins with [the paper's settings](../results/paper.md) in place of the defaults. The keys
+  of `--config` count before them.
 - In Python, `fcslam.map_recordings(..., config={"map": {"resolution_m": 0.1}})` takes the same keys.
 
 A key path such as `map.resolution_m` stands for nested keys:
@@ -73,14 +75,33 @@ map:
 Units are SI; angles are in radians. A setting without unit is a count, a ratio or a choice.
 """
 
-MISSION = """\
-## Mission
+CLOUD = """\
+## Cloud and map
 
-Commands that map, serve or run a robot read these keys with `--config`. `robot` applies on each robot, `fleet` and
-`map` in the cloud. The service keeps {cloud} with each mission, so that it can rebuild the mission from its packets.
+Commands that map or serve read these keys with `--config`. [Robots](settings-robot.md), their
+[LiDAR SLAM](settings-lidar.md) and [training](settings-training.md) have pages of their own. The service keeps {cloud}
+with each mission, so that it can rebuild the mission from its packets.
+"""
+
+ROBOT = """\
+# Settings of the robots
+
+With this page you find the settings that apply on each robot. Commands that map or run a robot read them with
+`--config`. [Settings](settings.md) shows how.
+"""
+
+LIDAR = """\
+# Settings of LiDAR SLAM
+
+With this page you find the settings with which each robot tracks its scans and closes its own loops. Commands that map
+or run a robot read them with `--config`. [Settings](settings.md) shows how.
 """
 
 TRAINING = """\
+# Settings of training
+
+With this page you find the settings of training on one machine and on several robots.
+
 ## Training
 
 `fcslam train --config` reads these keys from a YAML file.
@@ -93,11 +114,34 @@ The federated commands read these keys from a YAML file. `training` holds the ke
 """
 
 
-def page() -> str:
-    """The whole page."""
-    cloud = ", ".join(f"`{key}`" for key in CloudConfig.model_fields)
-    parts = [HEAD, MISSION.format(cloud=cloud), *tables(MissionConfig()), TRAINING, *tables(TrainingSettings())]
-    return "\n".join([*parts, FEDERATED, *tables(FederatedSettings(), documented=(TrainingSettings,))])
+def cloud_page() -> str:
+    """How to set settings, and those of the cloud and the map."""
+    cloud = CLOUD.format(cloud=", ".join(f"`{key}`" for key in CloudConfig.model_fields))
+    return "\n".join([HEAD, cloud, *tables(MissionConfig(), documented=(RobotConfig,))])
+
+
+def robot_page() -> str:
+    """The settings of the robots, without those of LiDAR SLAM."""
+    return "\n".join([ROBOT, *tables(MissionConfig().robot, "robot.", documented=(LidarConfig,))])
+
+
+def lidar_page() -> str:
+    """The settings of LiDAR SLAM on a robot."""
+    return "\n".join([LIDAR, *tables(MissionConfig().robot.lidar, "robot.lidar.")])
+
+
+def training_page() -> str:
+    """The settings of training."""
+    federated = tables(FederatedSettings(), documented=(TrainingSettings,))
+    return "\n".join([TRAINING, *tables(TrainingSettings()), FEDERATED, *federated])
+
+
+PAGES: dict[Path, Callable[[], str]] = {
+    FOLDER / "settings.md": cloud_page,
+    FOLDER / "settings-robot.md": robot_page,
+    FOLDER / "settings-lidar.md": lidar_page,
+    FOLDER / "settings-training.md": training_page,
+}
 
 
 def tables(settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = ()) -> Iterator[str]:
@@ -184,9 +228,10 @@ def sentence(description: str | None) -> str:
 
 
 def main() -> int:
-    """Write the page."""
-    PAGE.write_text(page(), encoding="utf-8")
-    print(f"{PAGE}: {page().count(chr(10) + '| `')} settings")
+    """Write the pages."""
+    for path, page in PAGES.items():
+        path.write_text(page(), encoding="utf-8")
+        print(f"{path}: {page().count(chr(10) + '| `')} settings")
     return 0
 
 

@@ -55,7 +55,7 @@ Drive = Callable[[Sequence[Source], RobotConfig], AbstractContextManager[Sequenc
 
 def one_by_one(sources: Sequence[Source], config: RobotConfig) -> AbstractContextManager[Sequence[Iterator[Leg]]]:
     """Drive each robot in this process, as far as its next leg is asked for."""
-    return nullcontext([_legs(source, config) for source in sources])
+    return nullcontext([legs(source, RobotFrontend(source.name, config)) for source in sources])
 
 
 def side_by_side(processes: int) -> Drive:
@@ -90,9 +90,8 @@ def side_by_side(processes: int) -> Drive:
     return drive
 
 
-def _legs(source: Source, config: RobotConfig) -> Iterator[Leg]:
+def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
     """Drive one robot over its whole recording."""
-    robot = RobotFrontend(source.name, config)
     packets: list[SizedPacket] = []
     stamps: list[float] = []
     for record in source.records():
@@ -199,10 +198,10 @@ def _work(number: int, source: Source, config: RobotConfig, channel: Any, turns:
     """
     obey_parent()
     try:
-        legs = _legs(source, config)
-        channel.put(_packed(number, next(legs)))
+        drive = legs(source, RobotFrontend(source.name, config))
+        channel.put(_packed(number, next(drive)))
         with turns:
-            for leg in legs:
+            for leg in drive:
                 channel.put(_packed(number, leg))
     except Exception as error:
         channel.put(_packed(number, _Failure(error, traceback.format_exc())))

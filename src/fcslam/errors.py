@@ -21,9 +21,26 @@ FcslamError
 └── UnavailableError      the cloud is unreachable or busy; retry later
 """
 
+import re
+
+_SYSTEM_ERROR = re.compile(r"\[Errno -?\d+\] ([^:()]+)(?:: '([^']*)')?")
+"""How Python writes an error of the operating system: its number, its text, and often the file."""
+
 
 class FcslamError(Exception):
-    """Base class of all exceptions of fcslam."""
+    """Base class of all exceptions of fcslam.
+
+    In the message, an error of the operating system stands without its number, and without the file if the message
+    begins with that file.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(_SYSTEM_ERROR.sub(lambda found: _readable(found, message), message))
+
+
+def _readable(system_error: re.Match[str], message: str) -> str:
+    text, file = system_error.groups()
+    return text if file is None or message.startswith(file) else f"{text}: '{file}'"
 
 
 class InputError(FcslamError):

@@ -51,7 +51,8 @@ def find_changes(folder: Path, since: str | None = None, until: str | None = Non
 
     Raises:
         EvaluationError: ``folder`` is no run folder, or it is broken.
-        SourceError: it has no mission file or no such map, or a time is unknown or before the first period.
+        SourceError: it has no mission file or no such map, its robots sent words only, or a time is unknown or before
+            the first period.
     """
     run = open_run(folder)
     seen = _seen(run, read_mission(folder), map_index, folder)
@@ -139,6 +140,8 @@ def _seen(run: Run, mission: SavedMission, map_index: int, folder: Path) -> _See
                 lasers[packet.robot] = packet.body.lasers
             elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m):
                 keyscans.append(packet.body)
+    if not keyscans:
+        raise SourceError(f"{folder}: no robot of map {map_index} sent ranges (robot.sends: words); nothing to compare")
     stamps = {name: np.argsort(robot.stamps, kind="stable") for name, robot in members.items()}
     for keyscan in keyscans:
         robot, order = members[keyscan.id.robot], stamps[keyscan.id.robot]

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 from contextlib import closing, suppress
@@ -20,23 +19,11 @@ from tests.cli.test_serve import API, Service, send
 pytestmark = pytest.mark.system
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no Playwright: make browser-test")
-CHROMIUM = shutil.which("chromium")
-if CHROMIUM is None:
-    pytest.skip("no Chromium: make browser-test", allow_module_level=True)
 
 AXE = Path(os.environ.get("FCSLAM_AXE", ".venv/axe/package/axe.min.js"))
 """axe-core, which looks for faults of accessibility; it comes from npm."""
 WAIT_MS = 60_000
 WHOLE_PAGE_BYTES = 150_000
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with (
-        playwright.sync_playwright() as started,
-        closing(started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])) as chromium,
-    ):
-        yield chromium
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fcslam.cli import main
 from fcslam.cli.output import new_folder
-from tests.sources.carmen_text import drive, save
+from tests.sources.carmen_text import drive, flaser, pose_at, save
 
 NOW = datetime(2026, 2, 3, 14, 5, 6)
 
@@ -27,6 +27,14 @@ def test_map_makes_a_run_folder_and_prints_where(tmp_path, monkeypatch, capsys):
         last = capsys.readouterr().out.splitlines()[-1]
         assert Path(last.removeprefix("map: ")).is_file()
         assert len(list(Path("runs").iterdir())) == runs
+
+
+def test_a_recording_without_stamps_has_no_speed(tmp_path, capsys):
+    log = save(tmp_path / "no_clock.log", [flaser(0.0, pose_at(step)) for step in range(40)])
+    assert main(["map", str(log), "-o", str(tmp_path / "run")]) == 0
+    streams = capsys.readouterr()
+    assert "real time" not in streams.out + streams.err
+    assert "40 scans in" in streams.out
 
 
 def test_quiet_map_prints_its_answer_only(tmp_path, capsys):

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from rich.console import Console
@@ -144,3 +145,17 @@ def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begin
             watch(RobotStatus(9, 9, WaitingPackets(0, 0), 9, 9, 0, 0, 0, 0.0, quality, times_lost, None, False, ()))
     said = [line.split(":")[0] for line in console.file.getvalue().splitlines()]
     assert said == ["connected", "lost", "relocalised in map 0, quality 0.50", "not relocalised", "lost"]
+
+
+def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():
+    console = Console(file=io.StringIO(), width=200)
+    with ProgressDisplay(console, interval_s=0.01) as display:
+        watch = _watch(display, console, total=10)
+        trouble = "http://cloud:8340: Connection refused"
+        now = RobotStatus(10, 3, WaitingPackets(7, 900), 0, 0, 0, 0, None, None, 0.0, 0, trouble, False, ())
+        for _ in range(3):
+            watch(now)
+        time.sleep(0.2)
+    text = console.file.getvalue()
+    assert text.count("all scans are mapped; 7 packets wait for the server") == 1
+    assert re.search(r"sending 0/7, .*offline, 7 waiting", text)

@@ -1,6 +1,7 @@
 """`fcslam vocabulary`, and robots that send its words: a whole mission without a range or a descriptor on the wire."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -120,3 +121,24 @@ def test_a_number_of_words_beyond_the_format_is_refused(words, tmp_path, capsys)
 def test_a_run_without_places_is_one_line(with_words, tmp_path, capsys):
     assert main(["vocabulary", str(with_words), "-o", str(tmp_path / "x")]) == 2
     assert "no place with descriptors" in capsys.readouterr().err
+
+
+def test_changes_are_not_found_where_robots_send_words(with_words, tmp_path, capsys):
+    assert main(["changes", str(with_words), "--output", str(tmp_path / "changes")]) == 2
+    assert "sent ranges (robot.sends: words)" in " ".join(capsys.readouterr().err.split())
+
+
+def test_regions_count_in_a_map_of_words_and_a_removed_stretch_stays_in_it(with_words, tmp_path):
+    run, edited = tmp_path / "run", tmp_path / "edited"
+    shutil.copytree(with_words, run)
+    robot = np.loadtxt(sorted((run / "trajectories").glob("*.tum"))[0])
+    name = sorted((run / "trajectories").glob("*.tum"))[0].stem
+    x, y = robot[0, 1:3]
+    assert main(["edit", "erase", str(run), f"{x - 0.5},{y - 0.5} {x + 0.5},{y + 0.5}", "--author", "eve"]) == 0
+    assert main(["edit", "remove", str(run), name, "--from", str(robot[-9, 0]), "--to", str(robot[-1, 0])]) == 0
+    assert main(["map", "--onto", str(run), "--quiet", "--output", str(edited)]) == 0
+    before, after = (read_map(folder / "map.yaml") for folder in (run, edited))
+    row, column = ((np.array([y, x]) - before.origin_xy[::-1]) / before.resolution_m).astype(int)
+    assert before.cells[row, column] == 1
+    assert after.cells[row, column] == 0
+    assert (run / "local" / f"{name}.pgm").read_bytes() == (edited / "local" / f"{name}.pgm").read_bytes()

@@ -95,6 +95,21 @@ def test_the_result_is_a_function_of_the_set_of_packets_whatever_was_forgotten(f
         assert [[k.id for k in robot.keyscans] for robot in result.robots] == kept
 
 
+def test_sessions_stay_joined_when_the_places_that_joined_them_are_forgotten():
+    """In a small flat only the comparison of the two maps is conclusive, and one of them is no longer there."""
+    drawn = small_fleet.draw(SESSIONS, path_length_m=18.0, seed=2)
+    sent = [
+        started_again(small_fleet.sent_by(replace(robot, stamps=robot.stamps + epoch * BETWEEN_S), "a"), epoch)
+        for epoch, robot in enumerate(drawn.robots)
+    ]
+    packets = in_order(packet for session in sent for packet in session)
+    fleet = feed(Cloud(FleetConfig(matcher=MatcherConfig(most_sessions_nearby=1)), 0), packets).fleet
+    assert not fleet._sessions.keyscans("a")
+    assert set(map_of(fleet.conclude()).values()) == {0}
+    fleet._decisions._comparison._compared.clear()
+    assert map_of(fleet.conclude())["a"] == 1, "without the earlier comparison it is separate"
+
+
 def test_packed_submaps_change_nothing_and_few_are_not_packed(forgetful, packets, monkeypatch):
     monkeypatch.setattr(submaps, "READY", 2)
     cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)

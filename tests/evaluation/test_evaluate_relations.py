@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from fcslam.evaluation.fleet.relations import (
     write_metrics,
 )
 from fcslam.geometry import se2
-from fcslam.runs import RobotTrajectory, Run
+from fcslam.runs import RobotTrajectory, Run, open_run
 
 ACROSS = RelationsQuestion(across_robots=True)
 
@@ -82,6 +83,15 @@ def test_a_run_of_no_robot_matches_nothing(folders):
     assert len(pose_table(Run({})).stamps) == 0
     with pytest.raises(EvaluationError, match="same recording"):
         evaluate_relations(folder / "empty", folder / "relations", RelationsQuestion())
+
+
+def test_robots_in_separate_maps_have_no_numbers_across_robots(folders):
+    folder, _ = folders
+    run = open_run(folder / "several")
+    apart = {name: replace(each, map_index=k) for k, (name, each) in enumerate(run.trajectories.items())}
+    Run(apart).save(folder / "apart")
+    with pytest.raises(EvaluationError, match=r"apart: none of the \d+ relations .* in different maps"):
+        evaluate_relations(folder / "apart", folder / "relations", ACROSS)
 
 
 def test_metrics_are_written_as_csv_and_json(folders):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fcslam.features.lidar_depth import LidarView, locate_keypoints
+from fcslam.features.lidar_depth import LidarView, locate_among, locate_keypoints
+from fcslam.features.lidar_depth import project as to_pixels
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, Transform
 from tests.features.pictures import CAMERA
@@ -123,3 +124,24 @@ def product(p, q):
     """Of two quaternions (x, y, z, w)."""
     (a, b), (s, t) = (p[:3], q[:3]), (p[3], q[3])
     return np.append(s * b + t * a + np.cross(a, b), s * t - a @ b)
+
+
+def test_projection_is_that_of_the_matrix_and_knows_what_is_behind():
+    points = np.array([[2.0, 0.3, 0.9], [4.0, -1.0, 0.2], [-1.0, 0.0, 0.6]])
+    pixels = to_pixels(points, CAMERA)
+    assert pixels[:2] == pytest.approx(project(points, CAMERA)[:2], abs=1e-3)
+    assert np.isnan(pixels[2]).all()
+
+
+def test_what_one_lidar_does_not_see_another_one_may():
+    rng = np.random.default_rng(3)
+    points = on_walls(POSE, room(), rng.uniform(-0.6, 0.6, 200), rng.uniform(0.1, 2.0, 200))
+    whole = seen_in(scan_at(POSE, room(), LASER))
+    half = len(whole.returns) // 2
+    sides = [whole._replace(returns=part) for part in (whole.returns[:half], whole.returns[half:])]
+    pixels = project(points)
+    expected, placed = locate_keypoints(pixels, CAMERA, whole, 3.0)
+    found, is_found = locate_among(pixels, CAMERA, sides, 3.0)
+    assert np.sum(placed & ~is_found) <= 3  # between the two halves
+    assert 0 < np.sum(locate_among(pixels, CAMERA, sides[:1], 3.0)[1]) < np.sum(is_found)
+    assert found[is_found] == pytest.approx(expected[is_found])

@@ -1,4 +1,4 @@
-"""Certificates and keys of a fleet, made as docs/federated.md says."""
+"""Certificates and keys of a fleet, made as docs/howto/federated.md says."""
 
 import shutil
 import socket

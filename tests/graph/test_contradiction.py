@@ -1,57 +1,23 @@
 """Robots that contradict others leave their map, whatever precision they claim; the others are as they were without."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from fcslam.geometry import se2
 from fcslam.graph.consistency import ConsistencySettings
-from fcslam.graph.contradiction import contradictions, leaving
+from fcslam.graph.contradiction import contradicting_robots, strained_pairs
+from fcslam.graph.factors import FactorCache
+from fcslam.graph.initialization import initialize
 from fcslam.graph.joint import JointEvidence, solve_jointly
+from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.records import ReasonCode
 from tests.scripted import CLOSURE_INFORMATION, MOTION_INFORMATION, rectangle
 
 TRUTH = rectangle()
 LIMIT = 0.3
-
-
-@pytest.mark.parametrize(
-    ("pairs", "senders", "left"),
-    [
-        ({}, (0, 1), {}),
-        ([(0, 3), (1, 3), (2, 3)], (0, 1, 2, 3), {3: 3}),
-        ([(0, 1)], (0, 1), {0: 1, 1: 1}),
-        ([(0, 1)], (0, 1, 2), {0: 1, 1: 1}),
-        # two sessions of one robot against two robots: neither outvotes the robots
-        ([(0, 2), (0, 3), (1, 2), (1, 3)], (0, 1, 2, 2), {2: 2, 3: 2}),
-        # two against two
-        ([(0, 2), (0, 3), (1, 2), (1, 3)], (0, 1, 2, 3), {0: 2, 1: 2, 2: 2, 3: 2}),
-    ],
-    ids=["none", "one against three", "two", "two and a third", "one robot twice", "two against two"],
-)
-def test_who_leaves(pairs, senders, left):
-    found = dict.fromkeys(pairs, 1.0)
-    assert leaving(found, found, senders) == left
-
-
-@pytest.mark.parametrize(("third", "left"), [(0.25, {1: 1}), (0.04, {0: 1, 1: 1})], ids=["clearly", "hardly"])
-def test_of_two_that_contradict_the_one_leaves_that_fits_a_third_worse(third, left):
-    contradicting = {(0, 1): 0.7}
-    assert leaving(contradicting, {**contradicting, (0, 2): 0.02, (1, 2): third}, (0, 1, 2)) == left
-
-
-@pytest.mark.parametrize(
-    ("found", "kept"),
-    [
-        ({(0, 1): 0.5}, []),
-        ({(0, 1): 0.7}, [(0, 1)]),
-        ({(0, 2): 0.4, (1, 2): 0.5}, [(0, 2), (1, 2)]),
-        ({(0, 2): 0.4, (0, 3): 0.5}, []),
-    ],
-    ids=["one pair", "one clear pair", "two robots against one", "two sessions of one robot"],
-)
-def test_a_slight_contradiction_counts_if_a_third_robot_confirms_it(found, kept):
-    assert list(contradictions(found, (0, 1, 2, 2), LIMIT)) == kept
 
 
 def world(*scales: float, senders=None) -> JointEvidence:
@@ -91,19 +57,58 @@ def test_a_scaled_copy_gets_a_map_of_its_own_and_bends_nobody(scale):
     assert np.abs(bent.poses[:honest] - alone.poses).max() > 0.05, "without the rule it bends them"
 
 
-def test_with_nobody_else_two_that_contradict_have_a_map_each():
-    assert solved(1.0, 1.04).maps == (0, 1)
-
-
-def test_two_sessions_of_one_robot_do_not_outvote_two_robots():
-    assert solved(1.0, 1.0, 1.04, 1.04, senders=(0, 1, 2, 2)).maps == (0, 0, 1, 1)
-
-
-def test_two_against_two_stay_two_by_two():
-    assert solved(1.0, 1.0, 1.04, 1.04).maps == (0, 0, 1, 1)
+@pytest.mark.parametrize("scales", [(1.0, 1.04), (1.0, 1.0, 1.04, 1.04)], ids=["two", "two against two"])
+def test_robots_that_contradict_each_other_share_no_map(scales):
+    assert solved(*scales).maps == tuple(int(scale > 1.0) for scale in scales)
 
 
 def test_robots_that_measure_alike_share_a_map():
     found = solved(1.0, 1.001, 0.999)
     assert found.maps == (0, 0, 0)
     assert not found.apart
+
+
+def test_a_robot_that_fits_each_other_one_but_not_all_of_them_leaves():
+    """It meets one robot at one place and the other one elsewhere, so nothing contradicts it in a pair."""
+    honest = world(1.0, 1.0)
+    count = len(TRUTH)
+    liar = world(1.0, 1.08)
+    own = [
+        Edge(2 * count + e.i - count, 2 * count + e.j - count, e.T_i_j, e.information, False)
+        for e in liar.graph.edges
+        if not e.robust and e.i >= count
+    ]
+    here, there = 0, count // 2
+    closures = [Edge(here, 2 * count + here, np.zeros(3), CLOSURE_INFORMATION, True)] * 4
+    closures += [Edge(count + there, 2 * count + there, np.zeros(3), CLOSURE_INFORMATION, True)] * 4
+    edges = [*honest.graph.edges, *own, *closures]
+    poses = np.concatenate((honest.graph.poses(), liar.graph.poses()[count:]))
+    solution = optimize(PoseGraph(poses, edges), initialize(PoseGraph(poses, edges)))
+    graph, owner, kept = PoseGraph(poses, edges), np.repeat(np.arange(3), count), np.ones(len(edges), bool)
+    left = contradicting_robots(FactorCache(graph), owner, solution.poses, kept, LIMIT)
+    assert list(left) == [2]
+    assert left[2] == {
+        pair: x for pair, x in strained_pairs(graph, owner, solution.poses, kept, LIMIT).items() if 2 in pair
+    }
+    for pair in ((0, 2), (1, 2)):  # each pair without the third robot
+        inside = np.array([{owner[e.i], owner[e.j]} <= set(pair) for e in edges])
+        alone = optimize(graph, solution.poses, kept=inside).poses
+        assert not strained_pairs(graph, owner, alone, inside, LIMIT)
+
+
+def test_the_robots_that_leave_cost_less_than_any_others():
+    """Against every choice of robots, by brute force."""
+    evidence = world(1.0, 1.03, 1.0, 0.97, 1.0)
+    graph, owner = evidence.graph, np.repeat(np.arange(5), len(TRUTH))
+    edges, kept = graph.arrays(), np.ones(len(graph.edges), bool)
+    between = edges.robust & (owner[edges.i] != owner[edges.j])
+    joint = optimize(graph, initialize(graph)).poses
+
+    def loss(leaving):
+        given_up = between & (np.isin(owner[edges.i], leaving) | np.isin(owner[edges.j], leaving))
+        poses = optimize(graph, joint, kept=~given_up).poses
+        return graph.chi2(poses)[~given_up].sum() + LIMIT * given_up.sum()
+
+    left = contradicting_robots(FactorCache(graph), owner, joint, kept, LIMIT)
+    choices = [list(c) for size in range(6) for c in itertools.combinations(range(5), size)]
+    assert sorted(left) == min(choices, key=loss) == [1, 3]

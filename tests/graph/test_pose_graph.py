@@ -66,6 +66,8 @@ def test_stiff_information_is_bounded_in_the_arrays_only() -> None:
     graph = PoseGraph(np.zeros((2, 3)), [edge(0, 1, stiff)])
     assert graph.edges[0].information[0, 0] == 1e12
     assert graph.arrays().information[0] == pytest.approx(np.diag([MAXIMUM_INFORMATION, 10.0, 50.0]))
+    assert np.array_equal(graph.edges[0].information, graph.given().information[0])
+    assert graph.edges[-1].information[0, 0] > MAXIMUM_INFORMATION, "as it was given"
 
 
 def test_arrays_grow_with_the_graph() -> None:

@@ -1,4 +1,4 @@
-"""A cloud that keeps to the contract of docs/wire.md, in memory, and the faults of a network before it."""
+"""A cloud that keeps to the contract of docs/reference/wire.md, in memory, and the faults of a network before it."""
 
 from dataclasses import dataclass, field, replace
 

@@ -115,7 +115,7 @@ def test_a_lamp_fails_even_where_there_is_one_room():
 
 
 def test_the_documented_building_can_be_built_and_driven_in():
-    text = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "howto" / "simulation.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     made = {}
     exec(compile(example, "simulation.md", "exec"), made)

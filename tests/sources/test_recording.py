@@ -118,7 +118,7 @@ def contents(folder):
 
 
 def test_the_golden_recording_means_what_it_says():
-    """Read by hand, as docs/recording.md lays it out."""
+    """Read by hand, as docs/reference/recording.md lays it out."""
     scans = (GOLDEN / "scans.bin").read_bytes()
     assert struct.unpack_from("<8sII", scans) == (b"FCSLAMsc", 2, SCAN)
     assert struct.unpack_from("<Qd3d", scans, HEADER + SCAN) == (4, 100.25, 0.125, 0.0, 0.0)

@@ -102,7 +102,7 @@ def test_a_plain_reader_of_the_published_rules_agrees():
 
 
 class PlainReader:
-    """Reads numbers as docs/wire.md describes them."""
+    """Reads numbers as docs/reference/wire.md describes them."""
 
     def __init__(self, data):
         self.number = int.from_bytes(data + bytes(ROOM), "big")

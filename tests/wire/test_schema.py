@@ -19,7 +19,7 @@ from tests.wire.examples import EXAMPLES
 
 ROOT = Path(__file__).parents[2]
 SCHEMA = "src/fcslam/wire/fcslam.proto"
-DOCUMENT = ROOT / "docs/wire.md"
+DOCUMENT = ROOT / "docs/reference/wire.md"
 
 NUMBERS = {
     FieldDescriptor.TYPE_DOUBLE,

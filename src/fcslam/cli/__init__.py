@@ -107,8 +107,8 @@ app.command(
 app.command(
     "serve",
     epilog=examples(
-        "fcslam serve --data missions",
-        "fcslam serve --data missions --host 0.0.0.0 --tokens tokens.yaml",
+        "fcslam serve --data cloud",
+        "fcslam serve --data cloud --host 0.0.0.0 --tokens tokens.yaml",
     ),
 )(serve.serve)
 app.command(

@@ -194,8 +194,16 @@ def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") 
 
 
 def _details(progress: "Progress", elapsed_s: float) -> str:
-    speed = progress.recorded_s / max(elapsed_s, 1e-9)
-    return f"{speed:.0f} x real time, {sum(progress.closures.values())} closures, {progress.keyscans} keyscans"
+    counts = f"{sum(progress.closures.values())} closures", f"{progress.keyscans} keyscans"
+    return ", ".join([*_speed(progress.recorded_s, elapsed_s), *counts])
+
+
+def _speed(recorded_s: float, elapsed_s: float) -> list[str]:
+    """The speed as a text; nothing if the recordings have no stamps that say how long they are."""
+    if not recorded_s > 0.0 < elapsed_s:
+        return []
+    speed = recorded_s / elapsed_s
+    return [f"{speed:.{0 if speed >= 10.0 else 1}f} x real time"]
 
 
 def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, settings: "MissionConfig") -> None:
@@ -215,9 +223,10 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, sett
             str(len(trajectory.stamps)),
         )
     console.print(table)
+    speed = "".join(f" ({text})" for text in _speed(values["recorded_time"], elapsed_s))
     print_line(
         console,
-        f"{values['scans']:.0f} scans in {elapsed_s:.1f} s ({values['recorded_time'] / elapsed_s:.0f} x real time), "
+        f"{values['scans']:.0f} scans in {elapsed_s:.1f} s{speed}, "
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
         f"{values['inter_robot_closures_accepted']:.0f} between them",
     )

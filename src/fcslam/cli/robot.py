@@ -331,17 +331,29 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
     trouble: str | None = "connecting"
     notices_before: tuple[str, ...] = ()
     localization, times_lost = "mapping", 0
+    waits = False
 
     def watch(now: "RobotStatus") -> None:
-        nonlocal trouble, notices_before, localization, times_lost
+        nonlocal trouble, notices_before, localization, times_lost, waits
         lines = [now.trouble or "connected"] * (now.trouble != trouble)
         if (now.localization, now.times_lost) != (localization, times_lost):
             lines.append(_localisation(now, times_lost))
         localization, times_lost = now.localization, now.times_lost
         for line in [*lines, *(notice for notice in now.notices if notice not in notices_before)]:
             print_line(console, line)
+        is_complete = now.scans == total
+        if is_complete and now.trouble and not waits:
+            waits = True
+            print_line(
+                console,
+                f"all scans are mapped; {now.waiting.packets} packets wait for the server. Ctrl-C ends the wait: they "
+                "stay on disk, and --resume sends them",
+            )
         trouble, notices_before = now.trouble, now.notices
-        display.show("mapping", now.scans, total, _details(now, is_complete=now.scans == total))
+        details = _details(now, is_complete)
+        display.show("mapping", now.scans, total, details)
+        if is_complete and now.waiting.packets:
+            display.show("sending", now.confirmed, now.confirmed + now.waiting.packets, details)
 
     return watch
 

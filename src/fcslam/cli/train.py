@@ -36,7 +36,9 @@ def train(
     images: Annotated[list[Path], typer.Argument(help="Folders of images, searched with all their subfolders.")],
     *,
     output: Annotated[Path | None, output_option(TRAINING_OUTPUT, TRAINING)] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML file of training settings; see docs/training.md.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file of training settings (docs/howto/training.md).")
+    ] = None,
     encoder: Annotated[
         str | None,
         typer.Option(
@@ -53,7 +55,7 @@ def train(
     ] = None,
     seed: TrainingSeed = None,
     teacher: Annotated[
-        Path | None, typer.Option(help="Folder with the keypoints of a teacher network; see docs/training.md.")
+        Path | None, typer.Option(help="Folder with the keypoints of a teacher network; see docs/howto/training.md.")
     ] = None,
     device: Device = "auto",
     quick: Quick = False,

@@ -151,6 +151,7 @@ class ClosureDecisions:
         return {
             "closures": self.closures.state(),
             "examined": [(sorted(pair), size) for pair, size in self._examined.items()],
+            "comparison": self._comparison.state(),
             "maps": self.maps,
             "version": self.version,
             "changes": [(kind_of(change), edit_json(change)) for change in self._changes],
@@ -163,6 +164,7 @@ class ClosureDecisions:
         """Take over a ``state``."""
         self.closures.restore(state["closures"])
         self._examined = {frozenset(pair): size for pair, size in state["examined"]}
+        self._comparison.restore(state["comparison"])
         self.maps, self.version = state["maps"], state["version"]
         changes = (read_edit(*change) for change in state["changes"])
         self._changes = tuple(change for change in changes if not isinstance(change, Undo))

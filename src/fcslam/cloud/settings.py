@@ -56,9 +56,9 @@ class FleetConfig(Settings):
     contradiction: float = Field(
         default=0.3,
         gt=0,
-        description="mean chi-square of the closures between two robots, solved without the others, above which the "
-        "paths of the two contradict each other; it is about 0.05 between robots that measure correctly, because the "
-        "stated noise of closures is a bound",
+        description="mean chi-square of the closures between two robots above which one of the robots of their map "
+        "contradicts the others; it is about 0.05 between robots that measure correctly, because the stated noise of "
+        "closures is a bound",
     )
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")

@@ -7,6 +7,7 @@ direction. Objects that overhang the scan plane, such as a table top, get a wron
 the submaps reject them.
 """
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -63,6 +64,25 @@ def locate_keypoints(
     placed = np.isfinite(distances) & (heights > FLOOR_MARGIN_M) & (heights < ceiling_m)
     positions = np.column_stack((eye + distances[:, None] * directions, heights))
     return np.where(placed[:, None], positions, 0.0), placed
+
+
+def locate_among(
+    keypoints_px: NDArray[np.float32], camera: CameraModel, surroundings: Sequence[LidarView], ceiling_m: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """``locate_keypoints`` with several LiDARs: what one does not see, another one may."""
+    positions, placed = np.zeros((len(keypoints_px), 3)), np.zeros(len(keypoints_px), np.bool_)
+    for lidar in surroundings:
+        found, is_found = locate_keypoints(keypoints_px, camera, lidar, ceiling_m)
+        fresh = is_found & ~placed
+        positions[fresh], placed = found[fresh], placed | is_found
+    return positions, placed
+
+
+def project(positions: FloatArray, camera: CameraModel) -> FloatArray:
+    """Pixels (K, 2) of positions (K, 3) in ``base``, metres, wherever they are; NaN behind the camera."""
+    seen = (positions - camera.T_base_camera.translation_m) @ rotation_matrix(camera.T_base_camera.rotation)
+    depth = np.where(seen[:, 2] > 0.0, seen[:, 2], np.nan)
+    return np.column_stack((camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy))
 
 
 def _rays(keypoints_px: FloatArray, camera: CameraModel) -> FloatArray:

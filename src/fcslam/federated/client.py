@@ -19,7 +19,8 @@ from fcslam.federated.privacy import privatise_update
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, trained_names
 from fcslam.learning.images import find_images
-from fcslam.learning.local_training import LocalTrainingPlan, local_training
+from fcslam.learning.local_training import NO_REVISITS, LocalTrainingPlan, local_training
+from fcslam.learning.revisit_batches import RevisitExamples
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
 from fcslam.learning.trainer import TrainingProgress, validation_pairs
@@ -72,6 +73,8 @@ class RobotClient:
     """The images with their labels; None until they are read."""
     images_settings: TrainingSettings | None = None
     """Settings with which the images were read; None if they were given."""
+    revisits: RevisitExamples = NO_REVISITS
+    """Views of places that were seen again, also to train on."""
 
     def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
         """Train from the weights. The result depends on the arguments, the cache, the images and the noise.
@@ -95,6 +98,7 @@ class RobotClient:
             proximal=settings.proximal if settings.strategy == "fedprox" else 0.0,
             compatible=settings.compatible,
             frozen_statistics=frozen,
+            only_codes=settings.trained == "codes",
         )
         legacy = legacy_weights(self.cache, run_id, round_number, weights) if plan.compatible else None
         trained = local_training(
@@ -106,6 +110,7 @@ class RobotClient:
             partial(self.on_step, self.name),
             legacy=None if legacy is None else weights_to_network(legacy, encoder).state_dict(),
             optimiser_state=load_optimiser_state(self.cache, run_id, round_number),
+            revisits=self.revisits,
         )
         save_optimiser_state(self.cache, run_id, round_number, trained.optimiser_state)
         new, names = network_to_weights(trained.network), trained_names(weights, frozen)

@@ -33,7 +33,7 @@ from fcslam.federated.registry import RobotRegistry, sample_robots
 from fcslam.federated.replies import RoundReplies, printable_line, read_replies
 from fcslam.federated.screening import screen
 from fcslam.federated.settings import FederatedSettings
-from fcslam.federated.strategies import Aggregator
+from fcslam.federated.strategies import Aggregator, StrategyFactory
 from fcslam.federated.weights import Weights, interpolate_weights
 from fcslam.learning.training_step import learning_rate
 
@@ -53,6 +53,8 @@ class CoordinatorHooks:
     """Called after each round with its report and the best weights so far, once both are on disk."""
     wait: Callable[[str], None] | None = None
     """Called with the reason when a round cannot be completed; returns when to try again. If None, training fails."""
+    strategy: StrategyFactory | None = None
+    """Makes the strategy; None: the one that the settings name."""
     clock: Callable[[], float] = time.monotonic
     """Seconds since any fixed moment."""
 
@@ -76,7 +78,7 @@ class Coordinator:
         self._initial = self._model(initial)
         self._run_id = run_id(settings, self._initial.version)
         self._robots = RobotRegistry(grid, settings.deadline_s)
-        self._aggregator = Aggregator(settings, {})
+        self._aggregator = Aggregator(settings, {}, hooks.strategy)
 
     def run(self) -> CoordinatorState:
         """Do all rounds that are not done yet.
@@ -102,7 +104,7 @@ class Coordinator:
             metrics = self._measure(initial, 0)  # a version must be at least as good to be released
             scores = {evaluator: combined_score(found) for evaluator, found in metrics.items()}
             return CoordinatorState.at_start(initial.weights, initial.version, scores), []
-        self._aggregator = Aggregator(self._settings, state.strategy_state)
+        self._aggregator = Aggregator(self._settings, state.strategy_state, self._hooks.strategy)
         return state, read_rows(self._folder / ROUNDS_FILE, state.rounds_done)
 
     def _round(self, state: CoordinatorState) -> tuple[CoordinatorState, RoundReport]:
@@ -217,7 +219,7 @@ class Coordinator:
         """The state after the round; ``state`` is the one in which the robots were asked."""
         number = state.rounds_done + 1
         if decision.returned:
-            self._aggregator = Aggregator(self._settings, {})
+            self._aggregator = Aggregator(self._settings, {}, self._hooks.strategy)
         return CoordinatorState(
             rounds_done=number,
             weights=state.best if decision.returned else weights,

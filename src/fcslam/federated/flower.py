@@ -5,7 +5,7 @@ FedAdam. ``tests/federated/test_flower.py`` checks each of them. To support anot
 ``SUPPORTED_VERSIONS`` and the requirement in pyproject.toml, and make that test pass.
 
 Flower's SuperLink and SuperNode are not used. They run whatever app a caller submits, and their Control API asks for no
-credentials; see docs/federated.md.
+credentials; see docs/howto/federated.md.
 """
 
 import logging

@@ -17,6 +17,7 @@ from fcslam.federated.history import RoundReport
 from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.public_images import calibration_images, public_evaluation, read_public_images
 from fcslam.federated.settings import FederatedSettings
+from fcslam.federated.strategies import StrategyFactory
 from fcslam.federated.weights import Weights
 from fcslam.learning.export import export_onnx
 from fcslam.learning.stages import StageCallback
@@ -36,6 +37,8 @@ class FederatedJob:
     """Checkpoint or exported detector to start from; None for a detector trained on synthetic shapes."""
     public: Sequence[Path] = ()
     """Folders of images that the server may read; without any, the robots evaluate."""
+    strategy: StrategyFactory | None = None
+    """Makes a strategy of your own; None: the one that the settings name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +89,7 @@ def run_job(
         callbacks.rounds(report)
 
     version = partial(weights_version, encoder=encoder)
-    hooks = CoordinatorHooks(version, public_evaluation(images, encoder, options.device), on_round, wait)
+    hooks = CoordinatorHooks(version, public_evaluation(images, encoder, options.device), on_round, wait, job.strategy)
     state = Coordinator(grid, job.settings, initial, job.output, hooks).run()
     _write_config(job, job.output / CONFIG_FILE, again=True)
     judged_on = "on pairs of public images" if images else "on pairs of images held out by the robots, their median"

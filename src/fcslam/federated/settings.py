@@ -9,6 +9,7 @@ from fcslam.learning.settings import TrainingSettings
 
 StrategyName = Literal["fedavg", "fedprox", "fedadam", "fedmedian", "fedtrimmedavg", "krum"]
 Normalisation = Literal["averaged", "frozen"]
+TrainedLayers = Literal["all", "codes"]
 
 
 class ScreeningSettings(Settings):
@@ -108,6 +109,11 @@ class FederatedSettings(Settings):
         default="averaged",
         description="batch statistics: averaged over the robots like weights, or frozen at their initial values",
     )
+    trained: TrainedLayers = Field(
+        default="all",
+        description="layers that robots train: all, or those of the codes alone, so that keypoints stay as they are; "
+        "codes needs frozen batch statistics",
+    )
     collapse: float = Field(
         default=0.15,
         gt=0.0,
@@ -129,6 +135,14 @@ class FederatedSettings(Settings):
     def _variances_stay_positive(self) -> Self:
         if self.normalisation == "averaged" and (self.strategy == "fedadam" or self.privacy.noise_multiplier > 0.0):
             raise ValueError("FedAdam and noise can make variances negative; set normalisation to frozen")
+        return self
+
+    @model_validator(mode="after")
+    def _codes_leave_statistics(self) -> Self:
+        if self.trained == "codes" and self.normalisation != "frozen":
+            raise ValueError(
+                "batch statistics belong to the keypoints too; set normalisation to frozen, or trained to all"
+            )
         return self
 
     def client_training(self) -> TrainingSettings:

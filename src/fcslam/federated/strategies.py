@@ -1,6 +1,7 @@
 """Aggregation: Flower's strategies, momentum between rounds, and the state of both that must survive a restart."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -27,6 +28,10 @@ from fcslam.federated.weights import Weights, trained_names, weights_error
 
 _MOMENTUM: Final = "momentum"
 
+StrategyFactory = Callable[..., FedAvg]
+"""A subclass of Flower's FedAvg, or a function that makes one from FedAvg's keyword arguments. A checkpoint keeps the
+state of a strategy only if it is that of FedAdam."""
+
 
 class Aggregator:
     """One of Flower's strategies with momentum between rounds.
@@ -34,10 +39,13 @@ class Aggregator:
     Args:
         settings: choose the strategy and the momentum.
         state: the ``state`` of an earlier aggregator to continue; empty for a new run.
+        strategy: makes a strategy in place of the one that the settings name.
     """
 
-    def __init__(self, settings: FederatedSettings, state: Mapping[str, NDArray[Any]]) -> None:
-        self.strategy = create_strategy(settings)
+    def __init__(
+        self, settings: FederatedSettings, state: Mapping[str, NDArray[Any]], strategy: StrategyFactory | None = None
+    ) -> None:
+        self.strategy = create_strategy(settings, strategy)
         restore_moments(self.strategy, {name: _group(state, name) for name in strategy_moments(self.strategy)})
         self._largest_momentum = settings.server_momentum
         # FedAdam has its own momentum. Krum selects one robot's update, which is too noisy to be followed further.
@@ -109,8 +117,11 @@ def apply_server_momentum(
     return following, next_momentum
 
 
-def create_strategy(settings: FederatedSettings) -> FedAvg:
-    """Flower's strategy for these settings. It asks all nodes that it is shown; the coordinator selects them."""
+def create_strategy(settings: FederatedSettings, factory: StrategyFactory | None = None) -> FedAvg:
+    """Flower's strategy for these settings, or that of ``factory``.
+
+    It asks all nodes that it is shown; the coordinator selects them.
+    """
     everyone: dict[str, Any] = {
         "fraction_train": 1.0,
         "min_train_nodes": 1,
@@ -120,19 +131,24 @@ def create_strategy(settings: FederatedSettings) -> FedAvg:
         "arrayrecord_key": ARRAYS_KEY,
         "configrecord_key": CONFIG_KEY,
     }
+    return (factory or _named(settings))(**everyone)
+
+
+def _named(settings: FederatedSettings) -> StrategyFactory:
+    """The strategy that the settings name."""
     match settings.strategy:
         case "fedavg":
-            return FedAvg(**everyone)
+            return partial(FedAvg)
         case "fedprox":
-            return FedProx(proximal_mu=settings.proximal, **everyone)
+            return partial(FedProx, proximal_mu=settings.proximal)
         case "fedadam":
-            return FedAdam(eta=settings.server_rate, **everyone)
+            return partial(FedAdam, eta=settings.server_rate)
         case "fedmedian":
-            return FedMedian(**everyone)
+            return partial(FedMedian)
         case "fedtrimmedavg":
-            return FedTrimmedAvg(beta=settings.trimmed, **everyone)
+            return partial(FedTrimmedAvg, beta=settings.trimmed)
         case "krum":
-            return Krum(num_malicious_nodes=settings.malicious, **everyone)
+            return partial(Krum, num_malicious_nodes=settings.malicious)
 
 
 def _group(state: Mapping[str, NDArray[Any]], group: str) -> dict[str, NDArray[Any]]:

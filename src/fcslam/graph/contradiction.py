@@ -1,28 +1,24 @@
-"""Robots whose paths contradict each other: the closures between them fit no pair of paths, though each fits somewhere.
+"""Robots whose paths contradict the others: their closures hold one by one, but fit no joint solution.
 
 A robot that measures wrongly, or lies, passes every test of a single closure: a copy of another robot's data, scaled by
-a few percent, matches everywhere. Solved together, its closures bend the others. The residuals of the closures that
-two robots agree on tell: those of true paths are far below the closures' stated noise, which is a bound for the worst
-place, and those of contradicting paths reach it everywhere.
+a few percent, matches everywhere. Solved jointly, its closures bend the paths of the others. The residuals tell: those
+between correct paths are far below the closures' stated noise, which is a bound for the worst place, and those between
+contradicting paths reach it everywhere.
+
+The robots that leave minimise a truncated loss, as graduated non-convexity does for single closures: a robot that stays
+costs the chi-square of its constraints in the joint solution; a robot that leaves costs the limit for each of its
+closures with the others.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.graph.optimizer import GncSettings, refine_inliers
-from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.graph.factors import FactorCache
+from fcslam.graph.optimizer import optimize
+from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray
-
-_KEPT = 0.5
-"""Weight above which a closure counts."""
-
-_UNCONFIRMED = 2.0
-"""Two robots that only each other contradict, nobody else either of them, need this many times the limit."""
-
-_CLEARLY_WORSE = 3.0
-"""Of two robots that contradict each other, the one that fits the others so many times worse is wrong."""
 
 Strains = Mapping[tuple[int, int], float]
 """Mean chi-square of the closures between two robots a < b."""
@@ -31,9 +27,7 @@ Strains = Mapping[tuple[int, int], float]
 def strained_pairs(
     graph: PoseGraph, owner: NDArray[np.int64], poses: FloatArray, kept: NDArray[np.bool_], limit: float
 ) -> Strains:
-    """Pairs of robots that poses strain: the mean chi-square of the closures between them is over the limit.
-
-    A necessary condition of a contradiction: the two alone could only fit better.
+    """Pairs of robots for which the mean chi-square of the closures between them is over the limit.
 
     Args:
         graph: N variables and E edges.
@@ -50,111 +44,36 @@ def strained_pairs(
     return {(int(a), int(b)): float(mean) for (a, b), mean in zip(pairs.T, means, strict=True) if mean > limit}
 
 
-def strains(
-    graph: PoseGraph,
-    owner: NDArray[np.int64],
-    poses: FloatArray,
-    weights: FloatArray,
-    within: NDArray[np.bool_],
-    limit: float,
-    gnc: GncSettings | None = None,
-) -> Strains:
-    """How well every two robots fit together, whatever the other robots measure; nothing if all fit.
+def contradicting_robots(
+    factors: FactorCache, owner: NDArray[np.int64], poses: FloatArray, kept: NDArray[np.bool_], limit: float
+) -> dict[int, Strains]:
+    """Find the robots that leave the maps of those that they contradict, by a greedy minimum of the truncated loss.
+
+    Nobody leaves while no pair of robots is strained. Of equal ones, the robot that started later leaves.
 
     Args:
-        graph: N variables and E edges.
+        factors: of a graph with N variables and E edges.
         owner: robot of each variable, shape (N,).
         poses: a joint solution, shape (N, 3), metres and radians.
-        weights: its weights, shape (E,).
-        within: edges that may count, shape (E,).
-        limit: largest mean chi-square in the joint solution at which two robots fit; then they fit alone as well.
-        gnc: threshold of inliers.
+        kept: edges that count in it, shape (E,).
+        limit: mean chi-square over which a pair of robots is strained, and the cost of a closure that is given up.
 
     Returns:
-        Mean chi-square of the closures between any two robots, solved without the others.
+        The robots in the order in which they leave, each with its strained pairs at that moment.
     """
-    kept = weights > _KEPT
-    if not strained_pairs(graph, owner, poses, kept, limit):
-        return {}
-    every = strained_pairs(graph, owner, poses, kept, 0.0)
-    return {pair: _pair_strain(graph, owner, pair, poses, weights, within, gnc) for pair in every}
-
-
-def _pair_strain(
-    graph: PoseGraph,
-    owner: NDArray[np.int64],
-    pair: tuple[int, int],
-    poses: FloatArray,
-    weights: FloatArray,
-    within: NDArray[np.bool_],
-    gnc: GncSettings | None,
-) -> float:
-    """Mean chi-square of the inliers between two robots in the solution of these two alone."""
-    edges = graph.arrays()
-    variables = np.flatnonzero(np.isin(owner, pair))
-    number = np.full(len(graph), -1)
-    number[variables] = np.arange(len(variables))
-    rows = np.flatnonzero(within & (number[edges.i] >= 0) & (number[edges.j] >= 0))
-    chosen = (graph.edges[row] for row in rows.tolist())
-    two = PoseGraph(
-        poses[variables], [Edge(int(number[e.i]), int(number[e.j]), e.T_i_j, e.information, e.robust) for e in chosen]
-    )
-    solution = refine_inliers(two, None, weights[rows], settings=gnc)
-    between = owner[edges.i[rows]] != owner[edges.j[rows]]
-    chi2 = two.chi2(solution.poses)[between & (solution.weights > _KEPT)]
-    return float(chi2.mean()) if len(chi2) else 0.0
-
-
-def contradictions(found: Strains, senders: Sequence[int], limit: float) -> Strains:
-    """The pairs of robots that contradict each other.
-
-    Their mean chi-square is over the limit, and a third robot contradicts one of them as well, or it is over twice the
-    limit.
-
-    Args:
-        found: all pairs.
-        senders: who sent each robot's packets; robots of one sender, its sessions, count as one.
-        limit: largest mean chi-square of two robots that fit.
-    """
-    over = {pair: mean for pair, mean in found.items() if mean > limit}
-    against = _against(over, senders)
-    return {
-        (a, b): mean for (a, b), mean in over.items() if mean > _UNCONFIRMED * limit or max(against[a], against[b]) > 1
-    }
-
-
-def leaving(contradicting: Strains, found: Strains, senders: Sequence[int]) -> dict[int, int]:
-    """Which robots leave the maps of those that they contradict, and how many others contradict each.
-
-    The robot that most others contradict leaves first, until no two that stay contradict each other. Of those that
-    equally many contradict, the one leaves that fits the others clearly worse. If none does, it is open which of them
-    is wrong, and all leave.
-
-    Args:
-        contradicting: pairs that contradict each other.
-        found: all pairs.
-        senders: as for ``contradictions``.
-    """
-    left: dict[int, int] = {}
-    pairs = contradicting
-    while pairs:
-        against = _against(pairs, senders)
-        most = max(against.values())
-        equal = {robot for robot, count in against.items() if count == most}
-        misfit = dict.fromkeys(equal, 0.0)
-        for pair, mean in found.items():
-            for robot in equal.intersection(pair) if len(equal.intersection(pair)) == 1 else ():
-                misfit[robot] = max(misfit[robot], mean)
-        worst = max(misfit.values())
-        left |= {robot: most for robot in equal if _CLEARLY_WORSE * misfit[robot] >= worst}
-        pairs = {pair: mean for pair, mean in pairs.items() if left.keys().isdisjoint(pair)}
+    graph = factors.graph
+    edges, left = graph.arrays(), dict[int, Strains]()
+    between = edges.robust & (owner[edges.i] != owner[edges.j])
+    while strained := strained_pairs(graph, owner, poses, kept, limit):
+        least, worst = graph.chi2(poses)[kept].sum(), -1
+        for robot in sorted({robot for pair in strained for robot in pair}, reverse=True):
+            given_up = kept & between & ((owner[edges.i] == robot) | (owner[edges.j] == robot))
+            without = optimize(graph, poses, kept=kept & ~given_up, factors=factors).poses
+            loss = graph.chi2(without)[kept & ~given_up].sum() + limit * np.count_nonzero(given_up)
+            if loss < least:
+                least, worst, remaining, best = loss, robot, kept & ~given_up, without
+        if worst < 0:
+            break
+        left[worst] = {pair: mean for pair, mean in strained.items() if worst in pair}
+        kept, poses = remaining, best
     return left
-
-
-def _against(pairs: Strains, senders: Sequence[int]) -> dict[int, int]:
-    """How many senders contradict each robot."""
-    others: dict[int, set[int]] = {}
-    for a, b in pairs:
-        others.setdefault(a, set()).add(senders[b])
-        others.setdefault(b, set()).add(senders[a])
-    return {robot: len(others[robot]) for robot in sorted(others)}

@@ -1,6 +1,6 @@
 """GTSAM's factors of a pose graph. The wheel of GTSAM 4.3 is built without TBB: one thread, same input, same bytes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from typing import Any
 
@@ -43,10 +43,8 @@ class FactorCache:
         self.graph = graph
         self.chains = chains
         self._trusted = gtsam.NonlinearFactorGraph()
-        self._closures: list[tuple[int, int, Any, FloatArray, Any]] = []
-        """Ends, motion, root of the information, and the factor of weight 1."""
-        self._robust: dict[Loss, list[Any]] = {}
-        """Factors of the closures, by loss."""
+        self._closures: dict[Loss, list[Any]] = {}
+        """Factors of the closures with weight 1, by loss; those of a loss are built when it is first used."""
         self._built = 0
         if chains is not None:
             self._add_trusted(chains.i, chains.j, chains.T_i_j, chains.information)
@@ -60,7 +58,8 @@ class FactorCache:
         part = FactorCache(graph)
         part.chains = self.chains
         part._trusted = gtsam.NonlinearFactorGraph(self._trusted)
-        part._closures = [closure for closure, keep in zip(self._closures, kept.tolist(), strict=True) if keep]
+        unit = zip(self._closures_under(Loss.SQUARED), kept.tolist(), strict=True)
+        part._closures[Loss.SQUARED] = [factor for factor, keep in unit if keep]
         part._built = len(graph.edges)
         return part
 
@@ -86,11 +85,13 @@ class FactorCache:
         """
         self._update()
         graph = gtsam.NonlinearFactorGraph(self._trusted)
-        for (i, j, measured, root, unit), scale in zip(self._closures, np.sqrt(weights).tolist(), strict=True):
+        scales = np.sqrt(weights)
+        scaled = self._closure_factors(np.flatnonzero((scales > 0.0) & (scales != 1.0)), scales)
+        for unit, scale in zip(self._closures_under(Loss.SQUARED), scales.tolist(), strict=True):
             if scale == 1.0:
                 graph.push_back(unit)
             elif scale > 0.0:
-                graph.push_back(_between(i, j, measured, _gaussian(root * scale)))
+                graph.push_back(next(scaled))
         self._anchor(graph, weights > 0.0, poses)
         return graph
 
@@ -107,13 +108,21 @@ class FactorCache:
         return graph
 
     def _closures_under(self, loss: Loss) -> list[Any]:
-        estimators = gtsam.noiseModel.mEstimator
-        huber = loss is Loss.HUBER
-        estimator = estimators.Huber.Create(HUBER_WIDTH) if huber else estimators.Cauchy.Create(CAUCHY_WIDTH)
-        built = self._robust.setdefault(loss, [])
-        for i, j, measured, root, _ in self._closures[len(built) :]:
-            built.append(_between(i, j, measured, gtsam.noiseModel.Robust.Create(estimator, _gaussian(root))))
+        built = self._closures.setdefault(loss, [])
+        count = int(np.count_nonzero(self.graph.arrays().robust))
+        built.extend(self._closure_factors(np.arange(len(built), count), np.ones(count), loss))
         return built
+
+    def _closure_factors(
+        self, numbers: NDArray[np.int64], scales: FloatArray, loss: Loss = Loss.SQUARED
+    ) -> Iterator[Any]:
+        """Factors of some closures, by their ``numbers`` (K,) among the closures; ``scales`` are of all closures."""
+        edges = self.graph.arrays()
+        rows = np.flatnonzero(edges.robust)[numbers]
+        roots = _roots(edges.information[rows]) * scales[numbers, None, None]
+        columns = zip(edges.i[rows].tolist(), edges.j[rows].tolist(), edges.T_i_j[rows].tolist(), roots, strict=True)
+        for i, j, T_i_j, root in columns:
+            yield _between(i, j, gtsam.Pose2(*T_i_j), _under(loss, _gaussian(root)))
 
     def _anchor(self, graph: Any, kept: NDArray[np.bool_], poses: FloatArray) -> None:
         """Add a prior on the first variable of every connected component."""
@@ -124,15 +133,10 @@ class FactorCache:
             graph.push_back(gtsam.PriorFactorPose2(variable, gtsam.Pose2(*poses[variable].tolist()), noise))
 
     def _update(self) -> None:
-        """Build the factors of new edges."""
+        """Build the factors of new trusted edges."""
         edges = self.graph.arrays()
         new = np.arange(self._built, len(edges.i))
-        closing, trusted = new[edges.robust[new]], new[~edges.robust[new]]
-        roots = _roots(edges.information[closing])
-        columns = zip(edges.i[closing].tolist(), edges.j[closing].tolist(), edges.T_i_j[closing].tolist(), strict=True)
-        for (i, j, T_i_j), root in zip(columns, roots, strict=True):
-            measured = gtsam.Pose2(*T_i_j)
-            self._closures.append((i, j, measured, root, _between(i, j, measured, _gaussian(root))))
+        trusted = new[~edges.robust[new]]
         if self.chains is None:
             self._add_trusted(edges.i[trusted], edges.j[trusted], edges.T_i_j[trusted], edges.information[trusted])
         self._built = len(edges.i)
@@ -166,6 +170,15 @@ def _between(i: int, j: int, measured: Any, noise: Any) -> Any:
 
 def _gaussian(root: FloatArray) -> Any:
     return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+
+
+def _under(loss: Loss, noise: Any) -> Any:
+    if loss is Loss.SQUARED:
+        return noise
+    estimators = gtsam.noiseModel.mEstimator
+    huber = loss is Loss.HUBER
+    estimator = estimators.Huber.Create(HUBER_WIDTH) if huber else estimators.Cauchy.Create(CAUCHY_WIDTH)
+    return gtsam.noiseModel.Robust.Create(estimator, noise)
 
 
 def _roots(information: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from fcslam.graph.cluster import (
     relative_frame,
 )
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
-from fcslam.graph.contradiction import Strains, contradictions, leaving, strains
+from fcslam.graph.contradiction import Strains, contradicting_robots
 from fcslam.graph.evidence import Uniqueness, shortfall
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
@@ -65,7 +65,7 @@ class JointEvidence:
     excluded: NDArray[np.bool_]
     """Per edge, shape (E,): closures that are known to be false, as by a veto."""
     senders: tuple[int, ...] | None = None
-    """Who sent each robot's packets: the sessions of one sender count as one where robots contradict each other. None:
+    """Sender of each robot's packets: the sessions of one sender count as one in the search for false bridges. None:
     each robot is its own sender."""
 
 
@@ -136,7 +136,8 @@ def solve_jointly(
         consistency: when closures are consistent, and what a cluster needs.
         gnc: settings of graduated non-convexity.
         examine: called for two robots where only the amount of evidence is open.
-        contradiction: mean chi-square of the closures between two robots above which they contradict each other.
+        contradiction: mean chi-square of the closures between two robots above which one of the robots of their map
+            contradicts the others.
         compare: called for robots of one map that only one other sender connects.
 
     Returns:
@@ -171,12 +172,10 @@ def solve_jointly(
             link for link in joining if _is_confirmed(link, paths, solution, evidence.informative, consistency)
         ]
         # 7. Robots that contradict others get maps of their own.
-        found = strains(
-            evidence.graph, _owners(evidence)[0], solution.poses, solution.weights, within_maps, contradiction, gnc
-        )
-        apart |= _separations(found, joining, senders, contradiction)
         _, bound = _merge_frames(len(own), known, ())
-        apart = {(a, b): reason for (a, b), reason in apart.items() if bound[a] != bound[b]}
+        owner = np.array(bound)[_owners(evidence)[0]]
+        left = contradicting_robots(factors, owner, solution.poses, solution.weights > INLIER_WEIGHT, contradiction)
+        apart |= _separations(left, joining, bound, contradiction)
         confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         # 8. Robots that alone join maps that contradict each other leave them.
         if len(confirmed) == len(joining):
@@ -409,24 +408,24 @@ def _is_confirmed(
 
 
 def _separations(
-    found: Strains, joining: Sequence[Link], senders: Sequence[int], limit: float
+    left: Mapping[int, Strains], joining: Sequence[Link], bound: Sequence[int], limit: float
 ) -> dict[tuple[int, int], Reason]:
-    """Pairs of robots that must not share a map any more: those that contradict each other, and links of robots that
-    leave to robots that stay. If that keeps all links, robots that leave keep none."""
-    contradicting = contradictions(found, senders, limit)
-    apart = {
-        pair: Reason(ReasonCode.PATHS_CONTRADICT, mean, limit, "fleet.contradiction")
-        for pair, mean in contradicting.items()
-    }
-    left = leaving(contradicting, found, senders)
+    """Pairs of robots that must not share a map: those that contradict each other, and links to robots that stay.
+
+    ``left`` has groups of robots that are known to share a map; ``bound`` is each robot's group.
+    """
+    strains = {pair: mean for found in left.values() for pair, mean in found.items()}
     alone = {
-        (link.a, link.b): Reason(ReasonCode.SEPARATED, max(left.get(link.a, 0), left.get(link.b, 0)))
+        (link.a, link.b): Reason(ReasonCode.SEPARATED, max(len(left.get(bound[k], ())) for k in (link.a, link.b)))
         for link in joining
-        if left.keys() & {link.a, link.b}
+        if len(left.keys() & {bound[link.a], bound[link.b]}) == 1
     }
-    crossing = {pair: reason for pair, reason in alone.items() if len(left.keys() & set(pair)) == 1}
-    dropped = crossing or not {(link.a, link.b) for link in joining}.isdisjoint(apart)
-    return (crossing if dropped else alone) | apart
+    contradicting = {
+        (a, b): Reason(ReasonCode.PATHS_CONTRADICT, strains[pair], limit, "fleet.contradiction")
+        for a, b in itertools.combinations(range(len(bound)), 2)
+        if (pair := (min(bound[a], bound[b]), max(bound[a], bound[b]))) in strains
+    }
+    return alone | contradicting
 
 
 def _false_bridges(

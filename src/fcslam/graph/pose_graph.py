@@ -1,8 +1,8 @@
 """A pose graph in the plane: variables numbered from 0, measured motions between them. It only grows."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from fcslam.geometry import se2
+from fcslam.graph.rows import Rows
 from fcslam.records import FloatArray, frozen
 
 MAXIMUM_INFORMATION = 1e8
@@ -59,13 +60,17 @@ class EdgeArrays:
     robust: NDArray[np.bool_]
 
 
+_NO_EDGES = EdgeArrays(
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, bool)
+)
+
+
 class PoseGraph:
     """Variables with initial poses, shape (N, 3), and edges between them; append-only."""
 
-    def __init__(self, poses: ArrayLike = (), edges: Sequence[Edge] = ()) -> None:
-        self._poses: list[FloatArray] = []
-        self._edges: list[Edge] = []
-        self._arrays = _stack([])
+    def __init__(self, poses: ArrayLike = (), edges: Iterable[Edge] = ()) -> None:
+        self._poses = Rows(np.zeros((0, 3)))
+        self._edges = _EdgeRows(_NO_EDGES)
         for pose in np.asarray(poses, dtype=np.float64).reshape(-1, 3):
             self.add_variable(pose)
         for edge in edges:
@@ -75,11 +80,7 @@ class PoseGraph:
     def restored(cls, poses: FloatArray, edges: EdgeArrays) -> Self:
         """A graph from the poses (N, 3) and edges of another one, which were checked when they were added to it."""
         graph = cls()
-        graph._poses = list(frozen(poses))
-        ends, robust = zip(edges.i.tolist(), edges.j.tolist(), strict=True), edges.robust.tolist()
-        measured = zip(frozen(edges.T_i_j), frozen(edges.information), strict=True)
-        rows = zip(ends, measured, robust, strict=True)
-        graph._edges = [_checked_edge(i, j, T, information, closes) for (i, j), (T, information), closes in rows]
+        graph._poses, graph._edges = Rows(poses), _EdgeRows(edges)
         return graph
 
     def __len__(self) -> int:
@@ -87,7 +88,7 @@ class PoseGraph:
 
     @property
     def edges(self) -> Sequence[Edge]:
-        """Edges in the order in which they were added."""
+        """Edges in the order in which they were added; each is made of its row when it is asked for."""
         return self._edges
 
     def add_variable(self, pose: ArrayLike) -> int:
@@ -96,8 +97,7 @@ class PoseGraph:
         Raises:
             ValueError: the pose is not three finite numbers.
         """
-        self._poses.append(frozen(_checked(pose, (3,), f"variable {len(self)}")))
-        return len(self._poses) - 1
+        return self._poses.append(_checked(pose, (3,), f"variable {len(self)}"))
 
     def add_edge(self, edge: Edge) -> int:
         """Append an edge; returns its number.
@@ -107,32 +107,19 @@ class PoseGraph:
         """
         if max(edge.i, edge.j) >= len(self):
             raise ValueError(f"edge {edge.i} -> {edge.j}: the graph has variables 0 to {len(self) - 1}")
-        self._edges.append(edge)
-        return len(self._edges) - 1
+        return self._edges.append(edge)
 
     def poses(self) -> FloatArray:
         """Initial poses, shape (N, 3)."""
-        return np.array(self._poses, dtype=np.float64).reshape(-1, 3)
+        return self._poses.values.copy()
 
     def given(self) -> EdgeArrays:
         """Edges as arrays with the information that was given, for ``restored``."""
-        bounded = self.arrays()
-        information = np.array([edge.information for edge in self._edges], dtype=np.float64).reshape(-1, 3, 3)
-        return replace(bounded, information=information)
+        return self._edges.given()
 
     def arrays(self) -> EdgeArrays:
-        """Edges as arrays; only those added since the last call are converted."""
-        known = len(self._arrays.i)
-        if known < len(self._edges):
-            old, new = self._arrays, _stack(self._edges[known:])
-            self._arrays = EdgeArrays(
-                i=np.concatenate((old.i, new.i)),
-                j=np.concatenate((old.j, new.j)),
-                T_i_j=np.concatenate((old.T_i_j, new.T_i_j)),
-                information=np.concatenate((old.information, new.information)),
-                robust=np.concatenate((old.robust, new.robust)),
-            )
-        return self._arrays
+        """Edges as arrays."""
+        return self._edges.bounded()
 
     def chi2(self, poses: ArrayLike | None = None, rows: NDArray[np.int64] | None = None) -> FloatArray:
         """Squared Mahalanobis length of the edges' residuals at ``poses`` (N, 3); None: initial poses.
@@ -167,31 +154,71 @@ def anchors(components: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.unique(components, return_index=True)[1].astype(np.int64)
 
 
-def _checked_edge(i: int, j: int, T_i_j: FloatArray, information: FloatArray, robust: bool) -> Edge:
-    """An edge without a new check."""
-    edge = object.__new__(Edge)
-    for name, value in (("i", i), ("j", j), ("T_i_j", T_i_j), ("information", information), ("robust", robust)):
-        object.__setattr__(edge, name, value)
-    return edge
+class _EdgeRows(Sequence[Edge]):
+    """Edges as rows of arrays."""
 
+    def __init__(self, edges: EdgeArrays) -> None:
+        """``edges`` with the information that was given."""
+        self._i, self._j, self._robust = Rows(edges.i), Rows(edges.j), Rows(edges.robust)
+        self._T_i_j, self._information = Rows(edges.T_i_j), Rows(edges.information)
+        self._given: dict[int, FloatArray] = {}
+        """What was given as information of those edges where it was bounded."""
+        self._bounded = 0
+        """Edges whose information is bounded where it has to be."""
 
-def _stack(edges: Sequence[Edge]) -> EdgeArrays:
-    return EdgeArrays(
-        i=np.array([edge.i for edge in edges], dtype=np.int64),
-        j=np.array([edge.j for edge in edges], dtype=np.int64),
-        T_i_j=np.array([edge.T_i_j for edge in edges], dtype=np.float64).reshape(-1, 3),
-        information=_bounded(np.array([edge.information for edge in edges], dtype=np.float64).reshape(-1, 3, 3)),
-        robust=np.array([edge.robust for edge in edges], dtype=bool),
-    )
+    def __len__(self) -> int:
+        return len(self._i)
+
+    @overload
+    def __getitem__(self, index: int) -> Edge: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Edge]: ...
+    def __getitem__(self, index: int | slice) -> Edge | Sequence[Edge]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        row = range(len(self))[index]
+        information = self._given.get(row)
+        edge = object.__new__(Edge)  # checked when it was added
+        for name, value in (
+            ("i", int(self._i.values[row])),
+            ("j", int(self._j.values[row])),
+            ("T_i_j", frozen(self._T_i_j.values[row])),
+            ("information", frozen(self._information.values[row]) if information is None else information),
+            ("robust", bool(self._robust.values[row])),
+        ):
+            object.__setattr__(edge, name, value)
+        return edge
+
+    def append(self, edge: Edge) -> int:
+        for rows, value in (
+            (self._i, edge.i), (self._j, edge.j), (self._robust, edge.robust), (self._T_i_j, edge.T_i_j)
+        ):  # fmt: skip
+            rows.append(value)
+        return self._information.append(edge.information)
+
+    def given(self) -> EdgeArrays:
+        information = self._information.values.copy()
+        for row, matrix in self._given.items():
+            information[row] = matrix
+        return replace(self.bounded(), information=information)
+
+    def bounded(self) -> EdgeArrays:
+        """Eigenvalues of the information are at most MAXIMUM_INFORMATION."""
+        information = self._information.values
+        new = information[self._bounded :]
+        stiff = np.flatnonzero(np.einsum("eaa->e", new) > MAXIMUM_INFORMATION)
+        self._given |= {self._bounded + row: frozen(new[row]) for row in stiff.tolist()}
+        new[stiff] = _bounded(new[stiff])
+        self._bounded = len(self)
+        return EdgeArrays(self._i.values, self._j.values, self._T_i_j.values, information, self._robust.values)
 
 
 def _bounded(information: FloatArray) -> FloatArray:
     """Information (E, 3, 3) with eigenvalues at most MAXIMUM_INFORMATION."""
-    stiff = np.flatnonzero(np.einsum("eaa->e", information) > MAXIMUM_INFORMATION)
-    values, vectors = np.linalg.eigh(information[stiff])
+    values, vectors = np.linalg.eigh(information)
     values = np.clip(values, _MINIMUM_INFORMATION, MAXIMUM_INFORMATION)
-    information[stiff] = np.einsum("eab,eb,ecb->eac", vectors, values, vectors)
-    return information
+    bounded: FloatArray = np.einsum("eab,eb,ecb->eac", vectors, values, vectors)
+    return bounded
 
 
 def _checked(values: ArrayLike, shape: tuple[int, ...], what: str) -> FloatArray:

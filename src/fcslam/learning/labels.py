@@ -67,7 +67,7 @@ def fuse_keypoints(first: Points, second: Points) -> Labels:
 
 
 def read_teacher(path: Path) -> Teacher:
-    """Read a teacher's file, which a script of the user has made (see docs/training.md).
+    """Read a teacher's file, which a script of the user has made (see docs/howto/training.md).
 
     Raises:
         TrainingError: the file does not exist, or lacks an array, or the arrays do not fit together.

@@ -39,7 +39,12 @@ class KeypointNetwork(nn.Module):
     def __init__(self, encoder: Encoder = "light") -> None:
         super().__init__()
         self.encoder: Encoder = encoder
-        self.body: nn.Module = LightBody() if encoder == "light" else VggBody()
+        self.body: LightBody | VggBody = LightBody() if encoder == "light" else VggBody()
+
+    @property
+    def code_head(self) -> nn.Module:
+        """The layers on which the codes depend and the keypoints do not."""
+        return self.body.code_head
 
     def forward(self, image: Tensor) -> Maps:
         """Maps of a batch.

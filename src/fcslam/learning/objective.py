@@ -11,6 +11,7 @@ from fcslam.features.dense import CELL_PX
 from fcslam.learning import losses
 from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.network import Maps, sample_codes
+from fcslam.learning.revisit_batches import RevisitBatch
 from fcslam.learning.settings import Encoder, LossSettings
 
 MIN_NEGATIVE_DISTANCE_PX = 8.0
@@ -81,6 +82,44 @@ def objective(
         parts["distillation"] = losses.distillation_loss(logits, wanted, batch.teacher_valid.repeat(2, 1))
         factors["distillation"] = weights.distillation * 0.25**progress
     total = sum((factors[name] * part for name, part in parts.items()), start=torch.zeros_like(parts["detector"]))
+    return total, parts
+
+
+def revisit_objective(
+    maps: Maps, batch: RevisitBatch, weights: LossSettings, progress: float
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The sum to minimise for views of places that were seen again, and the losses in it by name.
+
+    The codes of a point in both views must agree and differ from those of the other points of the other view. Fixed
+    codes of other robots count as a second view. The balance of the bits, and the negatives, keep codes from becoming
+    all alike.
+
+    Args:
+        maps: output of the network for ``batch.images``.
+        batch: images, points and codes.
+        weights: of the losses.
+        progress: share of the training that is done, in [0, 1].
+    """
+    count, fixed = len(batch.valid), len(batch.codes)
+    code_logits, places = maps.code_logits.float(), batch.points[: 2 * count - fixed]
+    logits = sample_codes(code_logits, places)
+    # The second views of pairs follow all first views; fixed codes stand behind them.
+    soft = torch.cat((torch.tanh(logits), batch.codes))
+    bits = torch.cat((losses.binary_activation(logits), (batch.codes + 1.0) / 2.0))
+    candidates = negatives(batch.points, batch.valid)
+    margin = weights.margin * (0.3 + 0.7 * progress)
+    distances = losses.code_distances(bits[:count], bits[count:], weights.rounding)
+    parts = {
+        "revisit_triplet": losses.triplet_loss(distances, candidates, batch.valid, margin, weights.negatives),
+        "revisit_contrastive": losses.contrastive_loss(
+            soft[:count], soft[count:], candidates, batch.valid, weights.temperature
+        ),
+        "revisit_balance": losses.balance_loss(soft[:count], batch.valid),
+    }
+    factors = (weights.triplet, weights.contrastive, weights.balance)
+    total = sum(
+        (f * part for f, part in zip(factors, parts.values(), strict=True)), start=torch.zeros_like(distances[0, 0, 0])
+    )
     return total, parts
 
 

@@ -49,6 +49,9 @@ class LossSettings(Settings):
     agreement: float = Field(
         default=1.0, ge=0.0, description="weight of the loss that makes the keypoint maps of both views agree"
     )
+    revisits: float = Field(
+        default=1.0, ge=0.0, description="weight of the losses on places that were seen again, if there are any"
+    )
 
 
 class TrainingSettings(Settings):

@@ -11,7 +11,8 @@ from fcslam.errors import TrainingError
 from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.losses import distillation_loss
 from fcslam.learning.network import KeypointNetwork, Maps, sample_codes
-from fcslam.learning.objective import TeacherBits, grid_shift, objective
+from fcslam.learning.objective import TeacherBits, grid_shift, objective, revisit_objective
+from fcslam.learning.revisit_batches import RevisitBatch
 from fcslam.learning.settings import TrainingSettings
 
 CLIP_NORM: Final = 1.0
@@ -98,6 +99,7 @@ def training_step(
     bits: TeacherBits | None = None,
     proximal: ProximalTerm | None = None,
     legacy: LegacyDetector | None = None,
+    revisits: RevisitBatch | None = None,
 ) -> dict[str, Tensor]:
     """Do one step in place; batch, network and optimiser are on one device.
 
@@ -111,6 +113,7 @@ def training_step(
         bits: the teacher's, if there is a teacher.
         proximal: added to the objective.
         legacy: the detector whose codes are still in use, if there is one.
+        revisits: views of places that were seen again, if there are any.
 
     Returns:
         The losses by name.
@@ -129,6 +132,12 @@ def training_step(
     if legacy is not None:
         losses["former"] = legacy.loss(maps, batch)
         total = total + legacy.strength * losses["former"]
+    if revisits is not None:
+        with torch.autocast(batch.images.device.type, torch.bfloat16):
+            maps = network(revisits.images.contiguous(memory_format=torch.channels_last))
+        seen_again, parts = revisit_objective(maps, revisits, settings.loss, step / settings.steps)
+        losses |= parts
+        total = total + settings.loss.revisits * seen_again
     if not torch.isfinite(total):
         raise TrainingError(f"training diverged at step {step}; lower the learning rate")
     optimiser.zero_grad(set_to_none=True)

@@ -91,7 +91,7 @@ def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | No
         return None
     middle = b.surface.points.mean(axis=0, keepdims=True)
     refined = (align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [T_a_b]))
-    rivals = (rival for rival in refined if _is_elsewhere(rival.T_a_b, T_a_b, middle))
+    rivals = (rival for rival in refined if is_elsewhere(rival.T_a_b, T_a_b, middle))
     return max(rivals, key=lambda rival: rival.score_m, default=None)
 
 
@@ -109,7 +109,7 @@ def two_best(a: Submap, b: Submap) -> tuple[MapAlignment, MapAlignment | None] |
     middle = b.surface.points.mean(axis=0, keepdims=True)
     refined = [align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [])]
     best = max(refined, key=lambda alignment: alignment.score_m)
-    rivals = (rival for rival in refined if _is_elsewhere(rival.T_a_b, best.T_a_b, middle))
+    rivals = (rival for rival in refined if is_elsewhere(rival.T_a_b, best.T_a_b, middle))
     return best, max(rivals, key=lambda rival: rival.score_m, default=None)
 
 
@@ -117,14 +117,14 @@ def _distinct_peaks(a: Submap, b: Submap, middle: FloatArray, known: list[FloatA
     """The best transforms of the exhaustive search that are elsewhere than each other and than the ``known`` ones."""
     distinct = list(known)
     for _, pose in sorted(_coarse_peaks(a, b), key=lambda peak: -peak[0]):
-        if all(_is_elsewhere(pose, other, middle) for other in distinct):
+        if all(is_elsewhere(pose, other, middle) for other in distinct):
             distinct.append(pose)
         if len(distinct) >= REFINED + len(known):
             break
     return distinct[len(known) :]
 
 
-def _is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool:
+def is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool:
     """Whether two transforms T_a_b put the middle (1, 2) of b at two places, or turn b differently."""
     gap = se2.transform(one, middle) - se2.transform(other, middle)
     turn = abs(se2.wrap_angle(one[2] - other[2]))

@@ -14,6 +14,7 @@ from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig
 from fcslam.lidar.backend import FinishedSubmap, LidarBackend
 from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
 from fcslam.records import CameraImage, Channel, DetectorFile, KeyscanId, LaserModel, LaserScan, Place
+from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
 from fcslam.robot.words import SendingConfig, Sends, WordSender, without_ranges
@@ -89,6 +90,11 @@ class RobotBackend:
         self._session = _Session(robot, 0, self._view_extractor, config)
         if self._words is not None:
             self._words.check(self._session.detector_versions)
+
+    @property
+    def keyframes(self) -> tuple[KeyframeImage, ...]:
+        """The images of the present session that the robot still has, oldest first. They stay on the robot."""
+        return self._view_extractor.keyframes
 
     def process(self, input: BackendInput) -> list[Body]:
         """Handle the next input; returns what the robot sends because of it.

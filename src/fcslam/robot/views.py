@@ -14,7 +14,7 @@ from fcslam.features.detector import GreyImage, OnnxConfig, decode_grey
 from fcslam.features.detector_file import open_detector_file
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.factory import make_detector
-from fcslam.features.lidar_depth import LidarView, locate_keypoints
+from fcslam.features.lidar_depth import LidarView, locate_among
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.scan import point_scan
@@ -116,6 +116,11 @@ class ViewExtractor:
             self._image_buffer.add(keyframe)
         return view
 
+    @property
+    def keyframes(self) -> tuple[KeyframeImage, ...]:
+        """The buffered images of the present session, oldest first."""
+        return tuple(self._image_buffer)
+
     def set_detector(self, file: DetectorFile, path: Path) -> None:
         """Use a downloaded network from now on.
 
@@ -137,11 +142,8 @@ class ViewExtractor:
 
     def _describe(self, image: KeyframeImage, picture: GreyImage) -> CameraView | None:
         features = self._detector.detect(picture)
-        positions, placed = np.zeros((len(features.keypoints_px), 3)), np.zeros(len(features.keypoints_px), np.bool_)
-        for seen in image.surroundings:  # what one laser does not see, another one may
-            found, is_found = locate_keypoints(features.keypoints_px, image.camera, seen, self._config.ceiling_m)
-            fresh = is_found & ~placed
-            positions[fresh], placed = found[fresh], placed | is_found
+        pixels, ceiling_m = features.keypoints_px, self._config.ceiling_m
+        positions, placed = locate_among(pixels, image.camera, image.surroundings, ceiling_m)
         if placed.sum() < self._config.fewest_keypoints:
             return None
         positions[:, :2] = se2.transform(image.T_keyscan_image, positions[:, :2])

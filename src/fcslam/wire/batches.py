@@ -1,4 +1,4 @@
-"""Batches: several packets in one request or reply, each preceded by its length (docs/wire.md)."""
+"""Batches: several packets in one request or reply, each preceded by its length (docs/reference/wire.md)."""
 
 import struct
 from collections.abc import Iterable

@@ -96,7 +96,7 @@ class BatchTransport(Protocol):
 
 
 class HttpTransport:
-    """Connection of one robot to one cloud; docs/howto-robot.md lists how it handles status codes."""
+    """Connection of one robot to one cloud; docs/howto/robot.md lists how it handles status codes."""
 
     def __init__(
         self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None,

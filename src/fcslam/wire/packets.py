@@ -1,4 +1,4 @@
-"""Encoding and decoding of packets (format: docs/wire.md)."""
+"""Encoding and decoding of packets (format: docs/reference/wire.md)."""
 
 from dataclasses import replace
 from typing import Any, NamedTuple

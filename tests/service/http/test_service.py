@@ -1,6 +1,8 @@
 """What the service answers: robots, viewers, administrators; and what it does not let happen."""
 
 import hashlib
+import io
+import zipfile
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -246,6 +248,20 @@ def test_a_result_is_a_run_folder(mapped):
     run = open_run(Path(answer["run"]))
     assert sum(len(t.stamps) for t in run.trajectories.values()) == 2 * len(POSES)
     assert mapped.ask("POST", f"{API}/finalize", "boss").json()["number"] == answer["number"] + 1
+
+
+def test_a_result_can_be_downloaded(mapped, tmp_path):
+    answer = mapped.ask("POST", f"{API}/finalize", "boss").json()
+    archive = mapped.ask("GET", answer["archive"], "boss")
+    assert archive.headers["content-type"] == "application/zip"
+    zipfile.ZipFile(io.BytesIO(archive.content)).extractall(tmp_path / "run")
+    folder = Path(answer["run"])
+    written = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    there = tmp_path / "run"
+    assert {path.relative_to(there): path.read_bytes() for path in there.rglob("*") if path.is_file()} == written
+    assert mapped.ask("GET", answer["archive"], "eye").status_code == 403
+    assert mapped.ask("GET", f"{API}/missions/mission/runs/99.zip", "boss").status_code == 404
+    assert mapped.ask("GET", f"{API}/missions/other/runs/1.zip", "boss").status_code == 404
 
 
 def test_a_full_disk_is_507_and_the_result_comes_when_there_is_room(mapped, monkeypatch):

@@ -33,8 +33,8 @@ def join(
 ) -> None:
     """Join a fleet as one robot: train on local images whenever the server at HOST:PORT asks; Ctrl-C stops.
 
-    The robot runs the installed fcslam and no program of the server. Give --ca and --robot-key; docs/federated.md shows
-    how to make them. Give --insecure only in a network that nobody else can reach.
+    The robot runs the installed fcslam and no program of the server. Give --ca and --robot-key;
+    docs/howto/federated.md shows how to make them. Give --insecure only in a network that nobody else can reach.
     """
     require_training_libraries("flwr", extra="federated")
     from fcslam.errors import TrainingError

@@ -20,7 +20,7 @@ _ROBOT_NEEDS = "give --ca and --robot-key, or --insecure in a network that nobod
 _TOO_MUCH = "--insecure, but certificates or keys are given; leave out one or the other"
 
 SettingsFile = Annotated[
-    Path | None, typer.Option("--config", help="YAML file of federated settings; see docs/federated.md.")
+    Path | None, typer.Option("--config", help="YAML file of federated settings; see docs/howto/federated.md.")
 ]
 Start = Annotated[
     Path | None,

@@ -65,8 +65,8 @@ def serve(
 ) -> None:
     """Run the server of a fleet: wait for robots at HOST:PORT and train one detector with them.
 
-    Give --ca, --certificate, --key and the --robot-key of each robot; docs/federated.md shows how to make them. Give
-    --insecure only in a network that nobody else can reach.
+    Give --ca, --certificate, --key and the --robot-key of each robot; docs/howto/federated.md shows how to make
+    them. Give --insecure only in a network that nobody else can reach.
     """
     from fcslam.cli.progress import ProgressDisplay
 

@@ -42,7 +42,8 @@ def evaluate_relations(run: Path, relations: Path, question: RelationsQuestion) 
     """Errors of the run folder ``run`` against the file ``relations``.
 
     Raises:
-        EvaluationError: one of them cannot be read, no relation is selected, or none has a stamp of the run.
+        EvaluationError: one of them cannot be read, no relation is selected, or none has both its poses in one map of
+            the run.
     """
     reference = read_relations(relations)
     poses = pose_table(open_run(run))
@@ -51,7 +52,11 @@ def evaluate_relations(run: Path, relations: Path, question: RelationsQuestion) 
     if not len(selected):
         which = "between different robots" if question.across_robots else "in it"
         raise EvaluationError(f"{relations}: no relation {which} spans more than {question.gap_s:g} s")
-    return relation_errors(selected, poses)
+    errors = relation_errors(selected, poses)
+    if not errors.used:
+        hint = "; the robots are in different maps, which closures.csv explains" if question.across_robots else ""
+        raise EvaluationError(f"{run}: none of the {errors.total} relations has both its poses in one map{hint}")
+    return errors
 
 
 def pose_table(run: Run) -> PoseTable:

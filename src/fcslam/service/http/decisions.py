@@ -32,7 +32,9 @@ class NewEdit(Settings):
     """An edit: what changes about the mission from now on."""
 
     kind: Literal["veto", "removal", "cut", "pin", "closure", "placement", "region", "floor"]
-    content: dict[str, Any] = Field(description="what it names, as `GET /edits` shows it; docs/deploy.md has examples")
+    content: dict[str, Any] = Field(
+        description="what it names, as `GET /edits` shows it; examples: docs/howto/deploy.md"
+    )
 
 
 def decision_router(state: ServiceState) -> APIRouter:
@@ -52,7 +54,11 @@ def decision_router(state: ServiceState) -> APIRouter:
             if asked.failure:
                 raise HTTPException(500, asked.failure)
             if asked.run:
-                return Finalized(number=number, run=str(mission.folder.run(asked.run).resolve()))
+                return Finalized(
+                    number=number,
+                    run=str(mission.folder.run(asked.run).resolve()),
+                    archive=f"/api/v1/missions/{mission.folder.name}/runs/{number}.zip",
+                )
             free = shutil.disk_usage(mission.folder.path).free
             if free < LEAST_FREE_BYTES:
                 raise HTTPException(

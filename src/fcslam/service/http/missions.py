@@ -1,11 +1,13 @@
-"""Routes of missions: create, open, export, import."""
+"""Routes of missions: create, open, export, import, results."""
 
+import shutil
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Query, Request
+from fastapi import Path as PathParameter
 from fastapi.responses import Response, StreamingResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
@@ -24,9 +26,11 @@ from fcslam.storage.database import translate_errors
 
 FILE = "application/vnd.sqlite3"
 """Media type of an exported mission."""
+ZIP = "application/zip"
 CHUNK_BYTES = 2**20
 LONGEST_IMPORT_BYTES = 64 * 2**30
 
+RunNumber = Annotated[int, PathParameter(ge=1, le=2**31 - 1, description="that `POST /finalize` returned")]
 MissionName = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 
 
@@ -104,17 +108,42 @@ def file_router(state: ServiceState) -> APIRouter:
         """A mission as one file."""
         if name not in state.missions.names:
             raise HTTPException(404, f"there is no mission '{name}'")
-        folder = tempfile.TemporaryDirectory(dir=state.missions.root, prefix=EXPORT)
-        path = Path(folder.name) / f"{name}.sqlite"
-        try:
-            await run_in_threadpool(state.missions.export, name, path)
-        except BaseException:
-            folder.cleanup()
-            raise
-        headers = {"Content-Disposition": f'attachment; filename="{name}.sqlite"'}
-        return StreamingResponse(_content(path, folder), media_type=FILE, headers=headers)
+        return await _download(state, f"{name}.sqlite", FILE, lambda path: state.missions.export(name, path))
+
+    @router.get(
+        "/missions/{name}/runs/{number}.zip",
+        response_class=Response,
+        responses={**refusals(400, 404, 507), 200: content(ZIP)},
+    )
+    async def download_run(name: Name, number: RunNumber) -> StreamingResponse:
+        """A result as one file: the run folder in a ZIP archive."""
+        run = state.missions.folder(name).run(str(number))
+        if name not in state.missions.names or not run.is_dir():
+            raise HTTPException(404, f"mission '{name}' has no result {number}; POST /finalize makes one")
+        return await _download(state, f"{name}-{number}.zip", ZIP, lambda path: _pack(run, path))
 
     return router
+
+
+def _pack(folder: Path, archive: Path) -> None:
+    """Write a ZIP archive of a folder's files; ``archive`` ends in ``.zip``."""
+    with translate_errors(archive):
+        shutil.make_archive(str(archive.with_suffix("")), "zip", folder)
+
+
+async def _download(
+    state: ServiceState, name: str, media_type: str, write: Callable[[Path], None]
+) -> StreamingResponse:
+    """Send a file that ``write`` makes in a folder of its own, which is removed afterwards."""
+    folder = tempfile.TemporaryDirectory(dir=state.missions.root, prefix=EXPORT)
+    path = Path(folder.name) / name
+    try:
+        await run_in_threadpool(write, path)
+    except BaseException:
+        folder.cleanup()
+        raise
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return StreamingResponse(_content(path, folder), media_type=media_type, headers=headers)
 
 
 def _missions(state: ServiceState) -> MissionList:

@@ -181,6 +181,7 @@ class Finalized(Settings):
 
     number: int
     run: str = Field(description="run folder, on the service's machine")
+    archive: str = Field(description="path of the run folder as a ZIP archive, to download from the service")
 
 
 class EditSummary(Settings):

@@ -1,1 +1,1 @@
-"""fcslam's own recording format, a folder for each robot: reader and writer. docs/recording.md specifies it."""
+"""fcslam's own recording format, a folder for each robot: reader and writer (docs/reference/recording.md)."""

@@ -1,0 +1,107 @@
+"""Batches of real views: pairs of images of one place, and images with codes that other robots gave to their points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fcslam.features.codes import CODE_BITS
+from fcslam.features.detector import GreyImage
+from fcslam.learning.labels import Points
+from fcslam.records import Codes
+
+VIEWS: Final = 4
+"""Images in a batch."""
+MOST_POINTS: Final = 160
+"""Most points of a pair or of a taught image in a batch."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RevisitPair:
+    """Two images of one place and the points that both show."""
+
+    images: tuple[GreyImage, GreyImage]
+    points: tuple[Points, Points]
+    """Shape (M, 2) each, pixels."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TaughtImage:
+    """An image and the codes that other robots gave to its points."""
+
+    image: GreyImage
+    points: Points
+    """Shape (M, 2), pixels."""
+    codes: Codes
+    """Shape (M, 32)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RevisitExamples:
+    """What a robot's own revisits, and the closures with others, give it to train on. All images are of one size."""
+
+    pairs: Sequence[RevisitPair] = field(default=())
+    taught: Sequence[TaughtImage] = field(default=())
+
+    def __bool__(self) -> bool:
+        return bool(self.pairs or self.taught)
+
+
+@dataclass(frozen=True, slots=True)
+class RevisitBatch:
+    """B pairs of views; of the last T pairs, fixed codes stand for the second view."""
+
+    images: Tensor
+    """Shape (2B - T, 1, H, W), grey in [0, 1]: B first views, then B - T second views."""
+    points: Tensor
+    """Shape (2B, N, 2) [px]: in the first views, then in the second ones; where these are codes, those of the first."""
+    valid: Tensor
+    """Shape (B, N), bool."""
+    codes: Tensor
+    """Shape (T, N, 256): -1 for a bit 0, 1 for a bit 1, 0 where not valid."""
+
+    def to(self, device: torch.device) -> "RevisitBatch":
+        """The batch on another device."""
+        return RevisitBatch(**{each.name: getattr(self, each.name).to(device) for each in fields(self)})
+
+
+def draw_revisits(examples: RevisitExamples, seed: int, step: int) -> RevisitBatch:
+    """The batch of a step: pairs, taught images, or both. ``VIEWS`` images, which all must have one size."""
+    rng = np.random.default_rng([seed, step, VIEWS])
+    taught_count = (VIEWS // 2 if examples.pairs else VIEWS) if examples.taught else 0
+    pairs = [examples.pairs[k] for k in rng.integers(len(examples.pairs) or 1, size=(VIEWS - taught_count) // 2)]
+    taught = [examples.taught[k] for k in rng.integers(len(examples.taught) or 1, size=taught_count)]
+    firsts, seconds, valid, codes = [], [], [], []
+    for pair in pairs:
+        chosen = _some(len(pair.points[0]), rng)
+        firsts.append(_padded(pair.points[0][chosen]))
+        seconds.append(_padded(pair.points[1][chosen]))
+        valid.append(np.arange(MOST_POINTS) < len(chosen))
+    for image in taught:
+        chosen = _some(len(image.points), rng)
+        firsts.append(_padded(image.points[chosen]))
+        seconds.append(firsts[-1])
+        valid.append(np.arange(MOST_POINTS) < len(chosen))
+        codes.append(_padded(2.0 * np.unpackbits(image.codes[chosen], axis=1) - 1.0))
+    images = [pair.images[0] for pair in pairs] + [image.image for image in taught] + [pair.images[1] for pair in pairs]
+    return RevisitBatch(
+        torch.from_numpy(np.stack(images).astype(np.float32) / 255.0).unsqueeze(1),
+        torch.from_numpy(np.stack(firsts + seconds)),
+        torch.from_numpy(np.stack(valid)),
+        torch.from_numpy(np.array(codes, np.float32).reshape(-1, MOST_POINTS, CODE_BITS)),
+    )
+
+
+def _some(count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    return rng.permutation(count)[:MOST_POINTS]
+
+
+def _padded(rows: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Rows (M, D), M at most ``MOST_POINTS``, with zeros below."""
+    padded = np.zeros((MOST_POINTS, rows.shape[1]), np.float32)
+    padded[: len(rows)] = rows
+    return padded

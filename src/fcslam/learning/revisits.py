@@ -1,0 +1,164 @@
+"""Correspondences between two images of one place, from the poses that SLAM estimated and the keypoints' depth.
+
+A homography makes pairs of one image only. Two visits show the same points in other light, from another side, and with
+other furniture around them.
+
+Poses and depths are a few centimetres off, which is several pixels nearby. So the codes of the points that match anyway
+first tell how far the predicted pixels are off in each part of the image. Then geometry alone decides which keypoint is
+which: also where codes disagree, as only those pairs can teach anything.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from fcslam.features.codes import hamming_matrix
+from fcslam.features.detector import GreyImage, ImageFeatures
+from fcslam.features.lidar_depth import LidarView, locate_among, project
+from fcslam.geometry import se2
+from fcslam.learning.labels import WORST_QUALITY, Labels
+from fcslam.records import CameraModel, FloatArray
+
+CEILING_M: Final = 3.0
+"""Keypoints above this height have no position."""
+BORDER_PX: Final = 4.0
+"""Points that are predicted closer to the border of an image count as not shown."""
+SAME_SURFACE_M: Final = 0.15
+"""Largest distance, seen from above, between a point and the surface that the other view shows in its direction."""
+SEARCH_PX: Final = 12.0
+"""Largest distance between a predicted pixel and a keypoint that may be the same point, before the correction."""
+ALIKE_BITS: Final = 60
+"""Codes that differ in at most this many bits tell how far the predicted pixels are off."""
+FEWEST_ALIKE: Final = 5
+"""Fewest such keypoints; two views with fewer give no correspondences."""
+NEIGHBOURS: Final = 9
+"""Keypoints over which the correction is a median."""
+AGREEMENT_PX: Final = 3.0
+AGREEING: Final = 0.5
+"""Least share of the keypoints with like codes whose own offset is within ``AGREEMENT_PX`` of the correction."""
+SNAP_PX: Final = 2.0
+"""Largest distance between a corrected pixel and the keypoint that is the same point."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """An image with its keypoints, and where they are."""
+
+    image: GreyImage
+    features: ImageFeatures
+    camera: CameraModel
+    surroundings: tuple[LidarView, ...]
+    """LiDAR returns in ``base`` at the time of the image."""
+    positions: FloatArray
+    """Position of each keypoint in ``base``, shape (K, 3), metres; 0 without one."""
+    placed: NDArray[np.bool_]
+    """Which keypoints have a position, shape (K,)."""
+
+    @classmethod
+    def of(
+        cls, image: GreyImage, features: ImageFeatures, camera: CameraModel, surroundings: tuple[LidarView, ...]
+    ) -> "Keyframe":
+        """Locate the keypoints."""
+        positions, placed = locate_among(features.keypoints_px, camera, surroundings, CEILING_M)
+        return cls(image, features, camera, surroundings, positions, placed)
+
+
+class Correspondences(NamedTuple):
+    """Which keypoints of two keyframes are the same points of the building."""
+
+    rows: NDArray[np.int64]
+    """Shape (M, 2): numbers of the keypoints in the first and in the second keyframe."""
+    shown: NDArray[np.bool_]
+    """Which keypoints of the first keyframe the second one shows, shape (K,), found again or not."""
+
+
+def predict(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Where the second keyframe shows the keypoints of the first.
+
+    Args:
+        first, second: two keyframes, also of two robots.
+        T_first_second: pose of the second base in the first, shape (3,), metres and radians.
+
+    Returns:
+        Pixels (K, 2), and which of them are shown, shape (K,): in the image, and on the surface that the LiDAR measures
+        in their direction, so that nothing hides them.
+    """
+    there = first.positions.copy()
+    there[:, :2] = se2.transform(se2.inverse(T_first_second), first.positions[:, :2])
+    pixels = project(there, second.camera)
+    last = np.array([second.camera.width - 1.0, second.camera.height - 1.0])
+    inside = np.all((pixels >= BORDER_PX) & (pixels <= last - BORDER_PX), axis=1)  # NaN is outside
+    shown = first.placed & inside
+    surface, met = locate_among(pixels[shown].astype(np.float32), second.camera, second.surroundings, CEILING_M)
+    gap_m = np.hypot(*(surface[:, :2] - there[shown, :2]).T)
+    shown[shown] = met & (gap_m <= SAME_SURFACE_M)
+    return pixels, shown
+
+
+def correspond(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> Correspondences:
+    """Find the keypoints that two keyframes share, given the estimated pose of the second base in the first, (3,)."""
+    pixels, shown = predict(first, second, T_first_second)
+    none = Correspondences(np.empty((0, 2), np.int64), np.zeros(len(shown), np.bool_))
+    asked = np.flatnonzero(shown & (len(second.features.keypoints_px) > 0))
+    if len(asked) < FEWEST_ALIKE:
+        return none
+    others = second.features.keypoints_px.astype(np.float64)
+    offsets, sources = _offsets_of_alike(first, second, pixels, asked, others)
+    if len(sources) < FEWEST_ALIKE:
+        return none
+    correction = _local_medians(pixels[sources], offsets, pixels[asked])
+    own = _local_medians(pixels[sources], offsets, pixels[sources])
+    if np.mean(np.hypot(*(offsets - own).T) <= AGREEMENT_PX) < AGREEING:
+        return none
+    corrected = pixels[asked] + correction
+    distances, nearest = map(np.asarray, cKDTree(others).query(corrected, distance_upper_bound=SNAP_PX))
+    back = np.asarray(cKDTree(corrected).query(others)[1])
+    found = np.flatnonzero(np.isfinite(distances))
+    found = found[back[nearest[found]] == found]
+    return Correspondences(np.column_stack((asked[found], nearest[found])), shown)
+
+
+def revisit_labels(
+    features: ImageFeatures, shown: Sequence[NDArray[np.bool_]], found: Sequence[NDArray[np.bool_]]
+) -> Labels:
+    """Labels of a keyframe by what became of its keypoints in the other views of its places.
+
+    A keypoint counts as much as the share of the views that show its point in which it was found again, with one view
+    of each kind added. A point that no other view shows keeps its rank.
+
+    Args:
+        features: of the keyframe, K keypoints.
+        shown: by view, the keypoints whose points it shows, shape (K,).
+        found: by view, the keypoints that it found again, shape (K,).
+    """
+    count = len(features.scores)
+    seen = np.sum(shown, axis=0) if len(shown) else np.zeros(count)
+    again = np.sum(found, axis=0) if len(found) else np.zeros(count)
+    rank = 1.0 - (1.0 - WORST_QUALITY) * np.arange(count) / max(count, 1)
+    quality = np.where(seen > 0, (again + 1.0) / (seen + 2.0), rank)
+    order = np.argsort(-quality, kind="stable")
+    return Labels(features.keypoints_px[order].astype(np.float32), quality[order].astype(np.float32))
+
+
+def _offsets_of_alike(
+    first: Keyframe, second: Keyframe, pixels: FloatArray, asked: NDArray[np.int64], others: FloatArray
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Of the keypoints with a like code near their predicted pixel: how far that is off, (N, 2), and their numbers."""
+    distances = hamming_matrix(first.features.descriptors[asked], second.features.descriptors).astype(np.int64)
+    gaps = others[None, :] - pixels[asked, None]
+    distances[np.hypot(gaps[..., 0], gaps[..., 1]) > SEARCH_PX] = ALIKE_BITS + 1
+    best, back = np.argmin(distances, axis=1), np.argmin(distances, axis=0)
+    rows = np.arange(len(asked))
+    rows = rows[(distances[rows, best] <= ALIKE_BITS) & (back[best] == rows)]
+    return gaps[rows, best[rows]], asked[rows]
+
+
+def _local_medians(places: FloatArray, values: FloatArray, asked: FloatArray) -> FloatArray:
+    """Medians (K, 2) of the values (N, 2) at the places (N, 2) nearest to each point (K, 2)."""
+    count = min(NEIGHBOURS, len(places))
+    _, rows = cKDTree(places).query(asked, k=np.arange(1, count + 1))
+    return np.asarray(np.median(values[rows], axis=1))

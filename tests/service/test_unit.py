@@ -1,0 +1,114 @@
+"""The systemd unit of docs/howto/deploy.md, and the service under the restrictions that it asks for."""
+
+import configparser
+import os
+import re
+import shlex
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from fcslam.cli import main
+
+ROOT = Path(__file__).parents[2]
+PATIENCE_S = 300.0
+RESTRICTED = """
+set -e
+for folder in {writable}; do mount --bind "$folder" "$folder"; done
+mount -o remount,bind,ro /
+exec setpriv --no-new-privs --bounding-set=-all --inh-caps=-all -- "$@"
+"""
+"""ProtectSystem=strict with the unit's state and cache, NoNewPrivileges=yes, and an unprivileged user: root without its
+capabilities, because the Python of this machine may lie where only root can read it."""
+
+
+def unit():
+    """The first unit of the page, by section and key."""
+    page = (ROOT / "docs" / "howto" / "deploy.md").read_text(encoding="utf-8")
+    parser = configparser.ConfigParser()
+    parser.optionxform = str
+    parser.read_string(re.search(r"```ini\n(\[Unit\]\n.*?)```", page, re.DOTALL)[1])
+    return parser
+
+
+def may_restrict():
+    programs = all(shutil.which(name) for name in ("unshare", "setpriv", "mount"))
+    return programs and not subprocess.run(["unshare", "--mount", "true"], capture_output=True, check=False).returncode
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_systemd_understands_the_unit(tmp_path):
+    path = tmp_path / "fcslam-cloud.service"
+    parser = unit()
+    parser["Service"]["ExecStart"] = re.sub(r"^\S+", "/bin/true", parser["Service"]["ExecStart"])
+    parser["Service"]["User"] = "daemon"
+    with path.open("w") as file:
+        parser.write(file, space_around_delimiters=False)
+    said = subprocess.run(["systemd-analyze", "verify", path], capture_output=True, text=True, check=False)
+    assert [line for line in said.stderr.splitlines() if path.name in line] == []
+
+
+@pytest.mark.system
+@pytest.mark.skipif(not may_restrict(), reason="needs root, unshare and setpriv, to make the file system read-only")
+def test_the_service_of_the_unit_runs_under_its_restrictions(tmp_path):
+    service = unit()["Service"]
+    assert (service["ProtectSystem"], service["NoNewPrivileges"]) == ("strict", "yes")
+    state, cache, etc = (tmp_path / name for name in ("state", "cache", "etc"))
+    state.mkdir()
+    cache.mkdir()
+    assert main(["certificates", "--host", "localhost", "--viewer", "lab", "-o", str(etc)]) == 0
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    places = {"/var/lib/fcslam": state, "/etc/fcslam": etc, "0.0.0.0": "127.0.0.1"}
+    program, *arguments = shlex.split(service["ExecStart"])
+    assert program.endswith("/fcslam")
+    for before, after in places.items():
+        assert any(before in argument for argument in arguments)
+        arguments = [argument.replace(before, str(after)) for argument in arguments]
+    name, _, value = service["Environment"].partition("=")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), name: value.replace("/var/cache/fcslam", str(cache))}
+    script = RESTRICTED.format(writable=shlex.join([str(state), str(cache)]))
+    command = [sys.executable, "-m", "fcslam.cli", *arguments, "--port", str(port)]
+    trusted = ssl.create_default_context(cafile=etc / "ca.pem")
+
+    def ask(path, token=None):
+        request = urllib.request.Request(f"https://localhost:{port}{path}")
+        if token:
+            request.add_header("Authorization", f"Bearer {token}")
+        with urllib.request.urlopen(request, context=trusted, timeout=10) as answer:
+            return answer.status
+
+    with subprocess.Popen(
+        ["unshare", "--mount", "--propagation", "private", "sh", "-c", script, "sh", *command],
+        env=environment, cwd="/", stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        try:
+            until = time.monotonic() + PATIENCE_S
+            while time.monotonic() < until and process.poll() is None:
+                try:
+                    if ask("/healthz") == 200:
+                        break
+                except (urllib.error.URLError, ConnectionError, TimeoutError):
+                    time.sleep(0.5)
+            assert process.poll() is None, process.stderr.read()
+            token = (etc / "tokens" / "lab").read_text().strip()
+            assert ask("/api/v1/fleet", token) == 200
+            process.send_signal(signal.SIGHUP)  # ExecReload
+            assert ask("/api/v1/fleet", token) == 200
+        finally:
+            process.send_signal(signal.SIGTERM)  # KillMode=mixed: the main process alone
+            process.wait(float(service["TimeoutStopSec"]))
+            err = process.stderr.read()
+    assert process.returncode in (0, -signal.SIGTERM), err  # systemd counts both as a clean stop
+    assert "Traceback" not in err
+    assert (state / "missions" / "mission" / "mission.sqlite").is_file()
+    assert any(cache.rglob("*.nbi"))

@@ -1,0 +1,113 @@
+"""Every program of examples/ is short and runs as a user would start it."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+import fcslam
+from tests.learning.textures import textured
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+
+
+def start(name, *arguments, cwd):
+    """Run an example in another folder, and return what it prints."""
+    command = [sys.executable, EXAMPLES / name, *map(str, arguments)]
+    # evo writes its settings into HOME when it is imported.
+    env = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}", "HOME": f"{cwd}"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, env=env)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def needs(*modules):
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    return pytest.mark.skipif(bool(missing), reason=f"needs {', '.join(missing)}")
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """The run folder of map_logs.py, and what it printed."""
+    folder = tmp_path_factory.mktemp("examples")
+    return folder / "two", start("map_logs.py", "two", cwd=folder)
+
+
+@pytest.mark.parametrize("program", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_an_example_has_under_forty_lines_and_a_test(program):
+    assert len(program.read_text(encoding="utf-8").splitlines()) < 40
+    assert f'start("{program.name}"' in Path(__file__).read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_two_logs_become_one_map(two):
+    folder, said = two
+    assert re.findall(r"^(\w+): map (\d)", said, re.MULTILINE) == [("anna", "0"), ("ben", "0")]
+    assert len(fcslam.open_run(folder).maps) == 1
+
+
+@pytest.mark.slow
+def test_a_robot_maps_a_yard_while_it_drives(tmp_path):
+    assert start("live_robot.py", "run", cwd=tmp_path).startswith("at (0.00, 0.00) m, 0.00 rad\n")
+    run = fcslam.open_run(tmp_path / "run")
+    assert run.trajectories["anna"].path_length_m == pytest.approx(40.0, rel=0.05)
+
+
+@pytest.mark.slow
+@needs("pandas")
+def test_pandas_reads_a_run(two):
+    folder, _ = two
+    said = start("run_with_pandas.py", folder, cwd=folder)
+    run = fcslam.open_run(folder)
+    for robot, trajectory in run.trajectories.items():
+        assert float(re.search(rf"^{robot}: ([\d.]+) m", said, re.MULTILINE)[1]) == pytest.approx(
+            trajectory.path_length_m, abs=0.1
+        )
+
+
+@pytest.mark.slow
+@needs("evo")
+def test_evo_draws_a_run_and_compares_it(two):
+    folder, _ = two
+    said = start("plot_with_evo.py", folder, cwd=folder)
+    assert cv2.imread(str(folder / "evo.png")) is not None
+    assert float(re.search(r"RMSE ([\d.]+) m", said)[1]) < 0.2
+
+
+@pytest.mark.slow
+def test_a_third_robot_is_found_in_the_map(two):
+    folder, _ = two
+    found, scans = map(int, re.search(r"at (\d+) of (\d+) scans", start("localize.py", folder, cwd=folder)).groups())
+    assert found > scans / 2
+
+
+@pytest.mark.slow
+def test_a_source_of_ones_own_is_mapped(tmp_path):
+    height, width = map(int, re.search(r"\((\d+), (\d+)\)", start("own_source.py", "run", cwd=tmp_path)).groups())
+    assert width * 0.05 == pytest.approx(8.0, abs=1.0)
+    assert height * 0.05 == pytest.approx(6.0, abs=1.0)
+
+
+@pytest.mark.slow
+@needs("onnx")
+def test_a_network_of_ones_own_is_a_detector(tmp_path):
+    assert "300 keypoints" in start("own_detector.py", "own.onnx", cwd=tmp_path)
+    assert (tmp_path / "own.onnx").is_file()
+
+
+@pytest.mark.slow
+@needs("torch", "onnx", "flwr")
+def test_a_strategy_of_ones_own_aggregates(tmp_path):
+    for robot in range(3):
+        (tmp_path / f"robot{robot}").mkdir()
+        for seed in range(2):
+            cv2.imwrite(str(tmp_path / f"robot{robot}" / f"{seed}.png"), textured(10 * robot + seed))
+    said = start("own_strategy.py", "out", "robot0", "robot1", "robot2", cwd=tmp_path)
+    assert said.count("leaves out the last") == 2
+    assert (tmp_path / "out" / "detector.onnx").is_file()

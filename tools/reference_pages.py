@@ -1,0 +1,189 @@
+"""Write the reference of the commands and of the REST interface from the code.
+
+    make docs
+
+To correct a page, correct the help of the command or the docstring of the route.
+"""
+
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import click
+import typer
+from fastapi import Depends
+from fastapi.routing import APIRoute
+
+from fcslam.cli import app as command_line
+from fcslam.service.http.app import PREFIX, create_app
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.state import ServiceState
+
+FOLDER = Path(__file__).parents[1] / "docs" / "reference"
+
+COMMANDS = """\
+# Commands
+
+With this page you find the command and the option that you need. `make docs` writes the page from the code;
+the option `--help` of each command prints the same.
+"""
+
+REST = """\
+# REST interface
+
+With this page you find the request that answers your question about a running service. `make docs` writes the page from
+the code.
+
+- A service on your machine: `fcslam serve --data cloud` listens at `http://127.0.0.1:8340`.
+- `/openapi.json` describes all requests, parameters and answers for programs. `fcslam serve --docs` shows them at
+  `/docs`.
+- Roles: each token has the role robot, viewer or admin. An admin may do what a viewer may. A robot acts in its own name
+  only. See [deployment](../howto/deploy.md).
+- An error is one line of JSON, `{"error": "..."}`.
+
+| status | reason |
+|---|---|
+| 400 | the request is invalid |
+| 401 | the token is unknown |
+| 403 | the role or the robot does not match |
+| 404 | there is no such thing |
+| 409 | two agents with one name, two packets with one number, a mission that exists, or an edit that cannot be undone |
+| 413 | the request exceeds 1 MiB, or 32 MiB decompressed |
+| 429 | too many requests; `Retry-After` says when to try again |
+| 503 | the service is stopping, or it is not ready |
+| 507 | the disk is full; the service writes a requested result when there is room again |
+
+After 429, 503 and 507, robots try again automatically.
+"""
+
+
+def cell(text: str) -> str:
+    """Text of one table cell."""
+    return " ".join(text.replace("\\[", "[").split()).replace("|", "\\|")
+
+
+def commands_page() -> str:
+    """The page of all commands."""
+    command = cast(click.Group, typer.main.get_command(command_line))
+    return "\n".join([COMMANDS, *sections(command, click.Context(command, info_name="fcslam"))])
+
+
+def sections(group: click.Group, context: click.Context) -> Iterator[str]:
+    """A section for each command, groups before their commands."""
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
+        inner = click.Context(command, parent=context, info_name=name)
+        yield section(command, inner)
+        if isinstance(command, click.Group):
+            yield from sections(command, inner)
+
+
+def section(command: click.Command, context: click.Context) -> str:
+    """One command: what it does, its usage, options and examples."""
+    depth = "##" if context.parent is not None and context.parent.parent is None else "###"
+    usage = " ".join([context.command_path, *command.collect_usage_pieces(context)])
+    head = [f"{depth} {context.command_path}", "", *paragraphs(command.help or "")]
+    lines = [*head, "```text", f"Usage: {usage}", "```", ""]
+    rows = [row(parameter, context) for parameter in command.params if not getattr(parameter, "hidden", False)]
+    if rows and not isinstance(command, click.Group):
+        lines += ["| argument or option | default or range | meaning |", "|---|---|---|", *rows, ""]
+    examples = [line for line in (command.epilog or "").split("\n") if line.startswith("fcslam ")]
+    if examples:
+        lines += ["```sh", *examples, "```", ""]
+    return "\n".join(lines)
+
+
+def paragraphs(text: str) -> list[str]:
+    """The help as Markdown; typer keeps the line breaks of paragraphs."""
+    return [part for block in re.split(r"\n\s*\n", text.strip()) for part in (" ".join(block.split()), "")]
+
+
+def row(parameter: click.Parameter, context: click.Context) -> str:
+    """One line of the table of a command."""
+    record = parameter.get_help_record(context)
+    assert record is not None, parameter.name
+    name, text = record
+    meaning, _, extra = text.replace("\\[", "[").partition("  [")
+    default = cell(extra.removesuffix("]").removeprefix("default: ")).replace("<", "&lt;")
+    return f"| `{cell(name)}` | {default} | {cell(meaning).replace('<', '&lt;')} |"
+
+
+class Described(ServiceState):
+    """The state of a service that never runs: routes only ask it who may use them."""
+
+    def __init__(self) -> None:
+        """Nothing to keep."""
+
+    def require(self, *roles: Role) -> list[Any]:
+        """Remember the roles in place of checking them."""
+
+        def allowed() -> tuple[Role, ...]:
+            return roles
+
+        return [Depends(allowed)]
+
+
+def rest_page() -> str:
+    """The page of all requests."""
+    app = create_app(Described())
+    roles = dict(roles_of(app.routes))
+    groups: dict[str, list[str]] = {}
+    parameters = []
+    for path, operations in app.openapi()["paths"].items():
+        for method, operation in operations.items():
+            request = f"`{method.upper()} {path}`"
+            who = roles[operation["summary"], path.removeprefix(PREFIX)]
+            does = cell(operation["description"].partition("\n\n")[0])
+            groups.setdefault(operation["tags"][0], []).append(f"| {request} | {who} | {does} |")
+            parameters += [
+                f"| {request} | `{each['name']}` | {each['in']} | {cell(allowed_values(each['schema']))} |"
+                for each in operation.get("parameters", ())
+                if each["in"] != "path"
+            ]
+    parts = [
+        "\n".join([f"## {name.capitalize()}", "", "| request | role | does |", "|---|---|---|", *rows, ""])
+        for name, rows in groups.items()
+    ]
+    head = ["## Parameters", "", "| request | parameter | in | allowed |", "|---|---|---|---|"]
+    return "\n".join([REST, *parts, *head, *parameters, ""])
+
+
+def roles_of(routes: Iterable[Any]) -> Iterator[tuple[tuple[str, str], str]]:
+    """Who may use each route, by its summary in OpenAPI and its path without prefix."""
+    for route in routes:
+        if isinstance(route, APIRoute):
+            roles = [role for needed in route.dependencies if needed.dependency for role in needed.dependency()]
+            summary = route.summary or route.name.replace("_", " ").title()
+            yield (summary, route.path.removeprefix(PREFIX)), ", ".join(role.value for role in roles) or "anybody"
+        elif hasattr(route, "original_router"):
+            yield from roles_of(route.original_router.routes)
+
+
+def allowed_values(schema: dict[str, Any]) -> str:
+    """Type, bounds and default of a parameter."""
+    kinds = [part for part in schema.get("anyOf", [schema]) if part.get("type") != "null"]
+    kind = kinds[0]
+    words = [kind.get("type", kind.get("$ref", "").rpartition("/")[2])]
+    bounds = [("minimum", ">="), ("maximum", "<="), ("maxLength", "length <="), ("pattern", "pattern")]
+    words += [f"{sign} `{kind[key]}`" for key, sign in bounds if key in kind]
+    if schema.get("default") not in (None, ""):
+        words.append(f"default `{schema['default']}`")
+    return ", ".join(words)
+
+
+PAGES = {FOLDER / "commands.md": commands_page, FOLDER / "rest.md": rest_page}
+
+
+def main() -> int:
+    """Write the pages."""
+    for path, page in PAGES.items():
+        path.write_text(page(), encoding="utf-8")
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
