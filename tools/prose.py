@@ -40,7 +40,7 @@ DROPPED = re.compile(r"^(?: {4}.*|\||#|!\[|:::|<|\[!).*$", re.MULTILINE)
 LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)")
 CODE = re.compile(r"`[^`]*`")
 BLOCK = re.compile(r"\n\s*\n|\n(?=[-*] |\d+\. )")
-SENTENCE = re.compile(r"(?<=[.!?:;])[\"')*]*\s+(?=[A-Z`*\"(\[])")
+SENTENCE = re.compile(r"(?<=[.!?:;])[\"')*]*\s+(?=[A-Z`*\"(\[]|fcslam )")
 
 
 def sentences(text: str) -> Iterator[str]:
