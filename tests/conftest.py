@@ -55,7 +55,7 @@ def drawn() -> SimulatedFleet:
 
 @pytest.fixture(scope="session")
 def packets(drawn) -> list[Packet]:
-    """What the three robots send, in canonical order."""
+    """Packets of the three robots, in canonical order."""
     return small_fleet.in_order(packet for robot in drawn.robots for packet in small_fleet.sent_by(robot))
 
 

@@ -47,7 +47,7 @@ def mirrored():
 
 
 def doors(count=16, period_m=2.5):
-    """A corridor 2 m wide whose doors are all alike."""
+    """A corridor 2 m wide whose doors are all equal."""
     sides = []
     for k in range(count):
         x = k * period_m

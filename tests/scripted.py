@@ -35,7 +35,7 @@ ALIAS = np.array([7.0, -3.0, 0.4])
 
 @dataclass(frozen=True)
 class Script:
-    """What the place matcher finds when place j comes in: i, T_i_j, and whether it is fixed in every direction."""
+    """The match of the place matcher for a new place j: i, T_i_j, and whether it is fixed in every direction."""
 
     i: KeyscanId
     j: KeyscanId
@@ -50,7 +50,7 @@ class ScriptedMatcher:
 
     script: ClassVar[list[Script]] = []
     predictions: ClassVar[dict[KeyscanId, dict]] = {}
-    """What each place was to be compared with since its robot shared a map with theirs."""
+    """Places with which each place was to be compared since its robot shared a map with theirs."""
 
     word_count = 0
 
@@ -136,7 +136,7 @@ def place(robot: str, number: int, **changed) -> Place:
 def closures(
     a: tuple[str, np.ndarray], b: tuple[str, np.ndarray], pairs: Sequence[tuple[int, int]], shift=None, informative=True
 ) -> list[Script]:
-    """What is measured between keyscans i of a and j of b; ``shift`` moves b as a whole, as an alias does."""
+    """The measurement between keyscans i of a and j of b; ``shift`` moves b as a whole, as an alias does."""
     (name_a, poses_a), (name_b, poses_b) = a, b
     moved = poses_b if shift is None else se2.compose(shift, poses_b)
     return [

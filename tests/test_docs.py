@@ -1,4 +1,4 @@
-"""What the documentation names exists: files, symbols, commands with their options, make targets, settings, links."""
+"""All names in the documentation exist: files, symbols, commands with their options, make targets, settings, links."""
 
 import re
 import shlex
@@ -61,7 +61,7 @@ def commands(text: str) -> Iterator[tuple[str, bool]]:
 
 
 def complaint(line: str, complete: bool) -> str:
-    """What click has against a command line; empty if it would run."""
+    """The error of click for a command line; empty if it would run."""
     command: click.Command = typer.main.get_command(app)
     words = shlex.split(line.partition(">")[0], comments=True)
     context = click.Context(command, info_name=words.pop(0))
@@ -232,7 +232,7 @@ BROKEN_TEXT = re.compile(r"\"\s*\n\s*f?\"")
 
 
 def parts_of_messages(text: str) -> list[str]:
-    """What stands between the dots of every message."""
+    """Text between the dots of every message."""
     return [part.strip("() ") for message in MESSAGE.findall(text) for part in message.split("...")]
 
 

@@ -1,4 +1,4 @@
-"""Floors: places of different floors are never compared, even if the floors look alike."""
+"""Floors: places of different floors are never compared, even if the floors look the same."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Two robots in one flat end in one map; robots in look-alike flats, or behind equal doors, do not."""
+"""Two robots in one flat end in one map; robots in equal flats, or behind equal doors, do not."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_flats_with_equal_walls_and_other_furniture_stay_apart():
 
 
 def test_robots_at_different_doors_of_a_corridor_stay_apart():
-    """They never met; every door fits every other, and the last line says so."""
+    """They never met; every door fits every other, and the last line names this."""
     ways = {"a": [(4.0, 0.0), (12.0, 0.1), (5.0, 0.0)], "b": [(26.0, 0.0), (34.0, 0.1), (27.0, 0.0)]}
     run = run_mission([Drive(name, way, doors()) for name, way in ways.items()], MissionConfig())
     assert maps_of(run) == {0, 1}

@@ -1,4 +1,4 @@
-"""What is drawn in a finished map is tied to keyscans near it; the direction of walls is that of most of them."""
+"""Drawings in a finished map are tied to keyscans near them; the direction of walls is that of most of them."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The prose of README.md and docs/ keeps the budget of tools/prose_budget.json, which may only fall."""
+"""README.md, docs/, docstrings and comments keep the budget of tools/prose_budget.json, which may only fall."""
 
 import json
 
@@ -40,3 +40,27 @@ def test_a_page_begins_with_the_reader():
     assert [kind for kind, _ in prose.findings("# Page\n\nIt is a page.\n")] == [
         "pages that do not begin with the reader"
     ]
+
+
+@pytest.mark.parametrize(
+    ("source", "kinds"),
+    [
+        ('"""The robot sends a packet."""\n', []),
+        ('x = 1\n"""What the robot sends."""\n', ["clauses as subjects in code"]),
+        ("# Two floors\n# look alike.\n", ["words in code"]),
+        ('def f():\n    """Send ' + "word " * 32 + 'now."""\n', ["long sentences in code"]),
+        (
+            'def f():\n    """Send.\n\n    Args:\n        a: '
+            + "word " * 20
+            + "\n        b: "
+            + "word " * 20
+            + '\n    """\n',
+            [],
+        ),
+        ('"""A format:\n\n    What ' + "word " * 40 + '\n\nThe end.\n"""\n', []),
+        ("x = 1  # What it is.\ny = 2  # It is two.\n", ["clauses as subjects in code"]),
+        ('text = "What it says."\n', []),
+    ],
+)
+def test_the_rules_for_code(source, kinds):
+    assert [kind for kind, _ in prose.findings_in_code(source)] == kinds

@@ -1,4 +1,4 @@
-"""What production installs: pinned as constraints.txt says, each file by its hash, in the bill of materials."""
+"""Packages of production: pinned as in constraints.txt, each file by its hash, in the bill of materials."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Check the prose of README.md and docs/ against the style of the project, within a budget that may only fall.
+"""Check README.md, docs/, docstrings and comments against the style of the project, within a budget that may only fall.
 
     python tools/prose.py            # print every finding, and the counts beside the budget
     python tools/prose.py --lower    # write lower counts into the budget
@@ -7,12 +7,19 @@ Findings: sentences of more than 32 words, words of the list below, sentences th
 as their subject, three passives in a row, pages of more than 25 words a sentence on average, and pages that do not
 begin with what the reader can do. The first page of the site and the README begin with what fcslam is. Generated
 pages, code and tables are left out, except that words of the list count in tables, too.
+
+Of docstrings and comments in ``src``, ``tests`` and ``examples``, the first three kinds count, with "in code" in their
+names. Indented blocks of docstrings, such as formats and diagrams, are left out.
 """
 
 import argparse
+import ast
+import inspect
+import io
 import json
 import re
 import sys
+import tokenize
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,6 +47,11 @@ DROPPED = re.compile(r"^(?: {4}.*|\||#|!\[|:::|<|\[!).*$", re.MULTILINE)
 LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)")
 CODE = re.compile(r"`[^`]*`")
 BLOCK = re.compile(r"\n\s*\n|\n(?=[-*] |\d+\. )")
+ITEM = re.compile(r"\n(?= *[-*] | {4}\S|\w+:$)", re.MULTILINE)
+"""Beginning of an item of a list or of a section of a docstring."""
+COLUMNS = re.compile(r"\S {3,}\S")
+"""Text in columns, such as a format."""
+SECTION = re.compile(r"(?:Args|Returns|Raises|Yields|Attributes):$", re.MULTILINE)
 SENTENCE = re.compile(r"(?<=[.!?:;])[\"')*]*\s+(?=[A-Z`*\"(\[]|fcslam )")
 
 
@@ -88,14 +100,68 @@ def pages() -> list[Path]:
     ]
 
 
+def docstrings(source: str) -> Iterator[str]:
+    """The docstrings of modules, classes, functions and attributes."""
+    for node in ast.walk(ast.parse(source)):
+        body = getattr(node, "body", None)
+        for statement in body if isinstance(body, list) else []:
+            match statement:
+                case ast.Expr(value=ast.Constant(value=str(text))):
+                    yield inspect.cleandoc(text)
+
+
+def comments(source: str) -> Iterator[str]:
+    """The comments; lines that are comments only, one below the other, are one."""
+    last, lines = -1, list[str]()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            row = token.start[0]
+            if lines and (row > last + 1 or not token.line.lstrip().startswith("#")):
+                yield "\n".join(lines)
+                lines.clear()
+            lines.append(token.string.lstrip("#! "))
+            last = row
+    if lines:
+        yield "\n".join(lines)
+
+
+def sentences_of_code(source: str) -> Iterator[str]:
+    """The sentences of docstrings and comments, without indented blocks."""
+    for text in (*docstrings(source), *comments(source)):
+        for block in re.split(r"\n\s*\n", text.replace("``", "`")):
+            if block.startswith("    ") or COLUMNS.search(block):
+                continue
+            for item in ITEM.split(block):
+                yield from filter(None, SENTENCE.split(" ".join(SECTION.sub("", item).split()).lstrip("-* ")))
+
+
+def findings_in_code(source: str) -> Iterator[tuple[str, str]]:
+    """Kind and place of each finding in docstrings and comments."""
+    for sentence in sentences_of_code(source):
+        if words_of(sentence) > LONGEST_SENTENCE:
+            yield "long sentences in code", sentence
+        if OPENING.match(sentence):
+            yield "clauses as subjects in code", sentence
+        prose = CODE.sub("code", sentence)
+        if any(re.search(rf"\b{phrase}\b", prose, re.IGNORECASE) for phrase in WORDS):
+            yield "words in code", sentence
+
+
+def code() -> list[Path]:
+    """Every Python file whose docstrings and comments count, without generated ones."""
+    files = (file for folder in ("src", "tests", "examples") for file in sorted((ROOT / folder).rglob("*.py")))
+    return [file for file in files if not file.stem.endswith("_pb2") and file.name != "test_prose.py"]
+
+
 def counts(report: bool = False) -> Counter[str]:
-    """The number of findings of each kind in all pages; with ``report``, print each."""
+    """The number of findings of each kind in all pages and files; with ``report``, print each."""
     total: Counter[str] = Counter()
-    for page in pages():
-        for kind, where in findings(page.read_text(encoding="utf-8")):
-            total[kind] += 1
-            if report:
-                print(f"{page.relative_to(ROOT)}: {kind}: {where}")
+    for files, check in ((pages(), findings), (code(), findings_in_code)):
+        for file in files:
+            for kind, where in check(file.read_text(encoding="utf-8")):
+                total[kind] += 1
+                if report:
+                    print(f"{file.relative_to(ROOT)}: {kind}: {where}")
     return total
 
 

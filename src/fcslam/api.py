@@ -146,12 +146,13 @@ def changes(
     output: StrPath | None = None,
     force: bool = False,
 ) -> "Changes":
-    """What changed in the building of a run between two times.
+    """Return the changes in the building of a run between two times.
 
     Args:
         run: run folder with a mission file.
-        since: the earlier time: a session (the end of its period), a stamp in seconds, or a date or time of ISO 8601
-            (without a zone UTC; a date means the end of the day). None: the oldest period.
+        since: the earlier time. A session means the end of its period; a number is a stamp in seconds. Else it is a
+            date or time of ISO 8601, in UTC if it has no zone; a date means the end of the day. None: the oldest
+            period.
         until: the later time; None: the newest period.
         map_index: number of the map in the run folder.
         output: folder to write; by default nothing is written.

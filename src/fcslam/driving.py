@@ -32,7 +32,7 @@ _POLL_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """What a robot did over some consecutive scans of its recording."""
+    """Motion and packets of a robot over some consecutive scans of its recording."""
 
     robot: str
     packets: tuple[SizedPacket, ...]
@@ -41,7 +41,7 @@ class Leg:
     tracks: Mapping[str, Track] = field(default_factory=dict)
     """All scans, by the name of the session; empty before the last leg."""
     faults: Faults | None = None
-    """What was wrong with the recording; None before the last leg."""
+    """Faults of the recording; None before the last leg."""
 
     @property
     def keyscans(self) -> int:

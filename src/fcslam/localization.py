@@ -49,12 +49,12 @@ class LocalizationProgress:
 
 
 def read_map(path: Path, floor: str = "") -> OccupancyMap:
-    """The first map of a floor of a run folder or of a mission file, whose packets are mapped; or the map of a YAML
-    file of ROS map_server and the PGM file that it names.
+    """Read the first map of a floor from a run folder, a mission file or a map of ROS. fcslam maps the packets of a
+    mission file. A map of ROS is a YAML file of map_server and the PGM file that it names.
 
     Args:
         path: the folder or file.
-        floor: the floor; it must be named where the run has several, as they may look alike.
+        floor: the floor; name it where the run has several, because they may look the same.
 
     Raises:
         SourceError: there is no map, or it cannot be read. The image must lie in the folder of the YAML file.

@@ -1,4 +1,4 @@
-"""What changed in a mission's building: a run folder in, grids, a picture and a table of changed regions out.
+"""Changes in a mission's building: from a run folder to grids, a picture and a table of changed regions.
 
 The poses are those of the run; the ranges are those of its mission file.
 """
@@ -40,12 +40,12 @@ class _Seen(NamedTuple):
 
 
 def find_changes(folder: Path, since: str | None = None, until: str | None = None, map_index: int = 0) -> Changes:
-    """What changed in a map of a run between two times.
+    """Return the changes in a map of a run between two times.
 
     Args:
         folder: a run folder with a mission file.
-        since: the map as it was at the end of this: a session, a stamp, or a date or time of ISO 8601 (without a zone
-            UTC; a date means the end of the day). None: the oldest period.
+        since: the end of a session, a stamp, or a date or time of ISO 8601, in UTC if it has no zone; a date means the
+            end of the day. None: the oldest period.
         until: as ``since``; None: the newest period.
         map_index: number of the map.
 

@@ -97,7 +97,7 @@ def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tu
 
 
 def wall_direction(occupancy: OccupancyMap) -> float:
-    """Direction of most walls, radians in [-pi/4, pi/4): walls along it and across it count alike.
+    """Direction of most walls, radians in [-pi/4, pi/4): walls along it and across it count the same.
 
     The direction is the one whose projections of the occupied cells are the most peaked.
     """

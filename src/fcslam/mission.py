@@ -76,7 +76,7 @@ class Progress:
     fusing: bool = False
     """Whether all packets are sent, and the cloud decides and fuses."""
     faults: Mapping[str, Faults] = field(default_factory=dict)
-    """What was wrong with the recordings, by robot; of those that were read to their end."""
+    """Faults of the recordings that were read to their end, by robot."""
 
 
 Watch = Callable[[Progress], None]

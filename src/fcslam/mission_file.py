@@ -63,7 +63,7 @@ class SavedMission:
         return 1 + max((sized.packet.epoch for sized in self.packets.get(robot, ())), default=-1)
 
     def legs(self) -> list[Iterator[Leg]]:
-        """What each robot did, as ``driving`` gives it for recordings."""
+        """Yield the legs of each robot, as ``driving`` gives them for recordings."""
         return [iter((self._leg(robot, packets),)) for robot, packets in self.packets.items()]
 
     def _leg(self, robot: str, packets: tuple[SizedPacket, ...]) -> Leg:

@@ -484,7 +484,7 @@ class Placement:
 
 
 class RegionUse(StrEnum):
-    """What a region is for."""
+    """Purpose of a region."""
 
     ERASE = "erase"
     """Its cells are unknown."""
@@ -524,7 +524,7 @@ class Undo:
 
 
 Change = Veto | Removal | Cut | Pin | ManualClosure | Placement | MapRegion | FloorLabel
-"""What an edit changes about a mission."""
+"""The change that an edit makes to a mission."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -554,5 +554,7 @@ class Correction:
     T_map_odom: FloatArray
     """Shape (3,). Here, ``odom`` is the chain of the robot's motions between keyscans; its first keyscan is zero."""
     quality: float = 0.0
-    """Support by other sessions, in [0, 1]: at the session's newest place, the share of the surfaces seen by both that
-    agree, times 1 - 2^-n with n closures to others. 0: no closure connects the session to others."""
+    """Support by other sessions, in [0, 1]; 0 if no closure connects the session to others. It is the share of the
+    surfaces at the session's newest place that agree, of those seen by both, times 1 - 2^-n with n closures to
+    others.
+    """

@@ -72,7 +72,7 @@ class Driver:
         self.scans.publish(scan)
 
     def look(self, newest, namespace):
-        """What tf2 knows after the last scan, and what the services answer."""
+        """Return the transforms of tf2 after the last scan, and the responses of the services."""
         time.sleep(2.0)  # longer than map -> odom goes on after the last scan
         stamps = [message.transforms[0].header.stamp.to_nsec() for message in self.transforms]
         return {

@@ -78,7 +78,7 @@ def fcslam(*arguments, cwd=None, **environment):
 
 
 def ended(process, *others):
-    """What the command wrote; it ended with 0 or one of the ``others``."""
+    """The output of the command; it ended with 0 or one of the ``others``."""
     try:
         out, error = process.communicate(timeout=LONGEST_S)
     finally:

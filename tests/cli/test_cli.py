@@ -174,7 +174,7 @@ def test_ctrl_c_is_one_line_and_130(tmp_path):
     """The installed entry point, interrupted while it waits for the relations on a pipe that nobody writes."""
     Run({}).save(tmp_path / "run")
     os.mkfifo(tmp_path / "relations")
-    # What runs in the background ignores Ctrl-C, and its children inherit that.
+    # A process in the background ignores Ctrl-C, and its children inherit that.
     heeds = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     program = f"{heeds}; import sys; from fcslam.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "evaluate", "relations", "run", "relations"]

@@ -23,7 +23,7 @@ def run_demo(output, *more):
 
 
 def told(output):
-    """What the table says, by name."""
+    """The values of the table, by name."""
     with (output / "evaluation.csv").open() as file:
         return {row["name"]: float(row["value"]) for row in csv.DictReader(file)}
 

@@ -15,7 +15,7 @@ CAMERA = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0, Transform((0.0, 0.0, 0.0), (0.0, 
 
 @dataclass
 class Recorded:
-    """A source of images that are told apart by their bytes."""
+    """A source of images that differ in their bytes."""
 
     name: str
     images: int
@@ -25,7 +25,7 @@ class Recorded:
 
 
 def learnt(folder, camera=True):
-    """What the demo takes, and what it says."""
+    """The detector that the demo takes, and the lines that it prints."""
     console = Console(record=True, width=200)
     sources = [Recorded("a", 100), Recorded("b", 3)]
     return demo._learn(sources, folder, 1, camera, console), console.export_text()

@@ -91,7 +91,7 @@ def test_completion_is_installed_for_the_shell_in_use(capsys, monkeypatch, tmp_p
 
 
 def completed(line):
-    """What bash would offer, and which heavy modules that loaded."""
+    """The completions of bash, and the heavy modules that they loaded."""
     words = line.split(" ")
     program = (
         "import atexit, sys\n"

@@ -218,7 +218,7 @@ def test_a_recording_of_one_scan_is_a_run(tmp_path):
     assert maps_of(tmp_path / "run") == {"one": 0}
 
 
-# What the user has to mend: exit code 2, one line, nothing at the output path
+# Faults that the user has to correct: exit code 2, one line, nothing at the output path
 
 
 def written(path, content):

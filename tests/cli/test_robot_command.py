@@ -115,7 +115,7 @@ def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, cap
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_robot_says_what_is_left_and_goes_on_later(log, cloud, tmp_path, number):
-    # What runs in the background of a shell ignores SIGINT.
+    # A process in the background of a shell ignores SIGINT.
     heeds = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     command = [sys.executable, "-c", f"{heeds}; import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"]
     nowhere = ["robot", str(log), "--state", str(tmp_path), "--speed", "2", "--server"]

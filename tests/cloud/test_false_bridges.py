@@ -20,7 +20,7 @@ SEAM = 4e2 * np.eye(3)
 
 
 def building(seed, name, robots=2):
-    """What robots send that drive through one building."""
+    """Packets of robots that drive through one building."""
     fleet = small_fleet.draw(robots, 30.0, seed=seed).robots
     return {f"{name}_{robot.name}": sent(robot, f"{name}_{robot.name}") for robot in fleet}
 
@@ -30,7 +30,7 @@ def sent(robot, name):
 
 
 def bridge(first, second, T_seam):
-    """What a robot sends that copies two streams, the second one after a motion ``T_seam``."""
+    """Packets of a robot that copies two streams, the second one after a motion ``T_seam``."""
     scans = sum(isinstance(packet.body, Keyscan) for packet in first)
 
     def later(body):

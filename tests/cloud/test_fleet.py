@@ -1,4 +1,6 @@
-"""What the fleet makes of evidence: joins on true clusters, refuses aliases, revokes what the rest contradicts."""
+"""Decisions of the fleet: it joins on true clusters, refuses aliases, and revokes closures that the rest
+contradicts.
+"""
 
 from dataclasses import replace
 from itertools import permutations
@@ -211,7 +213,7 @@ def test_a_robots_own_closure_can_be_vetoed(scripted):
 
 
 def test_one_surviving_closure_holds_no_maps_together(scripted):
-    """What fits the joint map only because of a join falls with it."""
+    """A closure that fits the joint map only because of a join falls with the join."""
     follower = closures(A, B, [(20, 20)], shift=ALIAS)
     cloud = feed(scripted(closures(A, B, [(0, 0), (8, 8), (16, 16)], shift=ALIAS), follower), two_robots())
     assert cloud.fleet.closure_counts()["between robots"] == 4
@@ -339,7 +341,7 @@ def test_nothing_received_is_nothing_mapped():
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", [(1, 2), (3, 4)])
 def test_robots_in_two_buildings_stay_in_two_maps(seeds):
-    """Real scans, real matching: two offices with corridors of one width are full of places that look alike."""
+    """Real scans, real matching: two offices with corridors of one width are full of places that look the same."""
     packets = [
         packet
         for number, seed in enumerate(seeds)

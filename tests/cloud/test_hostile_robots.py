@@ -23,7 +23,7 @@ PRECISE = frozen(np.diag((1e6, 1e6, 2.5e7)))
 
 
 def scaled(packets, name, scale):
-    """What a robot called ``name`` sends that copies another one's packets, all lengths scaled."""
+    """Packets of a robot called ``name`` that copies another one's packets, with all lengths scaled."""
 
     def changed(body):
         match body:

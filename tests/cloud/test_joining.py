@@ -47,7 +47,7 @@ def graph_of(**trajectories):
 
 
 def entries(pairs, shift=None, turned=()):
-    """Closures between a and b, some of them told from b's side; b's map lies at T_A_B in a's."""
+    """Closures between a and b, some of them written from b's side; b's map lies at T_A_B in a's."""
     T_a_b = T_A_B if shift is None else se2.compose(T_A_B, shift)
     found = []
     for n, line in enumerate(closures(("a", POSES), ("b", POSES), pairs, T_a_b)):

@@ -42,7 +42,7 @@ def drawn():
 
 @pytest.fixture(scope="module")
 def sessions(drawn):
-    """What one robot sends that comes back an hour later, and again."""
+    """Packets of one robot that comes back an hour later, and again."""
     sent = []
     for epoch, robot in enumerate(drawn.robots):
         later = replace(robot, stamps=robot.stamps + epoch * BETWEEN_S)

@@ -1,4 +1,4 @@
-"""What the cloud replies: acknowledgements without a gap, corrections that are news, detectors that a robot lacks."""
+"""Replies of the cloud: acknowledgements without a gap, new corrections, and detectors that a robot lacks."""
 
 from dataclasses import replace
 

@@ -43,7 +43,7 @@ def between(result, status):
 
 
 def ledger_of(*scripts, turned=()):
-    """Verified matches in this order; ``turned`` ones are told from the other end."""
+    """Verified matches in this order; ``turned`` ones are written from the other end."""
     ledger = ClosureLog()
     for number, line in enumerate(line for script in scripts for line in script):
         told = replace(line, i=line.j, j=line.i, T_i_j=se2.inverse(line.T_i_j)) if number in turned else line

@@ -1,4 +1,4 @@
-"""What other robots' codes teach about the points of one place, and what they must not."""
+"""Other robots' codes teach a robot about the points of one place, and about no other points."""
 
 import numpy as np
 import pytest

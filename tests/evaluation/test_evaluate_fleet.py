@@ -169,8 +169,8 @@ def test_closures_are_counted_by_hand(folder):
 def test_recall_counts_what_correct_closures_find(folder):
     scores = report_of(RUN, folder, *CLOSURES).closures
     lidar, camera, both = (scores[ClosureScope.FLEET, VERIFIED, channel] for channel in ("lidar", "camera", "both"))
-    # Robot 1 is half a metre ahead. A closure at s metres of both finds those of robot 0 in [s - 1.5, s + 2] and of
-    # robot 1 in [s - 2, s + 1.5]: four and three.
+    # Robot 1 is half a metre ahead. A closure at s metres of both finds those of robot 0 in [s - 1.5, s + 2], which are
+    # four. Of robot 1 it finds those in [s - 2, s + 1.5], which are three.
     assert (lidar.recall.found, camera.recall.found, both.recall.found) == (14, 7, 21)
     # Of the lidar's verified ones the second is more similar than the wrong one, the first is as similar.
     found = [score.recall_full_precision.found for score in (lidar, camera, both)]

@@ -242,7 +242,7 @@ def test_an_arm_may_not_take_the_name_of_another(name, robots, tmp_path):
 def test_a_network_matches_a_view_with_itself(robots, tmp_path):
     torch.manual_seed(1)
     network = KeypointNetwork("light").eval()
-    network.body.code_head[-1].bias.data.zero_()  # or all its codes are alike
+    network.body.code_head[-1].bias.data.zero_()  # or all its codes are equal
     export_onnx(network, tmp_path / "detector.onnx")
     detector = OnnxDetector(OnnxConfig(weights=tmp_path / "detector.onnx"))
     (pair,) = held_out_pairs("north", find_images([robots["north"]])[:1], 1)

@@ -49,7 +49,7 @@ def test_overlap_is_what_two_poses_see_of_the_same_walls():
     rng = np.random.default_rng(0)
     poses = np.column_stack((rng.uniform([0.5, 0.5], [7.5, 5.5], (14, 2)), rng.uniform(-np.pi, np.pi, 14)))
     poses[1] = poses[0] + (0.2, -0.1, 0.1)
-    poses[2], poses[3] = (3.5, 2.0, 0.0), (4.5, 2.0, 0.0)  # near, alike, and a wall in between
+    poses[2], poses[3] = (3.5, 2.0, 0.0), (4.5, 2.0, 0.0)  # near, equal, and a wall in between
     overlap = lidar_overlap(poses, np.array([ranges_from(pose) for pose in poses]), LASER, HALF_VIEW_RAD)
     expected = np.array([[min(overlap_oracle(a, b), overlap_oracle(b, a)) for b in poses] for a in poses])
     np.testing.assert_allclose(overlap, expected, atol=0.08)

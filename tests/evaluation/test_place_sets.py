@@ -1,4 +1,4 @@
-"""What each kind of folder says of its pairs, against its definition pair by pair."""
+"""The relations of the pairs in each kind of folder, against its definition pair by pair."""
 
 import re
 

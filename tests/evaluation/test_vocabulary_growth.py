@@ -71,7 +71,7 @@ def test_each_strategy_is_asked_in_its_own_words(world, strategy):
     assert ((growth.similarities >= 0.0) & (growth.similarities <= 1.0)).all()
     assert (growth.words > 1).all()
     assert (growth.seconds > 0.0).all()
-    assert growth.intervals(-1, SEED)["mismatch rate"].mean < 0.5  # drawn places are easily told apart
+    assert growth.intervals(-1, SEED)["mismatch rate"].mean < 0.5  # drawn places differ clearly
 
 
 def test_the_last_words_are_those_of_an_index_that_saw_the_same(world):

@@ -24,7 +24,7 @@ def pattern(number, length_m):
 
 
 def picture(pose, segments, camera=CAMERA, wears=lambda number: number):
-    """What the camera sees from the base's pose, shape (height, width): the nearest wall in every column.
+    """Draw the camera's view from the base's pose, shape (height, width): the nearest wall in every column.
 
     ``wears``: which pattern the wall of a number wears; its own.
     """

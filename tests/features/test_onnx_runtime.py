@@ -1,4 +1,4 @@
-"""Nothing is left behind, and nobody told, by running a network."""
+"""Running a network leaves no file and sends nothing."""
 
 import os
 import subprocess

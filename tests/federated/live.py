@@ -66,7 +66,7 @@ class LiveFleet:
                 yield grid
 
     def identity(self, robot, key=None):
-        """Who a robot says that it is, and the key with which it signs."""
+        """The name that a robot claims, and the key with which it signs."""
         return RobotIdentity(robot, read_private_key(self._keys / (key or robot)))
 
     def link(self, robot, key=None):

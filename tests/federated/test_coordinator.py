@@ -35,7 +35,7 @@ def ragged(seed):
 
 
 def by_hand(strategy, answers, before, memory):
-    """What a strategy should make of the answers, written down anew."""
+    """The result that a strategy should give for the answers, by an independent implementation."""
     stacked = {name: np.stack([answer[name].astype(np.float64) for answer in answers]) for name in before}
     mean = {name: np.average(stack, axis=0) for name, stack in stacked.items()}
     if strategy in ("fedavg", "fedprox"):

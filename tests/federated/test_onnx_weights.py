@@ -73,7 +73,7 @@ def test_its_normalisations_begin_as_none(tmp_path):
 
 @pytest.mark.slow
 def test_what_no_normalisation_had_become_is_another_function_as_soon_as_it_is_trained():
-    """Normalised anew it stays what it was, the more so the more alike the images are."""
+    """Normalised again, the network stays the same; the more similar the images are, the smaller is the difference."""
     released = read_detector_weights(BUNDLED_NETWORK, "light")
     shapes, others = ([example.image for example in SyntheticShapes(first, 8)[:]] for first in (5, 6))
     batch = torch.from_numpy(np.stack(shapes))[:, None].float() / 255.0

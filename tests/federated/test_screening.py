@@ -58,7 +58,7 @@ def test_one_poisoned_robot_of_five_is_refused_and_no_other(kind, settings):
     ("kind", "settings"), [("flipped", ScreeningSettings()), ("random", STRICT), ("scaled", ScreeningSettings())]
 )
 def test_poison_does_not_hide_behind_honest_statistics(kind, settings):
-    """These may be longer than all else by far, and alike, for all robots see other things than what the start saw."""
+    """These may be longer than all else by far, and equal, because all robots see other things than the start saw."""
 
     def in_daylight(weights):
         return weights | {

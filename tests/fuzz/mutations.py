@@ -8,13 +8,13 @@ NUMBERS = (
     b"0", b"-1", b"1e308", b"1e999", b"-1e-320", b"nan", b"inf", b"-inf", b"2147483648", b"9223372036854775808",
     b"1" + b"0" * 50, b"9" * 5000, b"0x7f", b"1_0", b"1:30", b"",
 )  # fmt: skip
-"""What takes the place of a number in a text."""
+"""Replacements of a number in a text."""
 TOKENS = (
     b"\x00", b"\xff\xfe", b"\n", b"\r", b"\t", b":", b"[" * 2000, b"{a: " * 500, b"- " * 2000, b"&a [*a]", b"*a",
     b"!!python/object:os.system", b"2020-13-45", b"? [1, 2]", b"<<: ", b"../../outside", b"/etc/passwd", b"null",
     b"!!float ''", b"!!int ''", b"!!timestamp x", b"!!binary x", b"true", b"'", b'"', b"%", b"{", b"a" * 100_000,
 )  # fmt: skip
-"""What is put into a text."""
+"""Insertions into a text."""
 _NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 

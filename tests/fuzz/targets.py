@@ -1,4 +1,4 @@
-"""What is fuzzed: each target reads one broken input. Everything but an answer or a refusal in words is a finding."""
+"""Targets of the fuzzer: each reads one broken input. Everything but an answer or a refusal in words is a finding."""
 
 import json
 import random
@@ -48,7 +48,7 @@ CELLS = (
     None, 0, -1, 1, 2**63 - 1, -(2**63), 0.5, -1e308, float("inf"), "", "a", "x" * 5000, "\x00", "{", "{}", "[1]", b"",
     b"\xff" * 300,
 )  # fmt: skip
-"""What takes the place of a value of a mission."""
+"""Replacements of a value of a mission."""
 CORNERS = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0))
 EDITS = (
     Removal("a"), Undo(1), Veto("a", "a", (1.0, 5.0)), Pin("a", "a", (1.0, 5.0)), Cut("a", 2.0, 3.0),

@@ -1,4 +1,4 @@
-"""Who leaves a map if one robot alone joins others whose maps contradict each other."""
+"""Robots that leave a map if one robot alone joins others whose maps contradict each other."""
 
 import pytest
 

@@ -220,7 +220,7 @@ def test_pairs_in_parts_are_pairs_in_one(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_closure_says_the_same_from_both_ends() -> None:
-    """Told from the other end, closures agree with the same others and make the same errors."""
+    """Written from the other end, closures agree with the same others and make the same errors."""
     a, b, closures = two_robots(3)
     there = closures.reversed(np.ones(len(closures), dtype=bool))
     assert pairwise_chi2(b, a, there)[0] == pytest.approx(pairwise_chi2(a, b, closures)[0], rel=0.2, abs=1.0)

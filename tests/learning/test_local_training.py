@@ -1,4 +1,6 @@
-"""A leg of a run: it starts where it is told, leaves alone what is frozen, and is pulled back as hard as asked."""
+"""A leg of a run: it starts at the given weights, does not change frozen ones, and is pulled back as hard as the
+settings say.
+"""
 
 from dataclasses import replace
 

@@ -91,7 +91,7 @@ def test_the_light_detector_has_no_grid_of_cells():
 
 
 def test_what_alternates_from_pixel_to_pixel_does_not_reach_the_keypoints():
-    """Sub-pixel convolution fills even and odd pixels from other channels; the smoothing makes them alike."""
+    """Sub-pixel convolution fills even and odd pixels from other channels; the smoothing makes them equal."""
     rows, columns = torch.meshgrid(torch.arange(12), torch.arange(16), indexing="ij")
     for pattern in (rows % 2, columns % 2, (rows + columns) % 2):
         smooth = smoothed(pattern[None, None].float())

@@ -1,4 +1,4 @@
-"""What a step minimises: keypoint maps of two views are compared where both see the same thing."""
+"""The objective of a step: it compares keypoint maps of two views where both see the same thing."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What becomes of a folder of images: which are found, which are used, which are held out."""
+"""Images of a folder: which are found, which are used, which are held out."""
 
 import cv2
 import numpy as np

@@ -147,7 +147,7 @@ def test_information_of_a_motion_turns_with_the_robot():
 
 
 def hotel(spacing_m, rooms=2):
-    """A corridor with rooms off it that look exactly alike, inside and at the door."""
+    """A corridor with rooms off it that look exactly the same, inside and at the door."""
     furniture = [box(-1.6, 3.9, -0.9, 5.0), box(0.9, 2.2, 1.7, 2.8), path((0.5, 5.0), (1.8, 4.2))]
     walls = [path((-2, 1), (-0.5, 1)), path((0.5, 1), (2, 1)), path((-2, 1), (-2, 5), (2, 5), (2, 1)), *furniture]
     one = np.vstack(walls)

@@ -1,4 +1,4 @@
-"""Two submaps of one room are the same place, two rooms are not; what cannot be told is not told."""
+"""Two submaps of one room are the same place, two rooms are not; an undecidable case gets no decision."""
 
 from dataclasses import replace
 

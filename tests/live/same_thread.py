@@ -1,4 +1,4 @@
-"""An executor without a thread: what is submitted is done at once, or when it is told to."""
+"""An executor without a thread: it does a task at once, or on request."""
 
 from concurrent.futures import BrokenExecutor, Executor, Future
 

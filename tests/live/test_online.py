@@ -36,7 +36,7 @@ def scans():
 
 @pytest.fixture(scope="module")
 def alone(scans):
-    """What the front end says without any network."""
+    """Results of the front end without any network."""
     frontend = RobotFrontend("alice", RobotConfig())
     return [packet for scan in scans for packet in frontend.process(scan)] + frontend.finish()
 

@@ -14,7 +14,7 @@ from tests.service.inline import InlineTask
 
 
 class Copy:
-    """A task in a copy of the process, done when the test says so."""
+    """A task in a copy of the process, done when the test ends it."""
 
     def __init__(self, task):
         self.exitcode, self.is_ended = None, False

@@ -55,7 +55,7 @@ def walk(index, codes):
 
 
 def words_oracle(index, places, query):
-    """Eq. (4) on [0, 1] of the query with every place, with document frequencies counted anew."""
+    """Eq. (4) on [0, 1] of the query with every place, with document frequencies counted again."""
     words = {number: walk(index, place) for number, place in places.items()}
     own = walk(index, query)
     top = max(int(w.max(initial=0)) for w in (*words.values(), own)) + 1
@@ -272,7 +272,7 @@ def test_algorithm_1_trains_at_every_place_after_the_first_L_on_the_last_C():
 
 
 def test_the_window_is_the_last_C_places():
-    """What came before it has no say in the tree."""
+    """Places before it have no influence on the tree."""
     places = random_places(np.random.default_rng(7), 20)
     trees = []
     for start in (0, 8):

@@ -32,7 +32,7 @@ def planted(count=40, channel=Channel.CAMERA, seed=0):
 
 
 def viewed(robot, pose):
-    """What a robot sees of the room, as a camera place."""
+    """A robot's view of the room, as a camera place."""
     features = Orb(OrbConfig()).detect(picture(pose, room()))
     scan = scan_at(pose, room(), LASER)
     positions, placed = locate_keypoints(

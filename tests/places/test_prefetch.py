@@ -1,4 +1,4 @@
-"""What is announced reaches the compiled code, and changes nothing."""
+"""Announcements reach the compiled code, and change no result."""
 
 import numpy as np
 from numba import njit

@@ -11,7 +11,7 @@ from tests.wire.examples import CLOSURE, CORRECTION, HELLO, packet
 
 
 def said(ordinal, body=CLOSURE, time=1042.5):
-    """What a front end gives: it knows no epoch."""
+    """Output of a front end, which knows no epoch."""
     body = replace(body, epoch=0) if body is HELLO else body
     return replace(packet(body), epoch=0, sequence=ordinal, time=time)
 

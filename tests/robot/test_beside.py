@@ -23,7 +23,7 @@ def scans():
 
 
 class Held(Executor):
-    """Works when it is told to, and breaks after so many tasks."""
+    """Works on request, and breaks after so many tasks."""
 
     def __init__(self, breaks_after=10**9):
         self._left = breaks_after

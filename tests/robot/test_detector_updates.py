@@ -48,7 +48,7 @@ def start(tmp_path):
 
 
 def drive(updates, frontend, records, catching_up=0):
-    """What was taken before each record."""
+    """Updates that were taken before each record."""
     taken = {}
     for number in records:
         before = len(frontend.took)

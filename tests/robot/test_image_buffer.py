@@ -1,4 +1,4 @@
-"""What a robot keeps of its images: the newest, never more than it may."""
+"""The images that a robot keeps: the newest, never more than the limit."""
 
 from hypothesis import given
 from hypothesis import strategies as st

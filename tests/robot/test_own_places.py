@@ -1,4 +1,4 @@
-"""A robot closes its own loops by their looks: however far it drifted, and never with a place that looks alike."""
+"""A robot closes its own loops by their looks: however far it drifted, and never with a similar place elsewhere."""
 
 from functools import lru_cache
 from types import SimpleNamespace

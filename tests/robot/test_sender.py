@@ -61,7 +61,7 @@ MOMENTS = st.one_of(
 def test_every_packet_arrives_once_and_in_order(tmp_path_factory, moments, large, unwanted):
     """Requests and answers lost, cut, repeated or refused for now; the robot killed and resumed at any moment.
 
-    What the cloud does not want is set aside, whatever became of the answer that said so.
+    Packets that the cloud refuses are set aside, even if its answer is lost.
     """
     network = Network(FakeCloud())
     path = tmp_path_factory.mktemp("robot") / "outbox"

@@ -104,7 +104,7 @@ def test_going_back_and_forth_describes_nothing_twice(seen, tmp_path):
             robot.set_detector(describe_detector_file(changes[number]), changes[number])
         packets += robot.process(record)
     robot.set_detector(describe_detector_file(tmp_path / "tiny.onnx"), tmp_path / "tiny.onnx")
-    packets += robot.finish()  # the last change is told even though no scan comes after it
+    packets += robot.finish()  # the last change is reported even though no scan comes after it
     announced = [packet.body.detector_versions[Channel.CAMERA] for packet in packets if isinstance(packet.body, Hello)]
     assert announced == [SHIPPED.version, "tiny-1", SHIPPED.version, "tiny-1"]
     described = [(p.body.id, p.body.detector_version) for p in packets if isinstance(p.body, Place)]

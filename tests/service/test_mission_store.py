@@ -131,7 +131,7 @@ def test_versions_of_corrections_grow_with_every_change_and_with_nothing_else(tm
 
 @pytest.mark.parametrize("axis", ["x", "y", "theta"])
 def test_what_a_robot_believes_creeps_no_further_away_than_what_is_news(store, axis):
-    """Many steps, each too small to be told of, are told of when they have become news together."""
+    """Many steps, each too small for a report, are reported when their sum is large enough."""
     limit = NEWS_RAD if axis == "theta" else NEWS_M
     versions = []
     for step in range(100):

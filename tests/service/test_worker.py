@@ -466,7 +466,7 @@ def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
 
 
 def content(run):
-    """What a run says of robots and maps, without its traffic."""
+    """The contents of a run about robots and maps, without its traffic."""
     poses = {name: (robot.map_index, robot.T_map_base.tobytes()) for name, robot in run.trajectories.items()}
     local = {name: (own.T_local_base.tobytes(), own.pgm) for name, own in run.local_maps.items()}
     return poses, local, run.map_files, run.pose_graph_g2o, [str(closure) for closure in run.closures]
@@ -604,7 +604,7 @@ def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scr
 
 @pytest.mark.slow
 def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):
-    """What is replayed in the end is read from the store again."""
+    """The worker reads from the store again what it replays in the end."""
 
     def in_memory():
         gc.collect()

@@ -29,7 +29,7 @@ def files(folder):
 
 
 def spoil(folder, tail):
-    """What a crash in the middle of a write leaves."""
+    """Files after a crash in the middle of a write."""
     for name in ("scans.bin", "ranges.bin", "images.bin", "ground_truth.tum"):
         if (folder / name).exists():
             with (folder / name).open("ab") as file:

@@ -1,4 +1,4 @@
-"""What sensors get wrong: odometry that drifts as said, ranges that are noisy as said."""
+"""Errors of sensors: odometry drifts and ranges are noisy as the settings say."""
 
 import numpy as np
 import pytest

@@ -48,7 +48,7 @@ def without(said, topic):
     return [message for message in said if message.topic != topic]
 
 
-# What is not in the bag
+# Missing from the bag
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -1,4 +1,4 @@
-"""What is written as a bag reads back the same, and is a bag for others."""
+"""A written bag reads back the same, and other programs can read it."""
 
 import math
 from itertools import pairwise

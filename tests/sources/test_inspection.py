@@ -1,4 +1,4 @@
-"""What `fcslam info` finds in recordings of each format, mappable or not."""
+"""Findings of `fcslam info` in recordings of each format, mappable or not."""
 
 import pytest
 

@@ -25,7 +25,7 @@ def insert(number):
 
 
 def written_while_another_writes(database, numbers):
-    """What becomes of writers that all come while another one is at work, and how many transactions they took."""
+    """Results of writers that all come while another one is at work, and the number of their transactions."""
     begun = []
     database._connection.set_trace_callback(lambda text: begun.append(text) if text.startswith("BEGIN") else None)
     with ThreadPoolExecutor(len(numbers)) as pool:

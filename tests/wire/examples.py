@@ -1,4 +1,4 @@
-"""One packet of every kind, written down; ``python -m wire.examples`` (from tests/) writes the golden files anew."""
+"""One packet of every kind, written down; ``python -m wire.examples`` (from tests/) writes the golden files again."""
 
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path

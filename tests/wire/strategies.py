@@ -98,7 +98,7 @@ def word_places(draw, robot):
 
 @st.composite
 def map_tiles(draw, robot):
-    """Cells that are all alike, in blocks, or noise."""
+    """Cells that are all equal, in blocks, or noise."""
     block = draw(st.sampled_from([1, 16, 256]))
     cells = np.random.default_rng(draw(st.integers(0, 9))).integers(0, 3, (256 // block, 256 // block), np.uint8)
     number = st.integers(-(2**15), 2**15)

@@ -1,4 +1,4 @@
-"""The arithmetic coder: what is written comes back, in hardly more bits than it is worth, and in one way only."""
+"""The arithmetic coder: written values come back, in hardly more bits than their information, and in one way only."""
 
 import math
 
@@ -31,7 +31,7 @@ def write(code, contents):
 
 
 def read(code, data, count):
-    """What a stream says, and whether it ends there."""
+    """The content of a stream, and whether it ends there."""
     data = np.frombuffer(bytearray(data), np.uint8)
     coder, contents = reader(data), []
     for _ in range(count):

@@ -20,7 +20,7 @@ def packet_or_reason(data):
 
 
 def receive(data):
-    """What is read can be trusted: it can be sent on and says the same."""
+    """Values that were read are valid: sent on, they stay the same."""
     result = packet_or_reason(data)
     if isinstance(result, str):
         assert 0 < len(result) < 400

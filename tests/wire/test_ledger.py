@@ -1,4 +1,6 @@
-"""What is counted: packets and bytes by robot, kind and channel; and a measured packet is what its receiver reads."""
+"""The ledger counts packets and bytes by robot, kind and channel, and a measured packet is the one that its receiver
+reads.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the schema can carry at all: no image leaves a robot. And that code, schema and document agree."""
+"""The contents that the schema can carry: no image leaves a robot. And that code, schema and document agree."""
 
 import re
 import subprocess
@@ -154,7 +154,7 @@ def test_the_generated_module_is_that_of_the_schema(tmp_path):
 
 
 def test_generating_the_module_anew_changes_nothing(tmp_path):
-    """What `make proto` runs, into another folder; the versions of its tools are pinned."""
+    """The command of `make proto`, into another folder; the versions of its tools are pinned."""
     pytest.importorskip("grpc_tools")
     arguments = [f"--proto_path={ROOT / 'src'}", f"--python_out={tmp_path}", f"--pyi_out={tmp_path}"]
     command = [sys.executable, "-m", "grpc_tools.protoc", *arguments, "fcslam/wire/fcslam.proto"]

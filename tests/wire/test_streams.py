@@ -72,7 +72,7 @@ def test_keypoints_come_back(axes, data):
 
 
 def test_a_grid_is_seen():
-    """On a grid of 10 steps a coordinate is worth log2(10) bits less."""
+    """On a grid of 10 steps a coordinate takes log2(10) bits less."""
     points = np.random.default_rng(0).integers(-120, 121, (400, 2)).astype(np.int16)
     points = points[ascending(points)]
     fine, coarse = len(pack_keypoints(points)), len(pack_keypoints((10 * points + 5).astype(np.int16)))

@@ -1,6 +1,6 @@
-"""What a bridge needs from a ROS network, whatever carries the messages.
+"""The interface of a ROS network, whatever carries the messages.
 
-Messages are bytes here; ``sources.bags.codec`` decodes them, as those of bags.
+Messages are bytes here; ``sources.bags.codec`` decodes them, like those of bags.
 """
 
 from collections.abc import Callable, Sequence

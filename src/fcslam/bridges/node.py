@@ -1,7 +1,7 @@
 """A live robot on a ROS network: reads its sensors, maps, and publishes map and pose.
 
-Messages are read in the thread that calls ``run``. A second thread publishes ``map -> odom`` at a fixed rate, a third
-one the map, the path and diagnostics, and a fourth one obeys commands, so that none of them delays the pose of a scan.
+The thread that calls ``run`` reads messages. A second thread publishes ``map -> odom`` at a fixed rate. A third one
+publishes the map, the path and diagnostics, and a fourth one obeys commands. So none of them delays the pose of a scan.
 """
 
 import queue
@@ -43,11 +43,11 @@ _LONGEST_INBOX = 20_000
 _COMMANDS_WAITING = 8
 """Most commands that wait; anybody on the network may send them."""
 _LINES_TOLD = 1000
-"""Most lines that are told; the names in some come from the network."""
+"""Largest number of different lines that are printed; the names in some come from the network."""
 _POLL_S = 0.1
 _SETTLES_FOR_ODOMETRY = 4
 _SILENCE_S = 2.0
-"""A pause of the scans that is longer is told."""
+"""A longer pause of the scans is reported."""
 _DEPTHS = {SCAN: 100, COMPRESSED_IMAGE: 10, IMAGE: 10, CAMERA_INFO: 1}
 _DEPTH = 1000
 """Messages that the middleware keeps for this process; of odometry and tf there are many."""

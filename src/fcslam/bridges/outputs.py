@@ -1,7 +1,6 @@
-"""What a robot tells the ROS network: map, pose, path, closures, tf and diagnostics.
+"""The outputs of a robot to the ROS network: map, pose, path, closures, tf and diagnostics.
 
-Frames are those of REP 105. The robot publishes ``map -> odom``; the driver of the base publishes
-``odom -> base``.
+Frames follow REP 105. The robot publishes ``map -> odom``; the driver of the base publishes ``odom -> base``.
 """
 
 import threading

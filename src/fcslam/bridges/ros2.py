@@ -1,10 +1,10 @@
 """A ROS 2 network over DDS, by Eclipse Cyclone DDS from PyPI.
 
 The types of messages are not declared: DDS carries them as bytes. Publishers and subscriptions of Fast DDS, the usual
-middleware of ROS 2, match by name only if Cyclone is told to ignore descriptions of types.
+middleware of ROS 2, match by name only if Cyclone ignores descriptions of types.
 
 A service is a topic of requests and one of responses. Cyclone DDS puts the identity of a request before its contents;
-Fast DDS puts it where Cyclone DDS cannot write it. So a caller on Fast DDS is served, and gets no response.
+Fast DDS puts it where Cyclone DDS cannot write it. So a call from Fast DDS takes effect, but gets no response.
 """
 
 import os
@@ -195,10 +195,10 @@ def raw_type(dds_kind: str) -> Any:
 
 
 def configuration(environment: Mapping[str, str]) -> str:
-    """The configuration of Cyclone DDS that follows from the variables by which ROS 2 is configured.
+    """Translate the variables that configure ROS 2 to a configuration of Cyclone DDS.
 
-    ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and ROS_LOCALHOST_ONLY mean what they mean in ROS 2. What
-    CYCLONEDDS_URI says comes last and counts.
+    ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and ROS_LOCALHOST_ONLY mean what they mean in ROS 2. CYCLONEDDS_URI
+    comes last and overrides them.
 
     Raises:
         NetworkError: a peer is no address.
@@ -209,7 +209,8 @@ def configuration(environment: Mapping[str, str]) -> str:
     for peer in peers:
         if not _PEER.fullmatch(peer):
             raise NetworkError(f"ROS_STATIC_PEERS has {peer!r}, which is no address; separate addresses by semicolons")
-    # Who is limited to this computer sends from the loopback interface, and Cyclone hears its own interfaces only.
+    # A node that is limited to this computer sends from the loopback interface, and Cyclone hears its own interfaces
+    # only.
     interfaces = [f'address="{_LOOPBACK}"'] * (local and reach != "OFF")
     if interfaces and peers:
         interfaces.append('autodetermine="true"')

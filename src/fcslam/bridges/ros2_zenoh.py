@@ -29,7 +29,7 @@ _SETTINGS: Final = {
     "scouting/multicast/enabled": "false",
     "timestamping/enabled": "true",
 }
-"""What rmw_zenoh's own configuration of a session says, too."""
+"""These are also the values of rmw_zenoh's own session configuration."""
 _TRIGGER_HASH: Final = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
 _ADMIN, _NODE = "@ros2_lv", 0
 _KINDS: Final = {"MP": True, "MS": False}
@@ -74,7 +74,7 @@ class ZenohNetwork:
         self._known: dict[str, Endpoint] = {}
         """Endpoints by their tokens."""
         self._declared: list[Any] = []
-        """What is undeclared at the end."""
+        """Tokens, publishers and subscribers to undeclare at the end."""
         self._declare(session.liveliness().declare_token(self._token(_NODE, "NN")))
         everything = f"{_ADMIN}/{domain}/**"
         self._declare(session.liveliness().declare_subscriber(everything, self._see, history=True))
@@ -176,7 +176,7 @@ class ZenohNetwork:
         return hashlib.blake2b(token.encode(), digest_size=16).digest()
 
     def _token(self, number: int, kind: str) -> str:
-        """What each token of this process begins with: ids, and the node's enclave, namespace and name."""
+        """The beginning of each token of this process: ids, and the node's enclave, namespace and name."""
         return f"{_ADMIN}/{self._domain}/{self._own}/{_NODE}/{number}/{kind}/%/%/fcslam"
 
     def _hash(self, kind: str) -> str:
@@ -228,7 +228,9 @@ def session_config(environment: Mapping[str, str]) -> Any:
 
 
 def attachment(number: int, time_ns: int, sender: bytes) -> bytes:
-    """What rmw_zenoh attaches to a message: its number, its time and the 16 bytes of its sender, with their length."""
+    """Return the attachment that rmw_zenoh adds to a message: its number, its time and the 16 bytes of its sender, with
+    their length.
+    """
     return struct.pack("<qqB16s", number, time_ns, len(sender), sender)
 
 

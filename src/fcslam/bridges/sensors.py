@@ -304,7 +304,7 @@ class LiveSensors:
                 yield from self._recorded(paired, entry)
 
     def _watch_clock(self, item: Message) -> None:
-        """Begin anew if the clock stepped back and stays there, as when a bag is played again."""
+        """Start again if the clock stepped back and stays there, as when a bag is played again."""
         if not isinstance(item, ScanMessage):
             return
         newest = self.newest_stamp

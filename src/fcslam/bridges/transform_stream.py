@@ -45,7 +45,7 @@ class TransformStream:
             self._newest = self._last_ns = None
 
     def due(self, now_ns: int) -> DueTransform | None:
-        """What to publish at ``now_ns``; None without a scan, or if nothing later is known than was published."""
+        """Return the transform to publish at ``now_ns``; None without a scan, or if nothing newer is known."""
         with self._lock:
             if self._newest is None:
                 return None

@@ -238,7 +238,7 @@ def _refuse_network(server: str | None, state: Path | None) -> None:
 
 
 def _required(server: str | None, state: Path | None) -> tuple[str, Path]:
-    """What the robot of a recording needs."""
+    """The options that the robot of a recording needs."""
     from fcslam.errors import InputError
 
     if server is None or state is None:
@@ -359,7 +359,7 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
 
 
 def _localisation(now: "RobotStatus", times_lost_before: int) -> str:
-    """What a robot that was lost knows about its place; ``times_lost_before``: its count at the last such line."""
+    """Return a line on the place of a robot that was lost; ``times_lost_before``: its count at the last such line."""
     if now.quality > 0.0:
         return f"relocalised in map {now.map_index}, quality {now.quality:.2f}"
     if now.times_lost > times_lost_before:

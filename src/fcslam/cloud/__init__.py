@@ -1,1 +1,1 @@
-"""What runs in the cloud: places matched, closures judged, one pose graph, one map."""
+"""The software of the cloud: it matches places, judges closures, and makes one pose graph and one map."""

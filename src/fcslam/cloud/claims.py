@@ -1,4 +1,4 @@
-"""What a robot may claim: bounds that no robot with a 2D LiDAR exceeds, so that none can exhaust or bend a mission."""
+"""Limits of the data of a robot. No robot with a 2D LiDAR exceeds them, so no robot can exhaust or bend a mission."""
 
 import math
 from collections.abc import Mapping

@@ -127,7 +127,7 @@ class ClosureLog:
         return entry
 
     def state(self) -> State:
-        """What ``restore`` needs."""
+        """The state that ``restore`` needs."""
         closures = [entry.closure for entry in self._entries]
         return {
             "T_i_j": np.array([closure.T_i_j for closure in closures]).reshape(-1, 3),

@@ -147,7 +147,7 @@ class ClosureDecisions:
         return fusion
 
     def state(self) -> State:
-        """What ``restore`` needs."""
+        """The state that ``restore`` needs."""
         return {
             "closures": self.closures.state(),
             "examined": [(sorted(pair), size) for pair, size in self._examined.items()],

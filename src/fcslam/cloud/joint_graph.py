@@ -153,7 +153,7 @@ class JointGraph:
         return {robot: variables.values.copy() for robot, variables in self._variables.items()}
 
     def state(self) -> State:
-        """What ``restore`` needs."""
+        """The state that ``restore`` needs."""
         edges = self.graph.given()
         return {
             "initial": self.graph.poses(),

@@ -161,7 +161,7 @@ class MapComparison:
         return Overlap(agreeing, contradicting)
 
     def state(self) -> State:
-        """What ``restore`` needs."""
+        """The state that ``restore`` needs."""
         rows = [(c.i, c.j, c.T_i_j.tolist(), c.keyscans, astuple(c.uniqueness)) for c in self._compared.values()]
         return {"compared": rows}
 

@@ -12,7 +12,7 @@ from fcslam.storage.state_file import State
 
 
 class PacketNumber(NamedTuple):
-    """What identifies a packet: its session and its number there."""
+    """Identity of a packet: its session and its number there."""
 
     session: str
     sequence: int

@@ -90,7 +90,7 @@ class PlaceRecognition:
         return tuple(VocabularyState(*key, matcher.word_count, len(matcher)) for key, matcher in self._matchers.items())
 
     def state(self) -> State:
-        """What ``restore`` needs; submaps are built again when they are needed."""
+        """The state that ``restore`` needs; submaps are built again on demand."""
         return {" ".join(key): matcher.state() for key, matcher in self._matchers.items()}
 
     def restore(self, state: State) -> None:

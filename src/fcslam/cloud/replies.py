@@ -1,4 +1,4 @@
-"""What the cloud replies to a robot: acknowledgements, a correction if it is news, and newer detectors.
+"""Replies of the cloud to a robot: acknowledgements, a correction if it is new, and newer detectors.
 
 The same replies leave the service (``service.intake``) and the cloud within one process (``cloud.cloud``).
 """
@@ -30,14 +30,14 @@ class SessionCorrection:
 
 @dataclass(frozen=True, slots=True)
 class ReplyState:
-    """What the replies to one robot depend on."""
+    """The state on which the replies to one robot depend."""
 
     next_sequences: Mapping[int, int]
     """By epoch, ascending: number of the first packet that did not arrive; the last epoch is the current one."""
     correction: SessionCorrection | None = None
     """Newest correction of the current epoch."""
     detector_versions: Mapping[Channel, str] | None = None
-    """What the robot describes places with, by its last hello; None before it."""
+    """The robot's detectors, by its last hello; None before it."""
 
 
 def replies(

@@ -72,7 +72,7 @@ class FleetResult:
     graph: PoseGraph
     """All keyscans at their optimised poses, with the accepted constraints."""
     regions: tuple[PlacedRegion, ...] = ()
-    """What users drew in the maps."""
+    """Regions that users drew in the maps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

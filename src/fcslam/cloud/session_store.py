@@ -1,4 +1,4 @@
-"""What the cloud keeps of each session, and the checks of a packet against the earlier ones of its session."""
+"""The data that the cloud keeps of each session, and the checks of a packet against the earlier ones of its session."""
 
 from collections.abc import Callable, Mapping
 from typing import TypeVar
@@ -208,7 +208,7 @@ class SessionStore:
         return np.array(self._stamps[robot][: self._connected[robot]])
 
     def detector_versions(self, robot: str) -> Mapping[Channel, str]:
-        """What the robot describes places with now; nothing before its hello."""
+        """The detectors of the robot now; none before its hello."""
         return self._hellos[robot].detector_versions if robot in self._hellos else {}
 
     def name_floors(self, floors: Mapping[str, str]) -> None:
@@ -228,7 +228,7 @@ class SessionStore:
         return self._hellos[robot].lasers
 
     def state(self) -> State:
-        """What ``restore`` needs. Keyscans are named by their packets, which are stored anyway."""
+        """The state that ``restore`` needs. Packets are stored anyway, so keyscans are named by theirs."""
         return {
             "robots": list(self._connected),
             "hellos": dict(self._hello_sequences),

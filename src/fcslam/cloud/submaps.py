@@ -16,7 +16,7 @@ READY: Final = 100
 
 @dataclass(slots=True)
 class _Entry:
-    """What is known of the submap around a place; None until it is asked for."""
+    """The submap around a place and values derived from it; None until they are needed."""
 
     submap: Submap | PackedSubmap | None = None
     noise: float | None = None

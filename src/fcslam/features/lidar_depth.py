@@ -1,10 +1,10 @@
 """Metric positions of image keypoints: bearing from the camera, depth from the LiDAR.
 
 Walls, cupboards and door frames are vertical. So a point above or below the scan plane is assumed to lie, seen from
-above, where the LiDAR measures a surface in its direction. Keypoints are dropped if the ray would be below the floor
-or above ``ceiling_m`` there, because it hit the floor or the ceiling first, or if the LiDAR has no return in its
-direction. Objects that overhang the scan plane, such as a table top, get a wrong depth. RANSAC and the verification of
-the submaps reject them.
+above, where the LiDAR measures a surface in its direction. A keypoint is dropped if the LiDAR has no return in its
+direction. It is also dropped if the ray would be below the floor or above ``ceiling_m`` there, because it hit the floor
+or the ceiling first. Objects that overhang the scan plane, such as a table top, get a wrong depth. RANSAC and the
+verification of the submaps reject them.
 """
 
 from collections.abc import Sequence

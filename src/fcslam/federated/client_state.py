@@ -1,4 +1,4 @@
-"""What a robot keeps from round to round: the weights of the legacy detector and the state of its optimiser.
+"""State of a robot from round to round: the weights of the legacy detector and the state of its optimiser.
 
 File names contain a checksum of the run's number and nothing else that a server sends. So no server can make a robot
 write outside its folder.

@@ -43,7 +43,7 @@ _SAMPLING_SEED: Final = 77
 
 @dataclass(frozen=True, slots=True)
 class CoordinatorHooks:
-    """What the coordinator calls outside itself."""
+    """Functions that the coordinator calls outside itself."""
 
     version: Callable[[Weights], str]
     """Gives the detector version of weights."""
@@ -60,7 +60,7 @@ class CoordinatorHooks:
 
 
 class Decision(NamedTuple):
-    """What becomes of the version that a round has made."""
+    """Decision on the version that a round has made."""
 
     released: bool
     """It is the best so far and becomes the new detector."""

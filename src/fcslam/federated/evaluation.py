@@ -25,7 +25,7 @@ class PublicImages:
 
 
 Evaluator = str | PublicImages
-"""Who measured a version: a robot, by its name, on images that it held out, or the coordinator."""
+"""The evaluator of a version: a robot, by its name, on images that it held out, or the coordinator."""
 
 
 def combined_score(metrics: Metrics) -> float:

@@ -1,4 +1,4 @@
-"""Who sends a request: a robot signs each request with its private key, and the server knows the public keys.
+"""Identity of robots: a robot signs each request with its private key, and the server knows the public keys.
 
 TLS shows the robot that it talks to the server, and these signatures show the server which robot it talks to.
 """

@@ -28,7 +28,7 @@ CONFIG_FILE: Final = "config.yaml"
 
 @dataclass(frozen=True, slots=True)
 class FederatedJob:
-    """What the server is asked to do."""
+    """The job of the server."""
 
     output: Path
     """Folder of the run; a run in it is continued."""

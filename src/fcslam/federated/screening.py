@@ -12,7 +12,7 @@ from fcslam.federated.settings import ScreeningSettings
 from fcslam.federated.weights import MEAN, VARIANCE, FloatVector, Weights, trained_names, update_vector, weights_error
 
 SMALLEST_MEDIAN: Final = 3
-"""Updates of which one can be told to be odd."""
+"""Least number of updates of which one can be recognised as an outlier."""
 WORST_CHANNEL: Final = 8.0
 """A channel may be as many times as far from the median as all channels together."""
 BATCH_NORM_EPSILON: Final = 1e-5

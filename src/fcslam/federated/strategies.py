@@ -96,9 +96,9 @@ def apply_server_momentum(
 ) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]]:
     """Continue beyond the aggregated weights by Nesterov's momentum, as in Douillard et al. 2023 (DiLoCo).
 
-    A mean of updates is less noisy than each of them and can be followed further: m <- share m + u,
-    w <- w + u + share m with u = ``aggregated`` - ``old``. Batch statistics are taken as aggregated: they are measured
-    and not trained, and variances must not become negative.
+    A mean of updates is less noisy than each of them, so it can be followed further. With u = ``aggregated`` - ``old``:
+    m <- share m + u, w <- w + u + share m. Batch statistics are taken as aggregated: they are measured and not trained,
+    and variances must not become negative.
 
     Args:
         aggregated: mean of the robots' weights.

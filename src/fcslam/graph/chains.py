@@ -35,7 +35,7 @@ class Chains:
     """The first edges of all chains, then the second ones of those that have one, and so on."""
 
     def contract(self, graph: PoseGraph) -> PoseGraph:
-        """The variables that are not inside of a chain, numbered anew, with one edge for each chain.
+        """The variables that are not inside of a chain, with new numbers, and one edge for each chain.
 
         Args:
             graph: that of these chains, with all or some of its closures.

@@ -110,10 +110,11 @@ def dominant_cluster(
 ) -> ClusterDecision:
     """Find the largest consistent cluster and decide whether it is enough to join two maps.
 
-    False closures from repeated structure are consistent with one another, too. So the cluster must have an informative
-    member, a clear lead over the largest cluster that contradicts it (``lead`` times as many closures, and no fewer
-    separate places), and enough evidence: members from separate places, or an alignment of the maps that is unique
-    (``fcslam.graph.evidence``).
+    False closures from repeated structure are consistent with one another, too. So the cluster must have:
+
+    - an informative member;
+    - a clear lead over the largest cluster that contradicts it: ``lead`` times as many closures, and no fewer places;
+    - enough evidence: members from separate places, or a unique alignment of the maps (``fcslam.graph.evidence``).
 
     Args:
         consistent: which pairs of closures are consistent, shape (K, K), from :func:`pairwise_consistency`.

@@ -1,13 +1,13 @@
 """Robots whose paths contradict the others: their closures hold one by one, but fit no joint solution.
 
 A robot that measures wrongly, or lies, passes every test of a single closure: a copy of another robot's data, scaled by
-a few percent, matches everywhere. Solved jointly, its closures bend the paths of the others. The residuals tell: those
-between correct paths are far below the closures' stated noise, which is a bound for the worst place, and those between
-contradicting paths reach it everywhere.
+a few percent, matches everywhere. Solved jointly, its closures bend the paths of the others. The residuals show it. The
+closures' stated noise is a bound for the worst place. Residuals between correct paths are far below it, and those
+between contradicting paths reach it everywhere.
 
-The robots that leave minimise a truncated loss, as graduated non-convexity does for single closures: a robot that stays
-costs the chi-square of its constraints in the joint solution; a robot that leaves costs the limit for each of its
-closures with the others.
+The choice of the robots that leave minimises a truncated loss, as graduated non-convexity does for single closures. A
+robot that stays costs the chi-square of its constraints in the joint solution. A robot that leaves costs the limit for
+each of its closures with the others.
 """
 
 from collections.abc import Mapping

@@ -1,9 +1,9 @@
-"""What counts as evidence for a transform between two maps: one measure and one rule, pure functions of counts.
+"""Evidence for a transform between two maps: one measure and one rule, pure functions of counts.
 
 Each separate place whose closures agree is one independent test of the transform: it counts one. Where the maps
 overlap in few places, an exhaustive alignment of them tells whether the transform is the only one that fits. It adds
-the ratio of its score to the best score elsewhere, less one. A corridor whose doors are alike scores nearly as well one
-door farther, so its alignment adds next to nothing. An unmistakable room replaces two further places.
+the ratio of its score to the best score elsewhere, less one. A corridor with equal doors scores nearly as well one door
+farther, so its alignment adds next to nothing. An unmistakable room replaces two further places.
 """
 
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ class Uniqueness:
 
 @dataclass(frozen=True, slots=True)
 class ClusterEvidence:
-    """What speaks for the transform of one cluster of closures, and what against it."""
+    """Evidence for and against the transform of one cluster of closures."""
 
     closures: int
     informative: int
@@ -78,7 +78,7 @@ def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason |
 
 
 def cluster_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
-    """What the cluster itself lacks, however well the maps fit."""
+    """Return the condition that the cluster itself fails, however well the maps fit."""
     if evidence.closures < settings.minimum_closures:
         return Reason(ReasonCode.FEW_CLOSURES, evidence.closures, settings.minimum_closures, "minimum_closures")
     if not evidence.informative:
@@ -91,7 +91,7 @@ def cluster_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> 
 
 
 def amount_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
-    """What keeps the amount of evidence below the least one."""
+    """Return the reason why the amount of evidence is below the least one."""
     if amount(evidence, settings) >= settings.minimum_evidence:
         return None
     places, unique = evidence.separate_places, evidence.uniqueness

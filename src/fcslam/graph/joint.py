@@ -127,9 +127,12 @@ def solve_jointly(
 ) -> JointSolution:
     """Find poses, maps and inlier closures from the evidence alone; no earlier estimate plays a part.
 
-    A link is dropped, and the rest solved again, if a third of its cluster turns out as outliers in the joint solution,
-    if the remaining members would not be enough to join two maps, if one of its robots contradicts others, or if it
-    joins maps that contradict each other.
+    A link is dropped, and the rest solved again, if
+
+    - a third of its cluster turns out as outliers in the joint solution;
+    - the remaining members would not be enough to join two maps;
+    - one of its robots contradicts others;
+    - it joins maps that contradict each other.
 
     Args:
         evidence: graph of N variables and E edges, with the role of every edge.

@@ -162,7 +162,7 @@ class _EdgeRows(Sequence[Edge]):
         self._i, self._j, self._robust = Rows(edges.i), Rows(edges.j), Rows(edges.robust)
         self._T_i_j, self._information = Rows(edges.T_i_j), Rows(edges.information)
         self._given: dict[int, FloatArray] = {}
-        """What was given as information of those edges where it was bounded."""
+        """The given information of those edges where it was bounded."""
         self._bounded = 0
         """Edges whose information is bounded where it has to be."""
 

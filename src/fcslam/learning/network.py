@@ -1,10 +1,10 @@
 """The network: it finds keypoints and gives 256 logits for each, whose signs are the bits of its descriptor.
 
-One class has two encoders. `vgg` is that of the paper: pairs of convolutions, three poolings, and a detector head with
-65 channels for each cell of 8 x 8 pixels (64 positions and "none"), which sub-pixel convolution rearranges to full
-resolution. `light` needs a tenth of the computation: strided convolutions, context from 1/16 of the resolution, and a
-detector head at half resolution with a sub-pixel step of 2 x 2. It is refined at full resolution and can find several
-keypoints in a cell.
+One class has two encoders. `vgg` is that of the paper: pairs of convolutions, three poolings, and a detector head. The
+head has 65 channels for each cell of 8 x 8 pixels (64 positions and "none"). Sub-pixel convolution rearranges them to
+full resolution. `light` needs a tenth of the computation: strided convolutions, context from 1/16 of the resolution,
+and a detector head at half resolution with a sub-pixel step of 2 x 2. It is refined at full resolution and can find
+several keypoints in a cell.
 
 All resampling is symmetric about the centre of a pixel block. So cell (r, c) of the logits is centred at the pixel
 (8 c + 3.5, 8 r + 3.5), where (0, 0) is the centre of the first pixel.

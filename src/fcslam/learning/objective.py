@@ -92,7 +92,7 @@ def revisit_objective(
 
     The codes of a point in both views must agree and differ from those of the other points of the other view. Fixed
     codes of other robots count as a second view. The balance of the bits, and the negatives, keep codes from becoming
-    all alike.
+    all the same.
 
     Args:
         maps: output of the network for ``batch.images``.

@@ -42,7 +42,7 @@ class TaughtImage:
 
 @dataclass(frozen=True, slots=True)
 class RevisitExamples:
-    """What a robot's own revisits, and the closures with others, give it to train on. All images are of one size."""
+    """Training data of a robot: its own revisits, and the closures with others. All images are of one size."""
 
     pairs: Sequence[RevisitPair] = field(default=())
     taught: Sequence[TaughtImage] = field(default=())

@@ -1,4 +1,4 @@
-"""The lasers of one robot, told apart by their mounting and their beams."""
+"""The lasers of one robot, distinguished by their mounting and their beams."""
 
 from fcslam.geometry.beams import is_same_laser
 from fcslam.records import LaserModel

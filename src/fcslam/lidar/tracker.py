@@ -16,14 +16,16 @@ from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan
 
 GOOD_SHARE, GOOD_KNOWN, GOOD_SIGMA_M = 0.8, 0.5, 0.01
-"""A good match explains this share of the points in known area, which are this share of all, and its points fix the
-position to this many metres in every direction: odometry is judged by it."""
+"""Limits of a good match, by which odometry is judged: the share of the points in known area that it explains, and the
+share of all points that lie there. Its points fix the position to this many metres in every direction.
+"""
 SEARCH_GAIN = 3.0
 """The result of a search replaces a match near odometry only if its log-probability is higher by this: the best of many
 poses explains some points by chance."""
 SEARCH_SIGMA_M = 0.02
-"""If the match explains what is known, the points of the result must also fix the position to this many metres in every
-direction: along a bare wall the pattern of the beams favours poses that the points hardly tell apart."""
+"""Limit in metres, for a match that explains the known area: its points must fix the position so well in every
+direction. Along a bare wall the points hardly distinguish poses, and the pattern of the beams favours some.
+"""
 USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
 """The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
 _NO_INFORMATION = np.zeros((3, 3))

@@ -1,9 +1,9 @@
 """Whether two maps fit each other in one way only: an exhaustive alignment, and the best one elsewhere.
 
-A false closure is as certain of itself as a true one where a building repeats. The maps around it tell them apart: at a
-false transform the walls of one map stand in the free space of the other, or the same walls fit a second time, one door
-farther. So both maps are laid on each other at every heading and every position, and the transform in question is
-compared with the best one elsewhere.
+A false closure is as certain of itself as a true one where a building repeats. The maps around it distinguish them. At
+a false transform, the walls of one map stand in the free space of the other, or the same walls fit a second time, one
+door farther. So this module aligns both maps at every heading and position, and compares the transform in question with
+the best one elsewhere.
 """
 
 from collections.abc import Iterator
@@ -187,7 +187,7 @@ def _smear(cells: int) -> NDArray[np.float32]:
 
 
 def _spectra(drawing: _Drawing, heading: float, smear: NDArray[np.float32]) -> tuple[Spectrum, Spectrum]:
-    """Spectra of a turned map: the cells with a surface, and what such a cell of another map is worth in each cell.
+    """Spectra of a turned map: the cells with a surface, and the score of such a cell of another map in each cell.
 
     Single precision is enough for peaks that are refined later, and takes two thirds of the time.
     """

@@ -188,7 +188,7 @@ def verify(
 def align(
     a: Submap, b: Submap, T_a_b_guess: FloatArray, config: VerificationConfig, prior: FloatArray = NO_PRIOR
 ) -> Aligned:
-    """What takes the time of ``verify``: the alignment, which does not depend on the noise of the submaps."""
+    """The slow part of ``verify``: the alignment, which does not depend on the noise of the submaps."""
     forward = match_scan(_sample(b.surface), a.field, T_a_b_guess, prior, _ALIGNMENT)
     # The prior must not count twice: backward it acts at the guess, as it does forward.
     start = T_a_b_guess if prior.any() else forward.T_field_base

@@ -39,7 +39,7 @@ def checked_lasers(lasers: Lasers | None) -> dict[str, LaserModel]:
     """The lasers by name; the name of the only one is empty.
 
     Raises:
-        InputError: one of them cannot be a laser, or two look alike.
+        InputError: one of them cannot be a laser, or two are equal.
     """
     if lasers is None:
         return {}

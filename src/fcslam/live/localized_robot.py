@@ -121,7 +121,7 @@ class LocalizedRobot(LiveTracker):
             self._localizer.suggest(se2.compose(T_map_base, se2.inverse(here)))
 
     def status(self) -> RobotStatus:
-        """What the robot has done so far."""
+        """Return the state of the robot: its pose, its connection, and counts since its start."""
         estimate, failure = self._estimate(), self._frontend.backend_failure
         broken = f"not localised any more, as the search failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
@@ -158,7 +158,7 @@ class LocalizedRobot(LiveTracker):
             force: replace a run that is there.
 
         Returns:
-            What was written.
+            The run that was written.
 
         Raises:
             OutputError: the folder cannot be written.

@@ -1,4 +1,4 @@
-"""What a live robot tells, as frozen records."""
+"""Records of a live robot: poses, counts and events."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -104,7 +104,7 @@ class LocalizationState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """What a robot has done so far."""
+    """State of a robot: its pose, its connection, and counts since its start."""
 
     scans: int
     keyscans: int
@@ -145,7 +145,7 @@ class RobotStatus:
 
 
 class EventKind(StrEnum):
-    """What can happen to a live robot besides its scans."""
+    """Kinds of events of a live robot."""
 
     LOST = "lost"
     """The scans contradict the map: the robot maps in a new session until its place is found. In a finished map, it is

@@ -221,7 +221,7 @@ class Robot(LiveTracker):
                 self._floors[self._part] = floor
 
     def status(self) -> RobotStatus:
-        """What the robot has done so far."""
+        """Return the state of the robot: its pose, its connection, and counts since its start."""
         uplink, localizer = self._uplink, self._localizer(self._part)
         failure = self._frontend.backend_failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
@@ -347,7 +347,7 @@ class Robot(LiveTracker):
             force: replace a run that is there.
 
         Returns:
-            What was written.
+            The run that was written.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -462,7 +462,7 @@ class Robot(LiveTracker):
         return max(first for first in self._floors if first <= part)
 
     def _localizer(self, part: int) -> Localizer:
-        """That of the server as soon as it has corrected this part of the start."""
+        """The localizer of a part: with the server's corrections as soon as there is one, else the robot's own."""
         own, by_server = self._localizers
         return by_server.get(part) or own.setdefault(part, Localizer(self._clock))
 

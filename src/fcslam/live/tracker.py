@@ -1,4 +1,4 @@
-"""What every live robot has: it takes scans, tracks them at once and tells what happens."""
+"""The part that all live robots share: it takes scans, tracks them at once and reports events."""
 
 import logging
 import math
@@ -21,7 +21,7 @@ from fcslam.robot.motion_prediction import MotionPrediction, without_odometry
 from fcslam.wire.messages import Packet
 
 UNDETERMINED_S = 1.0
-"""Scans without odometry that leave a direction open for longer are told."""
+"""The robot reports scans without odometry that leave a direction open for longer."""
 QUIET = (EventKind.CORRECTED, EventKind.ONLINE, EventKind.JOINED, EventKind.RELOCALISED, EventKind.LOCALISED)
 """Events that are logged as information; the others are warnings."""
 
@@ -33,7 +33,7 @@ class LiveTracker(ABC):
 
     _frontend: RobotFrontend
     _stack: ExitStack
-    """What ends with the robot."""
+    """Resources that end with the robot."""
 
     def __init__(
         self, name: str, laser: Lasers | None, config: MissionConfig, on_event: Callable[[RobotEvent], None] | None
@@ -54,10 +54,10 @@ class LiveTracker(ABC):
         self._prediction: MotionPrediction | None = None
         """Stands in for the odometry; None if there is odometry."""
         self._determined_s = -math.inf
-        """Stamp of the newest scan that fixed the position; infinity once it was told that none does."""
+        """Stamp of the newest scan that fixed the position; infinity after the event that none does."""
         self._is_finished = False
         self._told: set[str] = set()
-        """Failures that were told."""
+        """Failures that were reported."""
 
     @abstractmethod
     def _take(self, packets: list[Packet]) -> None:
@@ -132,7 +132,7 @@ class LiveTracker(ABC):
         return self._frontend.odometry.jumps
 
     def close(self) -> None:
-        """End the worker and the connection at once. What the server does not have waits in the state folder.
+        """End the worker and the connection at once. Packets that the server does not have wait in the state folder.
 
         A second call does nothing.
         """

@@ -1,4 +1,4 @@
-"""What changed in a building between two periods: cells that became occupied or free, as regions and as a picture."""
+"""Changes in a building between two periods: cells that became occupied or free, as regions and as a picture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class ChangedRegion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changes:
-    """What changed in a map from the end of one period to the end of a later one."""
+    """Changes in a map from the end of one period to the end of a later one."""
 
     now: OccupancyMap
     """The map at the later time."""
@@ -66,7 +66,7 @@ class Changes:
 
 
 def compare(maps: Sequence[OccupancyMap], periods: Sequence[Period]) -> Changes:
-    """What changed from the first of ``maps`` to the last.
+    """Find the changes from the first of ``maps`` to the last.
 
     Only cells that are known in both count, and surfaces that moved by more than ``TOLERANCE_M``.
 

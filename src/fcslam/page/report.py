@@ -27,7 +27,7 @@ ASKED = (
     "fleet", "maps", "separations", "robots", "edits", "learning", "metrics.json", "config.yaml",
     *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
 )  # fmt: skip
-"""What the page asks for, besides events, trajectories and tiles."""
+"""Paths that the page requests, besides events, trajectories and tiles."""
 MOST_TILES = 200
 """Of all maps together: a tile has about 15 kB. Of a larger map, the file holds coarser tiles."""
 SCRIPT, STYLE = '<script type="module" src="page.js"></script>', '<link rel="stylesheet" href="page.css">'
@@ -50,7 +50,7 @@ def _maps(mission: ViewedMission) -> dict[int, OccupancyMap]:
 
 
 async def _responses(app: FastAPI, maps: dict[int, OccupancyMap]) -> dict[str, dict[str, str]]:
-    """What the service answers to the page, by path: texts, and pictures in base64."""
+    """Responses of the service to the page, by path: texts, and pictures in base64."""
     transport = httpx.ASGITransport(app=app, raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url=f"http://localhost{PREFIX}/") as client:
 

@@ -51,7 +51,7 @@ class ShownRun:
 
     @property
     def name(self) -> str:
-        """What the page calls the run."""
+        """Name of the run on the page."""
         return self._name
 
     @property

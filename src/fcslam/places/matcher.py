@@ -31,7 +31,7 @@ NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
 
 
 class MatchDecision(StrEnum):
-    """What decides whether two places are the same."""
+    """Rules that decide whether two places are the same."""
 
     GEOMETRY = "geometry"
     """The overlap of their submaps."""
@@ -124,7 +124,7 @@ class PlaceMatch:
     def verified(
         cls, i: KeyscanId, j: KeyscanId, channel: Channel, similarity: float, check: Verification, predicted: bool
     ) -> Self:
-        """What geometry decided; a predicted pair needs less."""
+        """Decision of geometry; a predicted pair needs less."""
         return cls(
             i, j, channel, similarity,
             M=check.loose if predicted else check.strict,
@@ -135,7 +135,7 @@ class PlaceMatch:
 
     @classmethod
     def similar(cls, i: KeyscanId, j: KeyscanId, channel: Channel, similarity: float, delta: float) -> Self:
-        """What the words decided (Algorithm 1, lines 14-17). The paper takes both poses for one."""
+        """Decision by words (Algorithm 1, lines 14-17). The paper takes both poses for one."""
         score = PAPER_SCALE * similarity
         return cls(
             i, j, channel, similarity, M=score >= delta, reason=Reason(ReasonCode.SIMILAR, score, delta, "delta"),
@@ -145,7 +145,7 @@ class PlaceMatch:
 
 
 class _Comparison(NamedTuple):
-    """What is to be verified for one stored place."""
+    """Pairs of one stored place that are to be verified."""
 
     i: KeyscanId
     guesses: Sequence[tuple[FloatArray, FloatArray]]
@@ -238,7 +238,7 @@ class PlaceMatcher:
         predicted: Mapping[KeyscanId, FloatArray],
         is_unaligned: Callable[[KeyscanId], bool],
     ) -> list[_Comparison]:
-        """What geometry is to verify."""
+        """The pairs that geometry is to verify."""
         kept = {i: T_i_j for i, T_i_j in predicted.items() if i in self._places}
         near = [self._near(i, place, T_i_j) for i, T_i_j in kept.items()]
         lookalikes = self._lookalikes(place.id.robot, result, predicted, is_unaligned)
@@ -247,7 +247,7 @@ class PlaceMatcher:
         return [*near, *far]
 
     def state(self) -> State:
-        """What ``restore`` needs."""
+        """The state that ``restore`` needs."""
         places = list(self._places.values())
         return {
             "ids": [place.id for place in places],

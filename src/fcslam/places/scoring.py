@@ -93,7 +93,7 @@ def score_matches(
     Each descriptor of the query votes for a place with the Epanechnikov kernel 1 - (d / (near_bits + 1))^2 of the
     distance d to its nearest descriptor there. Its weight is ln((N + 1) / n), where n is the sum of its votes: a
     descriptor that many places have says little (idf). A place with m > 1 times as many descriptors as the query has
-    more chances to match, so its score is divided by sqrt(m): the geometric mean of the shares of both.
+    more chances to match. So its score is divided by sqrt(m), which gives the geometric mean of the shares of both.
 
     Args:
         entries: the stored places.

@@ -72,8 +72,8 @@ def sequence_similarity(similarity: FloatArray, places: int, reach: int) -> Floa
     """Mean similarity of the last ``places`` queries to a sequence of stored places, forwards or backwards.
 
     For query t and stored place j, query t - k contributes its most similar place within ``reach`` of j - k (same
-    direction) or of j + k (opposite direction); the higher mean counts (after SeqSLAM, Milford and Wyeth 2012).
-    Missing places count 0, and a similarity of 0 stays 0.
+    direction) or of j + k (opposite direction). The higher mean counts (after SeqSLAM, Milford and Wyeth 2012). Missing
+    places count 0, and a similarity of 0 stays 0.
 
     Args:
         similarity: shape (Q, G), queries and stored places in the order in which the robot passed them.

@@ -1,8 +1,8 @@
 """Vocabularies that robots and cloud share, so that a robot sends words in place of descriptors.
 
 A word stands for its centre, the descriptor that most resembles those of its cluster. So the cloud reads a place of
-words as one whose descriptors are centres: it retrieves and matches them as any others, and its own vocabulary
-(Algorithm 1) grows on what it received.
+words as one whose descriptors are centres. It retrieves and matches them as any others, and its own vocabulary
+(Algorithm 1) grows on them.
 """
 
 import hashlib
@@ -70,8 +70,8 @@ def train_words(
 ) -> WordVocabulary:
     """At most ``most_words`` words of these descriptors (N, 32), N > 0, by k-means.
 
-    A robot and the cloud look through all of them for each descriptor, which is exact and quick enough for the words of
-    a building; the tree of Algorithm 1 is the cloud's.
+    A robot and the cloud search all of them for each descriptor, which is exact, and fast enough for the words of a
+    building. Only the cloud has the tree of Algorithm 1.
     """
     shape = TreeShape(most_words, 1, 2, _ITERATIONS)
     centres, _ = k_means(code_words(descriptors), shape, np.array([seed], np.uint64))

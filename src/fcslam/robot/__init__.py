@@ -1,1 +1,1 @@
-"""What runs on a robot: sensor records in, numbered packets out."""
+"""The software on a robot: sensor records in, numbered packets out."""

@@ -100,8 +100,8 @@ class RobotBackend:
         """Handle the next input; returns what the robot sends because of it.
 
         Raises:
-            FeatureError: the file of a new detector is not the announced one, cannot be used, or describes a channel
-                that this robot does not use, or for whose descriptors it has no words; nothing has changed.
+            FeatureError: the file of a new detector is not the announced one or cannot be used. Or it describes a
+                channel that this robot does not use, or has no words for. Nothing has changed then.
         """
         bodies = self._process(input)
         if self._words is None:
@@ -225,7 +225,7 @@ class _Session:
 
 
 def essential(input: NewKeyscan, sends: Sends = Sends.DESCRIPTORS) -> list[Body]:
-    """What the pose graph cannot do without: the keyscan and its odometry."""
+    """Records that the pose graph needs in any case: the keyscan and its odometry."""
     keyscan, odometry = input.keyscan.record, input.keyscan.odometry
     record = without_ranges(keyscan) if sends is Sends.WORDS else keyscan
     return [record] if odometry is None else [record, odometry]

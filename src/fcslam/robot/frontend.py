@@ -267,10 +267,12 @@ class RobotFrontend:
         return output
 
     def _bodies(self, done: _Waiting) -> list[Body]:
-        """What the back end made of an input; once it has failed, what the map cannot do without."""
+        """Return the records that the back end made of an input; once it has failed, those that the map needs in any
+        case.
+        """
         try:
             bodies = done.output.result()
-        except FeatureError:  # told by ``set_detector``
+        except FeatureError:  # ``set_detector`` reports it
             return []
         except Exception as error:  # tracking must go on, whatever ended the back end
             self.backend_failure = self.backend_failure or f"{type(error).__name__}: {error}"

@@ -20,7 +20,7 @@ from fcslam.wire.messages import Body
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapState:
-    """What a localizer knew after an input."""
+    """State of a localizer after an input."""
 
     session: int
     """Number of the session, from 0; ``odom`` is another frame in each."""

@@ -93,8 +93,9 @@ class MapEstimate:
     covariance: FloatArray
     """Of the keyscan's pose in the map, over (x, y, theta), shape (3, 3)."""
     quality: float
-    """Share of the walls, where the map knows the area, that lie on walls of the map: the smaller one of those seen in
-    the last metres and of those of the newest keyscan; in [0, 1]."""
+    """Share of the walls that lie on walls of the map, where the map knows the area, in [0, 1]. It is the smaller of
+    two shares: of the last metres and of the newest keyscan.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -305,7 +306,7 @@ class MapLocalizer:
         self._begin_stretch(keyscan.travel_m)
 
     def _begin_stretch(self, travel_m: float) -> None:
-        """What was seen before is not searched for again."""
+        """Begin a stretch: the next search uses the scans from here on."""
         self._searched_m, self._next_search_m = travel_m, travel_m + self._config.first_m
 
     def _agree(self, one: "_Vote", other: "_Vote", keyscan: MappedKeyscan) -> bool:

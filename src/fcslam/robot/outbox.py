@@ -2,8 +2,8 @@
 
 Each start of a robot is an epoch. Each time the robot is lost, another epoch begins, the next part of the same start.
 The front end numbers its parts and the packets of each part. The outbox assigns the epoch and the sequence number on
-the wire, in the order of sending. It forgets the data of a packet once the cloud has stored it, but keeps a digest:
-with the digests it checks that a recording that is read again produces the same packets.
+the wire, in the order of sending. It forgets the data of a packet once the cloud has stored it, but keeps a digest. By
+the digests it checks that a recording that is read again produces the same packets.
 """
 
 import hashlib
@@ -49,10 +49,13 @@ CREATE TABLE releases (
 CREATE INDEX numbers ON packets (epoch, sequence);
 CREATE INDEX waiting ON packets (epoch, sequence) WHERE data IS NOT NULL;
 """
-# part: the front end's own epoch, 0 for the first part of a start; ordinal: the front end's own count; sequence: the
-# number on the wire, NULL for a packet that is never sent; data: NULL once it need not be sent; met: the cloud has
-# confirmed that the epoch belongs to this start; stored: number of packets of the epoch, from the first, that the cloud
-# has confirmed; releases: detector updates, with the record before which each was applied.
+# - part: the front end's own epoch, 0 for the first part of a start
+# - ordinal: the front end's own count
+# - sequence: the number on the wire, NULL for a packet that is never sent
+# - data: NULL once it need not be sent
+# - met: the cloud has confirmed that the epoch belongs to this start
+# - stored: number of packets of the epoch, from the first, that the cloud has confirmed
+# - releases: detector updates, with the record before which each was applied
 _IS_WAITING = "data IS NOT NULL"
 
 

@@ -89,7 +89,7 @@ class Uplink:
 
     @property
     def failure(self) -> Exception | None:
-        """What ended one of the threads: a cloud that rejects the robot, or an outbox that cannot be used."""
+        """The error that ended one of the threads: a cloud that rejects the robot, or an outbox that cannot be used."""
         with self._unstored_lock:
             while self._unstored and self._unstored[0].done():
                 error = self._unstored[0].exception()

@@ -20,8 +20,8 @@ _ROOM, _OTHER_ROOM = (6.0, 4.5), (5.7, 4.2)
 def warm_up_tracking(config: RobotConfig) -> None:
     """Compile, or load from the cache, all code that the pose of a scan may need.
 
-    A made-up robot crosses a room and is put down in another one, so that it also searches, and is lost. What is in
-    memory then is excluded from garbage collection, which would take longer than a scan.
+    A simulated robot crosses a room and is put down in another one, so it is lost and searches. Garbage collection
+    would take longer than a scan, so it excludes all objects that are in memory then.
     """
     frontend = LidarFrontend("warm-up", config.lidar)
     scans = list(_scans(_ROOM, 0.0))

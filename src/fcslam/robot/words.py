@@ -1,6 +1,7 @@
-"""What a robot sends that sends words only, as in the paper: bags of words, and its own map at the end of a session.
+"""Packets of a robot that sends words only, as in the paper: bags of words, and its own map at the end of a session.
 
-Ranges and descriptors stay on the robot. Keyscans are sent without ranges, for their constraints are the pose graph.
+Ranges and descriptors stay on the robot. Keyscans are sent without ranges, because the pose graph needs their
+constraints.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,7 +42,7 @@ _NO_RANGES: Ranges = frozen([], np.float32)
 
 
 class Sends(StrEnum):
-    """What a robot sends of its places."""
+    """The form in which a robot sends its places."""
 
     DESCRIPTORS = "descriptors"
     WORDS = "words"
@@ -57,7 +58,7 @@ class WordsConfig(Settings):
 
 
 class SendingConfig(Settings):
-    """What a robot sends."""
+    """The form of the packets of a robot."""
 
     sends: Sends = Field(
         default=Sends.DESCRIPTORS,
@@ -105,7 +106,7 @@ class WordSender:
                 )
 
     def convert(self, bodies: Sequence[Body]) -> list[Body]:
-        """What is sent of the next records of the session."""
+        """Return the packets for the next records of the session."""
         return [self._converted(body) for body in bodies]
 
     def end_session(self) -> list[Body]:

@@ -155,7 +155,7 @@ def is_run_folder(path: Path) -> bool:
 
 
 def identity(folder: Path) -> tuple[int, int]:
-    """What tells a run folder from another one that replaces it: no file in a run folder changes.
+    """Return an identifier that differs if another run folder replaces this one: no file in a run folder changes.
 
     Raises:
         FileNotFoundError: there is none.

@@ -27,7 +27,7 @@ HEADER_BYTES: Final = 4096
 
 
 class Occupancy(IntEnum):
-    """What is known of a cell."""
+    """State of a cell."""
 
     UNKNOWN = 0
     FREE = 1
@@ -54,7 +54,7 @@ class OccupancyMap:
 
 
 def map_stem(number: int) -> str:
-    """What the names of the map's files in a run folder begin with: ``map`` for map 0, ``map_1`` for map 1."""
+    """Beginning of the names of the map's files in a run folder: ``map`` for map 0, ``map_1`` for map 1."""
     return f"map_{number}" if number else "map"
 
 
@@ -73,7 +73,7 @@ def pixels_of(cells: Cells) -> NDArray[np.uint8]:
 
 
 def map_yaml(occupancy: OccupancyMap, image: str) -> str:
-    """What map_server needs to know about the PGM file named ``image``, which lies beside the YAML file."""
+    """YAML text for map_server about the PGM file named ``image``, which lies beside it."""
     content = {
         "image": image,
         "mode": "trinary",
@@ -100,7 +100,7 @@ class MapImage:
 
 
 class MapArea(NamedTuple):
-    """What a map covers."""
+    """Area and resolution of a map."""
 
     resolution_m: float
     extent_m: tuple[float, float, float, float]
@@ -134,7 +134,7 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
 
 
 def area_of(name: str, header: bytes, description: str) -> MapArea:
-    """What a map covers, by the first ``HEADER_BYTES`` of its image and the content of the YAML file.
+    """Read area and resolution of a map from the first ``HEADER_BYTES`` of its image and the content of the YAML file.
 
     ``name`` and errors as for ``parse_map``.
     """

@@ -1,4 +1,4 @@
-"""What a run holds, as frozen records. Arrays in them are read-only."""
+"""Records of a run. Arrays in them are read-only."""
 
 from dataclasses import dataclass
 
@@ -43,8 +43,9 @@ class LocalizedPoses:
     sigma: FloatArray
     """Standard deviations of x, y (m) and theta (rad), shape (N, 3); NaN where the robot was not localised."""
     quality: FloatArray
-    """Share of the walls, where the map knows the area, that lie on walls of the map, shape (N,): the smaller one of
-    those seen in the last metres and of those of the newest keyscan; 0 where the robot was not localised."""
+    """Share of the walls that lie on walls of the map, where the map knows the area, shape (N,); 0 where the robot was
+    not localised. It is the smaller of two shares: of the last metres and of the newest keyscan.
+    """
 
     @property
     def is_localized(self) -> NDArray[np.bool_]:

@@ -34,7 +34,7 @@ class Separation:
     verified: int
     """Closures between the maps that passed it."""
     reason: Reason | None
-    """What keeps the maps apart; None if no two of their places look alike."""
+    """The condition that keeps the maps apart; None if no two of their places are similar."""
 
     def __str__(self) -> str:
         first, second = (f"map {k} ({', '.join(robots)})" for k, robots in zip(self.maps, self.robots, strict=True))

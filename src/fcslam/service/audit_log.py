@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 REFUSED_EVERY_S = 60.0
-"""Refused logins make one line in this time at most, so that no stranger fills the disk."""
+"""Refused logins make one line in this time at most, so no client without a token can fill the disk."""
 _READ_BYTES = 2**20
 """Bytes at the end of the log that ``newest`` reads."""
 
@@ -32,7 +32,7 @@ class AuditEntry:
     status: int
     """HTTP status of the answer."""
     content: Mapping[str, Any]
-    """What the request said, without secrets."""
+    """The content of the request, without secrets."""
 
 
 class AuditLog:

@@ -47,7 +47,7 @@ class MissionFolder:
 
     @property
     def worker_task(self) -> Path:
-        """What the worker is doing, for the worker after it."""
+        """The present task of the worker, for the worker after it."""
         return self.path / "worker.task"
 
     @property

@@ -46,7 +46,7 @@ def recover_mission(path: Path) -> str | None:
     were found are kept beside it.
 
     Returns:
-        What was damaged and what is lost, in a line; None if nothing is damaged or there is no file.
+        The damage and the losses, in a line; None if nothing is damaged or there is no file.
 
     Raises:
         StoreError: the configuration or an edit is lost, or the disk is full; the file is as it was.

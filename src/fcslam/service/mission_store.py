@@ -105,7 +105,7 @@ class StoredPacket:
 
 
 class Envelope(NamedTuple):
-    """What orders a packet."""
+    """Order of a packet."""
 
     robot: str
     epoch: int

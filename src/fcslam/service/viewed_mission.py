@@ -1,4 +1,4 @@
-"""What viewers see of a mission. A live mission and a finished run give it in the same form, so one page shows both."""
+"""A mission as viewers see it. A live mission and a finished run have the same form, so one page shows both."""
 
 from functools import lru_cache
 from pathlib import Path

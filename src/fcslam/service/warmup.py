@@ -167,7 +167,7 @@ def _compile(run: Callable[[], None], turns: Any) -> None:
 
 
 def _scans(count: int) -> Iterator[LaserScan]:
-    """What a robot sees that drives around in the room, 0.4 m at a time."""
+    """Scans of a robot that drives around in the room, 0.4 m at a time."""
     turn = 2.0 * np.pi / _ROUND
     for k in range(count):
         x, y = 8.0 + 5.0 * np.cos(k * turn), 4.5 + 2.0 * np.sin(k * turn)

@@ -1,13 +1,13 @@
-"""The worker: the process in which the fleet of one mission lives. Taking packets in never waits for it.
+"""The worker: the process in which the fleet of one mission lives. The service accepts packets without waiting for it.
 
-It reads the store by turn, keeps the fleet in memory, and leaves what it made of the packets on disk: corrections in
-the store, the live run folder, the run folders that were asked for. From time to time it writes its state as well.
-Killed at any moment it goes on from there, or from turn 0, and says nothing new before it is where it was.
+It reads the store by turn and keeps the fleet in memory. It writes its results to disk: corrections in the store, the
+live run folder, and the run folders that users request. From time to time it also writes its state. If it is killed,
+the next worker continues from that state, or from turn 0, and reports nothing new before it has caught up.
 
     python -m fcslam.service.worker MISSION_FOLDER
 
-A byte on stdin says that there is something to do, its end that the service is gone. On stdout there is a line when it
-is ready, for its progress, for every change of the live run folder and for every answered request.
+A byte on stdin means that there is work; the end of stdin means that the service is gone. The worker prints a line when
+it is ready, for its progress, for every change of the live run folder and for every answered request.
 """
 
 import fcntl
@@ -73,7 +73,7 @@ LIVE_EVERY_S = 1.0
 _log = logging.getLogger(__name__)
 
 Tell = Callable[[str, int], None]
-"""Is told of an event and its number."""
+"""Receives each event with its number."""
 
 
 class Worker:
@@ -186,7 +186,7 @@ class Worker:
             return False
         try:
             self._store.progress(self._applied, self._corrections())
-        except StoreError as error:  # the fleet in memory is worth more than a new worker
+        except StoreError as error:  # a new worker would have to build the fleet in memory again
             _log.error("corrections are stored later: %s", error)
             self._report_at = now + PAUSE_S
             return False
@@ -271,7 +271,7 @@ class Worker:
         except MemoryError:
             raise  # most often the machine's fault, not the packet's: the next workers try again
         except Exception as error:
-            # What it left behind is unknown: the next worker starts again without it.
+            # Its state is unknown then: the next worker starts again without it.
             self._refuse(packet, f"the cloud failed on it: {type(error).__name__}: {error}")
             raise
         else:
@@ -404,8 +404,7 @@ def _chained(before: bytes, data: bytes) -> bytes:
 
 def main(arguments: Sequence[str]) -> int:
     """Work until stdin ends."""
-    # Who stops the service stops it first; its end ends stdin. It sends a signal as well, for nobody has to wait for a
-    # compiler.
+    # The service stops first, which ends stdin. It also sends a signal, so nobody has to wait for a compiler.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)  # a copy of this process would wait for threads that it does not have
     warm_up_fleet()

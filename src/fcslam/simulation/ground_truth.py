@@ -71,7 +71,7 @@ def true_relations(
 
 
 def true_map(fleet: SimulatedFleet) -> OccupancyMap:
-    """What the robots' beams meet without noise, from where they truly scanned: surfaces, and free space before them.
+    """The map of the robots' beams without noise, from their true poses: surfaces, and free space before them.
 
     The coordinate frame is the building's. A beam that returns nothing leaves its cells unknown. Where furniture moved,
     every surface that a robot saw is occupied.

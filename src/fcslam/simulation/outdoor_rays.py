@@ -68,7 +68,7 @@ LAYERS: Final = {
     PieceKind.FENCE: (Layer(0.0, 1.6, 0.5, 0.5),),
     PieceKind.CAR: (Layer(0.2, 0.85, 0.95, 0.3), Layer(0.85, 1.4, 0.4, 0.3)),
 }
-"""What stands in a yard, from the ground upwards."""
+"""Objects in a yard, from the ground upwards."""
 
 
 class _World(NamedTuple):

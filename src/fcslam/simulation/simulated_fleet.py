@@ -310,7 +310,7 @@ def _robot(
 
 
 def ray_caster(plan: FloorPlan) -> RayCaster | OutdoorRayCaster:
-    """What casts beams in a building or in a yard.
+    """Return the ray caster for a building or a yard.
 
     Raises:
         SimulationError: MuJoCo is missing, which buildings need.

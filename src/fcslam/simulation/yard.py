@@ -40,7 +40,7 @@ class _Block(tuple[float, float, float, float]):
 
 @dataclass(frozen=True, slots=True)
 class _Site:
-    """What grows while a yard is drawn."""
+    """Lists of objects that grow while a yard is drawn."""
 
     lanes: tuple[Lane, ...]
     rng: np.random.Generator
@@ -255,7 +255,7 @@ def _clutter(centre: FloatArray, site: _Site) -> None:
 
 
 def _around(size_m: tuple[float, float], site: _Site) -> None:
-    """What closes the yard or stands beyond it."""
+    """Draw the border of the yard and the objects beyond it."""
     rng = site.rng
     inner = _Block((_AROUND_M, _AROUND_M, size_m[0] - _AROUND_M, size_m[1] - _AROUND_M))
     kinds = ("hedge", "fence", "low wall", "trees", "facade", "nothing")

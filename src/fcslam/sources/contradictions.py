@@ -38,7 +38,7 @@ class _Seen(NamedTuple):
 
 @dataclass(slots=True)
 class _Laser:
-    """What is remembered of one laser."""
+    """The state of the check for one laser."""
 
     last: _Seen
     rest: _Seen

@@ -1,4 +1,4 @@
-"""What is in a recording of any format, and whether it can be mapped."""
+"""The contents of a recording of any format, and whether it can be mapped."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +39,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """What is in a recording."""
+    """The contents of a recording."""
 
     path: Path
     format: str
@@ -59,7 +59,7 @@ class Inspection:
     """Stamps of scans that are before the stamp of the scan before."""
     largest_step_back_s: float = 0.0
     faults: str = ""
-    """What was wrong with it and is tolerated, one line; empty without faults."""
+    """Faults that are tolerated, one line; empty without faults."""
     notes: tuple[str, ...] = ()
     """Choices that were made, such as topics."""
     problem: str | None = None

@@ -54,8 +54,8 @@ class Source(Protocol):
         """Summarise ``scans`` in one quick pass, and reject a recording that cannot be mapped.
 
         Raises:
-            SourceError: the archive is truncated, there are no laser scans or no odometry, most scans
-                are of another laser than the first ones, time jumps back, or most of the recording is damaged.
+            SourceError: the archive is truncated, or most of the recording is damaged. Or there are no laser scans, no
+                odometry, mostly scans of another laser than the first ones, or time jumps back.
         """
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:

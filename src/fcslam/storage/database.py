@@ -198,7 +198,7 @@ def check_file(path: Path, schema: str, version: int) -> None:
 
 
 def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> sqlite3.Connection:
-    # Transactions begin where this module says so.
+    # This module begins transactions explicitly.
     connection = sqlite3.connect(path, timeout=timeout_s, isolation_level=None, check_same_thread=False)
     for pragma in ("trusted_schema=OFF", f"page_size={PAGE_BYTES}", *pragmas):
         connection.execute(f"PRAGMA {pragma}")

@@ -92,7 +92,7 @@ def _mended(found: bytes) -> bytes | None:
 
 
 def _candidates(frame: bytes, before: Sum, salts: bytes, order: str) -> Iterator[bytes]:
-    """What a frame may have been: it is right, or one bit of it is wrong."""
+    """Possible contents of a frame: it is right, or one bit of it is wrong."""
     body, stored = frame[:8] + frame[FRAME_HEADER:], _numbers(frame[_SUM], ">")
     words, computed = _numbers(body, order), _checksum(body, before, order)
     if (computed == stored).all():

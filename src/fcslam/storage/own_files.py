@@ -32,7 +32,9 @@ def write_own(path: Path, data: bytes) -> bool:
 
 
 def read_own(path: Path) -> bytes | None:
-    """What this user wrote to ``path``; None if there is nothing, or somebody else wrote or changed it."""
+    """Read the bytes that this user wrote to ``path``; None if there are none, or another user wrote or changed
+    them.
+    """
     key = _key()
     try:
         if key is None or not path.is_file() or path.stat().st_size > MOST_BYTES:  # a pipe would wait for ever

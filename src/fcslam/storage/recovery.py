@@ -33,7 +33,7 @@ class Damage:
     """Damage that was found."""
 
     found: str
-    """What it is, in words."""
+    """Description of the damage."""
     rows: dict[str, list[Row]] | None
     """Rows that can be read, without their seals, by table; None: the file holds what it held before."""
     kept: Path | None
@@ -111,7 +111,7 @@ def mend_pages(path: Path) -> Path | None:
 
 
 def fault(path: Path, schema: str, version: int) -> str | None:
-    """What is wrong with a database by its header, log, trees and rows; None if nothing is, or if it is of another
+    """Find the damage of a database by its header, log, trees and rows; None if there is none, or if it is of another
     version.
 
     Raises:

@@ -1,7 +1,7 @@
 """Rows of a damaged SQLite file. A row counts if its seal is right, wherever in the file it is found.
 
-Neither the header nor the schema nor the inner pages of the trees are needed: each leaf page of a table is read by
-itself, from the file and from its write-ahead log. The format: https://www.sqlite.org/fileformat2.html
+This module reads each leaf page of a table by itself, from the file and from its write-ahead log. It needs neither the
+header nor the schema nor the inner pages of the trees. The format: https://www.sqlite.org/fileformat2.html
 """
 
 import struct

@@ -69,7 +69,7 @@ class PageSeals:
 
     @classmethod
     def read(cls, path: Path) -> "PageSeals | None":
-        """What ``write`` wrote; None if there is no file, or a damaged one.
+        """Read the bytes that ``write`` wrote; None if there is no file, or a damaged one.
 
         Raises:
             OSError: the file cannot be read.

@@ -1,1 +1,1 @@
-"""What a robot sends to the cloud and back, as bytes; the format is written down in docs/reference/wire.md."""
+"""Packets between robots and the cloud, as bytes; docs/reference/wire.md describes the format."""

@@ -319,7 +319,7 @@ class Codec(NamedTuple):
     write: Callable[[Any], Message]
     read: Callable[[Any, pb.Packet], Any]
     round: Callable[[Any], Any] = lambda body: body
-    """What reading gives of a record that was written, without writing it; most kinds keep every number."""
+    """Return a record as it is after writing and reading, without doing either; most kinds keep every number."""
 
 
 CODECS = {

@@ -1,4 +1,4 @@
-"""What leaves a robot and what comes back, field by field of the schema, and what each field reveals."""
+"""Fields of the schema that leave a robot or come back, with the information that each field reveals."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

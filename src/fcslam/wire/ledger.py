@@ -41,11 +41,11 @@ class Ledger:
         return sum(chosen, Traffic())
 
     def uplink(self, robot: str) -> Traffic:
-        """What the cloud accepted from one robot."""
+        """Packets that the cloud accepted from one robot."""
         return sum((self.total(robot, kind) for kind in UPLINK), Traffic())
 
     def downlink(self, robot: str) -> Traffic:
-        """What the cloud sent to one robot."""
+        """Data that the cloud sent to one robot."""
         return sum((self.total(robot, kind) for kind in PacketKind if kind not in UPLINK), Traffic())
 
 

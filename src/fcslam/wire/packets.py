@@ -79,7 +79,7 @@ class SizedPacket(NamedTuple):
 
 
 def measure(packet: Packet) -> SizedPacket:
-    """What a receiver reads and a network carries: as by ``encode`` and ``decode``, but nothing is decoded.
+    """Return the packet as a receiver reads it, and its bytes: as by ``encode`` and ``decode``, but without decoding.
 
     Raises:
         PacketError: as ``encode``.

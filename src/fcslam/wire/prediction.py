@@ -1,11 +1,10 @@
 """Linear prediction of descriptor bits for the entropy coder, with fixed weights.
 
-The bits of a descriptor depend on one another, as neighbouring comparisons of a patch or channels of a network do, and
-neighbouring keypoints have similar descriptors. So bit b of a descriptor is predicted to be 1 with probability
-1 / (1 + exp(-z)), z = bias_b + sum_j own_jb x_j + sum_j neighbour_jb y_j, where x are the bits before it in the same
-descriptor, y those of the descriptor at the nearest earlier keypoint, and bits count as +1 and -1. The weights are part
-of the format, one set for each channel; `tools/descriptor_predictors.py` fitted them. For descriptors of other
-detectors the coding is lossless as well, but needs more bytes.
+The bits of a descriptor depend on one another, and neighbouring keypoints have similar descriptors. So bit b of a
+descriptor is predicted to be 1 with probability 1 / (1 + exp(-z)), z = bias_b + sum_j own_jb x_j + sum_j neighbour_jb
+y_j. Here x are the bits before it in the same descriptor, and y those of the descriptor at the nearest earlier
+keypoint, as +1 and -1. The weights are part of the format, one set for each channel; `tools/descriptor_predictors.py`
+fitted them. For descriptors of other detectors the coding is lossless as well, but needs more bytes.
 """
 
 from functools import lru_cache

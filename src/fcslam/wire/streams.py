@@ -39,7 +39,9 @@ _APART: Final = 2
 _MOST_AXES: Final = 3
 _REFUSED: Final = -1
 _LEARNT_BITS: Final = 4
-"""The first bits of a word are learnt: numbers of similar words begin alike. A place has too few words for more."""
+"""The first bits of a word are learnt: numbers of similar words begin with the same bits. A place has too few words for
+more.
+"""
 _STATES: Final = 3
 """Of a cell: unknown, free, occupied."""
 _NEIGHBOURS: Final = _STATES**5

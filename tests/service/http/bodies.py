@@ -1,4 +1,4 @@
-"""What schemathesis sends where bytes are wanted that no schema describes: files from the folder named by BODIES."""
+"""Bodies for schemathesis where no schema describes the bytes: files from the folder named by BODIES."""
 
 import os
 from pathlib import Path

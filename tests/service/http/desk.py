@@ -45,7 +45,7 @@ def put_detector(desk, content):
 
 
 class InlineWorker:
-    """Works whenever it is told that there is something to do."""
+    """Works whenever it is notified of work."""
 
     pid: int | None = 1
     starts = 1

@@ -178,7 +178,7 @@ def fuzzed(tmp_path_factory):
     body=st.one_of(st.binary(min_size=1, max_size=300), st.sampled_from([b"{}", b"[]", b'{"name": 3}', b"\0" * 4])),
 )
 def test_bytes_that_are_nothing_are_refused_in_words(fuzzed, path, body):
-    """What schemathesis does not try: to it a body of bytes is one that is right."""
+    """Cases that schemathesis does not try: it takes any body of bytes for a right one."""
     response = fuzzed.ask("POST", f"/api/v1/{path}", content=body)
     assert 400 <= response.status_code < 500, response.text
     assert response.json()["error"]

@@ -18,7 +18,7 @@ AS_BOSS = ["--header", "Authorization: Bearer token of boss", "--exclude-tag", "
 AS_ROBOT = ["--header", "Authorization: Bearer token of a", "--include-tag", "robots"]
 AS_ANYBODY = ["--include-tag", "robots", "--include-tag", "operations"]
 ITSELF = '[parameters]\n"path.robot" = "a"\n'
-"""What is added to the configuration: a robot's token is good for that robot alone."""
+"""An addition to the configuration: a robot's token is valid for that robot alone."""
 
 
 @pytest.mark.slow

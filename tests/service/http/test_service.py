@@ -1,4 +1,4 @@
-"""What the service answers: robots, viewers, administrators; and what it does not let happen."""
+"""Answers of the service to robots, viewers and administrators, and the requests that it refuses."""
 
 import hashlib
 import io

@@ -61,7 +61,7 @@ class Arm(Settings):
 
 @dataclass(frozen=True, slots=True)
 class SeedContext:
-    """What all arms share that are trained with one seed."""
+    """Data that all arms of one seed share."""
 
     settings: FederatedSettings
     seed: int

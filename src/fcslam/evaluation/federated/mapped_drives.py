@@ -1,4 +1,4 @@
-"""What a mission leaves for learning: the robots' keyframes at their estimated poses, and the accepted closures.
+"""Training data from a mission: the robots' keyframes at their estimated poses, and the accepted closures.
 
 Images and LiDAR returns stay on the robots. The study has them all in one process and takes from them only what each
 robot, or the cloud, would have.

@@ -201,13 +201,13 @@ def _claim(study: Study) -> None:
 
 @dataclass(frozen=True, slots=True)
 class SharedInputs:
-    """What all seeds share."""
+    """Data that all seeds share."""
 
     start: Weights
     images: Mapping[str, TrainingImages]
     """Training images by robot, labelled by the initial network."""
     legacy: Sequence[DetectedFeatures]
-    """What the initial network detects in the first view of each pair."""
+    """Features that the initial network detects in the first view of each pair."""
 
 
 def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:

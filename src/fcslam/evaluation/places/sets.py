@@ -3,15 +3,15 @@
 The files in a folder decide how it is read:
 
 - ``dataset.csv`` (image, label, split, area; frames of clips ``<clip>_frame_<number>``): floors of a tower that look
-  alike. A match is the same clip, at most 4 frame numbers apart; different is another area of the same floor, or the
+  the same. A match is the same clip, at most 4 frame numbers apart; different is another area of the same floor, or the
   same clip more than 12 apart. A second question, ``near``: different is another floor.
 - ``loop_pairs.txt`` (i j ..., numbers of images): one tour, online. A match is a listed pair; unlisted ones within 8
   images of it at both ends are ignored, all others are different.
 - ``associations.txt`` and ``groundtruth.txt``: a TUM RGB-D sequence (Sturm et al. 2012), online. A match is an overlap
   of the views by depth and pose of more than 0.5, different is less than 0.1.
 - ``simulation.yaml``: a fleet that ``fcslam simulate`` recorded with cameras. Each robot's images, a metre or half a
-  radian apart, ask for those of the robots before it; overlap is that of the walls that the LiDARs met in the cameras'
-  views, and the limits are those of TUM's sequences.
+  radian apart, are queries for those of the robots before it. Overlap is that of the walls that the LiDARs met in the
+  cameras' views. The limits are those of TUM's sequences.
 - ``matches.csv`` (query, gallery, relation) with folders ``queries`` and ``gallery``: relation is ``match`` or
   ``ignored``; what is not listed is different.
 

@@ -20,7 +20,7 @@ from fcslam.wire.checks import check_name
 
 
 class Role(StrEnum):
-    """What a token is good for."""
+    """Role of a token."""
 
     ROBOT = "robot"
     """Sends packets as the robot that it names."""
@@ -31,7 +31,7 @@ class Role(StrEnum):
 
 
 class Identity(NamedTuple):
-    """Who asks."""
+    """The client of a request."""
 
     name: str
     role: Role

@@ -18,7 +18,7 @@ REQUEST_BYTES = 16.0 * 2**10
 LONGEST_JSON_BYTES = 64 * 2**10
 
 CONTENT = "content"
-"""What the state of a request names its body, for the audit log."""
+"""Key of the body in the state of a request, for the audit log."""
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

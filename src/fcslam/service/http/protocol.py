@@ -37,7 +37,7 @@ class GuardedServer(uvicorn.Server):
     """uvicorn's server with a limit for TLS handshakes, which come before a protocol; theirs is a minute."""
 
     def run(self, sockets: list[socket.socket] | None = None) -> None:
-        """Serve until the server is told to stop."""
+        """Serve until the server is stopped."""
         with asyncio.Runner(loop_factory=self._loop) as runner:
             runner.run(self.serve(sockets=sockets))
 

@@ -26,7 +26,7 @@ UNKNOWN_PER_S, UNKNOWN_BURST = 50.0, 1000.0
 ANYBODY = "anybody"
 """The author of what is done without authentication."""
 ACTOR = "actor"
-"""What the state of a request names whoever asks for what only administrators may do."""
+"""Key of the client in the state of a request that only administrators may make."""
 _BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
 
 

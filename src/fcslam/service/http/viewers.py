@@ -225,8 +225,9 @@ def map_router(state: ViewerState) -> APIRouter:
     ) -> Response:  # fmt: skip
         """Poses of a session's keyscans in its map.
 
-        Who has the first ``after`` bytes and sends the digest that came with them gets the rest, if they are as they
-        were. ``Fcslam-After`` says how many bytes are left out, ``Fcslam-Digest`` is that of all up to now.
+        A client that has the first ``after`` bytes sends the digest that came with them. It gets only the rest if those
+        bytes have not changed. ``Fcslam-After`` is the number of omitted bytes; ``Fcslam-Digest`` is the digest of all
+        up to now.
         """
         path = _existing(state, f"{TRAJECTORIES}/{session}.tum")
         poses = path.read_bytes()

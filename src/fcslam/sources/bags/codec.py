@@ -17,7 +17,7 @@ OLD_TRANSFORMS = "tf/tfMessage"
 GRID_UPDATE = "map_msgs/OccupancyGridUpdate"
 """A part of an occupancy grid; rosbags does not know this type."""
 TRIGGER_RESPONSE = "std_srvs/Trigger_Response"
-"""What a service of the type std_srvs/Trigger answers; rosbags knows no services."""
+"""The response of a service of the type std_srvs/Trigger; rosbags has no types of services."""
 
 _NANOSECONDS = 10**9
 _GRID_UPDATE_FIELDS = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"

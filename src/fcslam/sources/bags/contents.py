@@ -1,4 +1,4 @@
-"""What is in a bag, whether it can be mapped or not: topics with their rates, and frames."""
+"""The contents of a bag, also of one that cannot be mapped: topics with their rates, and frames."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

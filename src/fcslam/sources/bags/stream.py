@@ -186,7 +186,7 @@ class BagStream:
             yield scan
 
     def _reason(self, topic: Topic) -> str:
-        """What is wrong with the first scan, if its angles are."""
+        """Return the fault of the angles of the first scan, if they have one."""
         for message in islice(self._bag.messages([topic]), 1):
             try:
                 scan_of(self._bag.decode(message), message.bag_time_ns)

@@ -52,11 +52,15 @@ def write_bag(path: Path, records: Iterable[RecordedItem]) -> None:
     """Write ``records`` to ``path``; equal records give equal bytes.
 
     ``.bag`` is a ROS 1 bag, ``.mcap`` and ``.db3`` are files of ROS 2, a path without suffix is a new folder of
-    ROS 2 with an MCAP file in it. Scans go to /scan, those of a second laser to /scan_2 and so on; odometry, and that
-    of each scan and image at its stamp, to /odom and /tf (odom -> base_link); images, as they are encoded, to
-    /camera/image_raw/compressed, each with its /camera/camera_info; where lasers and camera sit to /tf_static
-    (base_link -> laser, laser_2, camera_optical_frame); ground truth to /ground_truth (building -> base_link). Header
-    stamps are the records' own, to the nanosecond; the time of recording only ever grows.
+    ROS 2 with an MCAP file in it. The bag has these topics:
+
+    - /scan, and /scan_2 and so on of further lasers;
+    - /odom and /tf (odom -> base_link): odometry, also that of each scan and image at its stamp;
+    - /camera/image_raw/compressed: images as they are encoded, each with its /camera/camera_info;
+    - /tf_static (base_link -> laser, laser_2, camera_optical_frame): the mounting of lasers and camera;
+    - /ground_truth (building -> base_link).
+
+    Header stamps are the records' own, to the nanosecond; the time of recording only ever grows.
 
     Raises:
         OutputError: the bag cannot be written, its kind is not known, or ROS has no such stamp.
