@@ -4,8 +4,8 @@
 
 Needs fcslam[federated]. One server, and robots in four processes with a thread each, fetch requests over loopback (no
 TLS; every request is signed with the robot's own key). In each round the server asks 30 % of the robots, drawn anew.
-Of those, half of the missing ones start again after the deadline, as after a loss of power, and half reply after
-it. The weights have the size of the bundled detector. A robot's update is drawn by its name and the round:
+Of those, a share is missing: half of these start again after the deadline, as after a loss of power, and half reply
+after it. The weights have the size of the bundled detector. A robot's update is drawn by its name and the round:
 training itself is the robots' own work and is measured elsewhere (`federated_deployed.py`).
 
 The same fleet runs in one process too, where the missing robots fail at once. Both runs must make the same version in
