@@ -43,6 +43,7 @@ WRONG_RAD = 0.1
 EDGES = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 CONFIDENT = 0.9
 RESAMPLES = 10_000
+SECTIONS = "carried", "corrections", "real"
 CARRIED, REAL, CORRECTIONS = "Poses of carried robots", "Poses of real robots", "Corrections"
 COLUMNS = {"quality over": ".2f", "up to": ".2f", "number": ",.0f", "wrong": ",.0f", "share wrong": ".4f",
            "at most": ".4f"}  # fmt: skip
@@ -55,16 +56,18 @@ def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("--keep", type=Path, help="file that keeps finished rows; the same one resumes")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of the fleets")
+    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS, help="what is measured")
     chosen = parser.parse_args()
     kept, report = common.Kept(chosen.keep), common.Report(__file__, __doc__, chosen)
     tables = {}
     with tempfile.TemporaryDirectory() as place:
         simulated = list(itertools.product(BUILDINGS, chosen.seeds))
-        cases: dict[str, list[tuple[tuple, Callable[[], Counts]]]] = {
-            CARRIED: [(case, functools.partial(carried, *case)) for case in simulated],
-            CORRECTIONS: [(case, functools.partial(corrected, *case)) for case in simulated],
-        }
-        if os.environ.get("FCSLAM_DATA"):
+        cases: dict[str, list[tuple[tuple, Callable[[], Counts]]]] = {}
+        if "carried" in chosen.sections:
+            cases[CARRIED] = [(case, functools.partial(carried, *case)) for case in simulated]
+        if "corrections" in chosen.sections:
+            cases[CORRECTIONS] = [(case, functools.partial(corrected, *case)) for case in simulated]
+        if "real" in chosen.sections and os.environ.get("FCSLAM_DATA"):
             cases[REAL] = [((name,), compute) for name, compute in real_drives(Path(place))]
         for title, drives in cases.items():
             counts = [np.array(kept.rows((title, *key), compute)) for key, compute in drives]
@@ -85,7 +88,7 @@ def carried(building: str, seed: int) -> Counts:
 
 
 def corrected(building: str, seed: int) -> Counts:
-    """Corrections of a robot that is carried away while it is mapped together with another one."""
+    """Corrections of a robot that is carried away while it is mapped together with another one; 0 is not counted."""
     drives = relocalisation.recorded(building, seed)
     kidnapped, _ = relocalisation.kidnap(drives[1], drives[2], np.random.default_rng(seed))
     others, packets = (relocalisation.driven(drive, relocalisation.WATCHED)[0] for drive in (drives[0], kidnapped))

@@ -43,6 +43,8 @@ class Script:
     informative: bool = True
     similarity: float | None = None
     """Set: words alone say that it is the same place."""
+    passes: bool = True
+    """Whether the verification passes."""
 
 
 class ScriptedMatcher:
@@ -85,7 +87,7 @@ def verified(line: Script) -> Verification:
     worse = Agreement(0.9, 0.0, 600, 0.9, np.eye(2) * 100.0)
     passed = Reason(ReasonCode.VERIFIED)
     return Verification(
-        frozen(line.T_i_j), CLOSURE_INFORMATION, worse, True, True, True, line.informative, passed, passed
+        frozen(line.T_i_j), CLOSURE_INFORMATION, worse, *(line.passes,) * 3, line.informative, passed, passed
     )
 
 

@@ -554,7 +554,7 @@ class Correction:
     T_map_odom: FloatArray
     """Shape (3,). Here, ``odom`` is the chain of the robot's motions between keyscans; its first keyscan is zero."""
     quality: float = 0.0
-    """Support by other sessions, in [0, 1]; 0 if no closure connects the session to others. It is the share of the
-    surfaces at the session's newest place that agree, of those seen by both, times 1 - 2^-n with n closures to
-    others.
+    """Support by other sessions, in [0, 1]; 0 if no other session supports the pose. It is the agreement of the newest
+    comparison with places of other sessions, times 1 - 2^-n with n places that closures connect to others. Both count
+    less with travel.
     """

@@ -1,8 +1,11 @@
-"""How well a correction is borne out: nothing alone, more with every witness, nothing where others see otherwise."""
+"""Quality of a correction: 0 alone, more with closures nearby, less with travel, 0 where others see something else."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from fcslam.cloud.correction_quality import MOST_TIES
+from fcslam.cloud.correction_quality import FRESH_M, HALVED_M, TIE_HALVED_M
 from fcslam.records import Correction, Veto
 from fcslam.wire.packets import decode, encode
 from tests.scripted import ALIAS, closures, rectangle, stream
@@ -11,6 +14,8 @@ from tests.small_fleet import feed
 POSES = rectangle()
 A, B = ("a", POSES), ("b", POSES)
 PAIRS = [(k, k) for k in range(0, 48, 4)]
+END = 60
+"""Number of the last keyscan; they are 1 m apart."""
 EXPLAINED = 0.9
 """Of every scripted match."""
 
@@ -23,32 +28,67 @@ def qualities(cloud):
     return {correction.robot: correction.quality for correction in cloud.fleet.corrections()}
 
 
+def expected(pairs, compared, now=END, share=EXPLAINED):
+    """Quality at keyscan ``now`` after closures at ``pairs``, if the newest comparison was at ``compared``."""
+    tied = sum(0.5 ** ((now - k) / TIE_HALVED_M) for k, _ in pairs)
+    return share * 0.5 ** (max(now - compared - FRESH_M, 0.0) / HALVED_M) * (1.0 - 0.5**tied)
+
+
 @pytest.mark.parametrize("count", [3, 5, 12])
-def test_every_closure_to_others_counts_for_both_robots(scripted, count):
-    cloud = feed(scripted(closures(A, B, PAIRS[:count])), two_robots())
-    expected = EXPLAINED * (1.0 - 0.5 ** min(count, MOST_TIES))
+def test_closures_count_for_both_robots_and_less_with_travel(scripted, count):
+    pairs = PAIRS[:count]
+    cloud = feed(scripted(closures(A, B, pairs)), two_robots())
     assert cloud.fleet.closure_counts()["between robots"] == count
-    assert qualities(cloud) == pytest.approx({"a": expected, "b": expected})
+    here = expected(pairs, pairs[-1][0])
+    assert qualities(cloud) == pytest.approx({"a": here, "b": here})
 
 
 def test_nobody_bears_out_a_robot_in_a_map_of_its_own(scripted):
     assert qualities(feed(scripted(closures(A, B, PAIRS[:2])), two_robots())) == {"a": 0.0, "b": 0.0}
 
 
-def test_a_robot_hears_of_it_with_the_place_that_joins_it(scripted):
+def test_a_robot_hears_of_it_with_the_place_that_joins_it_until_it_drives_away(scripted):
     cloud, heard = scripted(closures(A, B, PAIRS[:5])), []
     for packet in two_robots():
         for body in (decode(data).body for data in cloud.receive(encode(packet))):
             if isinstance(body, Correction) and packet.robot == "b":
                 heard.append(body.quality)
-    assert heard[:2] == [0.0, pytest.approx(EXPLAINED * 0.875)]
-    assert heard == sorted(heard)
-    assert len(heard) == 4, "places in new surroundings do not change it, so no correction is sent"
+    assert heard[:2] == [0.0, pytest.approx(expected(PAIRS[:3], 8, now=8))]
+    assert heard[3] == pytest.approx(expected(PAIRS[:5], 16, now=16))
+    assert np.all(np.diff(heard[:4]) > 0.0)
+    assert np.all(np.diff(heard[3:]) < 0.0)
+    assert heard[-1] < 0.1
 
 
 def test_a_place_that_shows_something_else_than_the_map_bears_out_nothing(scripted):
     cloud = feed(scripted(closures(A, B, PAIRS[:5]), closures(A, B, [(48, 48)], shift=ALIAS)), two_robots())
     assert qualities(cloud) == {"a": 0.0, "b": 0.0}
+
+
+def test_a_place_that_is_not_verified_where_the_map_predicts_it_counts_half(scripted):
+    (unlike,) = closures(A, B, [(48, 48)])
+    cloud = feed(scripted(closures(A, B, PAIRS), [replace(unlike, passes=False)]), two_robots())
+    half = expected(PAIRS, 48) / 2
+    assert qualities(cloud) == pytest.approx({"a": half, "b": half})
+
+
+def test_verified_matches_that_differ_from_the_map_lower_the_share(scripted):
+    cloud = feed(scripted(closures(A, B, PAIRS), closures(A, B, [(40, 44)], shift=ALIAS)), two_robots())
+    whole = expected(PAIRS, 44)
+    assert qualities(cloud) == pytest.approx({"a": whole, "b": whole / 2})
+
+
+def test_a_match_with_an_older_place_of_a_robot_says_nothing_about_where_it_is_now(scripted):
+    cloud = feed(scripted(closures(A, B, PAIRS), closures(A, B, [(4, 48)], shift=ALIAS)), two_robots())
+    assert qualities(cloud) == pytest.approx({"a": expected(PAIRS, 44), "b": 0.0})
+
+
+def test_a_place_with_closures_to_several_others_counts_once(scripted):
+    pairs = [(k, k) for k in range(0, 20, 4)]
+    twice = closures(A, B, [(0, 8), (4, 12)])
+    cloud = feed(scripted(closures(A, B, pairs), twice), two_robots())
+    assert cloud.fleet.closure_counts()["between robots"] == 7
+    assert qualities(cloud) == pytest.approx({"a": expected(pairs, 16), "b": expected(pairs, 16)})
 
 
 def test_what_is_vetoed_bears_out_nothing(scripted):

@@ -1,17 +1,35 @@
 """How well other sessions support the pose of a session in its map: ``Correction.quality``."""
 
 from collections.abc import Collection, Iterable
-from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureLog
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.places.matcher import PlaceMatch
+from fcslam.records import KeyscanId, Place
 from fcslam.storage.state_file import State
 
+FRESH_M = 4.0
+"""Travel, in metres, within which a comparison counts in full; the next place is about 2 m away."""
+HALVED_M = 10.0
+"""Further travel, in metres, after which a comparison counts half: the robot may have been carried since."""
+TIE_HALVED_M = 30.0
+"""Travel, in metres, after which a place with closures to other sessions counts half."""
+RECENT_M = 6.0 * TIE_HALVED_M
+"""Places before this travel are left out: each counts less than 1 / 64."""
 MOST_TIES = 10
-"""Number of closures after which more make no difference: 1 - 2^-10 is close to 1."""
+"""Number of places with closures after which more make no difference: 1 - 2^-10 is close to 1."""
+
+
+class _Comparison(NamedTuple):
+    """A session's newest place that was compared with those of other sessions of its map."""
+
+    last: int
+    """Number of the newest keyscan that took part."""
+    share: float
+    """Share of the surface seen by both sessions that agrees, in [0, 1]; less if a match differs or is not verified."""
 
 
 class CorrectionQuality:
@@ -21,35 +39,52 @@ class CorrectionQuality:
         """A comparison supports the map if it differs from it by at most ``off_m`` metres and ``off_rad`` radians."""
         self._graph = graph
         self._off_m, self._off_rad = off_m, off_rad
-        self._share: dict[str, float] = {}
-        """Share of the surface seen by both sessions that agrees, in [0, 1]."""
+        self._newest: dict[str, _Comparison] = {}
 
-    def update(self, matches: Iterable[PlaceMatch], robots: Collection[str]) -> None:
+    def update(self, place: Place, matches: Iterable[PlaceMatch], robots: Collection[str]) -> None:
         """Take the matches of a new place into account; ``robots`` share its map, whose estimate is current."""
-        shares: dict[str, float] = {}
+        compared: dict[KeyscanId, list[PlaceMatch]] = {}
         for match in matches:
-            fits = self._fits(match)
-            # An unpredicted match that neither fits nor is verified is most often an alias.
-            if match.i.robot in robots and (fits or match.predicted or match.M):
-                share = match.explained if fits else 0.0
-                for session in (match.i.robot, match.j.robot):
-                    shares[session] = max(share, shares.get(session, 0.0))
-        self._share |= shares
+            # An unpredicted match that is not verified is most often an alias.
+            if match.i.robot in robots and (match.predicted or match.M):
+                for keyscan in (match.i, KeyscanId(place.id.robot, place.last)):
+                    compared.setdefault(keyscan, []).append(match)
+        for (session, last), found in compared.items():
+            newest = self._newest.get(session)
+            if newest is None or newest.last <= last:
+                self._newest[session] = _Comparison(last, self._share(found))
 
     def state(self) -> State:
         """What ``restore`` needs."""
-        return {"share": dict(self._share)}
+        return {"newest": {session: tuple(comparison) for session, comparison in self._newest.items()}}
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
-        self._share = state["share"]
+        self._newest = {session: _Comparison(*comparison) for session, comparison in state["newest"].items()}
 
     def of(self, session: str, robots: Collection[str], closures: ClosureLog) -> float:
         """In [0, 1], as in ``Correction``; ``robots`` share the session's map."""
-        if len(robots) == 1:
+        newest = self._newest.get(session)
+        if len(robots) == 1 or newest is None:
             return 0.0
-        count = sum(1 for _ in islice(closures.ties(session), MOST_TIES))
-        return self._share.get(session, 0.0) * (1.0 - 0.5**count)
+        since_m = self._graph.travel_since(session)
+        tied = 0.0
+        for number in np.flatnonzero(since_m < RECENT_M)[::-1].tolist():
+            if tied < MOST_TIES and any(closures.ties_at(KeyscanId(session, number))):
+                tied += 0.5 ** (since_m[number] / TIE_HALVED_M)
+        weight = 0.5 ** (max(since_m[newest.last] - FRESH_M, 0.0) / HALVED_M)
+        return newest.share * float(weight * (1.0 - 0.5**tied))
+
+    def _share(self, matches: list[PlaceMatch]) -> float:
+        """The best share of the matches that fit, times the part of them that fit: half if it is not verified.
+
+        Zero if matches are verified, but none of these fits.
+        """
+        fitting = [match for match in matches if self._fits(match)]
+        verified = sum(match.M for match in fitting)
+        if not fitting or (not verified and any(match.M for match in matches)):
+            return 0.0
+        return max(match.explained for match in fitting) * 0.5 * (len(fitting) + verified) / len(matches)
 
     def _fits(self, match: PlaceMatch) -> bool:
         off = self._graph.innovation(match.i, match.j, match.T_i_j)

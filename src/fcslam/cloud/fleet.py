@@ -280,4 +280,4 @@ class Fleet:
             decisions.add_matches(matches, session)
             self._recognition.thin(place, decisions.map_of(session))
         decisions.optimize_if_due()
-        self._quality.update(matches, decisions.map_of(session))
+        self._quality.update(place, matches, decisions.map_of(session))

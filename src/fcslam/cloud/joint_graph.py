@@ -63,6 +63,13 @@ class JointGraph:
         end = None if last is None else last + 1
         return self._chains[robot].values[first:end].copy()
 
+    def travel_since(self, robot: str) -> FloatArray:
+        """Way in metres from each keyscan of the robot to its newest one by its motions, shape (N,)."""
+        steps = np.diff(self._chains[robot].values[:, :2], axis=0)
+        travel_m = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
+        since_m: FloatArray = travel_m[-1] - travel_m
+        return since_m
+
     def T_map_odom(self, robot: str, T_map_newest: FloatArray | None = None) -> FloatArray:
         """Where the robot's odometry (the chain of its motions) starts in the map, by its newest keyscan.
 
