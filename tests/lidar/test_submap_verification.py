@@ -248,6 +248,8 @@ def test_a_packed_submap_is_unpacked_as_it_was(same_room):
         *zip(submap.field.arrays, unpacked.field.arrays, strict=True),
         (submap.free.cells, unpacked.free.cells),
         (submap.surface.points, unpacked.surface.points),
+        (submap.surface.normals, unpacked.surface.normals),
+        (submap.surface.solitary, unpacked.surface.solitary),
     ]
     for before, after in pairs:
         assert after.dtype == before.dtype

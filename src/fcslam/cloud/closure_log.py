@@ -69,8 +69,6 @@ class ClosureLog:
         """Verified entries between each robot and others; a candidate never changes its status."""
         self._at: dict[KeyscanId, list[ClosureEntry]] = {}
         """Verified entries between robots, by each of their two places."""
-        self._confirmed: set[tuple[frozenset[KeyscanId], Channel]] = set()
-        """Pairs of places with a verified closure, and its channel."""
 
     def __iter__(self) -> Iterator[ClosureEntry]:
         return iter(self._entries)
@@ -83,7 +81,9 @@ class ClosureLog:
 
         The same places seen by another detector are no independent evidence.
         """
-        return (frozenset((match.i, match.j)), match.channel) in self._confirmed
+        places = {match.i, match.j}
+        found = (entry.closure for entry in self._at.get(match.j, ()))
+        return any({closure.i, closure.j} == places and closure.channel is match.channel for closure in found)
 
     def add(self, match: PlaceMatch) -> ClosureEntry:
         """Add a match, as verified or, if its verification failed, as a candidate."""
@@ -119,7 +119,6 @@ class ClosureLog:
         i, j = entry.closure.i, entry.closure.j
         self._between.setdefault(frozenset((i.robot, j.robot)), []).append(entry)
         if entry.closure.status is not ClosureStatus.CANDIDATE:
-            self._confirmed.add((frozenset((i, j)), entry.closure.channel))
             for robot in (i.robot, j.robot):
                 self._ties.setdefault(robot, []).append(entry)
             for place in (i, j):

@@ -52,6 +52,8 @@ class Submap:
     surface: PointScan
     """Surfels about 0.1 m apart, without moving ones (people), which beams of other scans passed through."""
     free: FreeSpace
+    rows: NDArray[np.int16] | None = None
+    """Row of each point of ``surface`` among the surfels of ``field``, shape (N,); None: they are not among them."""
 
 
 def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
@@ -65,13 +67,16 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]]) -> Submap:
     """
     near = [(_near(scan, pose), pose) for scan, pose in scans]
     field = field_of(near)
-    surface = spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
-    passes, hits, corner = _beam_counts(near, surface.points)
-    column, row = np.floor((surface.points - corner) / FREE_CELL_M).astype(np.int64).T
+    rows = _spaced_rows(field.points)
+    points = field.points[rows]
+    passes, hits, corner = _beam_counts(near, points)
+    column, row = np.floor((points - corner) / FREE_CELL_M).astype(np.int64).T
     passed, hit = passes[row, column], hits[row, column]
     moved = (passed >= SEEN_THROUGH) & (passed > SEEN_THROUGH_RATIO * hit)
+    rows = rows[~moved]
+    surface = PointScan(field.points, field.normals, field.solitary, np.zeros(2)).only(rows)
     field.compact()
-    return Submap(field, surface.only(~moved), FreeSpace(passes > 0, corner))
+    return Submap(field, surface, FreeSpace(passes > 0, corner), rows.astype(np.int16))
 
 
 def _near(scan: PointScan, T_anchor_base: FloatArray) -> PointScan:
@@ -125,19 +130,29 @@ def _count_beams(points, origin, T, corner, number, latest, passes, hits):  # ty
 
 def spaced(surfels: PointScan) -> PointScan:
     """The first surfel of each cell of ``SPACING_M``."""
-    cells = np.floor(surfels.points / SPACING_M).astype(np.int64)
-    _, first = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)
-    return surfels.only(np.sort(first))
+    return surfels.only(_spaced_rows(surfels.points))
+
+
+def _spaced_rows(points: FloatArray) -> NDArray[np.int64]:
+    """Number of the first of the points (N, 2) in each cell of ``SPACING_M``, ascending, shape (K,)."""
+    cells = np.floor(points / SPACING_M).astype(np.int64)
+    first: NDArray[np.int64] = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)[1]
+    return np.sort(first)
 
 
 class PackedSubmap:
-    """A submap in a third of the memory: its cells are compressed, without loss."""
+    """A submap in a third of the memory, without loss: its cells are compressed, its surface refers to the surfels."""
 
-    __slots__ = "_arrays", "_corner", "_free", "_free_shape", "_labels", "_labels_shape", "_surface"
+    __slots__ = (
+        "_arrays", "_corner", "_free", "_free_shape", "_labels", "_labels_shape", "_origin", "_rows", "_solitary",
+    )  # fmt: skip
 
     def __init__(self, submap: Submap) -> None:
+        """``submap`` comes from ``build_submap``."""
+        assert submap.rows is not None, "its surface consists of surfels"
         arrays = submap.field.arrays
-        self._surface, self._corner = submap.surface, submap.free.corner
+        self._rows, self._solitary, self._origin = submap.rows, submap.surface.solitary, submap.surface.origin
+        self._corner = submap.free.corner
         self._arrays = arrays._replace(labels=_NO_LABELS)
         self._labels_shape, self._free_shape = arrays.labels.shape, submap.free.cells.shape
         self._labels = zlib.compress(arrays.labels.tobytes(), _PACKING)
@@ -150,7 +165,8 @@ class PackedSubmap:
         bits = np.frombuffer(zlib.decompress(self._free), np.uint8)
         cells = np.unpackbits(bits, count=math.prod(self._free_shape)).view(np.bool_).reshape(self._free_shape)
         field = SurfelField.of(self._arrays._replace(labels=labels))
-        return Submap(field, self._surface, FreeSpace(cells, self._corner))
+        surface = PointScan(field.points[self._rows], field.normals[self._rows], self._solitary, self._origin)
+        return Submap(field, surface, FreeSpace(cells, self._corner), self._rows)
 
 
 _PACKING: Final = 1
