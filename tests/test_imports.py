@@ -28,6 +28,7 @@ ROOMS = [
     "sources",
     "graph",
     "lidar",
+    "cluster",
     "features",
     "maps",
     "places",
@@ -71,6 +72,8 @@ HEAVY = [
     "rosbags",
     "cyclonedds",
     "rospy",
+    "distributed",
+    "dask",
 ]
 
 

@@ -10,6 +10,7 @@ from fcslam import sources
 from fcslam.config import load, parse
 from fcslam.driving import side_by_side
 from fcslam.errors import SourceError
+from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission import Live, MissionConfig, Watch, continued_config, run_mission
 from fcslam.mission_file import SavedMission, read_mission
 from fcslam.records import FloatArray, Veto, frozen
@@ -42,6 +43,7 @@ def map_recordings(
     onto: StrPath | SavedMission | None = None,
     live: Live | None = None,
     floors: str | Mapping[str, str] = "",
+    verify_pairs: VerifyPairs = verify_here,
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
@@ -69,6 +71,8 @@ def map_recordings(
         live: called with the mission's cloud after every packet; it must return at once and change nothing.
         floors: the floor on which all recordings were made, or a mapping of robot names to floors. Places of different
             floors are never compared, so each floor has maps of its own.
+        verify_pairs: where closures are verified, see :func:`fcslam.cluster.verifying.verifying`; it does not change
+            the run.
 
     Raises:
         InputError: a recording, the configuration, a veto or the output folder cannot be used. The message is one line
@@ -83,7 +87,7 @@ def map_recordings(
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
     watch, look = progress or (lambda _: None), live or (lambda _: None)
-    run = run_mission(robots, settings, watch, tuple(vetoes), drive, earlier, look, floors)
+    run = run_mission(robots, settings, watch, tuple(vetoes), drive, earlier, look, floors, verify_pairs)
     if output is not None:
         run.save(output, force)
     return run

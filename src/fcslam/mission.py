@@ -24,6 +24,7 @@ from fcslam.config import Settings, dump
 from fcslam.driving import Drive, Leg, continued, on_floor, one_by_one
 from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.metrics.jumps import JumpLimits
 from fcslam.mission_file import EMPTY, SavedMission, mission_bytes, mission_state_bytes
 from fcslam.places.matcher import MatchDecision
@@ -102,6 +103,7 @@ def run_mission(
     onto: SavedMission | None = None,
     live: Live = lambda _: None,
     floors: Mapping[str, str] = MappingProxyType({}),
+    verify_pairs: VerifyPairs = verify_here,
 ) -> Run:
     """Map recordings together, one robot each.
 
@@ -116,6 +118,7 @@ def run_mission(
         live: called with the cloud after every packet.
         floors: floor of each recording that has one, by its robot's name; places of different floors are never
             compared.
+        verify_pairs: verifies pairs of submaps, here or elsewhere; the run is the same.
 
     Raises:
         SourceError: two recordings have one name, or one cannot be read.
@@ -126,7 +129,7 @@ def run_mission(
     _check_robots(sources)
     _check_vetoes(vetoes, [*onto.packets, *(source.name for source in sources)])
     _check_floors(floors, [source.name for source in sources])
-    cloud = MissionCloud(config, onto, vetoes)
+    cloud = MissionCloud(config, onto, vetoes, verify_pairs)
     meter = _Meter(watch, cloud, [*onto.packets, *(source.name for source in sources)])
     with drive(sources, config.robot) as robots:
         new = [
@@ -150,10 +153,14 @@ def run_mission(
 class MissionCloud:
     """The cloud of a mission within one process; it counts what is sent."""
 
-    def __init__(self, config: MissionConfig, onto: SavedMission = EMPTY, vetoes: Sequence[Veto] = ()) -> None:
+    def __init__(
+        self, config: MissionConfig, onto: SavedMission = EMPTY, vetoes: Sequence[Veto] = (),
+        verify_pairs: VerifyPairs = verify_here,
+    ) -> None:  # fmt: skip
         """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
         self.config = config
-        self._cloud = Cloud(config.fleet, config.seed)
+        self._verify_pairs = verify_pairs
+        self._cloud = Cloud(config.fleet, config.seed, verify_pairs)
         self._traffic = Counter()
         self._packets: list[SizedPacket] = []
         self._refused = onto.refused
@@ -184,7 +191,8 @@ class MissionCloud:
             return False
         try:
             config, state = self.config, onto.state["cloud"]
-            cloud = Cloud.restored(config.fleet, config.seed, state, (sent.packet for sent in packets))
+            applied = (sent.packet for sent in packets)
+            cloud = Cloud.restored(config.fleet, config.seed, state, applied, self._verify_pairs)
             traffic = {
                 Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(count, size)
                 for robot, kind, channel, count, size in onto.state["traffic"]

@@ -1,7 +1,12 @@
 """Pairs verified on an executor give what they give here, whatever the order in which batches are complete."""
 
+import os
 import pickle
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+import signal
+import threading
+import time
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from contextlib import ExitStack
 from multiprocessing import get_context
 
 import numpy as np
@@ -10,32 +15,60 @@ import pytest
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
+from fcslam.lidar import pair_verification
 from fcslam.lidar.pair_verification import Pair, VerificationPool, verify_here
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
+from fcslam.lidar.submap_bytes import read_submap, submap_bytes
 from fcslam.lidar.verification import VerificationConfig
 from tests import small_fleet
 from tests.small_fleet import fingerprint, in_order
 
 
 class LastFirst(Executor):
-    """Runs its tasks in reverse, and only when the first result is asked for; arguments pass as between processes."""
+    """Runs its tasks in reverse and late; arguments pass as between processes."""
 
     def __init__(self):
         self.tasks = []
+        self.wakes = threading.Event()
+        self.ends = False
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
 
     def submit(self, function, *arguments):
         future = Future()
-        future.result = lambda: self._run(future)
         self.tasks.append((future, pickle.dumps((function, arguments))))
+        self.wakes.set()
         return future
 
-    def _run(self, wanted):
-        while self.tasks:
-            future, data = self.tasks.pop()
-            function, arguments = pickle.loads(data)
-            future.set_result(pickle.loads(pickle.dumps(function(*arguments))))
-        return Future.result(wanted)
+    def _run(self):
+        while self.wakes.wait() and not self.ends:
+            self.wakes.clear()
+            time.sleep(0.005)
+            while self.tasks:
+                future, data = self.tasks.pop()
+                function, arguments = pickle.loads(data)
+                try:
+                    future.set_result(pickle.loads(pickle.dumps(function(*arguments))))
+                except Exception as error:
+                    future.set_exception(error)
+
+    def shutdown(self, **_):
+        self.ends = True
+        self.wakes.set()
+        self.thread.join()
+
+
+class Failing(Executor):
+    """Fails in a way of its own."""
+
+    def __init__(self, fails):
+        self.fails = fails
+        self.asked = 0
+
+    def submit(self, function, *arguments):
+        self.asked += 1
+        return self.fails(function, arguments)
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +91,19 @@ def pairs():
     ]
 
 
-def pool(workers, submaps_kept=3):
-    """Executors whose processes soon drop a submap."""
-    return VerificationPool([LastFirst() for _ in range(workers)], submaps_kept)
+@pytest.fixture
+def pool(monkeypatch):
+    """Makes pools with small batches, whose processes soon drop a submap."""
+    monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)
+    monkeypatch.setattr(pair_verification, "SUBMAPS_KEPT", 3)
+    monkeypatch.setattr(pair_verification, "NAMES_KEPT", 4)
+    with ExitStack() as stack:
+
+        def make(workers):
+            executors = [stack.enter_context(LastFirst()) for _ in range(workers)]
+            return VerificationPool(lambda: executors)
+
+        yield make
 
 
 def written(checks):
@@ -71,7 +114,7 @@ def written(checks):
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 20])
-def test_a_pool_finds_what_is_found_here(pairs, workers):
+def test_a_pool_finds_what_is_found_here(pairs, workers, pool):
     """The limits are such that the noise of the submaps, which its processes do not know, decides some pairs."""
     asked = []
     noisy = [pair._replace(noise=lambda: asked.append(1) or 0.5) for pair in pairs]
@@ -85,13 +128,100 @@ def test_a_pool_finds_what_is_found_here(pairs, workers):
     assert len({check.strict for check in found}) == 2, "pairs of both kinds"
 
 
-def test_no_pairs_need_no_batch():
-    executor = LastFirst()
-    assert VerificationPool([executor], 2)([], VerificationConfig()) == []
-    assert not executor.tasks
+def test_a_submap_read_from_its_bytes_is_the_same(pairs):
+    for submap in (pairs[0].a, pairs[-1].b):
+        data = submap_bytes(submap)
+        again = read_submap(data)
+        assert submap_bytes(again) == data
+        assert again.surface.points.flags.writeable
+        assert again.free.cells.flags.c_contiguous
 
 
-def test_a_fleet_with_a_pool_is_the_same(packets):
+def test_a_submap_is_sent_once_however_often_it_is_built(pairs, monkeypatch):
+    monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)
+    sent = []
+
+    def run(function, arguments):
+        sent.extend(arguments[1])
+        done = Future()
+        done.set_result(function(*arguments))
+        return done
+
+    executor = Failing(run)
+    verify = VerificationPool(lambda: [executor])
+    for _ in range(3):
+        rebuilt = [pair._replace(a=pickle.loads(pickle.dumps(pair.a))) for pair in pairs]
+        verify(rebuilt, VerificationConfig())
+    assert 0 < len(sent) == len(set(sent))
+
+
+def gone(function, arguments):
+    raise BrokenExecutor("it is gone")
+
+
+def dies(function, arguments):
+    future = Future()
+    future.set_exception(ConnectionError("it died"))
+    return future
+
+
+def is_cancelled(function, arguments):
+    future = Future()
+    future.cancel()
+    return future
+
+
+def stays_away(function, arguments):
+    return Future()
+
+
+def forgets(function, arguments):
+    future = Future()
+    future.set_result(list(arguments[0]))
+    return future
+
+
+@pytest.mark.parametrize("fails", [gone, dies, is_cancelled, stays_away, forgets])
+def test_what_a_process_does_not_do_is_done_by_others(pairs, fails, pool, monkeypatch, caplog):
+    monkeypatch.setattr(pair_verification, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(pair_verification, "PATIENCE_FACTOR", 0.0)
+    failing, config = Failing(fails), VerificationConfig()
+    expected = written(verify_here(pairs, config))
+    with LastFirst() as works:
+        verify = VerificationPool(lambda: [failing, works])
+        for _ in range(3):
+            assert written(verify(pairs, config)) == expected
+    assert failing.asked
+    if fails is not forgets:
+        assert failing.asked <= pair_verification.AHEAD + 1, "it rests, or still has what it was given"
+    assert len([record for record in caplog.records if record.levelname == "WARNING"]) == (fails is gone)
+
+
+def test_an_error_of_the_pairs_is_that_of_this_process(pairs, pool):
+    broken = [pair._replace(T_a_b_guess=np.zeros(1)) for pair in pairs]
+    with pytest.raises((IndexError, ValueError, TypeError)) as here:
+        verify_here(broken, VerificationConfig())
+    with pytest.raises(here.type):
+        pool(2)(broken, VerificationConfig())
+
+
+def test_few_pairs_need_no_batch():
+    executor = Failing(gone)
+    assert VerificationPool(lambda: [executor])([], VerificationConfig()) == []
+    assert not executor.asked
+
+
+@pytest.mark.parametrize(
+    ("count", "processes", "least", "lengths"),
+    [(0, 3, 5, [0]), (9, 3, 5, [9]), (10, 3, 5, [5, 5]), (39, 3, 5, [6, 7, 6, 7, 6, 7]), (1000, 2, 5, [125] * 8)],
+)
+def test_batches_are_long_enough_and_as_many_for_each_process(count, processes, least, lengths):
+    batches = pair_verification._split(count, processes, least)
+    assert [len(batch) for batch in batches] == lengths
+    assert [k for batch in batches for k in batch] == list(range(count))
+
+
+def test_a_fleet_with_a_pool_is_the_same(packets, pool):
     results = []
     for options in ({}, {"verify_pairs": pool(3)}):
         fleet = Fleet(FleetConfig(), 0, **options)
@@ -102,9 +232,15 @@ def test_a_fleet_with_a_pool_is_the_same(packets):
 
 
 @pytest.mark.slow
-def test_processes_find_what_is_found_here(pairs):
+def test_processes_find_what_is_found_here(pairs, monkeypatch):
+    """One of them is killed."""
+    monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)
     config = VerificationConfig()
     with ProcessPoolExecutor(1, get_context("spawn")) as one, ProcessPoolExecutor(1, get_context("spawn")) as two:
-        found = VerificationPool([one, two], 4)
-        for batch in (pairs, pairs[::-1], pairs[3:9]):
+        found = VerificationPool(lambda: [one, two])
+        killed = one.submit(os.getpid).result()
+        two.submit(os.getpid).result()
+        for batch in (pairs, pairs[::-1], pairs[3:9], pairs):
             assert written(found(batch, config)) == written(verify_here(batch, config))
+            if len(batch) < len(pairs):
+                os.kill(killed, signal.SIGKILL)

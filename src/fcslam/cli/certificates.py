@@ -23,13 +23,19 @@ def certificates(
     admin: Annotated[
         list[str] | None, typer.Option(help="Name of a user who may also manage missions. Can be repeated.")
     ] = None,
+    cluster: Annotated[
+        bool,
+        typer.Option(
+            "--cluster", help="Also make an authority and a certificate for a Dask cluster, see `fcslam map --workers`."
+        ),
+    ] = False,
 ) -> None:
     """Make a certificate authority, certificates of the service and of robots, and tokens for robots and users."""
     import datetime
 
     from fcslam.cloud.sessions import check_robot
     from fcslam.errors import InputError, PacketError
-    from fcslam.service.credentials import make_credentials
+    from fcslam.service.credentials import make_cluster_credentials, make_credentials
     from fcslam.service.http.authentication import Role
     from fcslam.wire.checks import check_name
 
@@ -43,7 +49,10 @@ def certificates(
             check_robot(name)
         except PacketError as error:
             raise InputError(str(error)) from error
-    make_credentials(output, host or [], dict(names), datetime.datetime.now(datetime.UTC))
+    now = datetime.datetime.now(datetime.UTC)
+    make_credentials(output, host or [], dict(names), now)
+    if cluster:
+        make_cluster_credentials(output, now)
     typer.echo(f"authority, for all clients: {output / 'ca.pem'}")
     typer.echo(f"for the service: {output / 'cloud.pem'}, {output / 'cloud.key'}, {output / 'tokens.yaml'}")
     for name, role in names:
@@ -51,3 +60,6 @@ def certificates(
         if role is Role.ROBOT:
             stem = output / "robots" / name
             typer.echo(f"or, for a service with --client-ca, instead of the token: {stem}.pem, {stem}.key")
+    if cluster:
+        stem = output / "cluster"
+        typer.echo(f"for a cluster, robots excepted: {stem / 'ca.pem'}, {stem / 'member.pem'}, {stem / 'member.key'}")

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.mission_options import ConfigFile, Fusion, MissionSeed, NoFuse, PresetName, mission_config
-from fcslam.cli.options import Force, Quiet, output_option
+from fcslam.cli.options import (
+    Force,
+    Quiet,
+    WorkerCa,
+    WorkerCertificate,
+    WorkerKey,
+    WorkersOption,
+    output_option,
+)
 from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line
 from fcslam.cli.recordings import (
     CameraTopic,
@@ -31,6 +39,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.lidar.pair_verification import VerifyPairs
     from fcslam.mission import MissionConfig, Progress
     from fcslam.mission_file import SavedMission
     from fcslam.page.live_map import LiveMap
@@ -90,10 +99,16 @@ def map_recordings(
     open_browser: OpenBrowser = None,
     force: Force = False,
     quiet: Quiet = False,
+    workers: WorkersOption = "1",
+    workers_ca: WorkerCa = None,
+    workers_certificate: WorkerCertificate = None,
+    workers_key: WorkerKey = None,
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
     with _without_collection():
         from fcslam.api import split_recordings
+        from fcslam.cluster.verifying import verifying
+        from fcslam.cluster.workers import Workers
         from fcslam.errors import InputError
         from fcslam.mission import continued_config
         from fcslam.mission_file import read_mission
@@ -109,8 +124,9 @@ def map_recordings(
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         sources = split_recordings(open_recordings(logs or [], options), split)
         floors = floors_of(floor or [], [source.name for source in sources])
-    with live_page(output, port, open_browser) if live else nullcontext() as page:
-        map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page, floors)
+    chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
+    with verifying(chosen) as verify, live_page(output, port, open_browser) if live else nullcontext() as page:
+        map_sources(sources, settings, output, notices(quiet), force, vetoes, earlier, page, floors, verify)
 
 
 def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, str]:
@@ -139,6 +155,7 @@ def map_sources(
     earlier: "SavedMission | None" = None,
     page: "LiveMap | None" = None,
     floors: "Mapping[str, str]" = MappingProxyType({}),
+    verify_pairs: "VerifyPairs | None" = None,
 ) -> "Run":
     """Run the mission, write the run folder and print a summary; progress and notices go to ``console``.
 
@@ -147,6 +164,7 @@ def map_sources(
     with _without_collection():
         from fcslam import api
         from fcslam.cli.progress import ProgressDisplay
+        from fcslam.lidar.pair_verification import verify_here
 
         surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
         gc.freeze()
@@ -160,6 +178,7 @@ def map_sources(
         run = api.map_recordings(
             sources, config=settings, vetoes=vetoes, progress=progress, processes=cores(), onto=earlier,
             live=None if page is None else page.look, floors=floors,
+            verify_pairs=verify_pairs or verify_here,
         )  # fmt: skip
         display.start("writing")
         run.save(output, force)

@@ -22,6 +22,36 @@ BuildingKind = Annotated[Building, typer.Option("--building", help="Kind of buil
 PathLength = Annotated[float, typer.Option(min=1.0, max=10_000.0, help="Distance that each robot drives, in metres.")]
 NoCamera = Annotated[bool, typer.Option("--no-camera", help="Simulate LiDARs only. This needs no GL library.")]
 
+_WORKERS = "Workers"
+WorkersOption = Annotated[
+    str,
+    typer.Option(
+        "--workers",
+        metavar="N|ADDRESS",
+        help="Processes that verify closures, this one included, or the Dask scheduler of a cluster: "
+        "tls://HOST:PORT or tcp://HOST:PORT. The result is the same.",
+        rich_help_panel=_WORKERS,
+    ),
+]
+WorkerCa = Annotated[
+    Path | None,
+    typer.Option(
+        "--workers-ca",
+        help="Certificate of the authority of the cluster (PEM). Everybody with a certificate of it can run programs "
+        "on the cluster and here.",
+        show_default="as Dask is configured",
+        rich_help_panel=_WORKERS,
+    ),
+]
+WorkerCertificate = Annotated[
+    Path | None,
+    typer.Option("--workers-certificate", help="Own certificate for the cluster (PEM).", rich_help_panel=_WORKERS),
+]
+WorkerKey = Annotated[
+    Path | None,
+    typer.Option("--workers-key", help="Private key of --workers-certificate (PEM).", rich_help_panel=_WORKERS),
+]
+
 
 def output_option(description: str, parent: str) -> Any:
     """The option ``--output``, whose default is a new folder ``parent/<time>``; see ``output.new_folder``."""

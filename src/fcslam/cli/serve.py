@@ -8,7 +8,7 @@ import typer
 
 from fcslam.cli.listening import listen
 from fcslam.cli.mission_options import ConfigFile, mission_config
-from fcslam.cli.options import Quiet
+from fcslam.cli.options import Quiet, WorkerCa, WorkerCertificate, WorkerKey, WorkersOption
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import tell_uncached
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from fcslam.cloud.settings import CloudConfig
+    from fcslam.cluster.workers import Workers
     from fcslam.service.http.authentication import Authenticator
     from fcslam.service.http.state import ServiceState
 
@@ -58,11 +59,17 @@ def serve(
     ] = None,
     docs: Annotated[bool, typer.Option("--docs", help="Describe the REST interface at /docs.")] = False,
     quiet: Quiet = False,
+    workers: WorkersOption = "1",
+    workers_ca: WorkerCa = None,
+    workers_certificate: WorkerCertificate = None,
+    workers_key: WorkerKey = None,
 ) -> None:
     """Receive packets of robots, map them, and serve map, trajectories and metrics; Ctrl-C stops the service."""
     import gc
     import logging
 
+    from fcslam.cluster.verifying import verifying
+    from fcslam.cluster.workers import Workers
     from fcslam.errors import ServiceError
     from fcslam.page.routes import documentation_router, page_router
     from fcslam.service.http.app import create_app
@@ -73,11 +80,16 @@ def serve(
     if is_open and not _is_loopback(host):
         raise ServiceError(f"everybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
     _check_tls(tls_certificate, tls_key, client_ca)
+    chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
+    chosen.check()
+    if chosen.is_cluster:
+        with verifying(chosen):  # refused here, not by the worker of each mission
+            pass
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with listen(host, port) as listening:
         authenticator = _authenticator(tokens, client_ca)
-        state = _state(data, authenticator, _cloud_config(config), learning)
+        state = _state(data, authenticator, _cloud_config(config), learning, chosen)
         _reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()
@@ -148,7 +160,10 @@ def _reload_on_hangup(state: "ServiceState", tokens: Path | None) -> None:
     signal.signal(signal.SIGHUP, reload)
 
 
-def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", learning: Path | None) -> "ServiceState":
+def _state(
+    data: Path, authenticator: "Authenticator", config: "CloudConfig", learning: Path | None, workers: "Workers"
+) -> "ServiceState":
+    import sys
     import time
 
     from fcslam.service.audit_log import AuditLog
@@ -159,9 +174,11 @@ def _state(data: Path, authenticator: "Authenticator", config: "CloudConfig", le
     from fcslam.service.supervisor import Supervisor
 
     events = EventStream()
+    command = (sys.executable, "-m", "fcslam.service.worker", *workers.options())
     missions = Missions(
-        data, config, time.monotonic, time.time, lambda folder: Supervisor(folder, time.monotonic, events.publish)
-    )
+        data, config, time.monotonic, time.time,
+        lambda folder: Supervisor(folder, time.monotonic, events.publish, command),
+    )  # fmt: skip
     audit = AuditLog(data / "audit.jsonl", time.time)
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, learning)
 

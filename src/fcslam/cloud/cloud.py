@@ -13,6 +13,7 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import in_session, session_name
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
+from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.records import Correction, Place, WordPlace, frozen
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Packet
@@ -22,8 +23,8 @@ from fcslam.wire.packets import decode, encode
 class Cloud:
     """A fleet and the packets that it is made of, in memory."""
 
-    def __init__(self, config: FleetConfig, seed: int) -> None:
-        self.fleet = Fleet(config, seed)
+    def __init__(self, config: FleetConfig, seed: int, verify_pairs: VerifyPairs = verify_here) -> None:
+        self.fleet = Fleet(config, seed, verify_pairs)
         self._log = PacketLog()
         self._packets: dict[PacketNumber, Packet] = {}
         self._corrections: dict[str, SessionCorrection] = {}
@@ -49,11 +50,14 @@ class Cloud:
         }
 
     @classmethod
-    def restored(cls, config: FleetConfig, seed: int, state: State, packets: Iterable[Packet]) -> Self:
+    def restored(
+        cls, config: FleetConfig, seed: int, state: State, packets: Iterable[Packet],
+        verify_pairs: VerifyPairs = verify_here,
+    ) -> Self:  # fmt: skip
         """The cloud of a ``state`` under the same configuration and seed; ``packets`` are those that it applied."""
-        cloud = cls(config, seed)
+        cloud = cls(config, seed, verify_pairs)
         cloud._packets = {PacketNumber(in_session(packet).robot, packet.sequence): packet for packet in packets}
-        cloud.fleet = Fleet.restored(config, seed, state["fleet"], cloud._packets.__getitem__)
+        cloud.fleet = Fleet.restored(config, seed, state["fleet"], cloud._packets.__getitem__, verify_pairs)
         cloud._log = PacketLog.restored(state["log"])
         cloud._sent = state["sent"]
         for session, kept in state["corrections"].items():

@@ -5,6 +5,7 @@ cloud.pem, cloud.key    the cloud's certificate
 tokens.yaml             name, role and SHA-256 of every token: for the cloud
 tokens/<name>           the token itself: for its holder
 robots/<name>.pem, .key a robot's certificate, instead of a token
+cluster/                an authority of its own, and the certificate of a cluster's scheduler, workers and clients
 """
 
 import datetime
@@ -41,12 +42,29 @@ def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Rol
             (folder / part).mkdir(parents=True, exist_ok=True)
         authority = _authority(folder, now)
         served = [_host(host) for host in dict.fromkeys([*hosts, "localhost", "127.0.0.1", "::1"])]
-        _make_leaf(folder / "cloud", "fcslam cloud", ExtendedKeyUsageOID.SERVER_AUTH, served, authority, now)
+        _make_leaf(folder / "cloud", "fcslam cloud", [ExtendedKeyUsageOID.SERVER_AUTH], served, authority, now)
         for name in (name for name, role in names.items() if role is Role.ROBOT):
-            _make_leaf(folder / "robots" / name, name, ExtendedKeyUsageOID.CLIENT_AUTH, (), authority, now)
+            _make_leaf(folder / "robots" / name, name, [ExtendedKeyUsageOID.CLIENT_AUTH], (), authority, now)
         _add_tokens(folder, names)
     except (OSError, ValueError) as error:
         raise OutputError(f"{folder}: cannot write credentials ({error}); name a new folder") from error
+
+
+def make_cluster_credentials(folder: Path, now: datetime.datetime) -> None:
+    """Make what a cluster needs for TLS, in the folder ``cluster``; its authority stays if it is there.
+
+    Whoever has a certificate of this authority can run programs on the whole cluster, so it signs no robot's.
+
+    Raises:
+        OutputError: the folder cannot be used, or what is in it cannot be read.
+    """
+    cluster = folder / "cluster"
+    try:
+        cluster.mkdir(parents=True, exist_ok=True)
+        purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        _make_leaf(cluster / "member", "fcslam cluster", purposes, (), _authority(cluster, now), now)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{cluster}: cannot write credentials ({error}); name a new folder") from error
 
 
 def _authority(folder: Path, now: datetime.datetime) -> Authority:
@@ -67,17 +85,17 @@ def _authority(folder: Path, now: datetime.datetime) -> Authority:
 
 
 def _make_leaf(
-    stem: Path, common_name: str, purpose: x509.ObjectIdentifier, hosts: Sequence[x509.GeneralName],
+    stem: Path, common_name: str, purposes: Sequence[x509.ObjectIdentifier], hosts: Sequence[x509.GeneralName],
     authority: Authority, now: datetime.datetime,
 ) -> None:  # fmt: skip
-    """A certificate of the authority's, good for one purpose; that of a host names it."""
+    """A certificate of the authority's, good for these purposes; that of a host names it."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
     builder = _builder(name, authority[0].subject, key, now, LEAF_DAYS)
     builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
     usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True}
     builder = builder.add_extension(x509.KeyUsage(**usage), critical=True)
-    builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+    builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     if hosts:
         builder = builder.add_extension(x509.SubjectAlternativeName(hosts), critical=False)
     signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority[1].public_key())

@@ -4,12 +4,13 @@ It reads the store by turn and keeps the fleet in memory. It writes its results 
 live run folder, and the run folders that users request. From time to time it also writes its state. If it is killed,
 the next worker continues from that state, or from turn 0, and reports nothing new before it has caught up.
 
-    python -m fcslam.service.worker MISSION_FOLDER
+    python -m fcslam.service.worker [--workers ...] MISSION_FOLDER
 
 A byte on stdin means that there is work; the end of stdin means that the service is gone. The worker prints a line when
 it is ready, for its progress, for every change of the live run folder and for every answered request.
 """
 
+import argparse
 import fcntl
 import gc
 import json
@@ -36,8 +37,11 @@ from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
+from fcslam.cluster.verifying import verifying
+from fcslam.cluster.workers import Workers
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
+from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.processes import Background, Start, start_copy
 from fcslam.records import Edit
 from fcslam.runs import Metric, Run
@@ -80,15 +84,17 @@ class Worker:
     """One mission's fleet; ``step`` by ``step`` it follows what the store holds."""
 
     def __init__(
-        self, folder: MissionFolder, store: MissionStore, clock: Callable[[], float], tell: Tell, start: Start
-    ) -> None:
+        self, folder: MissionFolder, store: MissionStore, clock: Callable[[], float], tell: Tell, start: Start,
+        verify_pairs: VerifyPairs = verify_here,
+    ) -> None:  # fmt: skip
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._tell, self._start = folder, store, clock, tell, start
+        self._verify_pairs = verify_pairs
         self._crashes = CrashLog(folder.worker_task)
         self._ready: deque[StoredPacket] = deque()
         """Packets that may take effect and did not yet."""
-        self._fleet = Fleet(self._config.fleet, self._config.seed)
+        self._fleet = Fleet(self._config.fleet, self._config.seed, verify_pairs)
         self._log = PacketLog()
         self._arrivals = 0
         """How many packets were read."""
@@ -153,7 +159,7 @@ class Worker:
         self._resumed_at = max(self._resumed_at, self._applied)
         self._written = 0
         self._ready.clear()
-        self._fleet, self._log = Fleet(self._config.fleet, self._config.seed), PacketLog()
+        self._fleet, self._log = Fleet(self._config.fleet, self._config.seed, self._verify_pairs), PacketLog()
         self._arrivals, self._read_hash = 0, b""
         self._times.clear()
         self._tell(PROGRESS, 0)
@@ -242,7 +248,9 @@ class Worker:
             edits = [edit for edit in self._store.edits() if edit.number <= state["edits"]]
             if read_hash.hex() != state["hash"] or state["edits"] > (edits[-1].number if edits else 0):
                 raise InputError(f"{self._folder.snapshot}: is of other packets")
-            fleet = Fleet.restored(self._config.fleet, self._config.seed, state["fleet"], self._read)
+            fleet = Fleet.restored(
+                self._config.fleet, self._config.seed, state["fleet"], self._read, self._verify_pairs
+            )
             log = PacketLog.restored(state["log"])
         except Exception as error:  # a mission must never depend on its snapshot
             _log.warning("%s; the worker applies all packets again", str(error) or type(error).__name__)
@@ -411,15 +419,32 @@ def main(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
-    folder = MissionFolder(Path(arguments[0]))
-    alone = _alone(folder)
-    worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print, start_copy)
-    _print(READY, 0)
-    while True:
-        wait_s = 0.0 if worker.step() else worker.wait_s()
-        if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
-            alone.close()
-            return 0
+    chosen = _chosen(arguments)
+    folder, alone = chosen.folder, _alone(chosen.folder)
+    with verifying(chosen.workers, must_connect=False) as verify_pairs:
+        worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print, start_copy, verify_pairs)
+        _print(READY, 0)
+        while True:
+            wait_s = 0.0 if worker.step() else worker.wait_s()
+            if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
+                alone.close()
+                return 0
+
+
+class _Chosen(NamedTuple):
+    folder: MissionFolder
+    workers: Workers
+
+
+def _chosen(arguments: Sequence[str]) -> _Chosen:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--workers", default=Workers().where)
+    for file in ("ca", "certificate", "key"):
+        parser.add_argument(f"--workers-{file}", type=Path)
+    given = parser.parse_args(arguments)
+    workers = Workers(given.workers, given.workers_ca, given.workers_certificate, given.workers_key)
+    return _Chosen(MissionFolder(given.folder), workers)
 
 
 def _alone(folder: MissionFolder) -> IO[str]:
