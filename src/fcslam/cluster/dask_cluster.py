@@ -208,7 +208,7 @@ class DaskCluster:
             return f"has no fcslam ({_text(error)}); install fcslam {fcslam.__version__} there"
         other = f"has fcslam {there}, and this is {fcslam.__version__}; install the same version there"
         try:
-            identity = Identity(*await self._ask(address, identify))
+            identity = CodeIdentity(*await self._ask(address, identify))
         except Exception as error:
             return other if there != fcslam.__version__ else f"cannot verify closures ({_text(error)})"
         here = identify()
@@ -266,7 +266,7 @@ class DaskWorker(Executor):
         return self._cluster.submit(self._address, function, arguments)
 
 
-class Identity(NamedTuple):
+class CodeIdentity(NamedTuple):
     """What must be equal where closures are verified."""
 
     version: str
@@ -276,9 +276,9 @@ class Identity(NamedTuple):
 
 
 @cache
-def identify() -> Identity:
+def identify() -> CodeIdentity:
     """The identity of the process that runs this; it compiles what a batch needs."""
-    return Identity(fcslam.__version__, code_version(), hashlib.blake2b(_proof(), digest_size=16).hexdigest())
+    return CodeIdentity(fcslam.__version__, code_version(), hashlib.blake2b(_proof(), digest_size=16).hexdigest())
 
 
 def _proof() -> bytes:
