@@ -267,7 +267,7 @@ class DaskWorker(Executor):
 
 
 class CodeIdentity(NamedTuple):
-    """What must be equal where closures are verified."""
+    """Properties that must be equal in all processes that verify closures."""
 
     version: str
     code: str
@@ -310,7 +310,7 @@ def _ranges(laser: LaserModel, pose: np.ndarray) -> np.ndarray:
 
 
 def _quiet() -> None:
-    """What Dask logs of lost connections is said here once; batches with many new submaps are large, and no fault."""
+    """Silence Dask: this module logs a lost connection once, and a batch may be large."""
     import dask
 
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GiB"})
@@ -319,7 +319,7 @@ def _quiet() -> None:
 
 
 def _note(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """What asyncio would print of connections that Dask gave up."""
+    """Log errors of connections that Dask gave up, which asyncio would print."""
     _log.debug("%s: %s", context["message"], context.get("exception"))
 
 

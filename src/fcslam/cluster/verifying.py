@@ -12,7 +12,7 @@ from fcslam.processes import obey_parent
 
 @contextmanager
 def verifying(workers: Workers, must_connect: bool = True) -> Iterator[VerifyPairs]:
-    """What verifies pairs until the block ends. All of them give the same results.
+    """Verify pairs on the chosen processes until the block ends. All of them give the same results.
 
     Args:
         workers: the processes.

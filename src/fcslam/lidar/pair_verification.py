@@ -157,7 +157,7 @@ class VerificationPool:
                 call.done[batch] = found
 
     def _result(self, peer: "_Peer", future: "Future[Answer]", count: int) -> list[Aligned] | None:
-        """What the process found; None: another one must repeat the batch."""
+        """The answer of the process; None: another one must repeat the batch."""
         if not future.done():
             self._failed(peer, TimeoutError("no answer"))
             return None
