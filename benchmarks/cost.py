@@ -6,7 +6,7 @@ Ten simulated buildings, each a mission of its own. The robots of a fleet are sp
 robots are in as many buildings, a hundred are ten in each. A robot drives 60 m with a LiDAR of 360 beams at 10 Hz. The
 same robots are in every fleet, so the front end of each runs once.
 
-CPU is user and system, all threads, after the first robot has loaded all compiled code. "Robot": the front end with
+CPU is user and system, all threads, after two robots have loaded all compiled code. "Robot": the front end with
 every packet that it sends. "Cloud": decode, match, verify and solve as packets come, in the order of their stamps.
 "End": the last robust solve, the fused map and the mission file. HTTP and the write of each packet come on top;
 `live.py` measures them. "Sent" counts packets as a robot sends them, "stored" the mission file. Area: known cells of
@@ -17,6 +17,7 @@ import heapq
 import itertools
 import time
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,9 +104,8 @@ def building_rows(building: int, sizes: Iterable[int]) -> Iterable[Spent]:
     """What a building costs with its first robots, for each number of them."""
     config = MissionConfig()
     settings = SimulationSettings(robots=LARGEST, path_length_m=PATH_M, camera=None, lidar=LidarSettings(rate_hz=10.0))
-    if building == 0:
-        warm_up(config)
     robots = simulate_fleet(settings, SEED + building).robots
+    warm_up()
     driven = [drive(robot, config) for robot in robots[: max(sizes)]]
     for size in sizes:
         print(f"building {building + 1}: {size} robots", flush=True)
@@ -148,9 +148,11 @@ def map_building(driven: list[Driven], config: MissionConfig) -> Spent:
     )
 
 
-def warm_up(config: MissionConfig) -> None:
-    """Load or compile every kernel of robot and cloud."""
-    settings = SimulationSettings(robots=2, path_length_m=20.0, camera=None, lidar=LidarSettings(rate_hz=5.0))
+@cache
+def warm_up() -> None:
+    """Load or compile every kernel of robot and cloud, once in a process."""
+    config = MissionConfig()
+    settings = SimulationSettings(robots=2, path_length_m=PATH_M, camera=None, lidar=LidarSettings(rate_hz=10.0))
     map_building([drive(robot, config) for robot in simulate_fleet(settings, SEED - 1).robots], config)
 
 
