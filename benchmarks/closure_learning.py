@@ -1,55 +1,66 @@
-"""What a detector learns from the fleet's own closures: federated training on places that robots saw again.
+"""What a detector learns from the fleet's own maps: federated training on points that robots saw again.
 
-    python benchmarks/closure_learning.py --fleets FOLDER [--keep ROWS.jsonl] [--train 301 ...] [--test 401 ...]
+    python benchmarks/closure_learning.py --fleets FOLDER [--keep ROWS.jsonl] [--train 301 ...] [--test 411 ...]
 
 Simulated fleets of three robots, 45 m each, by day, in the evening and with a third of the lamps off; half of the
 furniture moves before the second and the third robot. In the training buildings three more robots drive later, in the
-same three kinds of light, among other furniture. Each training fleet is mapped by camera places alone. From its
-estimated poses and accepted closures come the examples (`learning/revisits.py`, `cloud/teaching.py`): pairs of a
-robot's own keyframes, codes that at least two places of other robots agree on, and labels of keypoints by whether they
-were found again. True poses serve the evaluation only.
+same three kinds of light, among other furniture. Each training fleet is mapped by camera places alone, and all examples
+come from estimated poses (`learning/revisits.py`, `cloud/teaching.py`). True poses serve the evaluation only.
 
-All networks start from the bundled one. By default only the head of the codes is trained, so all find the same
-keypoints. Federated arms have every robot of every building as a client, and a third of them trains in a round. Central
-training has as many steps as all robots together, and a robot alone as many as one that trains in every round.
+All networks start from the bundled one. Robots train the layers of the codes (`learning/code_training.py`), on pairs of
+their own keyframes that show the same points of their map. Federated arms have every robot of every building as a
+client, and a sixth of them trains in a round. Central training has as many steps as all robots together, and a robot
+alone as many as one that trains in every round.
 
-- homographies: two views of one image under a random homography, labels from the bundled detector, federated
-- own revisits: that, pairs of each robot's own keyframes, and labels by what was found again, federated
-- closures: that, and the codes of other robots, federated
-- central: homographies, own pairs, and pairs across robots, whose images are in one place
-- alone: own revisits, one robot in each of three buildings; the mean over the three networks
+- homographies: as many pairs, each of two views of one image under a random homography, federated
+- own map: pairs of each robot's own keyframes, federated
+- closures: that, and codes on which places of at least two other keyframes agree, federated
+- poisoned: as closures, but one robot of five sends codes at random and reverses its updates, ten times as long
+- central: pairs of one robot and across robots, whose images are in one place
+- alone: own map, one robot in each of three buildings; the mean over the three networks
 
 Measured on unseen buildings and on later drives, between robots in different light, at places that an image shows every
 metre or half radian. Keypoint recall: mutual nearest neighbours of 300 keypoints that are right to 3 px by the true
 poses, divided by the keypoints that have a partner. Candidates: all pairs of images of two robots, by the inliers of
 the best motion; right if the views overlap by a half, wrong if by less than a tenth. Intervals are 95 %, by bootstrap
-over buildings, of the difference to the bundled detector.
+over buildings, of the difference to the bundled detector. The table of forgetting has 25 pairs of photographs of other
+places, corrected, NMS 8 px; it needs FCSLAM_DATA.
 
-All seeds were fixed before the first run. --keep resumes by arm and seed. It needs a GL library, and with the default
-size about two hours of one core; `--train 301 302 --test 401 402 403 404 --seeds 1` takes some ten minutes.
+All seeds were fixed before the first run. The recipe was chosen on networks that were trained in buildings 301 to 307
+and measured in 501 to 503. --keep resumes by arm, seed and building; networks and mapped drives stay in FOLDER, and
+drives are mapped again only if their file is removed. It needs a GL library, and with the default size about an hour of
+one core.
 """
 
 import pickle
+import shutil
 import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import common
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
-from fcslam.cloud.teaching import PlacePoints, teach
+from fcslam.cloud.teaching import HEAD_BYTES, RECORD_BYTES, PlacePoints, teach
+from fcslam.evaluation.detectors.evaluated_detectors import choose_detectors
+from fcslam.evaluation.detectors.homography import evaluate_homography
+from fcslam.evaluation.detectors.measures import mean
+from fcslam.evaluation.detectors.scenes import SceneKind, find_scenes
 from fcslam.evaluation.federated.mapped_drives import MappedDrive, Tie, map_drives, ties
+from fcslam.evaluation.federated.poison import PoisonedClient
 from fcslam.evaluation.places.sets import OTHER_OVERLAP, SAME_OVERLAP
 from fcslam.evaluation.places.simulated_views import EVERY_M, EVERY_RAD, lidar_overlap
 from fcslam.features.codes import Matches, mutual_matches
 from fcslam.features.detector import BUNDLED_NETWORK, FeatureDetector, OnnxConfig, OnnxDetector, decode_grey
+from fcslam.features.detector_kinds import EvaluatedDetectorKind
 from fcslam.features.lidar_depth import LidarView
-from fcslam.federated.client import RobotClient, seeded_noise
+from fcslam.federated.client import FederatedClient, RobotClient, seeded_noise
 from fcslam.federated.client_app import build_client_app
 from fcslam.federated.codec import weights_to_network, weights_version
 from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
@@ -58,17 +69,19 @@ from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
 from fcslam.geometry import se2
+from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
-from fcslam.learning.local_training import LocalTrainingPlan, local_training
+from fcslam.learning.labels import WORST_QUALITY, Labels
+from fcslam.learning.local_training import LocalTrainingPlan
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.pairs import TrainingExample
-from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, TaughtImage
-from fcslam.learning.revisits import Keyframe, correspond, predict, revisit_labels
+from fcslam.learning.pairs import TrainingExample, draw_pair
+from fcslam.learning.revisit_batches import MOST_POINTS, RevisitExamples, RevisitPair, TaughtImage
+from fcslam.learning.revisits import FARTHEST_M, FEWEST_SHARED, Keyframe, predict, revisits_in_map
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.stages import TrainingImages
 from fcslam.learning.trainer import ExecutionOptions
 from fcslam.lidar.scan import point_scan
-from fcslam.metrics.bootstrap import mean_interval
+from fcslam.metrics.bootstrap import Interval, mean_interval
+from fcslam.metrics.framing import HomographyGroundTruth
 from fcslam.metrics.retrieval import PairTruth, multi_match_curve
 from fcslam.metrics.trajectory import interpolate
 from fcslam.mission import MissionConfig
@@ -81,14 +94,13 @@ from fcslam.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.sources import Recording
 
-TRAIN, TEST, SEEDS = tuple(range(301, 311)), tuple(range(401, 411)), (1, 2, 3)
+TRAIN, TEST, SEEDS = tuple(range(301, 311)), tuple(range(411, 421)), (1, 2, 3)
 ROBOTS = ("robot_1", "robot_2", "robot_3")
 LATER = ("robot_4", "robot_5", "robot_6")
 LIGHT = (Lighting.DAY, Lighting.EVENING, Lighting.LAMP_OFF)
-FEWEST_POINTS = 12
-"""Correspondences of a pair, or taught points of an image, that make it an example."""
-FARTHEST_M = 4.0
-"""Places farther apart teach each other nothing."""
+LOCAL_STEPS, PARTICIPATION = 10, 1.0 / 6.0
+LIAR, POISONED = "robot_3", (0, 2, 4, 5, 7, 9)
+"""The robot that poisons, and the numbers of the training buildings in which it does: 6 of 30 robots."""
 CORRECT_PX = 3.0
 PAIR_OVERLAP = 0.2
 """Least overlap of two views between which keypoint recall is measured."""
@@ -96,10 +108,26 @@ PAIRS_A_BUILDING = 120
 """Most pairs of views per building on which keypoint recall is measured."""
 ALONE = 3
 """Robots that train alone."""
-ARMS = ("bundled", "homographies", "own revisits", "closures", "central", "alone")
+ARMS = ("bundled", "homographies", "own map", "closures", "poisoned", "central", "alone")
+REPEATED = ("own map",)
+"""Arms with all training seeds; the others have the first."""
+LATER_DRIVEN = ("bundled", "homographies", "own map", "closures")
+"""Arms that are also measured on later drives, with the first training seed."""
+COMPARED = (
+    ("own map", "homographies"),
+    ("own map", "alone"),
+    ("own map", "central"),
+    ("closures", "own map"),
+    ("poisoned", "closures"),
+)
+"""Arms that are compared with one another."""
 UNSEEN, LATER_DRIVES = "unseen buildings", "later drives"
 MEASURES = ("keypoint recall", "precision", "matches a pair", "average precision", "recall at 95 %", "recall at 100 %")
 COLUMNS = {"": "s", "seeds": "d"} | dict.fromkeys(MEASURES, "s")
+SCENES, NMS_PX = ("oxford_affine", "hpatches_subset"), 8
+FORGETTING = {"arm": "s", "seed": "d"} | dict.fromkeys(
+    ("repeatability, illumination", "viewpoint", "homography, 1 px", "3 px", "5 px", "MMA@3", "matching score"), ".3f"
+)
 ROWS = {"arm": "s", "seed": "d", "on": "s", "building": "d"} | dict.fromkeys(MEASURES, ".4f")
 
 
@@ -116,28 +144,26 @@ class TrueView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Examples:
+class Learner:
     """What one robot has to train on."""
 
     robot: str
-    plain: tuple[TrainingExample, ...]
-    """Keyframes with labels from the bundled detector."""
-    labelled: tuple[TrainingExample, ...]
-    """Keyframes with labels by what was found again."""
+    keyframes: tuple[TrainingExample, ...]
+    """Its images, with its keypoints as labels."""
     pairs: tuple[RevisitPair, ...]
     taught: tuple[TaughtImage, ...]
+    misled: tuple[TaughtImage, ...]
+    """As ``taught``, if the liar of the building sends codes at random."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fleet:
     """What one building gives for training."""
 
-    robots: tuple[Examples, ...]
-    across: tuple[RevisitPair, ...]
-    """Pairs of images of two robots, which only central training may use."""
+    learners: tuple[Learner, ...]
+    together: RevisitExamples
+    """Images of all robots in one place, with pairs across robots; positions in the fleet's map."""
     taught_bytes: int
-    within_ties: int
-    between_ties: int
 
 
 def main() -> None:
@@ -147,9 +173,7 @@ def main() -> None:
     parser.add_argument("--test", nargs="+", type=int, default=TEST, help="seeds of the unseen buildings")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of training")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="which networks")
-    parser.add_argument("--rounds", type=int, default=40, help="of federated training")
-    parser.add_argument("--local-steps", type=int, default=10, help="of a robot in a round")
-    parser.add_argument("--trained", choices=("codes", "all"), default="codes", help="layers")
+    parser.add_argument("--rounds", type=int, default=30, help="of federated training")
     parser.add_argument("--keep", type=Path, help="file that keeps finished arms; the same one resumes")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
@@ -159,37 +183,46 @@ def main() -> None:
     unseen = [recorded(seed, 3, chosen.fleets) for seed in chosen.test]
     examples = [fleet_examples(folder, chosen.fleets) for folder in fleets]
     settings = FederatedSettings(
-        rounds=chosen.rounds, local_steps=chosen.local_steps, participation=1.0 / len(ROBOTS), normalisation="frozen",
-        compatible=1.0, trained=chosen.trained,
-        training=TrainingSettings(pairs=2, side_px=160, points=160, learning_rate=1e-3),
+        rounds=chosen.rounds, local_steps=LOCAL_STEPS, participation=PARTICIPATION, normalisation="frozen",
+        compatible=2.0, trained="codes", training=TrainingSettings(learning_rate=1e-3),
     )  # fmt: skip
-    rows = []
+    rows: list[tuple] = []
+    forgetting: list[tuple] = []
     for arm in (arm for arm in ARMS if arm in chosen.arms):
-        for seed in chosen.seeds[: 1 if arm == "bundled" else None]:
-            with tempfile.TemporaryDirectory() as place:
-                train = partial(trained, arm, seed, examples, settings, Path(place))
-                key = (arm, seed, chosen.trained, chosen.rounds, chosen.local_steps, *chosen.train, *chosen.test)
-                measure = partial(arm_rows, arm, seed, train, fleets, unseen)
-                rows += kept.rows(key, measure)
+        for seed in chosen.seeds[: 3 if arm in REPEATED else 1]:
+            key = (arm, seed, chosen.rounds, *chosen.train)
+            place = chosen.fleets / "-".join(["networks", common.commit(), *map(str, key)]).replace(" ", "_")
+            networks = kept_networks(place, partial(trained, arm, seed, examples, settings))
+            forgetting += kept.rows((*key, "photographs"), partial(photograph_rows, arm, seed, networks))
+            for on, folders, names in ((UNSEEN, unseen, ROBOTS), (LATER_DRIVES, fleets, LATER)):
+                if on == LATER_DRIVES and (arm not in LATER_DRIVEN or seed != chosen.seeds[0]):
+                    continue
+                for folder in folders:
+                    measure = partial(building_row, arm, seed, on, folder, names, networks)
+                    rows += kept.rows((*key, on, int(folder.name)), measure)
             print(arm, seed, rows[-1], file=sys.stderr, flush=True)
+    report.picture("What the arms gain in unseen buildings, with 95 % intervals over buildings", draw(rows))
     report.table("Examples", EXAMPLES, map(examples_row, chosen.train, examples))
     for on in (UNSEEN, LATER_DRIVES):
         report.table(f"Above the bundled detector, {on}", COLUMNS, gains(rows, on))
         report.table(f"Means, {on}", COLUMNS, means(rows, on))
+    report.table("Differences, unseen buildings", COLUMNS, differences(rows))
+    report.table("Photographs of other places", FORGETTING, forgetting)
     report.table("Buildings", ROWS, rows)
     report.write()
 
 
-EXAMPLES = {"building": "d", "keyframes": "d", "own pairs": "d", "pairs across robots": "d", "taught images": "d",
-            "taught points": "d", "kB received": ".0f"}  # fmt: skip
+EXAMPLES = {"building": "d", "keyframes": "d", "pairs of one robot": "d", "pairs across robots": "d",
+            "taught images": "d", "taught points": "d", "kB received": ".0f"}  # fmt: skip
 
 
 def examples_row(seed: int, fleet: Fleet) -> tuple:
-    robots = fleet.robots
-    taught = [image for robot in robots for image in robot.taught]
+    learners = fleet.learners
+    taught = [image for learner in learners for image in learner.taught]
+    own = sum(len(learner.pairs) for learner in learners)
     return (
-        seed, sum(len(robot.plain) for robot in robots), sum(len(robot.pairs) for robot in robots), len(fleet.across),
-        len(taught), sum(len(image.points) for image in taught), fleet.taught_bytes / 1e3,
+        seed, sum(len(learner.keyframes) for learner in learners), own, len(fleet.together.pairs) - own, len(taught),
+        sum(len(image.points) for image in taught), fleet.taught_bytes / 1e3,
     )  # fmt: skip
 
 
@@ -206,145 +239,192 @@ def recorded(seed: int, robots: int, folder: Path) -> Path:
 
 
 def fleet_examples(folder: Path, kept: Path) -> Fleet:
-    """Map a fleet by camera places alone and collect what its robots learn from; kept in a file for each commit."""
-    file = kept / f"examples-{folder.name}-{common.commit()}.pickle"
+    """Map a fleet by camera places alone and collect what its robots learn from; the mapped drives are kept."""
+    file = kept / f"drives-{folder.name}.pickle"
     if not file.exists():
         config = MissionConfig(robot=RobotConfig(channels=(Channel.CAMERA,)))
         sources = [Recording(folder / name, name) for name in ROBOTS]
         drives, run = map_drives(sources, config, OnnxDetector(OnnxConfig()))
-        within, between = list(ties(drives, run, within=True)), list(ties(drives, run, within=False))
-        file.write_bytes(pickle.dumps(examples_of(drives, within, between)))
-    fleet: Fleet = pickle.loads(file.read_bytes())
+        file.write_bytes(pickle.dumps((drives, list(ties(drives, run)))))
+    examples = kept / f"examples-{folder.name}-{common.commit()}.pickle"
+    if not examples.exists():
+        drives, tied = pickle.loads(file.read_bytes())
+        examples.write_bytes(pickle.dumps(fleet_of(drives, tied)))
+    fleet: Fleet = pickle.loads(examples.read_bytes())
     print(folder.name, examples_row(int(folder.name), fleet), file=sys.stderr, flush=True)
     return fleet
 
 
-def examples_of(drives: dict[str, MappedDrive], within: Sequence[Tie], between: Sequence[Tie]) -> Fleet:
-    """Pairs, taught images and labels from keyframes that accepted closures connect."""
-    shown, found = defaultdict(list), defaultdict(list)
-    pairs: dict[str, list[RevisitPair]] = {name: [] for name in drives}
-    for tie in within:
-        first, second = drives[tie.robot_i].keyframes[tie.i], drives[tie.robot_j].keyframes[tie.j]
-        for each, other, T, key in (
-            (first, second, tie.T_i_j, (tie.robot_i, tie.i)),
-            (second, first, se2.inverse(tie.T_i_j), (tie.robot_j, tie.j)),
-        ):
-            same = correspond(each, other, T)
-            if len(same.rows) >= FEWEST_POINTS:
-                again = np.zeros(len(same.shown), np.bool_)
-                again[same.rows[:, 0]] = True
-                shown[key].append(same.shown)
-                found[key].append(again)
-                if each is first:
-                    pairs[tie.robot_i].append(pair_of(each, other, same.rows))
-    across, others_of = [], defaultdict(list)
-    for tie in between:
-        first, second = drives[tie.robot_i].keyframes[tie.i], drives[tie.robot_j].keyframes[tie.j]
-        if np.hypot(*tie.T_i_j[:2]) <= FARTHEST_M:
-            others_of[tie.robot_i, tie.i].append(points_of(second, tie.T_i_j))
-            others_of[tie.robot_j, tie.j].append(points_of(first, se2.inverse(tie.T_i_j)))
-        same = correspond(first, second, tie.T_i_j)
-        if len(same.rows) >= FEWEST_POINTS:
-            across.append(pair_of(first, second, same.rows))
-    taught: dict[str, list[TaughtImage]] = {name: [] for name in drives}
-    taught_bytes = 0
-    for (name, k), others in others_of.items():
-        frame = drives[name].keyframes[k]
-        codes = teach(points_of(frame, np.zeros(3)), others)
-        taught_bytes += codes.size_bytes
-        if len(codes.rows) >= FEWEST_POINTS:
-            pixels = frame.features.keypoints_px[frame.placed][codes.rows]
-            taught[name].append(TaughtImage(frame.image, pixels, codes.codes))
-    robots = tuple(
-        Examples(
-            name,
-            tuple(TrainingExample(f.image, revisit_labels(f.features, [], [])) for f in drive.keyframes),
-            tuple(
-                TrainingExample(f.image, revisit_labels(f.features, shown[name, k], found[name, k]))
-                for k, f in enumerate(drive.keyframes)
-            ),
-            tuple(pairs[name]),
-            tuple(taught[name]),
+def fleet_of(drives: dict[str, MappedDrive], tied: Sequence[Tie]) -> Fleet:
+    """Pairs that each robot finds in its own map, and codes for keyframes that accepted closures connect."""
+    learners = []
+    honest, misled = taught_images(drives, tied, None), taught_images(drives, tied, LIAR)
+    for name, drive in drives.items():
+        pairs = [
+            pair_of((i, j), drive.keyframes[i], drive.keyframes[j], rows, drive.T_own_base[i])
+            for i, j, rows in revisits_in_map(drive.keyframes, drive.T_own_base)
+        ]
+        keyframes = tuple(
+            TrainingExample(f.image, Labels(f.features.keypoints_px, ranked(len(f.features.scores))))
+            for f in drive.keyframes
         )
+        learners.append(Learner(name, keyframes, tuple(pairs), tuple(honest[name]), tuple(misled[name])))
+    largest = max(np.bincount([drive.map_index for drive in drives.values()]).argmax(), 0)
+    joint = [drive for drive in drives.values() if drive.map_index == largest]
+    frames = [frame for drive in joint for frame in drive.keyframes]
+    poses = np.concatenate([drive.T_map_base for drive in joint])
+    everything = [
+        pair_of((i, j), frames[i], frames[j], rows, poses[i]) for i, j, rows in revisits_in_map(frames, poses)
+    ]
+    received = sum(HEAD_BYTES + RECORD_BYTES * len(image.points) for name in drives for image in honest[name])
+    return Fleet(tuple(learners), RevisitExamples([frame.image for frame in frames], everything), received)
+
+
+def taught_images(
+    drives: dict[str, MappedDrive], tied: Sequence[Tie], liar: str | None
+) -> dict[str, list[TaughtImage]]:
+    """By robot, the codes that others gave to its points; the liar, if there is one, sends codes at random."""
+    rng = np.random.default_rng(1)
+    sent = {
+        (name, k): points_of(frame, np.zeros(3))
         for name, drive in drives.items()
-    )
-    return Fleet(robots, tuple(across), taught_bytes, len(within), len(between))
+        for k, frame in enumerate(drive.keyframes)
+    }
+    for (name, k), points in sent.items():
+        if name == liar:
+            sent[name, k] = PlacePoints(points.positions, rng.integers(0, 256, points.codes.shape).astype(np.uint8))
+    others_of = defaultdict(list)
+    for tie in tied:
+        if np.hypot(*tie.T_i_j[:2]) <= FARTHEST_M:
+            ends = (tie.robot_i, tie.i), (tie.robot_j, tie.j)
+            others_of[ends[0]].append(moved(sent[ends[1]], tie.T_i_j))
+            others_of[ends[1]].append(moved(sent[ends[0]], se2.inverse(tie.T_i_j)))
+    taught: dict[str, list[TaughtImage]] = {name: [] for name in drives}
+    for (name, k), others in others_of.items():
+        drive = drives[name]
+        frame = drive.keyframes[k]
+        codes = teach(points_of(frame, np.zeros(3)), others)
+        if len(codes.rows) >= FEWEST_SHARED:
+            placed = moved(points_of(frame, np.zeros(3)), drive.T_own_base[k])
+            pixels = frame.features.keypoints_px[frame.placed][codes.rows]
+            taught[name].append(TaughtImage(k, pixels, codes.codes, placed.positions[codes.rows]))
+    return taught
+
+
+def ranked(count: int) -> np.ndarray:
+    """Qualities (count,) of keypoints that fall with their rank."""
+    return np.linspace(1.0, WORST_QUALITY, count, dtype=np.float32)
 
 
 def points_of(frame: Keyframe, T: FloatArray) -> PlacePoints:
     """What the cloud knows of a keyframe, moved by a pose (3,)."""
-    positions = frame.positions[frame.placed].copy()
+    return moved(PlacePoints(frame.positions[frame.placed], frame.features.descriptors[frame.placed]), T)
+
+
+def moved(points: PlacePoints, T: FloatArray) -> PlacePoints:
+    positions = points.positions.copy()
     positions[:, :2] = se2.transform(T, positions[:, :2])
-    return PlacePoints(positions, frame.features.descriptors[frame.placed])
+    return PlacePoints(positions, points.codes)
 
 
-def pair_of(first: Keyframe, second: Keyframe, rows: np.ndarray) -> RevisitPair:
+def pair_of(
+    images: tuple[int, int], first: Keyframe, second: Keyframe, rows: np.ndarray, T_map_first: FloatArray
+) -> RevisitPair:
     points = (first.features.keypoints_px[rows[:, 0]], second.features.keypoints_px[rows[:, 1]])
-    return RevisitPair((first.image, second.image), points)
+    positions = first.positions[rows[:, 0]].copy()
+    positions[:, :2] = se2.transform(T_map_first, positions[:, :2])
+    return RevisitPair(images, points, positions)
+
+
+def homography_pairs(learner: Learner, seed: int) -> RevisitExamples:
+    """As many pairs as the robot has in its map, each of two views of one image under a random homography."""
+    rng = np.random.default_rng([seed, len(learner.keyframes)])
+    images, pairs = [], []
+    for k in range(len(learner.pairs)):
+        example = learner.keyframes[k % len(learner.keyframes)]
+        pair = draw_pair(example, example.image.shape[::-1], MOST_POINTS, 0, rng)
+        first, second = pair.views
+        images += [np.round(255.0 * view.image).clip(0, 255).astype(np.uint8) for view in (first, second)]
+        nowhere = np.full((int(pair.valid.sum()), 3), np.nan)
+        pairs.append(RevisitPair((2 * k, 2 * k + 1), (first.points[pair.valid], second.points[pair.valid]), nowhere))
+    return RevisitExamples(images, pairs)
+
+
+def revisits_of(arm: str, learner: Learner, lied_to: bool, seed: int) -> RevisitExamples:
+    """What a robot of the fleet trains on in an arm."""
+    if arm == "homographies":
+        return homography_pairs(learner, seed)
+    images = [example.image for example in learner.keyframes]
+    if arm in ("own map", "alone"):
+        return RevisitExamples(images, learner.pairs)
+    return RevisitExamples(images, learner.pairs, learner.misled if lied_to else learner.taught)
+
+
+def joined(fleets: Sequence[Fleet]) -> RevisitExamples:
+    """The images of all buildings in one place; buildings are a kilometre apart."""
+    images, pairs = [], []
+    for number, fleet in enumerate(fleets):
+        for pair in fleet.together.pairs:
+            numbers = (pair.images[0] + len(images), pair.images[1] + len(images))
+            pairs.append(RevisitPair(numbers, pair.points, pair.positions + np.array([1000.0 * number, 0.0, 0.0])))
+        images += fleet.together.images
+    return RevisitExamples(images, pairs)
 
 
 def trained(
     arm: str, seed: int, fleets: Sequence[Fleet], settings: FederatedSettings, folder: Path
-) -> list[FeatureDetector]:
-    """The detectors of an arm, one or several, of which the mean counts."""
+) -> list[Path | None]:
+    """The networks of an arm, one or several, of which the mean counts; None for the bundled one."""
     if arm == "bundled":
-        return [OnnxDetector(OnnxConfig())]
+        return [None]
     settings = settings.model_copy(update={"training": settings.training.model_copy(update={"seed": seed})})
     start = prepare_initial_weights(BUNDLED_NETWORK, folder, settings, ExecutionOptions(), lambda *_: None)
-    robots = [(k, robot) for k, fleet in enumerate(fleets) for robot in fleet.robots]
+    learners = [(k, learner) for k, fleet in enumerate(fleets) for learner in fleet.learners]
+    steps = settings.rounds * settings.local_steps
     if arm == "central":
-        everything = [example for _, robot in robots for example in robot.labelled]
-        pairs = [pair for _, robot in robots for pair in robot.pairs] + [p for fleet in fleets for p in fleet.across]
-        steps = settings.rounds * settings.local_steps * len(fleets)
-        networks = [trained_here(start, everything, RevisitExamples(pairs), settings, seed, steps)]
+        a_round = round(settings.participation * len(learners))
+        networks = [trained_here(start, joined(fleets), settings, seed, steps * a_round)]
     elif arm == "alone":
-        own = [robots[round(k)][1] for k in np.linspace(0, len(robots) - 1, ALONE)]
-        steps = settings.rounds * settings.local_steps
-        networks = [
-            trained_here(start, robot.labelled, RevisitExamples(robot.pairs), settings, seed, steps) for robot in own
-        ]
+        own = [learners[round(k)][1] for k in np.linspace(0, len(learners) - 1, ALONE)]
+        networks = [trained_here(start, revisits_of(arm, each, False, seed), settings, seed, steps) for each in own]
     else:
-        networks = [federated(arm, robots, start, settings, folder)]
-    detectors = []
-    for k, network in enumerate(networks):
-        export_onnx(network, folder / f"{k}.onnx")
-        detectors.append(OnnxDetector(OnnxConfig(weights=folder / f"{k}.onnx")))
-    return detectors
+        networks = [federated(arm, seed, learners, start, settings, folder)]
+    paths = [folder / f"{k}.onnx" for k in range(len(networks))]
+    for network, path in zip(networks, paths, strict=True):
+        export_onnx(network, path)
+    return paths
 
 
 def trained_here(
-    start: Weights,
-    images: Sequence[TrainingExample],
-    revisits: RevisitExamples,
-    settings: FederatedSettings,
-    seed: int,
-    steps: int,
+    start: Weights, revisits: RevisitExamples, settings: FederatedSettings, seed: int, steps: int
 ) -> KeypointNetwork:
-    """Training in one place, with the losses and the rate of a robot in the fleet."""
+    """Training in one place, with the losses and the rate of a robot in the fleet, and averaged as the fleet is."""
     state = weights_to_network(start, settings.training.encoder).state_dict()
     training = settings.training.model_copy(update={"steps": steps, "seed": seed})
-    plan = LocalTrainingPlan(
-        0, steps, compatible=settings.compatible, frozen_statistics=True, only_codes=settings.trained == "codes"
-    )
-    return local_training(
-        state, images, training, plan, torch.device("cpu"), legacy=state, revisits=revisits
-    ).network  # fmt: skip
+    plan = LocalTrainingPlan(0, steps, compatible=settings.compatible)
+    return train_codes(state, revisits, CodeInputs(), training, plan, torch.device("cpu")).network
 
 
 def federated(
-    arm: str, robots: Sequence[tuple[int, Examples]], start: Weights, settings: FederatedSettings, folder: Path
+    arm: str,
+    seed: int,
+    learners: Sequence[tuple[int, Learner]],
+    start: Weights,
+    settings: FederatedSettings,
+    folder: Path,
 ) -> KeypointNetwork:
-    """Federated training of all robots; a third of them in each round."""
-    clients = []
+    """Federated training of all robots; some of them in each round."""
+    clients: list[FederatedClient] = []
     (folder / "rounds").mkdir()
-    for building, robot in robots:
-        name = f"{building}-{robot.robot}"
+    for building, learner in learners:
+        name = f"{building}-{learner.robot}"
         (folder / name).mkdir()
-        images = TrainingImages(list(robot.plain if arm == "homographies" else robot.labelled), [], 0)
-        pairs = () if arm == "homographies" else robot.pairs
-        revisits = RevisitExamples(pairs, robot.taught if arm == "closures" else ())
+        lied_to = arm == "poisoned" and building in POISONED
         noise = seeded_noise(name, settings.training.seed)
-        clients.append(RobotClient(name, folder / name, folder / name, noise, images=images, revisits=revisits))
+        client = RobotClient(
+            name, folder / name, folder / name, noise, revisits=revisits_of(arm, learner, lied_to, seed)
+        )
+        clients.append(PoisonedClient(client, "reversed") if lied_to and learner.robot == LIAR else client)
     hooks = CoordinatorHooks(
         partial(weights_version, encoder=settings.training.encoder),
         evaluate_fn=lambda _weights: {},  # without metrics the last version counts, as in the other arms
@@ -357,17 +437,48 @@ def federated(
     return weights_to_network(state.average, settings.training.encoder)
 
 
-def arm_rows(
-    arm: str, seed: int, train: Callable[[], list[FeatureDetector]], fleets: Sequence[Path], unseen: Sequence[Path]
-) -> Iterator[tuple]:
-    """Measures by building: the mean over the detectors of an arm."""
-    detectors = train()
-    for on, folders, names in ((UNSEEN, unseen, ROBOTS), (LATER_DRIVES, fleets, LATER)):
-        for folder in folders:
-            views = [view for name in names for view in true_views(folder / name)]
-            overlap = overlaps(views)
-            values = [building_measures(views, overlap, detector) for detector in detectors]
-            yield arm, seed, on, int(folder.name), *np.mean(values, axis=0).tolist()
+def kept_networks(place: Path, train: Callable[[Path], list[Path | None]]) -> list[Path | None]:
+    """The networks of an arm, trained now unless they are in the folder."""
+    if not place.exists():
+        with tempfile.TemporaryDirectory() as folder:
+            networks = [path for path in train(Path(folder)) if path is not None]
+            place.with_suffix(".part").mkdir(exist_ok=True)
+            for path in networks:
+                shutil.copy(path, place.with_suffix(".part") / path.name)
+            place.with_suffix(".part").rename(place)
+    return sorted(place.glob("*.onnx")) or [None]
+
+
+def building_row(
+    arm: str, seed: int, on: str, folder: Path, names: Sequence[str], networks: Sequence[Path | None]
+) -> list[tuple]:
+    """Measures in a building: the mean over the networks of an arm."""
+    views, overlap = views_of(folder, tuple(names))
+    values = [building_measures(views, overlap, OnnxDetector(OnnxConfig(weights=path))) for path in networks]
+    return [(arm, seed, on, int(folder.name), *np.mean(values, axis=0).tolist())]
+
+
+def photograph_rows(arm: str, seed: int, networks: Sequence[Path | None]) -> list[tuple]:
+    """Measures on photographs: the mean over the networks of an arm."""
+    vision = common.recordings(*SCENES, kind="vision")
+    detectors = choose_detectors([EvaluatedDetectorKind.ONNX], [path or BUNDLED_NETWORK for path in networks], [])
+    report = evaluate_homography(
+        find_scenes([vision / name for name in SCENES]), detectors, HomographyGroundTruth.CORRECTED
+    )
+    values = []
+    for detector in report.detectors:
+        pairs = report.of(detector)
+        kinds = [mean(pairs, "repeatability", kind) for kind in (SceneKind.ILLUMINATION, SceneKind.VIEWPOINT)]
+        corners = [mean(pairs, f"homography_{px}px_nms{NMS_PX}") for px in (1, 3, 5)]
+        values.append([*kinds, *corners, mean(pairs, f"accuracy_3px_nms{NMS_PX}"), mean(pairs, f"score_nms{NMS_PX}")])
+    return [(arm, seed, *np.mean(values, axis=0).tolist())]
+
+
+@cache
+def views_of(folder: Path, names: tuple[str, ...]) -> tuple[list[TrueView], FloatArray]:
+    """The views of some robots and their overlaps."""
+    views = [view for name in names for view in true_views(folder / name)]
+    return views, overlaps(views)
 
 
 def true_views(folder: Path) -> Iterator[TrueView]:
@@ -456,21 +567,54 @@ def by_building(rows: Sequence[tuple], arm: str, on: str) -> FloatArray:
     return np.array([np.mean([row[4:] for row in found if row[3] == each], axis=0) for each in buildings])
 
 
-def table(rows: Sequence[tuple], show: Callable[[str], FloatArray], sign: str) -> Iterator[tuple]:
-    for arm in dict.fromkeys(row[0] for row in rows):
-        seeds = len({row[1] for row in rows if row[0] == arm})
-        shown = (mean_interval(values, np.random.default_rng(1)) for values in show(arm).T)
-        yield arm, seeds, *(f"{each.mean:{sign}.3f} [{each.low:{sign}.3f}, {each.high:{sign}.3f}]" for each in shown)
+def gain(rows: Sequence[tuple], arm: str, other: str, on: str) -> list[Interval]:
+    """By measure, an arm less another one on the same buildings."""
+    differences = by_building(rows, arm, on) - by_building(rows, other, on)
+    return [mean_interval(values, np.random.default_rng(1)) for values in differences.T]
+
+
+def shown(values: Sequence[Interval], sign: str = "+") -> list[str]:
+    return [f"{each.mean:{sign}.3f} [{each.low:{sign}.3f}, {each.high:{sign}.3f}]" for each in values]
+
+
+def seeds_of(rows: Sequence[tuple], arm: str) -> int:
+    return len({row[1] for row in rows if row[0] == arm})
 
 
 def gains(rows: Sequence[tuple], on: str) -> Iterator[tuple]:
-    """Every arm less the bundled detector on the same buildings."""
-    bundled = by_building(rows, "bundled", on)
-    yield from (r for r in table(rows, lambda arm: by_building(rows, arm, on) - bundled, "+") if r[0] != "bundled")
+    """Every arm less the bundled detector."""
+    for arm in dict.fromkeys(row[0] for row in rows if row[2] == on and row[0] != "bundled"):
+        yield arm, seeds_of(rows, arm), *shown(gain(rows, arm, "bundled", on))
+
+
+def differences(rows: Sequence[tuple]) -> Iterator[tuple]:
+    """One arm less another."""
+    measured = {row[0] for row in rows}
+    for arm, other in COMPARED:
+        if {arm, other} <= measured:
+            yield f"{arm} - {other}", seeds_of(rows, arm), *shown(gain(rows, arm, other, UNSEEN))
 
 
 def means(rows: Sequence[tuple], on: str) -> Iterator[tuple]:
-    yield from table(rows, lambda arm: by_building(rows, arm, on), "")
+    for arm in dict.fromkeys(row[0] for row in rows if row[2] == on):
+        values = [mean_interval(each, np.random.default_rng(1)) for each in by_building(rows, arm, on).T]
+        yield arm, seeds_of(rows, arm), *shown(values, "")
+
+
+def draw(rows: Sequence[tuple]) -> Figure:
+    """The gains of two measures in points, an arm a line."""
+    arms = [arm for arm in reversed(ARMS) if arm != "bundled" and any(row[0] == arm for row in rows)]
+    figure = Figure(figsize=(8.0, 0.5 * len(arms) + 1.0))
+    for axes, measure in zip(figure.subplots(1, 2, sharey=True), ("keypoint recall", "average precision"), strict=True):
+        found = [gain(rows, arm, "bundled", UNSEEN)[MEASURES.index(measure)] for arm in arms]
+        values = 100.0 * np.array([(each.mean, each.low, each.high) for each in found]).reshape(-1, 3)
+        errors = np.abs(values[:, 1:] - values[:, :1]).T
+        axes.errorbar(values[:, 0], range(len(arms)), xerr=errors, fmt="o", capsize=3)
+        axes.axvline(0.0, color="grey", linewidth=1)
+        axes.set_yticks(range(len(arms)), arms)
+        axes.set_xlabel(f"{measure}, points above the bundled detector")
+    figure.tight_layout()
+    return figure
 
 
 if __name__ == "__main__":

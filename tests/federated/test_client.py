@@ -17,8 +17,10 @@ from fcslam.federated.codec import network_to_weights, weights_to_network, weigh
 from fcslam.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.federated.weights import trained_names, update_vector  # noqa: E402
 from fcslam.learning.arrays import read_arrays, write_arrays  # noqa: E402
+from fcslam.learning.code_training import code_names  # noqa: E402
 from fcslam.learning.local_training import network_from_state  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
+from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -225,3 +227,22 @@ def test_with_noise_no_exact_number_leaves_a_robot(folder, start, tmp_path):
     assert ours.train(start, 0, "run", private).losses == {}
     with pytest.raises(TrainingError, match="give --public"):
         ours.evaluate(start, private)
+
+
+def test_codes_are_trained_on_revisits_and_need_no_image_files(start, tmp_path):
+    images = [textured(seed, 96, 96) for seed in range(2)]
+    points = np.random.default_rng(1).uniform(8, 88, (30, 2)).astype(np.float32)
+    pair = RevisitPair((0, 1), (points, points), np.full((30, 3), np.nan))
+    codes = settings(trained="codes", normalisation="frozen")
+
+    def update(name, revisits, round_number=0):
+        client = RobotClient(name, tmp_path, tmp_path / name, seeded_noise(name, 1), revisits=revisits)
+        return client.train(start, round_number, "run", codes).weights
+
+    found = update("a", RevisitExamples(images, [pair]))
+    changed = {name for name, array in found.items() if not np.array_equal(array, start[name])}
+    assert changed
+    assert changed <= code_names(KeypointNetwork("light"))
+    assert not same(found, update("b", RevisitExamples(images[::-1], [pair])))
+    with pytest.raises(TrainingError, match="there are none"):
+        update("c", RevisitExamples(images))

@@ -156,28 +156,3 @@ def test_weights_that_make_training_diverge_are_said(examples, start):
     broken = start | {"body.code_head.1.bias": torch.full_like(start["body.code_head.1.bias"], torch.nan)}
     with pytest.raises(TrainingError, match="diverged at step 7"):
         local_training(broken, examples, SMALL, LocalTrainingPlan(7, 1), CPU)
-
-
-def test_codes_alone_leave_the_keypoints_as_they_are(examples, start):
-    plan = LocalTrainingPlan(0, 3, frozen_statistics=True, only_codes=True)
-    network = local_training(start, examples, SMALL, plan, CPU).network
-    changed = {name for name, tensor in network.state_dict().items() if not torch.equal(start[name], tensor)}
-    assert changed
-    assert all(name.startswith("body.code_head.") for name in changed)
-    assert not any("running" in name for name in changed)
-    image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(1))
-    before = network_from_state("light", start)
-    with torch.inference_mode():
-        assert torch.allclose(before(image).point_logits, network(image).point_logits, atol=1e-5)
-        assert not torch.allclose(before(image).code_logits, network(image).code_logits, atol=1e-5)
-
-
-def test_codes_alone_continue_with_their_moments(examples, start):
-    whole = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS + 1, only_codes=True), CPU)
-    first = local_training(start, examples, SMALL, LocalTrainingPlan(0, RAMP_STEPS, only_codes=True), CPU)
-    plan = LocalTrainingPlan(RAMP_STEPS, 1, only_codes=True)
-    second = local_training(
-        first.network.state_dict(), examples, SMALL, plan, CPU, optimiser_state=first.optimiser_state
-    )
-    expected = whole.network.state_dict()
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())

@@ -6,7 +6,15 @@ import pytest
 from fcslam.features.detector import ImageFeatures
 from fcslam.features.lidar_depth import LidarView, project
 from fcslam.geometry import se2
-from fcslam.learning.revisits import FEWEST_ALIKE, Keyframe, correspond, predict, revisit_labels
+from fcslam.learning.revisits import (
+    FARTHEST_M,
+    FEWEST_ALIKE,
+    FEWEST_SHARED,
+    Keyframe,
+    correspond,
+    predict,
+    revisits_in_map,
+)
 from tests.features.pictures import CAMERA
 from tests.lidar.worlds import LASER, box, room, scan_at
 
@@ -109,18 +117,14 @@ def test_a_wrong_pose_gives_hardly_anything():
     assert right.sum() == len(right) == 0
 
 
-def test_labels_prefer_what_was_found_again():
-    frame, _ = view(FIRST, room(), world_points(room()))
-    count = len(frame.features.scores)
-    shown = np.zeros(count, np.bool_)
-    shown[:20] = True
-    found = shown.copy()
-    found[:10] = False
-    labels = revisit_labels(frame.features, [shown] * 3, [found] * 3)
-    quality = {tuple(point): q for point, q in zip(labels.keypoints, labels.quality, strict=True)}
-    of = [quality[tuple(point)] for point in frame.features.keypoints_px]
-    assert max(of[:10]) == pytest.approx(1 / 5)
-    assert min(of[10:20]) == pytest.approx(4 / 5)
-    plain = revisit_labels(frame.features, [], [])
-    assert np.array_equal(plain.keypoints, frame.features.keypoints_px)
-    assert np.all(np.diff(plain.quality) < 0)
+def test_keyframes_near_one_another_in_the_map_are_paired_from_any_time():
+    walls, points = room(), world_points(room())
+    poses = np.array([FIRST, [1.8, 1.2, np.pi], SECOND])
+    views = [view(pose, walls, points, seed) for seed, pose in enumerate(poses)]
+    found = list(revisits_in_map([frame for frame, _ in views], poses))
+    assert [(i, j) for i, j, _ in found] == [(0, 2)]  # the one between them looks the other way
+    rows = found[0][2]
+    assert len(rows) >= FEWEST_SHARED
+    assert np.mean(views[0][1][rows[:, 0]] == views[2][1][rows[:, 1]]) > 0.98
+    far = np.array([FIRST, [1.8, 1.2, np.pi], [FIRST[0] + FARTHEST_M + 1.0, 0.0, 0.0]])
+    assert not list(revisits_in_map([frame for frame, _ in views], far))

@@ -2,7 +2,7 @@
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple, Protocol
@@ -18,8 +18,9 @@ from fcslam.federated.evaluation import SCORE_METRICS
 from fcslam.federated.privacy import privatise_update
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, trained_names
+from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.images import find_images
-from fcslam.learning.local_training import NO_REVISITS, LocalTrainingPlan, local_training
+from fcslam.learning.local_training import LocalTrainingPlan, local_training
 from fcslam.learning.revisit_batches import RevisitExamples
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
@@ -73,8 +74,10 @@ class RobotClient:
     """The images with their labels; None until they are read."""
     images_settings: TrainingSettings | None = None
     """Settings with which the images were read; None if they were given."""
-    revisits: RevisitExamples = NO_REVISITS
-    """Views of places that were seen again, also to train on."""
+    revisits: RevisitExamples = field(default_factory=RevisitExamples)
+    """Points that were seen again, on which codes are trained alone."""
+    inputs: CodeInputs = field(default_factory=CodeInputs)
+    """Of the images of ``revisits``."""
 
     def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
         """Train from the weights. The result depends on the arguments, the cache, the images and the noise.
@@ -90,28 +93,27 @@ class RobotClient:
                 or the cache cannot be used.
         """
         encoder, frozen = settings.training.encoder, settings.normalisation == "frozen"
-        network = weights_to_network(weights, encoder)
-        images = self._labelled_images(weights, settings)
+        start = weights_to_network(weights, encoder).state_dict()
         plan = LocalTrainingPlan(
             first_step=round_number * settings.local_steps,
             steps=settings.local_steps,
             proximal=settings.proximal if settings.strategy == "fedprox" else 0.0,
             compatible=settings.compatible,
             frozen_statistics=frozen,
-            only_codes=settings.trained == "codes",
         )
-        legacy = legacy_weights(self.cache, run_id, round_number, weights) if plan.compatible else None
-        trained = local_training(
-            network.state_dict(),
-            images.train,
-            settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)}),
-            plan,
-            torch.device(self.device),
-            partial(self.on_step, self.name),
-            legacy=None if legacy is None else weights_to_network(legacy, encoder).state_dict(),
-            optimiser_state=load_optimiser_state(self.cache, run_id, round_number),
-            revisits=self.revisits,
-        )
+        only_codes = settings.trained == "codes"
+        training = settings.client_training().model_copy(update={"seed": robot_seed(self.name, settings.training.seed)})
+        former = legacy_weights(self.cache, run_id, round_number, weights) if plan.compatible or only_codes else None
+        legacy = None if former is None else weights_to_network(former, encoder).state_dict()
+        device, on_step = torch.device(self.device), partial(self.on_step, self.name)
+        moments = load_optimiser_state(self.cache, run_id, round_number)
+        if only_codes:
+            trained = train_codes(
+                start, self.revisits, self.inputs, training, plan, device, on_step, legacy, optimiser_state=moments
+            )
+        else:
+            images = self._labelled_images(weights, settings).train
+            trained = local_training(start, images, training, plan, device, on_step, legacy, optimiser_state=moments)
         save_optimiser_state(self.cache, run_id, round_number, trained.optimiser_state)
         new, names = network_to_weights(trained.network), trained_names(weights, frozen)
         update = privatise_update(new, weights, names, settings.privacy, self.noise(round_number))

@@ -11,7 +11,6 @@ from fcslam.errors import TrainingError
 from fcslam.learning.batches import batch_stream
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample
-from fcslam.learning.revisit_batches import RevisitExamples, draw_revisits
 from fcslam.learning.settings import Encoder, TrainingSettings
 from fcslam.learning.training_step import (
     LegacyDetector,
@@ -25,8 +24,6 @@ from fcslam.learning.training_step import (
 
 RAMP_STEPS: Final = 10
 """Steps over which the learning rate rises of a new optimiser: without moments, Adam only follows gradients' signs."""
-
-NO_REVISITS: Final = RevisitExamples()
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +39,6 @@ class LocalTrainingPlan:
     """Weight of the loss that keeps codes compatible with those of a legacy detector; 0 for none."""
     frozen_statistics: bool = False
     """Batch normalisation uses the means and variances that it has, and does not change them."""
-    only_codes: bool = False
-    """Only the layers that nothing but the codes depends on are trained: the keypoints stay where they are."""
 
 
 class LocalTrainingResult(NamedTuple):
@@ -65,7 +60,6 @@ def local_training(
     on_step: Callable[[int], None] = lambda _steps: None,
     legacy: Mapping[str, Tensor] | None = None,
     optimiser_state: Mapping[str, Tensor] | None = None,
-    revisits: RevisitExamples = NO_REVISITS,
 ) -> LocalTrainingResult:
     """Train for some steps. The result depends on the arguments alone.
 
@@ -78,7 +72,6 @@ def local_training(
         on_step: called with the number of steps done.
         legacy: state of the network whose codes are still in use.
         optimiser_state: result of an earlier local training, to continue it.
-        revisits: views of places that were seen again, also to train on.
 
     Raises:
         TrainingError: ``start``, ``legacy`` or ``optimiser_state`` does not fit the network, or training diverged.
@@ -87,34 +80,62 @@ def local_training(
     network.train()
     if plan.frozen_statistics:
         freeze_statistics(network)
-    if plan.only_codes:
-        freeze_all_but_codes(network)
-    proximal = None
-    if plan.proximal > 0.0:
-        weights = {name: value.detach().clone() for name, value in network.named_parameters()}
-        proximal = ProximalTerm(plan.proximal, weights)
+    proximal = proximal_term(network, plan)
     legacy_detector = None
     if legacy is not None and plan.compatible > 0.0:
         legacy_detector = LegacyDetector(plan.compatible, network_from_state(settings.encoder, legacy).to(device))
+    optimiser = continued_optimiser(network, optimiser_state)
+    sums: dict[str, float] = {}
+    until = settings.model_copy(update={"steps": plan.first_step + plan.steps})
+    for step, batch in batch_stream(examples, until, plan.first_step, ahead=2, threads=1):
+        done = step - plan.first_step + 1
+        rate = local_rate(settings, step, done, optimiser_state is None)
+        losses = training_step(
+            network, optimiser, batch.to(device), settings, step, rate, proximal=proximal, legacy=legacy_detector
+        )
+        for name, loss in losses.items():
+            sums[name] = sums.get(name, 0.0) + float(loss)
+        on_step(done)
+    return local_result(network, optimiser, sums, plan)
+
+
+def proximal_term(network: KeypointNetwork, plan: LocalTrainingPlan) -> ProximalTerm | None:
+    """The plan's proximal term for the present weights; None without one."""
+    if plan.proximal <= 0.0:
+        return None
+    return ProximalTerm(plan.proximal, {name: value.detach().clone() for name, value in network.named_parameters()})
+
+
+def continued_optimiser(
+    network: KeypointNetwork, optimiser_state: Mapping[str, Tensor] | None
+) -> torch.optim.Optimizer:
+    """A new optimiser, or one that continues from the result of an earlier local training.
+
+    Raises:
+        TrainingError: the state belongs to another network.
+    """
     optimiser = create_optimiser(network)
     if optimiser_state is not None:
         try:
             restore_optimiser_state(optimiser, optimiser_state)
         except (KeyError, ValueError) as error:
             raise TrainingError(f"the optimiser cannot continue ({error})") from error
-    sums: dict[str, float] = {}
-    until = settings.model_copy(update={"steps": plan.first_step + plan.steps})
-    for step, batch in batch_stream(examples, until, plan.first_step, ahead=2, threads=1):
-        done = step - plan.first_step + 1
-        rate = learning_rate(settings, step) * (min(done / RAMP_STEPS, 1.0) if optimiser_state is None else 1.0)
-        again = draw_revisits(revisits, settings.seed, step).to(device) if revisits else None
-        losses = training_step(
-            network, optimiser, batch.to(device), settings, step, rate, proximal=proximal, legacy=legacy_detector,
-            revisits=again,
-        )  # fmt: skip
-        for name, loss in losses.items():
-            sums[name] = sums.get(name, 0.0) + float(loss)
-        on_step(done)
+    return optimiser
+
+
+def local_rate(settings: TrainingSettings, step: int, done: int, is_new: bool) -> float:
+    """Learning rate of a step of the whole run, the ``done``-th here, of an optimiser that may be new."""
+    return learning_rate(settings, step) * (min(done / RAMP_STEPS, 1.0) if is_new else 1.0)
+
+
+def local_result(
+    network: KeypointNetwork, optimiser: torch.optim.Optimizer, sums: Mapping[str, float], plan: LocalTrainingPlan
+) -> LocalTrainingResult:
+    """The result after the last step, from sums of the losses over the steps.
+
+    Raises:
+        TrainingError: training diverged.
+    """
     network.eval()
     state = get_optimiser_state(optimiser)
     if not all(bool(torch.isfinite(value).all()) for value in state.values()):
@@ -136,15 +157,6 @@ def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> Keypoin
         raise TrainingError(f"the weights are not those of a {encoder} network ({error})") from error
     network.eval()
     return network
-
-
-def freeze_all_but_codes(network: KeypointNetwork) -> None:
-    """Let only the head of the codes be trained, without its batch statistics."""
-    head = network.code_head
-    trained = {id(parameter) for parameter in head.parameters()}
-    for parameter in network.parameters():
-        parameter.requires_grad_(id(parameter) in trained)
-    freeze_statistics(network)
 
 
 def freeze_statistics(network: nn.Module) -> None:

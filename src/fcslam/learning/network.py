@@ -33,6 +33,15 @@ class Maps(NamedTuple):
     """Shape (B, 256, H/8, W/8): positive where a bit is set."""
 
 
+class Description(NamedTuple):
+    """Output of the layers of the codes for a batch."""
+
+    code_logits: Tensor
+    """Shape (B, 256, H/8, W/8), as in ``Maps``."""
+    context: Tensor
+    """The part of their output on which the keypoints depend, shape (B, C, H/8, W/8)."""
+
+
 class KeypointNetwork(nn.Module):
     """Grey images (B, 1, H, W) in [0, 1], H and W multiples of 8, to ``Maps``."""
 
@@ -42,9 +51,18 @@ class KeypointNetwork(nn.Module):
         self.body: LightBody | VggBody = LightBody() if encoder == "light" else VggBody()
 
     @property
-    def code_head(self) -> nn.Module:
-        """The layers on which the codes depend and the keypoints do not."""
-        return self.body.code_head
+    def code_layers(self) -> tuple[nn.Module, ...]:
+        """The layers that give the codes at 1/8 of the resolution; the keypoints depend on them a little."""
+        return self.body.code_layers
+
+    def code_inputs(self, image: Tensor) -> Tensor:
+        """Input of the layers of the codes for images (B, 1, H, W), shape (B, C, H/8, W/8)."""
+        inputs: Tensor = self.body.code_inputs(image)
+        return inputs
+
+    def describe(self, code_inputs: Tensor) -> Description:
+        """The codes for the output of ``code_inputs``."""
+        return self.body.describe(code_inputs)
 
     def forward(self, image: Tensor) -> Maps:
         """Maps of a batch.
@@ -91,18 +109,36 @@ class LightBody(nn.Module):
         )
         nn.init.zeros_(self.refine[-1].weight)  # the refinement starts as the identity
 
+    @property
+    def code_layers(self) -> tuple[nn.Module, ...]:
+        """As in ``KeypointNetwork``."""
+        return self.to_sixteenth, self.joint, self.code_head
+
+    def code_inputs(self, image: Tensor) -> Tensor:
+        """As in ``KeypointNetwork``."""
+        return self._resolutions(_even_contrast(image))[-1]
+
+    def describe(self, code_inputs: Tensor) -> Description:
+        """As in ``KeypointNetwork``."""
+        around = _twice(self.to_sixteenth(code_inputs))[..., : code_inputs.shape[-2], : code_inputs.shape[-1]]
+        joint = self.joint(code_inputs + around)
+        return Description(self.code_head(joint), self.context_eighth(joint))
+
     def forward(self, image: Tensor) -> Maps:
         """As in ``KeypointNetwork``."""
         image = _even_contrast(image)
-        half = self.to_half(image)
-        quarter = self.to_quarter(half)
-        eighth = self.to_eighth(quarter)
-        around = _twice(self.to_sixteenth(eighth))[..., : eighth.shape[-2], : eighth.shape[-1]]
-        joint = self.joint(eighth + around)
-        context = _twice(self.context_quarter(quarter) + _twice(self.context_eighth(joint)))
+        half, quarter, eighth = self._resolutions(image)
+        described = self.describe(eighth)
+        context = _twice(self.context_quarter(quarter) + _twice(described.context))
         points = smoothed(F.pixel_shuffle(self.point_head(half + context), 2))
         points = smoothed(points + self.refine(torch.cat((image, points), dim=1)))
-        return Maps(points.squeeze(1), self.code_head(joint))
+        return Maps(points.squeeze(1), described.code_logits)
+
+    def _resolutions(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Features at 1/2, 1/4 and 1/8 of the resolution."""
+        half = self.to_half(image)
+        quarter = self.to_quarter(half)
+        return half, quarter, self.to_eighth(quarter)
 
 
 class VggBody(nn.Module):
@@ -118,6 +154,20 @@ class VggBody(nn.Module):
         )  # fmt: skip
         self.point_head = nn.Sequential(_convolution(128, 256), nn.Conv2d(256, CELL_PX**2 + 1, 1))
         self.code_head = nn.Sequential(_convolution(128, 256), nn.Conv2d(256, CODE_BITS, 1))
+
+    @property
+    def code_layers(self) -> tuple[nn.Module, ...]:
+        """As in ``KeypointNetwork``."""
+        return (self.code_head,)
+
+    def code_inputs(self, image: Tensor) -> Tensor:
+        """As in ``KeypointNetwork``."""
+        features: Tensor = self.encoder(image)
+        return features
+
+    def describe(self, code_inputs: Tensor) -> Description:
+        """As in ``KeypointNetwork``; the keypoints do not depend on the head of the codes."""
+        return Description(self.code_head(code_inputs), code_inputs)
 
     def forward(self, image: Tensor) -> Maps:
         """As in ``KeypointNetwork``."""

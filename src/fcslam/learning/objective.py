@@ -10,7 +10,7 @@ from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX
 from fcslam.learning import losses
 from fcslam.learning.batches import TrainingBatch
-from fcslam.learning.network import Maps, sample_codes
+from fcslam.learning.network import Description, Maps, sample_codes
 from fcslam.learning.revisit_batches import RevisitBatch
 from fcslam.learning.settings import Encoder, LossSettings
 
@@ -18,6 +18,12 @@ MIN_NEGATIVE_DISTANCE_PX = 8.0
 """Points closer to a match than this are no negatives, because their codes should be similar."""
 TEACHER_SHARPNESS = 2.0
 """Logit of a bit per standard deviation of its projection: one standard deviation gives a probability of 88 %."""
+MIN_NEGATIVE_DISTANCE_M = 0.3
+"""The same in a map, for points in images of two places; positions are some centimetres off."""
+CODE_SHARPNESS = 2.0
+"""Factor from a code's logit to the log odds of its bit, for a trained network and for the one before it."""
+_STILL = 1e-6
+"""Least variance by which the change of the keypoints' context is divided."""
 _SEEN = 0.999
 """Least interpolated visibility of a pixel that counts as visible: all four neighbours are, up to rounding."""
 
@@ -86,41 +92,62 @@ def objective(
 
 
 def revisit_objective(
-    maps: Maps, batch: RevisitBatch, weights: LossSettings, progress: float
+    described: Description, before: Description, batch: RevisitBatch, weights: LossSettings, compatible: float
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The sum to minimise for views of places that were seen again, and the losses in it by name.
+    """The sum to minimise for points that were seen again, and the losses in it by name.
 
-    The codes of a point in both views must agree and differ from those of the other points of the other view. Fixed
-    codes of other robots count as a second view. The balance of the bits, and the negatives, keep codes from becoming
-    all the same.
+    The codes of a point in both views must agree and differ from those of all other points of the batch, also in
+    images of other places. Fixed codes of other robots count as a second view. The balance of the bits, and the
+    negatives, keep codes from becoming all the same.
 
     Args:
-        maps: output of the network for ``batch.images``.
-        batch: images, points and codes.
+        described: by the network, for the batch's images.
+        before: by the network that training started from.
+        batch: points and codes.
         weights: of the losses.
-        progress: share of the training that is done, in [0, 1].
+        compatible: weight of the loss that keeps codes as they were.
     """
     count, fixed = len(batch.valid), len(batch.codes)
-    code_logits, places = maps.code_logits.float(), batch.points[: 2 * count - fixed]
-    logits = sample_codes(code_logits, places)
+    places = batch.points[: 2 * count - fixed]
+    seen = torch.cat((batch.valid, batch.valid[: count - fixed]))
+    logits = sample_codes(described.code_logits.float(), places)
+    wanted = torch.sigmoid(CODE_SHARPNESS * sample_codes(before.code_logits.float(), places))
     # The second views of pairs follow all first views; fixed codes stand behind them.
     soft = torch.cat((torch.tanh(logits), batch.codes))
-    bits = torch.cat((losses.binary_activation(logits), (batch.codes + 1.0) / 2.0))
-    candidates = negatives(batch.points, batch.valid)
-    margin = weights.margin * (0.3 + 0.7 * progress)
-    distances = losses.code_distances(bits[:count], bits[count:], weights.rounding)
+    first, second = (side[batch.valid] for side in soft.chunk(2))
+    every = torch.ones(len(first), dtype=torch.bool, device=first.device)
+    moved = (described.context.float() - before.context.float()).square().mean()
     parts = {
-        "revisit_triplet": losses.triplet_loss(distances, candidates, batch.valid, margin, weights.negatives),
-        "revisit_contrastive": losses.contrastive_loss(
-            soft[:count], soft[count:], candidates, batch.valid, weights.temperature
-        ),
-        "revisit_balance": losses.balance_loss(soft[:count], batch.valid),
+        "contrastive": losses.contrastive_loss(first, second, revisit_negatives(batch), every, weights.temperature),
+        "balance": losses.balance_loss(torch.tanh(logits), seen),
+        "keypoints": moved / before.context.float().var().clamp(min=_STILL),
+        "former": losses.distillation_loss(CODE_SHARPNESS * logits, wanted, seen),
     }
-    factors = (weights.triplet, weights.contrastive, weights.balance)
-    total = sum(
-        (f * part for f, part in zip(factors, parts.values(), strict=True)), start=torch.zeros_like(distances[0, 0, 0])
-    )
+    factors = {
+        "contrastive": weights.contrastive,
+        "balance": weights.balance,
+        "keypoints": weights.keypoints,
+        "former": compatible,
+    }
+    total = sum((factors[name] * part for name, part in parts.items()), start=torch.zeros_like(moved))
     return total, parts
+
+
+def revisit_negatives(batch: RevisitBatch) -> Tensor:
+    """Which valid points of a batch differ for certain, shape (V, V), bool.
+
+    Points of one pair differ if they are far apart in both views, and points of two pairs if they are far apart in the
+    map.
+    """
+    valid = batch.valid
+    first, second = (side[valid] for side in batch.points.chunk(2))
+    apart = (torch.cdist(first, first) > MIN_NEGATIVE_DISTANCE_PX) & (
+        torch.cdist(second, second) > MIN_NEGATIVE_DISTANCE_PX
+    )
+    pair = torch.arange(len(valid), device=valid.device).repeat_interleave(valid.sum(1))
+    # Distances by differences: the usual expansion loses centimetres in a large building.
+    gaps = torch.cdist(batch.positions[valid], batch.positions[valid], compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.where(pair[:, None] == pair, apart, gaps > MIN_NEGATIVE_DISTANCE_M)
 
 
 def views_aligned(maps: Tensor, batch: TrainingBatch) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Batches of real views: pairs of images of one place, and images with codes that other robots gave to their points."""
+"""Batches of points that a robot saw again: in pairs of its images, and with codes that other robots gave to them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -12,11 +12,11 @@ from torch import Tensor
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.detector import GreyImage
 from fcslam.learning.labels import Points
-from fcslam.records import Codes
+from fcslam.records import Codes, FloatArray
 
 VIEWS: Final = 4
 """Images in a batch."""
-MOST_POINTS: Final = 160
+MOST_POINTS: Final = 100
 """Most points of a pair or of a taught image in a batch."""
 
 
@@ -24,26 +24,34 @@ MOST_POINTS: Final = 160
 class RevisitPair:
     """Two images of one place and the points that both show."""
 
-    images: tuple[GreyImage, GreyImage]
+    images: tuple[int, int]
+    """Their numbers in ``RevisitExamples``."""
     points: tuple[Points, Points]
     """Shape (M, 2) each, pixels."""
+    positions: FloatArray
+    """Of the points in the robot's map, shape (M, 3), metres; NaN where unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaughtImage:
     """An image and the codes that other robots gave to its points."""
 
-    image: GreyImage
+    image: int
+    """Its number in ``RevisitExamples``."""
     points: Points
     """Shape (M, 2), pixels."""
     codes: Codes
     """Shape (M, 32)."""
+    positions: FloatArray
+    """Of the points in the robot's map, shape (M, 3), metres; NaN where unknown."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RevisitExamples:
-    """Training data of a robot: its own revisits, and the closures with others. All images are of one size."""
+    """Training data of a robot: its own revisits, and the closures with others."""
 
+    images: Sequence[GreyImage] = field(default=())
+    """All of one size."""
     pairs: Sequence[RevisitPair] = field(default=())
     taught: Sequence[TaughtImage] = field(default=())
 
@@ -51,14 +59,16 @@ class RevisitExamples:
         return bool(self.pairs or self.taught)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RevisitBatch:
     """B pairs of views; of the last T pairs, fixed codes stand for the second view."""
 
     images: Tensor
-    """Shape (2B - T, 1, H, W), grey in [0, 1]: B first views, then B - T second views."""
+    """Numbers of the images, shape (2B - T,): B first views, then B - T second views."""
     points: Tensor
     """Shape (2B, N, 2) [px]: in the first views, then in the second ones; where these are codes, those of the first."""
+    positions: Tensor
+    """Shape (B, N, 3), metres; NaN where unknown."""
     valid: Tensor
     """Shape (B, N), bool."""
     codes: Tensor
@@ -70,27 +80,30 @@ class RevisitBatch:
 
 
 def draw_revisits(examples: RevisitExamples, seed: int, step: int) -> RevisitBatch:
-    """The batch of a step: pairs, taught images, or both. ``VIEWS`` images, which all must have one size."""
+    """The batch of a step, with ``VIEWS`` images: pairs, taught images, or both."""
     rng = np.random.default_rng([seed, step, VIEWS])
     taught_count = (VIEWS // 2 if examples.pairs else VIEWS) if examples.taught else 0
     pairs = [examples.pairs[k] for k in rng.integers(len(examples.pairs) or 1, size=(VIEWS - taught_count) // 2)]
     taught = [examples.taught[k] for k in rng.integers(len(examples.taught) or 1, size=taught_count)]
-    firsts, seconds, valid, codes = [], [], [], []
+    firsts, seconds, positions, valid, codes = [], [], [], [], []
     for pair in pairs:
-        chosen = _some(len(pair.points[0]), rng)
+        chosen = _some(len(pair.positions), rng)
         firsts.append(_padded(pair.points[0][chosen]))
         seconds.append(_padded(pair.points[1][chosen]))
+        positions.append(_padded(pair.positions[chosen]))
         valid.append(np.arange(MOST_POINTS) < len(chosen))
     for image in taught:
-        chosen = _some(len(image.points), rng)
+        chosen = _some(len(image.positions), rng)
         firsts.append(_padded(image.points[chosen]))
         seconds.append(firsts[-1])
+        positions.append(_padded(image.positions[chosen]))
         valid.append(np.arange(MOST_POINTS) < len(chosen))
         codes.append(_padded(2.0 * np.unpackbits(image.codes[chosen], axis=1) - 1.0))
     images = [pair.images[0] for pair in pairs] + [image.image for image in taught] + [pair.images[1] for pair in pairs]
     return RevisitBatch(
-        torch.from_numpy(np.stack(images).astype(np.float32) / 255.0).unsqueeze(1),
+        torch.tensor(images),
         torch.from_numpy(np.stack(firsts + seconds)),
+        torch.from_numpy(np.stack(positions)),
         torch.from_numpy(np.stack(valid)),
         torch.from_numpy(np.array(codes, np.float32).reshape(-1, MOST_POINTS, CODE_BITS)),
     )

@@ -8,7 +8,7 @@ first tell how far the predicted pixels are off in each part of the image. Then 
 which: also where codes disagree, as only those pairs can teach anything.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -20,7 +20,6 @@ from fcslam.features.codes import hamming_matrix
 from fcslam.features.detector import GreyImage, ImageFeatures
 from fcslam.features.lidar_depth import LidarView, locate_among, project
 from fcslam.geometry import se2
-from fcslam.learning.labels import WORST_QUALITY, Labels
 from fcslam.records import CameraModel, FloatArray
 
 CEILING_M: Final = 3.0
@@ -42,6 +41,12 @@ AGREEING: Final = 0.5
 """Least share of the keypoints with like codes whose own offset is within ``AGREEMENT_PX`` of the correction."""
 SNAP_PX: Final = 2.0
 """Largest distance between a corrected pixel and the keypoint that is the same point."""
+
+FARTHEST_M: Final = 4.0
+WIDEST_RAD: Final = 1.5
+"""Two views farther apart, or turned by more, are not compared."""
+FEWEST_SHARED: Final = 12
+"""Fewest points that make two views a pair."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,26 +127,24 @@ def correspond(first: Keyframe, second: Keyframe, T_first_second: FloatArray) ->
     return Correspondences(np.column_stack((asked[found], nearest[found])), shown)
 
 
-def revisit_labels(
-    features: ImageFeatures, shown: Sequence[NDArray[np.bool_]], found: Sequence[NDArray[np.bool_]]
-) -> Labels:
-    """Labels of a keyframe by what became of its keypoints in the other views of its places.
-
-    A keypoint counts as much as the share of the views that show its point in which it was found again, with one view
-    of each kind added. A point that no other view shows keeps its rank.
+def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+    """Pairs of keyframes of one map that show the same points, from whatever time.
 
     Args:
-        features: of the keyframe, K keypoints.
-        shown: by view, the keypoints whose points it shows, shape (K,).
-        found: by view, the keypoints that it found again, shape (K,).
+        frames: N keyframes.
+        T_map_base: their estimated poses in the map, shape (N, 3), metres and radians.
+
+    Yields:
+        The numbers of two keyframes, and those of their keypoints that are the same points, shape (M, 2), with M at
+        least ``FEWEST_SHARED``.
     """
-    count = len(features.scores)
-    seen = np.sum(shown, axis=0) if len(shown) else np.zeros(count)
-    again = np.sum(found, axis=0) if len(found) else np.zeros(count)
-    rank = 1.0 - (1.0 - WORST_QUALITY) * np.arange(count) / max(count, 1)
-    quality = np.where(seen > 0, (again + 1.0) / (seen + 2.0), rank)
-    order = np.argsort(-quality, kind="stable")
-    return Labels(features.keypoints_px[order].astype(np.float32), quality[order].astype(np.float32))
+    for i, first in enumerate(frames):
+        between = se2.between(T_map_base[i], T_map_base[i + 1 :])
+        near = (np.hypot(*between[:, :2].T) <= FARTHEST_M) & (np.abs(between[:, 2]) <= WIDEST_RAD)
+        for k in np.flatnonzero(near).tolist():
+            rows = correspond(first, frames[i + 1 + k], between[k]).rows
+            if len(rows) >= FEWEST_SHARED:
+                yield i, i + 1 + k, rows
 
 
 def _offsets_of_alike(

@@ -49,8 +49,10 @@ class LossSettings(Settings):
     agreement: float = Field(
         default=1.0, ge=0.0, description="weight of the loss that makes the keypoint maps of both views agree"
     )
-    revisits: float = Field(
-        default=1.0, ge=0.0, description="weight of the losses on places that were seen again, if there are any"
+    keypoints: float = Field(
+        default=100.0,
+        ge=0.0,
+        description="weight of the loss that leaves keypoints where they are while robots train codes alone",
     )
 
 

@@ -11,8 +11,7 @@ from fcslam.errors import TrainingError
 from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.losses import distillation_loss
 from fcslam.learning.network import KeypointNetwork, Maps, sample_codes
-from fcslam.learning.objective import TeacherBits, grid_shift, objective, revisit_objective
-from fcslam.learning.revisit_batches import RevisitBatch
+from fcslam.learning.objective import CODE_SHARPNESS, TeacherBits, grid_shift, objective
 from fcslam.learning.settings import TrainingSettings
 
 CLIP_NORM: Final = 1.0
@@ -24,8 +23,6 @@ LAST_RATE: Final = 1e-5
 """Learning rate at the end of training, and the lowest one."""
 DECAY_SHARE: Final = 0.3
 """Share of the steps, at the end, over which the learning rate falls."""
-CODE_SHARPNESS: Final = 2.0
-"""Factor from a code's logit to the log odds of its bit, for both detectors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +96,6 @@ def training_step(
     bits: TeacherBits | None = None,
     proximal: ProximalTerm | None = None,
     legacy: LegacyDetector | None = None,
-    revisits: RevisitBatch | None = None,
 ) -> dict[str, Tensor]:
     """Do one step in place; batch, network and optimiser are on one device.
 
@@ -113,7 +109,6 @@ def training_step(
         bits: the teacher's, if there is a teacher.
         proximal: added to the objective.
         legacy: the detector whose codes are still in use, if there is one.
-        revisits: views of places that were seen again, if there are any.
 
     Returns:
         The losses by name.
@@ -132,19 +127,22 @@ def training_step(
     if legacy is not None:
         losses["former"] = legacy.loss(maps, batch)
         total = total + legacy.strength * losses["former"]
-    if revisits is not None:
-        with torch.autocast(batch.images.device.type, torch.bfloat16):
-            maps = network(revisits.images.contiguous(memory_format=torch.channels_last))
-        seen_again, parts = revisit_objective(maps, revisits, settings.loss, step / settings.steps)
-        losses |= parts
-        total = total + settings.loss.revisits * seen_again
+    descend(network, optimiser, total, step)
+    return {name: loss.detach() for name, loss in losses.items()}
+
+
+def descend(network: KeypointNetwork, optimiser: torch.optim.Optimizer, total: Tensor, step: int) -> None:
+    """Follow the gradient of a step's sum of losses in place, with the rate that the optimiser has.
+
+    Raises:
+        TrainingError: the sum is not finite; the step changed nothing.
+    """
     if not torch.isfinite(total):
         raise TrainingError(f"training diverged at step {step}; lower the learning rate")
     optimiser.zero_grad(set_to_none=True)
     total.backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)
     optimiser.step()
-    return {name: loss.detach() for name, loss in losses.items()}
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:

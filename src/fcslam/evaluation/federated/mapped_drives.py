@@ -74,16 +74,15 @@ def map_drives(
     return {name: _drive(fronts[name], runner.kept, run, detector) for name, runner in runners.items()}, run
 
 
-def ties(drives: dict[str, MappedDrive], run: Run, within: bool) -> Iterator[Tie]:
-    """Pairs of keyframes near both ends of an accepted closure, each once, within the robots or between them.
+def ties(drives: dict[str, MappedDrive], run: Run) -> Iterator[Tie]:
+    """Pairs of keyframes of two robots near both ends of an accepted closure between them, each once.
 
-    A robot knows its own map, and the cloud the fleet's.
+    Their relative poses are those of the fleet's map.
     """
     seen: set[tuple[str, int, str, int]] = set()
     for closure in run.closures:
         names = closure.robot_i, closure.robot_j
-        is_within = names[0] == names[1]
-        if closure.status is not ClosureStatus.ACCEPTED or is_within is not within or not set(names) <= drives.keys():
+        if closure.status is not ClosureStatus.ACCEPTED or names[0] == names[1] or not set(names) <= drives.keys():
             continue
         a, b = (drives[name] for name in names)
         if a.map_index != b.map_index:
@@ -91,11 +90,10 @@ def ties(drives: dict[str, MappedDrive], run: Run, within: bool) -> Iterator[Tie
         for i in _near(a, closure.stamp_i):
             for j in _near(b, closure.stamp_j):
                 key = min((names[0], i, names[1], j), (names[1], j, names[0], i))
-                if key not in seen and key[:2] != key[2:]:
+                if key not in seen:
                     seen.add(key)
-                    first, second = drives[key[0]], drives[key[2]]
-                    poses = [each.T_own_base if within else each.T_map_base for each in (first, second)]
-                    yield Tie(*key, se2.between(poses[0][key[1]], poses[1][key[3]]))
+                    first, second = (drives[name].T_map_base[k] for name, k in (key[:2], key[2:]))
+                    yield Tie(*key, se2.between(first, second))
 
 
 class _Keeping(Inline):

@@ -1,0 +1,128 @@
+"""Training of the codes alone, on points that a robot saw again: a client's part of a federated round.
+
+Only the layers at 1/8 of the resolution are trained. The output of the layers before them is computed once for each
+image. The keypoints depend on the trained layers a little, so a loss keeps the keypoints where they were.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fcslam.errors import TrainingError
+from fcslam.learning.local_training import (
+    LocalTrainingPlan,
+    LocalTrainingResult,
+    continued_optimiser,
+    freeze_statistics,
+    local_rate,
+    local_result,
+    network_from_state,
+    proximal_term,
+)
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.objective import revisit_objective
+from fcslam.learning.revisit_batches import RevisitExamples, draw_revisits
+from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.training_step import descend
+
+_IMAGES_AT_ONCE: Final = 8
+
+
+@dataclass(slots=True)
+class CodeInputs:
+    """The inputs of the trained layers for a robot's images; computed again if the layers before them change."""
+
+    _frozen: dict[str, Tensor] = field(default_factory=dict)
+    _inputs: Tensor | None = None
+
+    def of(self, network: KeypointNetwork, examples: RevisitExamples, device: torch.device) -> Tensor:
+        """Shape (K, C, H/8, W/8), float16, for the examples' K images; always of the same examples."""
+        frozen = {name: value for name, value in network.state_dict().items() if name not in code_names(network)}
+        is_same = self._frozen.keys() == frozen.keys() and all(
+            torch.equal(value, self._frozen[name]) for name, value in frozen.items()
+        )
+        if self._inputs is None or not is_same:
+            self._frozen = {name: value.clone() for name, value in frozen.items()}
+            parts = []
+            for k in range(0, len(examples.images), _IMAGES_AT_ONCE):
+                grey = np.stack(examples.images[k : k + _IMAGES_AT_ONCE]).astype(np.float32) / 255.0
+                with torch.no_grad():
+                    parts.append(network.code_inputs(torch.from_numpy(grey).unsqueeze(1).to(device)).half())
+            self._inputs = torch.cat(parts)
+        return self._inputs
+
+
+def code_names(network: KeypointNetwork) -> set[str]:
+    """Names of the parameters and statistics of the layers that are trained here."""
+    values = {id(value) for layer in network.code_layers for value in layer.state_dict(keep_vars=True).values()}
+    return {name for name, value in network.state_dict(keep_vars=True).items() if id(value) in values}
+
+
+def train_codes(
+    start: Mapping[str, Tensor],
+    revisits: RevisitExamples,
+    inputs: CodeInputs,
+    settings: TrainingSettings,
+    plan: LocalTrainingPlan,
+    device: torch.device,
+    on_step: Callable[[int], None] = lambda _steps: None,
+    legacy: Mapping[str, Tensor] | None = None,
+    optimiser_state: Mapping[str, Tensor] | None = None,
+) -> LocalTrainingResult:
+    """Train for some steps, with the batch statistics as they are. The result depends on the arguments alone.
+
+    Args:
+        start: state of a network, which is not changed.
+        revisits: points that were seen again.
+        inputs: of the images of ``revisits``, kept from call to call.
+        settings: of the whole run; the learning rate falls towards the end of its steps.
+        plan: which steps are done, and how.
+        device: to train on.
+        on_step: called with the number of steps done.
+        legacy: state of the network that the whole training started from; None for ``start``. Keypoints stay where it
+            finds them, and codes compatible with it.
+        optimiser_state: result of an earlier local training, to continue it.
+
+    Raises:
+        TrainingError: nothing was seen again; ``start``, ``legacy`` or ``optimiser_state`` does not fit the network, or
+            training diverged.
+    """
+    if not revisits:
+        raise TrainingError("codes are trained on places that were seen again, and there are none; set trained to all")
+    network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
+    before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
+    freeze_all_but_codes(network)
+    known = inputs.of(network, revisits, device)
+    proximal = proximal_term(network, plan)
+    optimiser = continued_optimiser(network, optimiser_state)
+    sums: dict[str, float] = {}
+    for done in range(1, plan.steps + 1):
+        step = plan.first_step + done - 1
+        for group in optimiser.param_groups:
+            group["lr"] = local_rate(settings, step, done, optimiser_state is None)
+        batch = draw_revisits(revisits, settings.seed, step).to(device)
+        given = known[batch.images].float().contiguous(memory_format=torch.channels_last)
+        with torch.autocast(device.type, torch.bfloat16):
+            described = network.describe(given)
+            with torch.no_grad():
+                described_before = before.describe(given)
+        total, losses = revisit_objective(described, described_before, batch, settings.loss, plan.compatible)
+        if proximal is not None:
+            total = total + proximal.loss(network)
+        descend(network, optimiser, total, step)
+        for name, loss in losses.items():
+            sums[name] = sums.get(name, 0.0) + float(loss.detach())
+        on_step(done)
+    return local_result(network, optimiser, sums, plan)
+
+
+def freeze_all_but_codes(network: KeypointNetwork) -> None:
+    """Let only the layers of the codes be trained, without their batch statistics."""
+    trained = code_names(network)
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(name in trained)
+    freeze_statistics(network)

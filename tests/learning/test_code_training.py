@@ -1,0 +1,137 @@
+"""Training of the codes alone: what changes, what stays, and that it goes on where it was interrupted."""
+
+import numpy as np
+import pytest
+
+from tests.learning.textures import textured
+
+torch = pytest.importorskip("torch", reason="needs fcslam[train]")
+
+from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
+from fcslam.federated.codec import weights_to_network  # noqa: E402
+from fcslam.federated.initial_weights import read_detector_weights  # noqa: E402
+from fcslam.learning.code_training import CodeInputs, code_names, train_codes  # noqa: E402
+from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, network_from_state  # noqa: E402
+from fcslam.learning.network import KeypointNetwork, sample_codes  # noqa: E402
+from fcslam.learning.revisit_batches import RevisitExamples, RevisitPair, TaughtImage  # noqa: E402
+from fcslam.learning.settings import TrainingSettings  # noqa: E402
+
+CPU = torch.device("cpu")
+SMALL = TrainingSettings(steps=40)
+SIZE, SHIFT = 96, 8
+PICTURE = textured(1)
+POINTS = np.random.default_rng(2).uniform(16, SIZE - 16, (40, 2)).astype(np.float32)
+NOWHERE = np.full((40, 3), np.nan)
+DARK = (0.4 * PICTURE[:SIZE, SHIFT : SHIFT + SIZE]).astype(np.uint8)
+PAIR = RevisitPair((0, 1), (POINTS, POINTS - np.array([SHIFT, 0], np.float32)), NOWHERE)
+TAUGHT = TaughtImage(0, POINTS, np.random.default_rng(3).integers(0, 256, (40, 32)).astype(np.uint8), NOWHERE)
+OWN = RevisitExamples([PICTURE[:SIZE, :SIZE], DARK], [PAIR])
+
+
+@pytest.fixture(scope="module", params=["light", "vgg"])
+def encoder(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def start(encoder):
+    torch.manual_seed(1)
+    return KeypointNetwork(encoder).state_dict()
+
+
+@pytest.fixture(scope="module")
+def light():
+    """The bundled network, which a fleet starts from."""
+    return weights_to_network(read_detector_weights(BUNDLED_NETWORK, "light"), "light").state_dict()
+
+
+def codes(state, image, points):
+    network = network_from_state("light", state)
+    with torch.inference_mode():
+        maps = network(torch.from_numpy(image)[None, None].float() / 255.0)
+    return sample_codes(maps.code_logits, torch.from_numpy(points)[None])[0].numpy() >= 0
+
+
+def test_only_the_layers_of_the_codes_change(encoder, start):
+    settings = SMALL.model_copy(update={"encoder": encoder})
+    network = train_codes(start, OWN, CodeInputs(), settings, LocalTrainingPlan(0, 3), CPU).network
+    changed = {name for name, tensor in network.state_dict().items() if not torch.equal(start[name], tensor)}
+    assert changed
+    assert changed <= code_names(network)
+    assert not any("running" in name for name in changed)
+    before = network_from_state(encoder, start)
+    image = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        assert not torch.allclose(before(image).code_logits, network(image).code_logits, atol=1e-5)
+        if encoder == "vgg":
+            assert torch.allclose(before(image).point_logits, network(image).point_logits, atol=1e-5)
+
+
+def test_whole_images_give_what_their_inputs_give(encoder, start):
+    network = network_from_state(encoder, start)
+    image = torch.rand(2, 1, 64, 48, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        described = network.describe(network.code_inputs(image))
+        assert torch.equal(described.code_logits, network(image).code_logits)
+
+
+def test_training_brings_the_codes_of_a_point_together(light):
+    def distance(state):
+        first, second = (codes(state, image, points) for image, points in zip(OWN.images, PAIR.points, strict=True))
+        return float(np.mean(first != second))
+
+    plan = LocalTrainingPlan(0, 40)
+    done = train_codes(light, OWN, CodeInputs(), SMALL, plan, CPU)
+    assert {"contrastive", "balance", "keypoints", "former"} == done.losses.keys()
+    assert distance(done.network.state_dict()) < 0.8 * distance(light)
+
+
+def test_training_brings_codes_towards_the_taught_ones(light):
+    taught = np.unpackbits(TAUGHT.codes, axis=1).astype(bool)
+    examples = RevisitExamples(OWN.images, [PAIR], [TAUGHT])
+    done = train_codes(light, examples, CodeInputs(), SMALL, LocalTrainingPlan(0, 40), CPU).network.state_dict()
+    apart = [float(np.mean(codes(state, OWN.images[0], POINTS) != taught)) for state in (light, done)]
+    assert apart[1] < apart[0] - 0.1
+
+
+def test_earlier_codes_and_keypoints_hold_as_hard_as_asked(light):
+    loose = SMALL.model_copy(update={"loss": SMALL.loss.model_copy(update={"keypoints": 0.0})})
+    free = train_codes(light, OWN, CodeInputs(), loose, LocalTrainingPlan(0, 40), CPU)
+    held = train_codes(light, OWN, CodeInputs(), SMALL, LocalTrainingPlan(0, 40, compatible=100.0), CPU)
+    assert held.losses["keypoints"] < 0.5 * free.losses["keypoints"]
+    same = [
+        np.mean(codes(each.network.state_dict(), OWN.images[0], POINTS) == codes(light, OWN.images[0], POINTS))
+        for each in (free, held)
+    ]
+    assert same[1] > same[0] + 0.05
+
+
+def test_rounds_continue_with_their_moments_and_from_where_the_first_began(light):
+    inputs = CodeInputs()
+    plan = LocalTrainingPlan(0, RAMP_STEPS + 1, compatible=1.0)
+    whole = train_codes(light, OWN, inputs, SMALL, plan, CPU, legacy=light)
+    first = train_codes(light, OWN, inputs, SMALL, LocalTrainingPlan(0, RAMP_STEPS, compatible=1.0), CPU)
+    second = train_codes(
+        first.network.state_dict(), OWN, inputs, SMALL, LocalTrainingPlan(RAMP_STEPS, 1, compatible=1.0), CPU,
+        legacy=light, optimiser_state=first.optimiser_state,
+    )  # fmt: skip
+    expected = whole.network.state_dict()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
+
+
+def test_inputs_are_computed_again_only_if_the_layers_before_changed(light):
+    inputs = CodeInputs()
+    network = network_from_state("light", light)
+    first = inputs.of(network, OWN, CPU)
+    with torch.no_grad():
+        network.body.code_head[-1].bias += 1.0
+    assert inputs.of(network, OWN, CPU) is first
+    with torch.no_grad():
+        network.body.to_half[0][0].weight += 0.1
+    assert not torch.equal(inputs.of(network, OWN, CPU), first)
+
+
+def test_a_robot_that_saw_nothing_again_is_told_so(light):
+    with pytest.raises(TrainingError, match="none; set trained to all"):
+        train_codes(light, RevisitExamples(OWN.images), CodeInputs(), SMALL, LocalTrainingPlan(0, 1), CPU)
