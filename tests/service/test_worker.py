@@ -293,6 +293,16 @@ def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkey
     assert "ZeroDivisionError" in cloud.store.refusals("a")[0][2]
 
 
+def test_a_worker_tells_what_its_stages_cost(cloud):
+    packets = two_robots()
+    cloud.put(packets)
+    cloud.work()
+    told = dict(cloud.told)
+    assert told["runs of apply"] == len(packets)
+    assert told["runs of solve"] > 0
+    assert told["ms of apply"] >= told["ms of solve"] >= 0
+
+
 def test_corrections_leave_while_there_is_still_a_queue(cloud):
     cloud.put(two_robots())
     waiting = []

@@ -22,9 +22,11 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.shared_words import SharedWords
+from fcslam.cloud.stage_times import StageTimes
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
-from fcslam.lidar.pair_verification import VerifyPairs, verify_here
+from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
+from fcslam.lidar.verification import Verification, VerificationConfig
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Change,
@@ -72,10 +74,12 @@ class Fleet:
         self._seed = seed
         self._words = SharedWords(config)
         self._sessions = SessionStore(config.claims, read)
-        self._graph = JointGraph()
+        self.stages = StageTimes()
+        """Times of verification and of solves, since this fleet was made."""
+        self._graph = JointGraph(self.stages)
         self._decisions = ClosureDecisions(config, self._sessions, self._graph)
         self._recognition = PlaceRecognition(
-            config, seed, self._sessions, self._graph, self._decisions.closures, verify_pairs
+            config, seed, self._sessions, self._graph, self._decisions.closures, self._timed(verify_pairs)
         )
         self._quality = CorrectionQuality(self._graph, config.surprise_m, config.surprise_rad)
         self._needs_replay = False
@@ -116,6 +120,15 @@ class Fleet:
                 self._sessions.add_tile(tile, packet.sequence)
             case Correction() | Acknowledgement() | DetectorUpdate():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
+
+    def _timed(self, verify_pairs: VerifyPairs) -> VerifyPairs:
+        def verify(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
+            if not pairs:
+                return []
+            with self.stages.measure("verification"):
+                return verify_pairs(pairs, config)
+
+        return verify
 
     def state(self) -> State:
         """The state after the packets so far, without what those hold; ``restored`` makes an equal fleet of it."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.cloud.stage_times import StageTimes
 from fcslam.geometry import se2
 from fcslam.graph.contradiction import strained_pairs
 from fcslam.graph.factors import FactorCache, Loss
@@ -23,7 +24,8 @@ SOLVED_SHARE = 0.05
 class JointGraph:
     """Grows with the packets; poses of robots in different maps are each in their own map's frame."""
 
-    def __init__(self) -> None:
+    def __init__(self, stages: StageTimes | None = None) -> None:
+        self._stages = stages or StageTimes()
         self.graph = PoseGraph()
         self._factors = FactorCache(self.graph)
         self._variables: dict[str, Rows[np.int64]] = {}
@@ -124,8 +126,9 @@ class JointGraph:
 
     def optimize(self) -> None:
         """Quick solve (Levenberg-Marquardt with a Cauchy loss on closures)."""
-        start = self._poses.values
-        self.take(optimize(self.graph, start, loss=Loss.CAUCHY, kept=self._kept(), factors=self._factors).poses)
+        with self._stages.measure("solve"):
+            start = self._poses.values
+            self.take(optimize(self.graph, start, loss=Loss.CAUCHY, kept=self._kept(), factors=self._factors).poses)
 
     def is_strained(self, limit: float) -> bool:
         """Whether the mean chi-square of the closures between two robots is over the limit: they may contradict."""

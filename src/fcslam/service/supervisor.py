@@ -6,10 +6,11 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+from fcslam.cloud.stage_times import StageTotal
 from fcslam.service.mission_folder import MissionFolder
 
 LONGEST_PAUSE_S = 30.0
@@ -21,6 +22,10 @@ READY = "ready"
 
 PROGRESS = "progress"
 """The event by which a worker reports how many packets it has applied; the supervisor keeps the number."""
+
+STAGE_RUNS, STAGE_MS = "runs of ", "ms of "
+"""Before the name of a stage: the events by which a worker reports how often it ran, and how many milliseconds it took
+in all. The supervisor keeps the numbers."""
 
 Listen = Callable[[str, int], None]
 """Called with a worker's events, on a separate thread."""
@@ -52,6 +57,15 @@ class RunningWorker(Protocol):
         """Stop the worker after its current step, and wait."""
 
 
+@runtime_checkable
+class MeasuredWorker(Protocol):
+    """A worker that says what its stages cost."""
+
+    @property
+    def stages(self) -> Mapping[str, StageTotal]:
+        """Totals of the present worker's stages, by name."""
+
+
 _log = logging.getLogger(__name__)
 
 
@@ -71,6 +85,7 @@ class Supervisor:
         self._starts = 0
         self._is_ready = False
         self._applied = 0
+        self._stages: dict[str, StageTotal] = {}
         self._thread = threading.Thread(target=self._run, name=f"worker of {folder.name}", daemon=True)
         self._thread.start()
 
@@ -94,6 +109,11 @@ class Supervisor:
     def applied(self) -> int:
         """How many packets the present worker has applied, those of its snapshot included."""
         return self._applied
+
+    @property
+    def stages(self) -> Mapping[str, StageTotal]:
+        """Totals of the present worker's stages, by name."""
+        return dict(self._stages)
 
     def ring(self) -> None:
         """Notify the worker of new packets or requests."""
@@ -135,6 +155,7 @@ class Supervisor:
             with self._lock:
                 self._process, self._is_ready, self._applied = process, False, 0
                 self._starts += 1
+                self._stages = {}
                 if self._stopping.is_set():
                     self._end_input()
             try:
@@ -153,6 +174,12 @@ class Supervisor:
                 self._is_ready = True
             elif event == PROGRESS:
                 self._applied = number
+            elif event.startswith(STAGE_RUNS):
+                stage = event.removeprefix(STAGE_RUNS)
+                self._stages[stage] = self._stages.get(stage, StageTotal(0, 0.0))._replace(runs=number)
+            elif event.startswith(STAGE_MS):
+                stage = event.removeprefix(STAGE_MS)
+                self._stages[stage] = self._stages.get(stage, StageTotal(0, 0.0))._replace(seconds=1e-3 * number)
             else:
                 self._listen(event, number)
         except (ValueError, TypeError, KeyError):

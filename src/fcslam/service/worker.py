@@ -48,7 +48,7 @@ from fcslam.runs import Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
-from fcslam.service.supervisor import PROGRESS, READY
+from fcslam.service.supervisor import PROGRESS, READY, STAGE_MS, STAGE_RUNS
 from fcslam.service.warmup import warm_up_fleet
 from fcslam.storage.state_file import code_version, read_state, write_state
 from fcslam.wire.ledger import Ledger
@@ -183,7 +183,13 @@ class Worker:
         self._report()
         if self._applied > applied:
             self._tell(PROGRESS, self._applied)
+            self._tell_stages()
         return self._arrivals > arrivals or self._applied > applied
+
+    def _tell_stages(self) -> None:
+        for stage, total in self._fleet.stages.totals.items():
+            self._tell(f"{STAGE_RUNS}{stage}", total.runs)
+            self._tell(f"{STAGE_MS}{stage}", round(1e3 * total.seconds))
 
     def _report(self) -> bool:
         """Store how many packets took effect, and new corrections, if the last time is long enough ago."""
@@ -273,7 +279,8 @@ class Worker:
             return
         self._crashes.begin(task)
         try:
-            self._fleet.apply(decode(packet.data))
+            with self._fleet.stages.measure("apply"):
+                self._fleet.apply(decode(packet.data))
         except PacketError as error:
             self._refuse(packet, str(error))
         except MemoryError:

@@ -2,6 +2,8 @@
 
 import hashlib
 import io
+import json
+import re
 import zipfile
 from collections import Counter
 from dataclasses import replace
@@ -31,6 +33,8 @@ from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, readdress
 from tests.scripted import LASER
 from tests.service.http.desk import POSES, A, B, Desk, put_detector
+
+ROOT = Path(__file__).parents[3]
 
 API = "/api/v1"
 PACKETS = f"{API}/robots/a/packets"
@@ -552,7 +556,46 @@ def test_measures_say_what_came_in(mapped):
     assert lines['fcslam_packets_total{channel="lidar",kind="place",mission="mission",robot="a"}'] > 0
     assert uplink(mapped, "a") == sum(map(len, A))
     assert lines["fcslam_packets_stored"] == len(A) + len(B)
-    assert lines["fcslam_packets_queued"] == 0
+    assert lines["fcslam_packets_queued"] == lines["fcslam_oldest_packet_age_seconds"] == 0
+
+
+def test_every_panel_of_the_dashboard_asks_for_a_metric_that_there_is(mapped):
+    text = get(mapped, "../../metrics").text
+    there = {line.split()[2] for line in text.splitlines() if line.startswith("# TYPE fcslam_")}
+    there -= {name for name in there if name.endswith("_created")}
+    dashboard = json.loads((ROOT / "docs" / "howto" / "grafana.json").read_text(encoding="utf-8"))
+    asked = [
+        set(re.findall(r"fcslam_\w+", target["expr"])) for panel in dashboard["panels"] for target in panel["targets"]
+    ]
+    assert all(asked)
+    assert set().union(*asked) == there
+    described = set(re.findall(r"`(fcslam_\w+)`", (ROOT / "docs" / "howto" / "monitor.md").read_text(encoding="utf-8")))
+    assert described == there
+
+
+def test_the_age_is_that_of_the_oldest_packet_without_effect(desk):
+    """The desk's worker stands still, as does the clock until it is moved."""
+    now = [100.0]
+    metrics = measures.ServiceMetrics(lambda: now[0])
+    desk.state.mission.worker.ring = lambda: None
+
+    def age():
+        text = metrics.text(desk.state.mission).decode()
+        (line,) = (line for line in text.splitlines() if line.startswith("fcslam_oldest_packet_age_seconds "))
+        return float(line.split()[1])
+
+    assert age() == 0.0
+    desk.told(desk.send("a", A[:5]))
+    metrics.arrived(desk.state.mission)
+    now[0] = 107.0
+    desk.told(desk.send("a", A[5:9]))
+    metrics.arrived(desk.state.mission)
+    now[0] = 110.0
+    assert age() == 10.0
+    desk.state.mission.store.progress(5, [])
+    assert age() == 3.0
+    desk.state.mission.store.progress(9, [])
+    assert age() == 0.0
 
 
 @pytest.mark.slow

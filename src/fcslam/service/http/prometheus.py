@@ -1,26 +1,32 @@
 """Metrics for Prometheus."""
 
 import threading
-from collections import defaultdict
-from collections.abc import Iterator
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, generate_latest
 from prometheus_client.core import CounterMetricFamily
 from prometheus_client.registry import Collector
 
+from fcslam.cloud.stage_times import StageTotal
 from fcslam.service.missions import OpenMission
+from fcslam.service.supervisor import MeasuredWorker
 from fcslam.wire.batches import read_batch
 from fcslam.wire.ledger import Traffic
 from fcslam.wire.packets import read_label
 
 _AT_ONCE = 10_000
 """Packets counted in one query of the store."""
+_MOST_NOTED = 100_000
+"""Arrivals whose times are kept; while so many wait, later ones are not noted."""
 
 
 class ServiceMetrics:
     """Counts replies and refusals; reads everything else from the mission on request."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self._registry = CollectorRegistry()
         self._answered = Counter(
             "fcslam_answer_bytes", "Bytes of packets sent to a robot", ("robot", "kind"), registry=self._registry
@@ -28,16 +34,28 @@ class ServiceMetrics:
         self._refused = Counter("fcslam_refusals", "Requests refused, by status", ("status",), registry=self._registry)
         self._packets = Gauge("fcslam_packets_stored", "Packets of the open mission", registry=self._registry)
         self._queue = Gauge("fcslam_packets_queued", "Packets without effect so far", registry=self._registry)
+        self._age = Gauge(
+            "fcslam_oldest_packet_age_seconds",
+            "Time since the oldest packet arrived that has no effect so far",
+            registry=self._registry,
+        )
         self._waiting = Gauge("fcslam_packets_waiting", "Packets after one that is missing", registry=self._registry)
         self._starts = Gauge("fcslam_worker_starts", "Starts of the open mission's worker", registry=self._registry)
         self._alive = Gauge("fcslam_worker_up", "Whether the worker runs", registry=self._registry)
         self._uplink = _Uplink()
         self._registry.register(self._uplink)
+        self._stages = _Stages()
+        self._registry.register(self._stages)
+        self._arrivals = _Arrivals()
 
     def answer(self, robot: str, batch: bytes) -> None:
         """Count the bytes of a reply."""
         for data in read_batch(batch):
             self._answered.labels(robot, read_label(data).kind).inc(len(data))
+
+    def arrived(self, mission: OpenMission) -> None:
+        """Note when packets of a mission arrived."""
+        self._arrivals.add(mission.folder.name, mission.intake.ready_count(), self._clock())
 
     def refuse(self, status: int) -> None:
         """Count a refused request."""
@@ -47,12 +65,65 @@ class ServiceMetrics:
         """All metrics in the Prometheus text format."""
         ready = mission.intake.ready_count()
         self._packets.set(ready)
-        self._queue.set(ready - mission.store.applied())
+        applied = mission.store.applied()
+        self._queue.set(ready - applied)
+        self.arrived(mission)  # packets of before this start, if nobody noted them
+        self._age.set(self._arrivals.age_s(applied, self._clock()))
+        self._stages.follow(mission)
         self._waiting.set(mission.intake.waiting_count())
         self._starts.set(mission.worker.starts)
         self._alive.set(mission.worker.pid is not None)
         self._uplink.follow(mission)
         return generate_latest(self._registry)
+
+
+class _Arrivals:
+    """When packets arrived that have no effect yet."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._mission = ""
+        self._noted: deque[tuple[int, float]] = deque()
+        """How many packets there were from when on; the oldest first."""
+
+    def add(self, mission: str, packets: int, now_s: float) -> None:
+        """Note how many packets a mission has now."""
+        with self._lock:
+            if mission != self._mission:
+                self._mission = mission
+                self._noted.clear()
+            is_new = not self._noted or packets > self._noted[-1][0]
+            if is_new and len(self._noted) < _MOST_NOTED:
+                self._noted.append((packets, now_s))
+
+    def age_s(self, applied: int, now_s: float) -> float:
+        """Age of the oldest packet after the first ``applied`` ones; 0 if there is none."""
+        with self._lock:
+            while self._noted and self._noted[0][0] <= applied:
+                self._noted.popleft()
+            return now_s - self._noted[0][1] if self._noted else 0.0
+
+
+class _Stages(Collector):
+    """Runs of the present worker's stages and the time they took; they begin again with a new worker."""
+
+    def __init__(self) -> None:
+        self._totals: Mapping[str, StageTotal] = {}
+
+    def follow(self, mission: OpenMission) -> None:
+        """Take over the totals of the mission's worker."""
+        worker = mission.worker
+        self._totals = worker.stages if isinstance(worker, MeasuredWorker) else {}
+
+    def collect(self) -> Iterator[CounterMetricFamily]:
+        """For the registry."""
+        runs = CounterMetricFamily("fcslam_stage_runs", "Runs of a stage of the worker", labels=("stage",))
+        seconds = CounterMetricFamily("fcslam_stage_seconds", "Time of a stage of the worker", labels=("stage",))
+        for stage, total in sorted(self._totals.items()):
+            runs.add_metric((stage,), total.runs)
+            seconds.add_metric((stage,), total.seconds)
+        yield runs
+        yield seconds
 
 
 class _Uplink(Collector):
