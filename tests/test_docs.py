@@ -14,6 +14,7 @@ import yaml
 from fcslam.cli import app
 from fcslam.config import Settings
 from fcslam.mission import MissionConfig
+from fcslam.records import ReasonCode
 from tests.test_imports import ROOMS
 
 ROOT = Path(__file__).parents[1]
@@ -234,6 +235,11 @@ BROKEN_TEXT = re.compile(r"\"\s*\n\s*f?\"")
 def parts_of_messages(text: str) -> list[str]:
     """Text between the dots of every message."""
     return [part.strip("() ") for message in MESSAGE.findall(text) for part in message.split("...")]
+
+
+def test_the_page_on_results_explains_every_reason():
+    text = (ROOT / "docs" / "howto" / "report.md").read_text(encoding="utf-8")
+    assert [reason for reason in ReasonCode if f"`{reason}`" not in text] == []
 
 
 def test_every_message_in_troubleshooting_is_one_of_the_code():

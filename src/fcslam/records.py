@@ -316,7 +316,6 @@ class ReasonCode(StrEnum):
     SEPARATED = "robot_contradicted"
     FALSE_BRIDGE = "joins_contradicting_maps"
     VETOED = "vetoed"
-    CUT = "cut"
     PINNED = "pinned"
     MADE_BY_HAND = "made_by_hand"
     UNUSED = "not_needed_by_rigid_fusion"
@@ -349,7 +348,6 @@ _REASON_TEXT = {
     ReasonCode.SEPARATED: "the robot has a map of its own: the paths of {value} others contradict its path",
     ReasonCode.FALSE_BRIDGE: "one robot alone joins maps that contradict each other at {value} separate places",
     ReasonCode.VETOED: "vetoed by hand",
-    ReasonCode.CUT: "a stretch that was cut by hand",
     ReasonCode.PINNED: "pinned by hand",
     ReasonCode.MADE_BY_HAND: "made by hand",
     ReasonCode.UNUSED: "not needed by the rigid fusion",

@@ -261,6 +261,21 @@ def test_a_closure_by_hand_joins_maps_where_nothing_was_recognised(scripted):
     assert [c.reason.code for c in result.closures] == ["made_by_hand"]
 
 
+@pytest.mark.parametrize("veto", [Veto("b", "a"), Veto("a", "b", (10.0, 1020.0))])
+@pytest.mark.parametrize("before", [True, False], ids=["edits first", "packets first"])
+def test_a_veto_outweighs_a_closure_by_hand_that_is_made_with_it(scripted, veto, before):
+    cloud = scripted()
+    changes = [ManualClosure("a", 10.2, "b", 1020.0, (1.0, 2.0, 0.5), (0.1, 0.05)), veto]
+    if before:
+        cloud.fleet.edit(changes)
+    feed(cloud, TWO)
+    if not before:
+        cloud.fleet.edit(changes)
+    result = cloud.finalize()
+    assert map_of(result) == {"a": 0, "b": 1}
+    assert [(c.status, c.reason.code) for c in result.closures] == [("revoked", "vetoed")]
+
+
 def test_a_closure_by_hand_outweighs_others(scripted):
     """Six closures say one thing, the user another."""
     cloud = feed(scripted(closures(A, B, PAIRS, shift=ALIAS)), TWO)

@@ -131,7 +131,7 @@ class ClosureDecisions:
         ``final``: no packet comes after it, so closures by hand may end at the last keyscan of a session.
         """
         for made in self._missing(final):
-            self.closures.add_by_hand(made, *self._ends(made))
+            self._mark(self.closures.add_by_hand(made, *self._ends(made)))
         fusion = reevaluate(
             self._graph,
             self.closures,
