@@ -19,7 +19,7 @@ from tests.wire.examples import EXAMPLES
 
 ROOT = Path(__file__).parents[2]
 SCHEMA = "src/fcslam/wire/fcslam.proto"
-DOCUMENT = ROOT / "docs/reference/wire.md"
+DOCUMENTS = sorted((ROOT / "docs/reference").glob("wire*.md"))
 
 NUMBERS = {
     FieldDescriptor.TYPE_DOUBLE,
@@ -163,8 +163,8 @@ def test_generating_the_module_anew_changes_nothing(tmp_path):
         assert (tmp_path / "fcslam/wire" / name).read_bytes() == (ROOT / "src/fcslam/wire" / name).read_bytes()
 
 
-def test_the_document_names_every_field_and_limit():
-    document = DOCUMENT.read_text(encoding="utf-8")
+def test_the_documents_name_every_field_and_limit():
+    document = "".join(page.read_text(encoding="utf-8") for page in DOCUMENTS)
     missing = [field.name for field in FIELDS.values() if f"`{field.name}`" not in document]
     assert missing == []
     plain = re.sub(r"(?<=\d),(?=\d{3})", "", document)
