@@ -1,4 +1,4 @@
-"""Mean bytes of a keyscan's ranges, by encoding, over all scans of three logs: the table of docs/reference/wire-coding.md.
+"""Mean bytes of a keyscan's ranges, by encoding, over all scans of three logs, for docs/reference/wire-coding.md.
 
     FCSLAM_DATA=/path/to/data python benchmarks/ranges_encoding.py
 

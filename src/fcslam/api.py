@@ -71,7 +71,7 @@ def map_recordings(
         live: called with the mission's cloud after every packet; it must return at once and change nothing.
         floors: the floor on which all recordings were made, or a mapping of robot names to floors. Places of different
             floors are never compared, so each floor has maps of its own.
-        verify_pairs: where closures are verified, see :func:`fcslam.cluster.verifying.verifying`; it does not change
+        verify_pairs: where closures are verified, see ``fcslam.cluster.verifying.verifying``; it does not change
             the run.
 
     Raises:
@@ -113,7 +113,7 @@ def localize(
         recording: a recording of any known format, or an object of your own that implements ``Source``.
         map: a run folder or mission file; the YAML file of a ROS map with the PGM file beside it; or a map.
         initial_pose: about where the recording starts in the map, (x, y, theta), metres and radians; None: anywhere.
-        config: as for :func:`map_recordings`; ``robot`` counts.
+        config: as for ``map_recordings``; ``robot`` counts.
         output: run folder to write; by default nothing is written.
         bag_options: topics and the pose of the laser, where a ROS bag leaves a choice.
         progress: called every 50 scans.

@@ -32,7 +32,7 @@ _NEGATIVE = {"ignore_unknown_options": True}
 
 Mission = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder or mission file.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, in whose map you read the coordinates.")]
-Author = Annotated[str | None, typer.Option(help="Who edits.", show_default="your user name")]
+Author = Annotated[str | None, typer.Option(help="Name of the editor.", show_default="your user name")]
 MapIndex = Annotated[int, typer.Option("--map", min=0, help="Number of the map, as in map_1.png.")]
 Polygon = Annotated[
     str, typer.Argument(metavar="CORNERS", help='Corners in the map, metres: "X,Y X,Y X,Y". Two are a rectangle.')

@@ -117,7 +117,7 @@ def dominant_cluster(
     - enough evidence: members from separate places, or a unique alignment of the maps (``fcslam.graph.evidence``).
 
     Args:
-        consistent: which pairs of closures are consistent, shape (K, K), from :func:`pairwise_consistency`.
+        consistent: which pairs of closures are consistent, shape (K, K), from ``pairwise_consistency``.
         places: positions of the closures in metres, shape (K, 2), or (K, S, 2) as seen by S trajectories, each side in
             one coordinate frame.
         informative: whether each closure fixes the pose in every direction, shape (K,).

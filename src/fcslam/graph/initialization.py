@@ -60,10 +60,10 @@ def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray
 
 
 def initialize_robust(graph: PoseGraph, rounds: int = 20) -> FloatArray:
-    """Compute poses as :func:`initialize`, with closures reweighted until false ones hardly count.
+    """Compute poses as ``initialize``, with closures reweighted until false ones hardly count.
 
     Iteratively reweighted least squares with weight ``d^-1.8`` at a residual of d > 1 standard deviations. After large
-    drift, :func:`fcslam.graph.optimizer.optimize_gnc` converges from here and not from odometry. We tried the INTEL
+    drift, ``fcslam.graph.optimizer.optimize_gnc`` converges from here and not from odometry. We tried the INTEL
     graph of 1,228 poses with as many random false closures as true ones. From here it keeps every true closure and
     rejects every false one; from odometry it loses two thirds of the true ones.
 

@@ -134,13 +134,13 @@ def optimize_gnc(
         graph: N variables and E edges.
         initial: poses to start from, shape (N, 3), odometry or better; None: the graph's own.
         settings: steps and threshold.
-        factors: as in :func:`optimize`.
+        factors: as in ``optimize``.
 
     Returns:
         Poses (N, 3) and weights (E,).
 
     Raises:
-        ValueError: as :func:`optimize`.
+        ValueError: as ``optimize``.
     """
     chosen = settings or GncSettings()
     start, cache = _start(graph, initial), _cache(graph, factors)
@@ -165,7 +165,7 @@ def refine_inliers(
 ) -> Solution:
     """Alternate solving and deciding every closure by its residual, until no decision changes.
 
-    The last part of :func:`optimize_gnc`, from closures that are trusted already: for graphs most of whose closures are
+    The last part of ``optimize_gnc``, from closures that are trusted already: for graphs most of whose closures are
     false, where optimising with all of them gives no useful start.
 
     Args:
@@ -173,13 +173,13 @@ def refine_inliers(
         initial: poses to start from, shape (N, 3); None: the graph's own.
         weights: weights of the edges, shape (E,); closures above one half are trusted at the start.
         settings: threshold of the decision.
-        factors: as in :func:`optimize`.
+        factors: as in ``optimize``.
 
     Returns:
         Poses (N, 3) and weights (E,).
 
     Raises:
-        ValueError: ``weights`` do not fit the graph, or as :func:`optimize`.
+        ValueError: ``weights`` do not fit the graph, or as ``optimize``.
     """
     chosen = settings or GncSettings()
     start, cache = _start(graph, initial), _cache(graph, factors)

@@ -28,7 +28,7 @@ def solve_single_robot(
     - Odometry decides which closures are inliers. Correct while odometry has drifted less than closures are uncertain.
     - Graduated non-convexity with every closure, from odometry. Correct while false closures are few, or small.
     - Graduated non-convexity with the closures that have supporting closures
-      (:func:`fcslam.graph.consistency.count_supporting_closures`), whose solution then decides which of all closures
+      (``fcslam.graph.consistency.count_supporting_closures``), whose solution then decides which of all closures
       are inliers. Correct where false closures are isolated, however many and however far they reach.
 
     Args:

@@ -138,7 +138,7 @@ def search_pyramid(
     config: SearchConfig,
     better_than: FloatArray | None = None,
 ) -> SearchResult:
-    """As :func:`search`, on a pyramid that was built before; poses have shape (3,)."""
+    """As ``search``, on a pyramid that was built before; poses have shape (3,)."""
     reach = _quantile(np.hypot(*scan.points.T), REACH_QUANTILE) if len(scan) else 1.0
     step_rad = 2.0 * np.arcsin(min(0.5, 0.5 * pyramid.cell_m / max(reach, 1.0)))
     turns = int(np.ceil(window.angle_rad / step_rad))

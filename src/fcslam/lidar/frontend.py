@@ -126,7 +126,7 @@ class LidarFrontend:
         """The keyscans of the last ``submap_reach_m`` of travel."""
 
     def localize(self, scan: LaserScan) -> TrackingResult:
-        """Find the pose of the next scan; nothing changes before :meth:`process`."""
+        """Find the pose of the next scan; nothing changes before ``process``."""
         return self._tracker.localize(scan)
 
     def process(self, scan: LaserScan, tracking: TrackingResult | None = None) -> Step:
@@ -134,7 +134,7 @@ class LidarFrontend:
 
         Args:
             scan: the scan.
-            tracking: its result of :meth:`localize`, if that was called before.
+            tracking: its result of ``localize``, if that was called before.
 
         Returns:
             The pose of the scan, and the keyscan that it became.

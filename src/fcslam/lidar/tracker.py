@@ -103,7 +103,7 @@ class TrackedScan:
 
 @dataclass(frozen=True, slots=True)
 class TrackingResult:
-    """The match of one scan, and the state of the tracker after it (see :meth:`ScanTracker.commit`)."""
+    """The match of one scan, and the state of the tracker after it (see ``ScanTracker.commit``)."""
 
     tracked: TrackedScan
     explained: float
@@ -149,7 +149,7 @@ class ScanTracker:
         return result.tracked
 
     def localize(self, scan: LaserScan) -> TrackingResult:
-        """Find the pose of the next scan; the tracker does not change before :meth:`commit`."""
+        """Find the pose of the next scan; the tracker does not change before ``commit``."""
         config = self._config
         # 1. Prediction: the last pose, moved by odometry.
         T_local_guess, moved_m, turned_rad = self._predict(scan)
@@ -182,7 +182,7 @@ class ScanTracker:
         return TrackingResult(tracked, *accepted, matched_here, trust, usual)
 
     def commit(self, result: TrackingResult) -> None:
-        """Continue from the pose that :meth:`localize` found."""
+        """Continue from the pose that ``localize`` found."""
         self._T_local_base = result.tracked.T_local_base
         self._T_odom_base = result.T_odom_base
         self._moved_m, self._turned_rad = result.moved_m, result.turned_rad

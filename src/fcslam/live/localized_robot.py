@@ -46,7 +46,7 @@ class LocalizedRobot(LiveTracker):
                     print(pose.x, pose.y, pose.theta)
 
     Its starting pose need not be known. While the robot does not know where it is, its poses are NaN, never a guess.
-    Threads and processes are as for :class:`fcslam.Robot`. It needs no network, and it sends and keeps nothing.
+    Threads and processes are as for ``fcslam.Robot``. It needs no network, and it sends and keeps nothing.
     """
 
     def __init__(

@@ -25,7 +25,7 @@ class BackendRunner(Protocol):
     """Handles the inputs of one robot's back end in their order."""
 
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
-        """Start to handle the next input; see :meth:`RobotBackend.process`."""
+        """Start to handle the next input; see ``RobotBackend.process``."""
 
 
 class Inline:

@@ -176,7 +176,7 @@ class RobotFrontend:
             path: the downloaded file.
 
         Returns:
-            Done when the back end uses it, or refuses it with the ``FeatureError`` of :meth:`RobotBackend.process`.
+            Done when the back end uses it, or refuses it with the ``FeatureError`` of ``RobotBackend.process``.
         """
         return self._submit(NewDetector(file, path))
 
