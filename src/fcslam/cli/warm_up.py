@@ -59,7 +59,10 @@ def compiled(console: "Console") -> Iterator[None]:
         yield
         return
     processes = cores()
-    about_s = EVERYTHING_S if processes == 1 else FIRST_SCANS_S
-    print_line(console, f"compiling, first run only, about {about_s} s")
+    first_s = EVERYTHING_S if processes == 1 else FIRST_SCANS_S
+    print_line(
+        console,
+        f"compiling, first run only: about {first_s} s until the first scan, about {EVERYTHING_S} s until full speed",
+    )
     with compiling(processes, (warm_up_matching,)):
         yield

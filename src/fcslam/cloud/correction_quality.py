@@ -55,7 +55,7 @@ class CorrectionQuality:
                 self._newest[session] = _Comparison(last, self._share(found))
 
     def state(self) -> State:
-        """What ``restore`` needs."""
+        """The state that ``restore`` takes."""
         return {"newest": {session: tuple(comparison) for session, comparison in self._newest.items()}}
 
     def restore(self, state: State) -> None:
