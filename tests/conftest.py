@@ -1,6 +1,7 @@
 """One small fleet for all tests that need one: simulated once, its packets made once."""
 
 import re
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from fcslam.simulation.simulated_fleet import SimulatedFleet
 from fcslam.sources import write_carmen
 from fcslam.wire.messages import Packet
 from tests import small_fleet
+from tests.postgres import HAS_POSTGRES, WHY_NOT, Server
 from tests.scripted import ScriptedMatcher
 
 # How long an example takes says something of the machine, and of code that is compiled at its first call.
@@ -45,6 +47,31 @@ def state_home(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
+
+
+@pytest.fixture(scope="session")
+def postgres_server(tmp_path_factory):
+    """A PostgreSQL server, in a folder that its user may enter."""
+    if not HAS_POSTGRES:
+        pytest.skip(WHY_NOT)
+    with tempfile.TemporaryDirectory(prefix="fcslam-postgres-") as folder:
+        server = Server(Path(folder))
+        yield server
+        server.stop()
+
+
+@pytest.fixture
+def postgres(postgres_server):
+    """A connection to a PostgreSQL server with the tables of this version and, perhaps, missions of other tests."""
+    from fcslam.service.shared.schema import prepare
+    from fcslam.storage.postgres import Postgres, take_password
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PGPASSWORD", "")
+        server = Postgres(take_password(postgres_server.url), "tests")
+        prepare(server)
+        yield server
+        server.close()
 
 
 @pytest.fixture(scope="session")

@@ -5,12 +5,12 @@ import os
 
 import pytest
 
-from fcslam.service.audit_log import AuditLog
+from fcslam.service.audit_log import AuditFile, AuditLog
 
 
 @pytest.fixture
 def log(tmp_path):
-    return AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
+    return AuditLog(AuditFile(tmp_path / "audit.jsonl"), lambda: 0.0)
 
 
 def test_lines_are_appended_and_private(log, tmp_path):
@@ -33,7 +33,7 @@ def test_of_a_long_log_the_end_is_read(log):
 
 
 def test_what_cannot_be_written_is_said_and_stops_nothing(tmp_path, caplog):
-    log = AuditLog(tmp_path / "missing" / "audit.jsonl", lambda: 0.0)
+    log = AuditLog(AuditFile(tmp_path / "missing" / "audit.jsonl"), lambda: 0.0)
     log.record("boss", "::1", "POST /x", 201, {})
     (line,) = caplog.messages
     assert "cannot be written" in line

@@ -1,6 +1,7 @@
-"""Packets are stored once and unchanged, in the order of their arrival."""
+"""Packets are stored once and unchanged, in the order of their arrival, in a file and on a PostgreSQL server."""
 
 import os
+import secrets
 import sqlite3
 import threading
 from dataclasses import replace
@@ -14,6 +15,9 @@ from fcslam.cloud.replies import NEWS_M, NEWS_RAD, SessionCorrection
 from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Channel, Correction, Edit, Removal, Undo, Veto, frozen
 from fcslam.service.mission_store import EDITS, FACTS, PACKETS, MissionStore, StoredPacket, check_mission
+from fcslam.service.shared.mission_tables import MissionTables
+from fcslam.service.shared.registry import Registry
+from fcslam.storage.database import SealedConnection
 from fcslam.storage.seals import seal
 from fcslam.wire.messages import PacketKind
 
@@ -26,9 +30,36 @@ def packet(robot="a", epoch=0, sequence=0, data=None) -> StoredPacket:
     return StoredPacket(robot, epoch, sequence, 0.5 * sequence, PacketKind.PLACE, Channel.CAMERA, content)
 
 
+class FilePlace:
+    """A mission in a file."""
+
+    def __init__(self, folder):
+        self._path = folder / "mission.sqlite"
+
+    def open(self):
+        return MissionStore(self._path)
+
+
+class ServerPlace:
+    """A mission on a PostgreSQL server."""
+
+    def __init__(self, server):
+        self._server = server
+        self._number = Registry(server, "tests", "tests").create(f"m{secrets.token_hex(8)}")
+
+    def open(self):
+        return MissionStore(MissionTables(self._server, self._number))
+
+
+@pytest.fixture(params=["file", "server"])
+def place(request, tmp_path):
+    """Each test of a store is one of both stores."""
+    return FilePlace(tmp_path) if request.param == "file" else ServerPlace(request.getfixturevalue("postgres"))
+
+
 @pytest.fixture
-def store(tmp_path):
-    store = MissionStore(tmp_path / "mission.sqlite")
+def store(place):
+    store = place.open()
     yield store
     store.close()
 
@@ -43,9 +74,11 @@ def stored(store):
 
 @pytest.mark.slow
 @given(batches=BATCHES)
-def test_packets_are_stored_once_in_the_order_of_their_arrival(batches, tmp_path_factory):
-    path = tmp_path_factory.mktemp("store") / "mission.sqlite"
-    store = MissionStore(path)
+@pytest.mark.parametrize("kind", ["file", "server"])
+def test_packets_are_stored_once_in_the_order_of_their_arrival(kind, batches, tmp_path_factory, request):
+    is_file = kind == "file"
+    place = FilePlace(tmp_path_factory.mktemp("store")) if is_file else ServerPlace(request.getfixturevalue("postgres"))
+    store = place.open()
     expected: dict[tuple[str, int, int], None] = {}
     for batch in batches:
         new = store.put([packet(*number) for number in batch], received_s=1.0)
@@ -56,7 +89,7 @@ def test_packets_are_stored_once_in_the_order_of_their_arrival(batches, tmp_path
     assert [arrival for arrival, _ in arrivals] == list(range(1, len(expected) + 1))
     assert [e[:3] for e in store.envelopes()] == list(expected)
     store.close()
-    again = MissionStore(path)
+    again = place.open()
     assert again.arrivals(0, 1000) == arrivals
     again.close()
 
@@ -77,7 +110,7 @@ def test_another_packet_with_the_same_number_is_a_conflict_and_those_before_it_a
 
 def test_a_batch_that_fails_in_the_middle_leaves_nothing(store, monkeypatch):
     store.put([packet(sequence=0)], 0.0)
-    with pytest.raises(StoreError, match="full"):
+    with pytest.raises(StoreError, match="full|null value"):
         store.put([packet(sequence=1), replace(packet(sequence=2), data=None)], 0.0)  # type: ignore[arg-type]
     assert [p.sequence for p in stored(store)] == [0]
     store.put([packet(sequence=1)], 0.0)
@@ -98,8 +131,8 @@ def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
     store.close()
 
 
-def test_what_another_process_wrote_is_seen(store, tmp_path):
-    other = MissionStore(tmp_path / "mission.sqlite")
+def test_what_another_process_wrote_is_seen(store, place):
+    other = place.open()
     other.put([packet()], 0.0)
     other.refuse("a", 0, 0, "no good")
     assert store.refusals("a") == [(0, 0, "no good")]
@@ -108,15 +141,14 @@ def test_what_another_process_wrote_is_seen(store, tmp_path):
 
 
 @pytest.mark.parametrize("reopened", [False, True])
-def test_versions_of_corrections_grow_with_every_change_and_with_nothing_else(tmp_path, reopened):
-    path = tmp_path / "mission.sqlite"
-    store = MissionStore(path)
+def test_versions_of_corrections_grow_with_every_change_and_with_nothing_else(place, reopened):
+    store = place.open()
     told = []
     for x in (0.0, 0.0, 1.0, 1.0, 0.0):
         store.progress(5, [correction("a", x), correction("b", 3.0)])
         if reopened:
             store.close()
-            store = MissionStore(path)
+            store = place.open()
         versions = {robot: store.correction(robot, 0).correction.version for robot in "ab"}
         told.append((x, versions["a"], versions["b"]))
     assert [x for x, *_ in told] == [0.0, 0.0, 1.0, 1.0, 0.0]
@@ -228,7 +260,7 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
     elif harm == "torn":
         path.write_bytes(content[: len(content) // 2])
     else:
-        connection = sqlite3.connect(path)
+        connection = sqlite3.connect(path, factory=SealedConnection)
         connection.create_function("seal", -1, seal)
         changes = {"kind": {"kind": "rumour"}, "channel": {"channel": "smell"}, "none": {"kind": None}}
         rows = {
@@ -243,10 +275,10 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
             "seal": "UPDATE packets SET time = 1.0 WHERE sequence = 3",
         }
         if harm in changes:
-            PACKETS.update(connection, changes[harm], "sequence = 3", {})
+            connection.update(PACKETS, changes[harm], "sequence = 3", {})
         elif harm in rows:
             table, row = rows[harm]
-            table.insert(connection, row)
+            connection.insert(table, [row])
         else:
             connection.execute(statements[harm])
         connection.commit()

@@ -1,6 +1,7 @@
 """`fcslam serve`: the cloud as a service over HTTP."""
 
 import ipaddress
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from fcslam.service.http.state import ServiceState
 
 _TLS = "TLS"
+_INSTANCES = "Several instances"
 
 
 def serve(
@@ -59,6 +61,28 @@ def serve(
     ] = None,
     docs: Annotated[bool, typer.Option("--docs", help="Describe the REST interface at /docs.")] = False,
     quiet: Quiet = False,
+    store: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="PostgreSQL database for all missions, postgresql://USER@HOST:PORT/DATABASE; several instances may "
+            "share it. The default is a file for each mission in --data.",
+            rich_help_panel=_INSTANCES,
+        ),
+    ] = None,
+    instance: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of this instance of --store; the default is the host's name.", rich_help_panel=_INSTANCES
+        ),
+    ] = None,
+    max_missions: Annotated[
+        int, typer.Option(min=0, help="Workers that this instance of --store runs.", rich_help_panel=_INSTANCES)
+    ] = 20,
+    max_robots: Annotated[
+        int,
+        typer.Option(min=1, help="Robots that may send to this instance of --store.", rich_help_panel=_INSTANCES),
+    ] = 200,
     workers: WorkersOption = "1",
     workers_ca: WorkerCa = None,
     workers_certificate: WorkerCertificate = None,
@@ -68,11 +92,13 @@ def serve(
     import gc
     import logging
 
+    from fcslam.cli.shared_service import Shared, shared_state
     from fcslam.cluster.verifying import verifying
     from fcslam.cluster.workers import Workers
     from fcslam.errors import ServiceError
     from fcslam.page.routes import documentation_router, page_router
     from fcslam.service.http.app import create_app
+    from fcslam.service.shared.missions import NAMED
     from fcslam.service.warmup import warm_up_decoding
     from fcslam.storage.files import keep_private
 
@@ -88,19 +114,26 @@ def serve(
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with listen(host, port) as listening:
-        authenticator = _authenticator(tokens, client_ca)
-        state = _state(data, authenticator, _cloud_config(config), learning, chosen)
-        _reload_on_hangup(state, tokens)
-        tell_uncached(notices(quiet))
-        warm_up_decoding()
-        gc.freeze()  # collecting these objects again and again would delay packets
-        pages = (page_router(), documentation_router()) if docs else (page_router(),)
-        server = _server(create_app(state, pages, local_names=is_open), tls_certificate, tls_key, client_ca)
-        scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
-        mission = state.mission.folder.name
-        shown = f"[{address}]" if ":" in address else address
-        typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{shown}:{number}; Ctrl-C stops it")
-        server.run(sockets=[listening])
+        authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
+        with (
+            nullcontext(_state(data, authenticator, given, learning, chosen))
+            if store is None
+            else shared_state(
+                Shared(store, instance, max_missions, max_robots), data, authenticator, given, learning, chosen
+            )
+        ) as state:
+            _reload_on_hangup(state, tokens)
+            tell_uncached(notices(quiet))
+            warm_up_decoding()
+            gc.freeze()  # collecting these objects again and again would delay packets
+            pages = (page_router(), documentation_router()) if docs else (page_router(),)
+            app = create_app(state, pages, local_names=is_open, named=None if store is None else NAMED)
+            server = _server(app, tls_certificate, tls_key, client_ca)
+            scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
+            mission = state.mission.folder.name
+            shown = f"[{address}]" if ":" in address else address
+            typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{shown}:{number}; Ctrl-C stops it")
+            server.run(sockets=[listening])
 
 
 def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_ca: Path | None) -> "uvicorn.Server":
@@ -166,7 +199,7 @@ def _state(
     import sys
     import time
 
-    from fcslam.service.audit_log import AuditLog
+    from fcslam.service.audit_log import AuditFile, AuditLog
     from fcslam.service.http.events import EventStream
     from fcslam.service.http.limits import RateLimit
     from fcslam.service.http.state import ServiceState
@@ -179,7 +212,7 @@ def _state(
         data, config, time.monotonic, time.time,
         lambda folder: Supervisor(folder, time.monotonic, events.publish, command),
     )  # fmt: skip
-    audit = AuditLog(data / "audit.jsonl", time.time)
+    audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, learning)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 REFUSED_EVERY_S = 60.0
 """Refused logins make one line in this time at most, so no client without a token can fill the disk."""
@@ -35,11 +35,57 @@ class AuditEntry:
     """The content of the request, without secrets."""
 
 
-class AuditLog:
+class AuditPlace(Protocol):
+    """Where the lines of the log are."""
+
+    def append(self, line: bytes) -> None:
+        """Append a line.
+
+        Raises:
+            OSError: it is lost.
+        """
+
+    def newest(self, limit: int) -> list[bytes]:
+        """At most ``limit`` newest lines, the oldest of them first.
+
+        Raises:
+            OSError: the log cannot be read.
+        """
+
+
+class AuditFile:
     """A file that is written in one thread and may be read in any."""
 
-    def __init__(self, path: Path, wall_clock: Callable[[], float]) -> None:
-        self._path, self._wall_clock = path, wall_clock
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    def append(self, line: bytes) -> None:
+        """As in AuditPlace."""
+        file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        try:
+            os.write(file, line + b"\n")
+        finally:
+            os.close(file)
+
+    def newest(self, limit: int) -> list[bytes]:
+        """As in AuditPlace."""
+        try:
+            with self._path.open("rb") as file:
+                start = max(0, file.seek(0, os.SEEK_END) - _READ_BYTES)
+                file.seek(start)
+                return file.read().splitlines()[1 if start else 0 :][-limit:]
+        except FileNotFoundError:
+            return []
+
+
+class AuditLog:
+    """Lines that only the service appends."""
+
+    def __init__(self, place: AuditPlace, wall_clock: Callable[[], float]) -> None:
+        self._place, self._wall_clock = place, wall_clock
         self._refused, self._refused_from = 0, ""
         """Refused logins that have no line yet, and where the last one came from."""
         self._line_at = 0.0
@@ -48,15 +94,11 @@ class AuditLog:
         """Append what somebody did. A disk that is full loses the line, which the service's own log then says."""
         time = datetime.fromtimestamp(self._wall_clock(), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         entry = AuditEntry(time, who, address, action, status, content)
-        line = json.dumps(asdict(entry), separators=(",", ":")).encode() + b"\n"
+        line = json.dumps(asdict(entry), separators=(",", ":")).encode()
         try:
-            file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
-            try:
-                os.write(file, line)
-            finally:
-                os.close(file)
+            self._place.append(line)
         except OSError as error:
-            _log.error("%s: cannot be written (%s); lost: %s", self._path, error, line.decode().rstrip())
+            _log.error("%s: cannot be written (%s); lost: %s", self._place, error, line.decode())
 
     def refuse_login(self, address: str) -> None:
         """Count a request that no known token or certificate came with."""
@@ -76,11 +118,4 @@ class AuditLog:
         Raises:
             OSError: the log cannot be read.
         """
-        try:
-            with self._path.open("rb") as file:
-                start = max(0, file.seek(0, os.SEEK_END) - _READ_BYTES)
-                file.seek(start)
-                lines = file.read().splitlines()[1 if start else 0 :]
-        except FileNotFoundError:
-            return []
-        return [AuditEntry(**json.loads(line)) for line in lines[-limit:]]
+        return [AuditEntry(**json.loads(line)) for line in self._place.newest(limit)]

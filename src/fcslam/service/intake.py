@@ -1,7 +1,7 @@
 """Checks, stores and acknowledges batches of packets; knows no network and does not wait for the fleet."""
 
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import ReplyState, replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
-from fcslam.errors import FcslamError, PacketConflictError, PacketError
+from fcslam.errors import FcslamError, PacketError
 from fcslam.records import Channel, DetectorFile, Place, WordPlace
 from fcslam.service.mission_store import MissionStore, StoredPacket
 from fcslam.service.token_buckets import TokenBuckets
@@ -74,6 +74,42 @@ class SessionState(NamedTuple):
     """Number of the first packet that is missing."""
 
 
+class Agents:
+    """Which agent speaks for each robot. Any thread may call."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._held: dict[str, tuple[str, float]] = {}
+        """Agent of each robot, and when its last request came."""
+
+    def hold(self, robot: str, agent: str) -> None:
+        """Let an agent speak for a robot.
+
+        Raises:
+            LeaseError: another one does.
+        """
+        now = self._clock()
+        with self._lock:
+            holder, heard = self._held.get(robot, (agent, now))
+            if holder != agent and now < heard + LEASE_S:
+                raise held_by_another(robot, heard + LEASE_S - now)
+            self._held[robot] = agent, now
+
+    def silent_s(self, robot: str) -> float | None:
+        """Seconds since the robot's last batch; None: never."""
+        held = self._held.get(robot)
+        return None if held is None else self._clock() - held[1]
+
+
+def held_by_another(robot: str, wait_s: float) -> LeaseError:
+    """Another agent speaks for a robot, for so long at most if it is gone."""
+    return LeaseError(
+        f"{robot}: another agent speaks for this robot; stop one of the two or name it differently, "
+        f"or wait {wait_s:.0f} s if it is gone"
+    )
+
+
 class Intake:
     """Takes batches for one mission. Any thread may call."""
 
@@ -84,18 +120,20 @@ class Intake:
         wall_clock: Callable[[], float],
         announced: Callable[[], Mapping[Channel, DetectorFile]] = dict,
         limits: ClaimLimits | None = None,
+        agents: "Agents | None" = None,
     ) -> None:
-        """``announced``: detectors that robots are to use; ``limits``: what a robot may send."""
+        """``announced``: detectors that robots are to use; ``limits``: what a robot may send; ``agents``: who speaks
+        for the robots, if other instances know that as well.
+        """
         self._limits = limits = limits or ClaimLimits()
         burst = max(BURST_S * limits.packets_per_s, MAXIMUM_BATCH_PACKETS)
         self._packet_rate = TokenBuckets(clock, limits.packets_per_s, burst)
         self._session_rate = TokenBuckets(clock, limits.sessions_per_hour / 3600.0, limits.sessions_per_hour)
-        self._store, self._clock, self._wall_clock, self._announced = store, clock, wall_clock, announced
+        self._store, self._wall_clock, self._announced = store, wall_clock, announced
+        self._agents = agents or Agents(clock)
         self._lock = threading.Lock()
-        self._leases: dict[str, tuple[str, float]] = {}
-        """Agent of each robot, and when its last request came."""
-        self._log = PacketLog()
-        self._note((e.robot, e.epoch, e.sequence) for e in store.envelopes())
+        self._log, self._arrivals = PacketLog(), 0
+        self.follow()
 
     def take(self, robot: str, agent: str, batch: bytes, known_correction: int) -> IntakeReply:
         """Store a robot's packets; the reply acknowledges all that is stored without a gap.
@@ -108,8 +146,9 @@ class Intake:
             BusyError: it has to be sent again later.
             StoreError: the disk is full; nothing is stored.
         """
-        self._lease(robot, agent)
         check_robot(robot)
+        self._agents.hold(robot, agent)
+        self.follow()
         encoded = read_batch(batch)
         self._limit_packets(robot, len(encoded))
         packets, refusal = _checked(robot, encoded)
@@ -118,10 +157,8 @@ class Intake:
         self._make_room(robot, numbers)
         try:
             self._store.put(packets, self._wall_clock())
-        except PacketConflictError as conflict:
-            self._note(numbers[: conflict.index])
-            raise
-        self._note(numbers)
+        finally:
+            self.follow()
         if refusal:
             raise refusal
         epochs = sorted({epoch for _, epoch, _ in numbers}) or [s.epoch for s in self.sessions(robot)[-1:]]
@@ -130,8 +167,7 @@ class Intake:
 
     def last_heard_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never since the service started."""
-        lease = self._leases.get(robot)
-        return None if lease is None else self._clock() - lease[1]
+        return self._agents.silent_s(robot)
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
         """Sessions of one robot or of all, by robot and epoch."""
@@ -149,25 +185,15 @@ class Intake:
             names = [name for name in self._log.sessions if robot in (None, robot_of(name))]
             return sum(self._log.waiting_count(name) for name in names)
 
-    def _note(self, numbers: Iterable[tuple[str, int, int]]) -> None:
-        """Take packets that are stored into the log; their effect is the worker's."""
+    def follow(self) -> None:
+        """Take into the log what was stored since, here or by another instance; its effect is the worker's."""
         with self._lock:
-            for robot, epoch, sequence in numbers:
-                session = session_name(robot, epoch)
-                self._log.add(PacketNumber(session, sequence), 0.0)
+            for envelope in self._store.envelopes(after=self._arrivals):
+                self._arrivals += 1
+                session = session_name(envelope.robot, envelope.epoch)
+                self._log.add(PacketNumber(session, envelope.sequence), 0.0)
                 for _ in self._log.ready(session):
                     pass
-
-    def _lease(self, robot: str, agent: str) -> None:
-        now = self._clock()
-        with self._lock:
-            holder, heard = self._leases.get(robot, (agent, now))
-            if holder != agent and now < heard + LEASE_S:
-                raise LeaseError(
-                    f"{robot}: another agent speaks for this robot; stop one of the two or name it differently, "
-                    f"or wait {heard + LEASE_S - now:.0f} s if it is gone"
-                )
-            self._leases[robot] = agent, now
 
     def _limit_packets(self, robot: str, count: int) -> None:
         wait_s = self._packet_rate.wait_s(robot, count)

@@ -81,8 +81,7 @@ def recover_mission(path: Path) -> str | None:
                     (TRACKS, {row[:2]: row for row in damage.rows["tracks"]}.values()),
                     (FACTS, facts.items()),
                 ):
-                    for row in rows:
-                        table.insert(connection, row)
+                    connection.insert(table, rows)
         finally:
             database.close()
         replace(path, rebuilt)

@@ -22,8 +22,9 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.config import one_line
 from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Correction, Edit, ManualClosure, Removal, Undo, frozen
-from fcslam.storage.database import Database, SealedTable, check_file, translate_errors
+from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.storage.recovery import fault
+from fcslam.storage.row_store import RowStore, Table, Transaction
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Hello, PacketKind
 from fcslam.wire.packets import Label, decode
@@ -38,12 +39,16 @@ CONFIG_COPY = "config copy"
 
 VERSION = 6
 """Version of the schema and of the packets."""
+MOST_PACKETS = 2**53
+"""No mission has as many."""
 LARGEST_TRACK = 1 << 28
 """Largest size of one column of a session's scans, bytes."""
 NEARBY_S = 1.0
 """So far outside of a session an edit may name a moment: stamps are rounded when they are printed."""
 _AT_ONCE = 10_000
 """Packets that are read at once."""
+_ASKED_AT_ONCE = 1024
+"""Packets whose numbers are looked up at once: those of one batch."""
 _COLUMNS = "robot, epoch, sequence, time, kind, channel, data, refusal"
 
 SCHEMA = """
@@ -77,14 +82,20 @@ CREATE TABLE tracks (
 ) STRICT;
 CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL, seal BLOB NOT NULL) STRICT
 """
-PACKETS = SealedTable(
-    "packets", "arrival", "robot", "epoch", "sequence", "received", "time", "kind", "channel", "refusal", "data"
-)
-CORRECTIONS = SealedTable("corrections", "robot", "epoch", "version", "time", "map_index", "x", "y", "theta", "quality")
-EDITS = SealedTable("edits", "number", "author", "time", "kind", "content")
-FINALIZATIONS = SealedTable("finalizations", "number", "arrivals", "edits", "run", "failure")
-TRACKS = SealedTable("tracks", "robot", "epoch", "stamps", "keyscans", "offsets")
-FACTS = SealedTable("facts", "name", "value")
+PACKETS = Table(
+    "packets", ("arrival",),
+    ("arrival", "robot", "epoch", "sequence", "received", "time", "kind", "channel", "refusal", "data"),
+)  # fmt: skip
+CORRECTIONS = Table(
+    "corrections", ("robot", "epoch"),
+    ("robot", "epoch", "version", "time", "map_index", "x", "y", "theta", "quality"),
+)  # fmt: skip
+EDITS = Table("edits", ("number",), ("number", "author", "time", "kind", "content"))
+FINALIZATIONS = Table("finalizations", ("number",), ("number", "arrivals", "edits", "run", "failure"))
+TRACKS = Table("tracks", ("robot", "epoch"), ("robot", "epoch", "stamps", "keyscans", "offsets"))
+FACTS = Table("facts", ("name",), ("name", "value"))
+TABLES = PACKETS, CORRECTIONS, EDITS, FINALIZATIONS, TRACKS, FACTS
+"""All that a mission is, in the order of ``SCHEMA``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,13 +145,13 @@ class MissionStore:
         StoreError: from every method: the disk is full or broken, and nothing has changed.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Open a mission, or create one if there is no file.
+    def __init__(self, place: Path | RowStore) -> None:
+        """Open a mission: that of a file, which is created if there is none, or that of a server.
 
         Raises:
             StoreError: the file is no mission of this version, or cannot be used.
         """
-        self._database = Database(path, SCHEMA, VERSION)
+        self._database: RowStore = Database(place, SCHEMA, VERSION) if isinstance(place, Path) else place
 
     def close(self) -> None:
         """Close the file."""
@@ -180,15 +191,15 @@ class MissionStore:
         (row,) = self._database.rows(statement, (robot, epoch, sequence))
         return _packet(*row)
 
-    def envelopes(self, until: int | None = None) -> list[Envelope]:
-        """The envelopes of all packets, or of those that arrived first until arrival ``until``, in that order."""
+    def envelopes(self, until: int = MOST_PACKETS, after: int = 0) -> list[Envelope]:
+        """The envelopes of the packets after arrival ``after`` until arrival ``until``, in that order."""
         statement = (
             "SELECT robot, epoch, sequence, time, refusal IS NOT NULL FROM packets"
-            " WHERE ?1 IS NULL OR arrival <= ?1 ORDER BY arrival"
+            " WHERE arrival > ? AND arrival <= ? ORDER BY arrival"
         )
         return [
             Envelope(robot, epoch, sequence, time, bool(refused))
-            for robot, epoch, sequence, time, refused in self._database.rows(statement, (until,))
+            for robot, epoch, sequence, time, refused in self._database.rows(statement, (after, until))
         ]
 
     def refuse(self, robot: str, epoch: int, sequence: int, reason: str) -> None:
@@ -196,7 +207,7 @@ class MissionStore:
         where = "robot = :robot AND epoch = :epoch AND sequence = :sequence"
         number = {"robot": robot, "epoch": epoch, "sequence": sequence}
         with self._database.transaction() as database:
-            PACKETS.update(database, {"refusal": reason}, where, number)
+            database.update(PACKETS, {"refusal": reason}, where, number)
 
     def refusals(self, robot: str) -> list[tuple[int, int, str]]:
         """Epoch, number and reason of every refused packet of a robot."""
@@ -254,7 +265,7 @@ class MissionStore:
             if isinstance(content, Undo):
                 check_undo(_edits(database.execute, 0), content.number)
             number = _next(database, "edits", "number")
-            EDITS.insert(database, (number, author, float(time_s), kind_of(content), edit_json(content)))
+            database.insert(EDITS, [(number, author, float(time_s), kind_of(content), edit_json(content))])
         return Edit(number, author, time_s, content)
 
     def check_named(self, content: Change | Undo) -> None:
@@ -304,7 +315,7 @@ class MissionStore:
         with self._database.transaction() as database:
             number = _next(database, "finalizations", "number")
             arrivals, edits = _next(database, "packets", "arrival") - 1, _next(database, "edits", "number") - 1
-            FINALIZATIONS.insert(database, (number, arrivals, edits, None, None))
+            database.insert(FINALIZATIONS, [(number, arrivals, edits, None, None)])
             return number
 
     def finalizations(self) -> list[Finalization]:
@@ -321,7 +332,7 @@ class MissionStore:
     def answer(self, number: int, run: str | None, failure: str | None = None) -> None:
         """Store the outcome of a request."""
         with self._database.transaction() as database:
-            FINALIZATIONS.update(database, {"run": run, "failure": failure}, "number = :number", {"number": number})
+            database.update(FINALIZATIONS, {"run": run, "failure": failure}, "number = :number", {"number": number})
 
     def fact(self, name: str) -> str | None:
         """A stored fact about the mission; None if there is none."""
@@ -343,7 +354,7 @@ class MissionStore:
         arrays = track.stamps.astype("<f8"), track.keyscans.astype("<i8"), track.T_keyscan_base.astype("<f8")
         row = (robot, epoch, *(zlib.compress(array.tobytes()) for array in arrays))
         with self._database.transaction() as database:
-            TRACKS.insert(database, row)
+            database.insert(TRACKS, [row])
 
     def tracks(self) -> dict[tuple[str, int], Track]:
         """The scans of every session whose scans are known, by robot and epoch.
@@ -357,7 +368,10 @@ class MissionStore:
     def traffic(self) -> Ledger:
         """Traffic of accepted packets by label, and of refused ones."""
         columns, groups = "robot, kind, channel, refusal IS NULL", "robot, kind, channel, refusal IS NULL"
-        statement = f"SELECT {columns}, count(*), sum(length(data)) FROM packets GROUP BY {groups}"
+        statement = (
+            f"SELECT {columns}, count(*), CAST(sum(length(data)) AS BIGINT) FROM packets"
+            f" GROUP BY {groups} ORDER BY {groups}"
+        )
         accepted: dict[Label, Traffic] = {}
         refused = Traffic()
         for robot, kind, channel, counts, packets, size in self._database.rows(statement):
@@ -379,7 +393,10 @@ class MissionStore:
             " WHERE arrival > ? ORDER BY arrival LIMIT ?"
         )
         groups = "robot, kind, channel"
-        statement = f"SELECT max(arrival), {groups}, count(*), sum(size) FROM ({chosen}) GROUP BY {groups}"
+        statement = (
+            f"SELECT max(arrival), {groups}, count(*), CAST(sum(size) AS BIGINT) FROM ({chosen}) AS chosen"
+            f" GROUP BY {groups} ORDER BY {groups}"
+        )
         return [
             (arrival, robot, kind and PacketKind(kind), channel and Channel(channel), Traffic(count, size))
             for arrival, robot, kind, channel, count, size in self._database.rows(statement, (after, limit))
@@ -443,36 +460,47 @@ def _check_edits(rows: Sequence[tuple[int, str, float, str, str]]) -> None:
         edits.append(edit)
 
 
-def _remember(database: sqlite3.Connection, name: str, value: str) -> None:
-    FACTS.insert(database, (name, value), replaces=True)
+def _remember(database: Transaction, name: str, value: str) -> None:
+    database.insert(FACTS, [(name, value)], replaces=True)
 
 
-def _next(database: sqlite3.Connection, table: str, column: str) -> int:
+def _next(database: Transaction, table: str, column: str) -> int:
     """The number after the last one of a table."""
-    return int(database.execute(f"SELECT ifnull(max({column}), 0) + 1 FROM {table}").fetchone()[0])
+    return int(database.execute(f"SELECT coalesce(max({column}), 0) + 1 FROM {table}").fetchone()[0])
 
 
-def _put(database: sqlite3.Connection, packets: Sequence[StoredPacket], received_s: float) -> tuple[int, int | None]:
+def _put(database: Transaction, packets: Sequence[StoredPacket], received_s: float) -> tuple[int, int | None]:
     """How many packets are new, and the index of the first conflicting packet, where it stops."""
-    conflict, new, arrival = None, 0, _next(database, "packets", "arrival")
+    known, first = _known(database, packets), _next(database, "packets", "arrival")
+    conflict: int | None = None
+    rows: list[tuple[object, ...]] = []
     for index, packet in enumerate(packets):
-        known = _data(database, packet)
-        if known is None:
-            number = (packet.robot, packet.epoch, packet.sequence)
+        number = (packet.robot, packet.epoch, packet.sequence)
+        if number not in known:
+            known[number] = packet.data
             times, label = (float(received_s), float(packet.time)), (packet.kind, packet.channel)
-            PACKETS.insert(database, (arrival + new, *number, *times, *label, packet.refusal, packet.data))
-            new += 1
-        elif known != packet.data:
+            rows.append((first + len(rows), *number, *times, *label, packet.refusal, packet.data))
+        elif known[number] != packet.data:
             conflict = index
             break
-    return new, conflict
+    database.insert(PACKETS, rows)
+    return len(rows), conflict
 
 
-def _data(database: sqlite3.Connection, packet: StoredPacket) -> bytes | None:
-    """The stored packet of the same number; None if there is none."""
-    statement = "SELECT data FROM packets WHERE robot = ? AND epoch = ? AND sequence = ?"
-    row = database.execute(statement, (packet.robot, packet.epoch, packet.sequence)).fetchone()
-    return None if row is None else bytes(row[0])
+def _known(database: Transaction, packets: Sequence[StoredPacket]) -> dict[tuple[str, int, int], bytes]:
+    """The stored packets of the same numbers."""
+    known: dict[tuple[str, int, int], bytes] = {}
+    for begin in range(0, len(packets), _ASKED_AT_ONCE):
+        asked = packets[begin : begin + _ASKED_AT_ONCE]
+        numbers = ", ".join("(?, ?, ?)" for _ in asked)
+        statement = (
+            f"SELECT robot, epoch, sequence, data FROM packets WHERE (robot, epoch, sequence) IN (VALUES {numbers})"
+        )
+        values = [value for packet in asked for value in (packet.robot, packet.epoch, packet.sequence)]
+        for *number, data in database.execute(statement, values).fetchall():
+            robot, epoch, sequence = number
+            known[robot, epoch, sequence] = bytes(data)
+    return known
 
 
 def _read_track(name: str, *blobs: bytes) -> Track:
@@ -520,10 +548,10 @@ def _read_correction(
     return None
 
 
-def _write_correction(database: sqlite3.Connection, news: SessionCorrection) -> None:
+def _write_correction(database: Transaction, news: SessionCorrection) -> None:
     """Replace the session's correction; its version is the mission's next one."""
     correction = news.correction
-    (version,) = database.execute("SELECT ifnull(max(version) + 1, 0) FROM corrections").fetchone()
+    (version,) = database.execute("SELECT coalesce(max(version) + 1, 0) FROM corrections").fetchone()
     pose, quality = correction.T_map_odom.tolist(), float(correction.quality)
     row = (news.robot, news.epoch, version, float(news.time), correction.map_index, *pose, quality)
-    CORRECTIONS.insert(database, row, replaces=True)
+    database.insert(CORRECTIONS, [row], replaces=True)

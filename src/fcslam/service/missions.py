@@ -5,9 +5,9 @@ import logging
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO
+from typing import IO, Protocol
 
-from fcslam.cloud.settings import CloudConfig
+from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.cloud.shared_words import SharedWords
 from fcslam.errors import InputError, ServiceError, StoreError
 from fcslam.records import Change, Edit, Undo
@@ -33,31 +33,24 @@ Launch = Callable[[MissionFolder], RunningWorker]
 """Starts the worker of a mission."""
 
 
+class UnknownMissionError(ServiceError):
+    """There is no mission of a name."""
+
+
 class OpenMission:
     """A mission with an intake and a worker. Viewers see it as a ``ViewedMission``."""
 
     def __init__(
-        self, folder: MissionFolder, config: CloudConfig, clock: Callable[[], float],
-        wall_clock: Callable[[], float], launch: Launch, detectors: DetectorStore,
+        self, folder: MissionFolder, store: MissionStore, intake: Intake, find_worker: Callable[[], RunningWorker],
+        wall_clock: Callable[[], float],
     ) -> None:  # fmt: skip
-        """Check and open the mission's file; ``config`` is that of a new mission.
+        self.folder, self.store, self.intake = folder, store, intake
+        self._find_worker, self._wall_clock = find_worker, wall_clock
 
-        Raises:
-            ServiceError: a vocabulary that its settings name cannot be read.
-            StoreError: the file cannot be used, or what determines the map is lost.
-        """
-        self.folder = folder
-        _check_file(folder)
-        self.store = MissionStore(folder.store)
-        settings = self.store.configure(config).fleet
-        try:
-            SharedWords(settings)  # without them, every worker would end at its start
-        except InputError as error:
-            self.store.close()
-            raise ServiceError(f"mission '{folder.name}': {error}") from error
-        self.intake = Intake(self.store, clock, wall_clock, detectors.announced, settings.claims)
-        self.worker = launch(folder)
-        self._wall_clock = wall_clock
+    @property
+    def worker(self) -> RunningWorker:
+        """The mission's worker as it is now."""
+        return self._find_worker()
 
     @property
     def name(self) -> str:
@@ -68,6 +61,10 @@ class OpenMission:
     def run_folder(self) -> Path | None:
         """The live run folder as it is now; None: the worker has written none yet."""
         return self.folder.live.resolve() if self.folder.live.exists() else None
+
+    def result(self, name: str) -> Path | None:
+        """The run folder of a requested result; None if there is none."""
+        return existing_result(self.folder, name)
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
         """Sessions of one robot or of all, by robot and epoch."""
@@ -98,6 +95,24 @@ class OpenMission:
         self.store.close()
 
 
+def existing_result(folder: MissionFolder, name: str) -> Path | None:
+    """The run folder of a requested result, if it is there."""
+    return folder.run(name).resolve() if folder.run(name).is_dir() else None
+
+
+def check_words(name: str, settings: FleetConfig) -> None:
+    """Check that the vocabularies of a mission's settings can be read; without them, every worker would end at its
+    start.
+
+    Raises:
+        ServiceError: they cannot.
+    """
+    try:
+        SharedWords(settings)
+    except InputError as error:
+        raise ServiceError(f"mission '{name}': {error}") from error
+
+
 def _check_file(folder: MissionFolder) -> None:
     """Recover a damaged file; refuse a mission whose file is gone.
 
@@ -117,6 +132,44 @@ def _check_file(folder: MissionFolder) -> None:
         _log.error("%s", told)
 
 
+class ServedMissions(Protocol):
+    """All missions of a service: ``Missions``, or those that several instances share."""
+
+    @property
+    def root(self) -> Path:
+        """Folder of the service's own files."""
+
+    @property
+    def detectors(self) -> DetectorStore:
+        """Detectors that robots may download."""
+
+    @property
+    def names(self) -> list[str]:
+        """All missions."""
+
+    @property
+    def open_mission(self) -> OpenMission:
+        """The mission that a request is about."""
+
+    def create(self, name: str) -> None:
+        """Create a mission and open it."""
+
+    def open(self, name: str) -> None:
+        """Open a mission."""
+
+    def result(self, name: str, number: int) -> Path | None:
+        """The run folder of a result of a mission; None if there is none."""
+
+    def export(self, name: str, path: Path) -> None:
+        """Write a mission as one new file."""
+
+    def take_in(self, name: str, path: Path) -> None:
+        """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open."""
+
+    def close(self) -> None:
+        """Close all missions."""
+
+
 class Missions:
     """All missions below one folder, which this service locks."""
 
@@ -132,9 +185,9 @@ class Missions:
         """
         self.root = root
         self._config, self._clock, self._wall_clock, self._launch = config, clock, wall_clock, launch
-        self._lock = _locked(root)
+        self._lock = locked(root)
         try:
-            _sweep(root)
+            sweep(root)
             self.detectors = DetectorStore(root / "detectors")
             named = self._open_file.read_text(encoding="utf-8").strip() if self._open_file.exists() else FIRST
             self.open_mission = self._opened(named)
@@ -173,12 +226,20 @@ class Missions:
             ServiceError: there is none of this name.
         """
         if not create and not self.folder(name).store.exists():
-            raise ServiceError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
         if name == self.open_mission.folder.name:
             return
         before = self.open_mission
         self.open_mission = self._opened(name)
         before.close()
+
+    def result(self, name: str, number: int) -> Path | None:
+        """The run folder of a result of a mission; None if there is none.
+
+        Raises:
+            PacketError: it is no name.
+        """
+        return existing_result(self.folder(name), str(number))
 
     def export(self, name: str, path: Path) -> None:
         """Write a mission as one new file.
@@ -192,7 +253,7 @@ class Missions:
             self.open_mission.store.export(path)
             return
         if not folder.store.exists():
-            raise ServiceError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
+            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self.names)}")
         store = MissionStore(folder.store)
         try:
             store.export(path)
@@ -227,7 +288,17 @@ class Missions:
         folder = self.folder(name)
         with translate_errors(folder.path):
             folder.path.mkdir(parents=True, exist_ok=True)
-        mission = OpenMission(folder, self._config, self._clock, self._wall_clock, self._launch, self.detectors)
+        _check_file(folder)
+        store = MissionStore(folder.store)
+        try:
+            settings = store.configure(self._config).fleet
+            check_words(name, settings)
+            intake = Intake(store, self._clock, self._wall_clock, self.detectors.announced, settings.claims)
+        except BaseException:
+            store.close()
+            raise
+        worker = self._launch(folder)
+        mission = OpenMission(folder, store, intake, lambda: worker, self._wall_clock)
         try:
             with translate_errors(self._open_file):
                 write_file(self._open_file, name + "\n")
@@ -237,7 +308,7 @@ class Missions:
         return mission
 
 
-def _sweep(root: Path) -> None:
+def sweep(root: Path) -> None:
     """Remove unfinished files of a service that was killed; the folder is locked."""
     left = [*root.glob(f"{IMPORT}*"), *root.glob(f"{EXPORT}*"), *(root / "detectors").glob(f"{STAGING}*")]
     for path in left:
@@ -246,7 +317,7 @@ def _sweep(root: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _locked(root: Path) -> IO[str]:
+def locked(root: Path) -> IO[str]:
     """The folder's lock file, held until it is closed."""
     try:
         root.mkdir(parents=True, exist_ok=True)

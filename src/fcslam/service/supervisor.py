@@ -66,7 +66,22 @@ class MeasuredWorker(Protocol):
         """Totals of the present worker's stages, by name."""
 
 
+WORKER = (sys.executable, "-m", "fcslam.service.worker")
+"""The command that starts a worker."""
+
+SPARE = "--spare"
+"""The only argument of a worker that gets its other arguments later, as a line of JSON on stdin."""
+
+StartWorker = Callable[[Sequence[str]], subprocess.Popen[bytes]]
+"""Starts the process of a worker."""
+
 _log = logging.getLogger(__name__)
+
+
+def start_worker(command: Sequence[str]) -> subprocess.Popen[bytes]:
+    """Start a worker with pipes to its input and output."""
+    # Unbuffered: what a dead worker did not read must not turn up when the pipe is closed.
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
 
 
 class Supervisor:
@@ -74,10 +89,10 @@ class Supervisor:
 
     def __init__(
         self, folder: MissionFolder, clock: Callable[[], float], listen: Listen,
-        command: Sequence[str] = (sys.executable, "-m", "fcslam.service.worker"),
+        command: Sequence[str] = WORKER, start: StartWorker = start_worker,
     ) -> None:  # fmt: skip
-        """``command`` starts a worker when the mission's folder is added to it."""
-        self._command = (*command, str(folder.path))
+        """``start`` makes a process of ``command``, to which the mission's folder is added."""
+        self._command, self._start = (*command, str(folder.path)), start
         self._clock, self._listen = clock, listen
         self._stopping = threading.Event()
         self._lock = threading.Lock()
@@ -147,8 +162,7 @@ class Supervisor:
 
     def _watch_one(self) -> int:
         """Start a worker and pass on its events until it ends."""
-        # Unbuffered: what a dead worker did not read must not turn up when the pipe is closed.
-        with subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0) as process:
+        with self._start(self._command) as process:
             assert process.stdin is not None
             assert process.stdout is not None
             os.set_blocking(process.stdin.fileno(), False)

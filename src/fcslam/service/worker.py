@@ -4,10 +4,11 @@ It reads the store by turn and keeps the fleet in memory. It writes its results 
 live run folder, and the run folders that users request. From time to time it also writes its state. If it is killed,
 the next worker continues from that state, or from turn 0, and reports nothing new before it has caught up.
 
-    python -m fcslam.service.worker [--workers ...] MISSION_FOLDER
+    python -m fcslam.service.worker [--workers ...] [--store ... --lease MISSION FENCE] MISSION_FOLDER
+    python -m fcslam.service.worker --spare
 
-A byte on stdin means that there is work; the end of stdin means that the service is gone. The worker prints a line when
-it is ready, for its progress, for every change of the live run folder and for every answered request.
+A spare worker compiles its code, then waits for a line with the other arguments. A byte on stdin means that there is
+work; the end of stdin means that the service is gone. The worker prints a line when it is ready, for its progress, for every change of the live run folder and for every answered request.
 """
 
 import argparse
@@ -22,7 +23,8 @@ import signal
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from hashlib import blake2b
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -48,8 +50,11 @@ from fcslam.runs import Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
-from fcslam.service.supervisor import PROGRESS, READY, STAGE_MS, STAGE_RUNS
+from fcslam.service.shared.files import LIVE, RESULT, SNAPSHOT, SharedFiles
+from fcslam.service.shared.mission_tables import Lease, MissionTables
+from fcslam.service.supervisor import PROGRESS, READY, SPARE, STAGE_MS, STAGE_RUNS
 from fcslam.service.warmup import warm_up_fleet
+from fcslam.storage.postgres import Postgres
 from fcslam.storage.state_file import code_version, read_state, write_state
 from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Packet
@@ -71,6 +76,8 @@ SNAPSHOT_SHARE = 0.05
 """Of the worker's time, for its snapshots: the next worker repeats no more than this part's inverse."""
 SNAPSHOT_EVERY_S = 5.0
 """The snapshot is not written more often than this."""
+SHARED_LOOK_S = 0.25
+"""Between two looks for packets that other instances stored."""
 LIVE_EVERY_S = 1.0
 """The live run folder is not written more often than this."""
 
@@ -79,18 +86,21 @@ _log = logging.getLogger(__name__)
 Tell = Callable[[str, int], None]
 """Receives each event with its number."""
 
+Share = Callable[[str, Path], None]
+"""Receives the name and the place of each file or run folder that the worker wrote, for other instances."""
+
 
 class Worker:
     """One mission's fleet; ``step`` by ``step`` it follows what the store holds."""
 
     def __init__(
         self, folder: MissionFolder, store: MissionStore, clock: Callable[[], float], tell: Tell, start: Start,
-        verify_pairs: VerifyPairs = verify_here,
+        verify_pairs: VerifyPairs = verify_here, share: Share = lambda *_: None,
     ) -> None:  # fmt: skip
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._tell, self._start = folder, store, clock, tell, start
-        self._verify_pairs = verify_pairs
+        self._verify_pairs, self._share = verify_pairs, share
         self._crashes = CrashLog(folder.worker_task)
         self._ready: deque[StoredPacket] = deque()
         """Packets that may take effect and did not yet."""
@@ -236,7 +246,8 @@ class Worker:
         }
         try:
             write_state(self._folder.snapshot, self._fits(), state)
-        except OSError as error:  # a restart takes longer then, and no more
+            self._share(SNAPSHOT, self._folder.snapshot)
+        except (OSError, StoreError) as error:  # a restart takes longer then, and no more
             _log.error("no snapshot of the worker was written: %s", error)
         self._written = self._applied
         self._write_at = self._clock() + max((self._clock() - began) / SNAPSHOT_SHARE, SNAPSHOT_EVERY_S)
@@ -334,6 +345,7 @@ class Worker:
             _log.exception("result %s failed", name)
             self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:
+            self._share(RESULT + name, self._folder.run(name))
             self._store.answer(asked.number, name)
         self._crashes.end()
         self._published = -1
@@ -384,6 +396,10 @@ class Worker:
         self._publishing = None
         if publishing.task.exitcode:  # packets matter more, and the disk may be freed
             return self._postpone(f"its writer ended with code {publishing.task.exitcode}")
+        try:
+            self._share(LIVE, self._folder.live)
+        except StoreError as error:
+            return self._postpone(str(error))
         self._publish_at = now + max((now - publishing.began_s) / LIVE_SHARE, LIVE_EVERY_S)
         self._tell("live", publishing.applied)
         return True
@@ -426,32 +442,66 @@ def main(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
+    if arguments == [SPARE] and not (arguments := _told_arguments()):
+        return 0
     chosen = _chosen(arguments)
     folder, alone = chosen.folder, _alone(chosen.folder)
-    with verifying(chosen.workers, must_connect=False) as verify_pairs:
-        worker = Worker(folder, MissionStore(folder.store), time.monotonic, _print, start_copy, verify_pairs)
+    with verifying(chosen.workers, must_connect=False) as verify_pairs, _mission(chosen) as (store, share):
+        worker = Worker(folder, store, time.monotonic, _print, start_copy, verify_pairs, share)
         _print(READY, 0)
         while True:
-            wait_s = 0.0 if worker.step() else worker.wait_s()
+            wait_s = 0.0 if worker.step() else min(worker.wait_s(), chosen.look_s)
             if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
                 alone.close()
                 return 0
 
 
+def _told_arguments() -> list[str]:
+    """The arguments of a spare worker, a line of JSON that comes when there is a mission for it; empty: none came."""
+    line = b""
+    while not line.endswith(b"\n"):
+        byte = os.read(sys.stdin.fileno(), 1)
+        if not byte:
+            return []
+        line += byte
+    return [str(argument) for argument in json.loads(line)]
+
+
+@contextmanager
+def _mission(chosen: "_Chosen") -> Iterator[tuple[MissionStore, Share]]:
+    """The mission of a file, or of a server to which the worker has a lease."""
+    if chosen.store is None or chosen.lease is None:
+        yield MissionStore(chosen.folder.store), lambda *_: None
+        return
+    with closing(Postgres(chosen.store, f"worker of {chosen.folder.name}")) as server:
+        files = SharedFiles(server, chosen.lease)
+        files.fetch_snapshot(chosen.folder)
+        yield MissionStore(MissionTables(server, chosen.lease.mission, chosen.lease)), files.put
+
+
 class _Chosen(NamedTuple):
     folder: MissionFolder
     workers: Workers
+    store: str | None
+    lease: Lease | None
+
+    @property
+    def look_s(self) -> float:
+        """Between two looks for packets that other instances stored: nobody rings for them."""
+        return math.inf if self.store is None else SHARED_LOOK_S
 
 
 def _chosen(arguments: Sequence[str]) -> _Chosen:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--store")
+    parser.add_argument("--lease", type=int, nargs=2, metavar=("MISSION", "FENCE"))
     parser.add_argument("--workers", default=Workers().where)
     for file in ("ca", "certificate", "key"):
         parser.add_argument(f"--workers-{file}", type=Path)
     given = parser.parse_args(arguments)
     workers = Workers(given.workers, given.workers_ca, given.workers_certificate, given.workers_key)
-    return _Chosen(MissionFolder(given.folder), workers)
+    return _Chosen(MissionFolder(given.folder), workers, given.store, Lease(*given.lease) if given.lease else None)
 
 
 def _alone(folder: MissionFolder) -> IO[str]:

@@ -3,30 +3,40 @@
 import os
 import sqlite3
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from fcslam.errors import StoreError
+from fcslam.storage.group_commit import GroupCommit
+from fcslam.storage.row_store import Result, Table
 from fcslam.storage.seals import PAGE_BYTES, seal, seal_pages, seals_file
 
 BUSY_S = 30.0
 """How long a writer waits for another process to finish."""
 
-_Result = TypeVar("_Result")
 
+class SealedConnection(sqlite3.Connection):
+    """A connection to a database whose rows end with a seal (``storage.seals``)."""
 
-@dataclass(slots=True, eq=False)
-class _Waiting:
-    """Work that waits for a transaction."""
+    def insert(self, table: Table, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
+        """Insert rows; ``replaces``: in place of those with the same key.
 
-    work: Callable[[sqlite3.Connection], Any]
-    result: Any = None
-    failure: BaseException | None = None
-    is_done: bool = False
+        Values of REAL columns must be floats: the seal is of the value as it is read again.
+        """
+        marks = ", ".join(f"?{number}" for number in range(1, len(table.columns) + 1))
+        verb = "INSERT OR REPLACE" if replaces else "INSERT"
+        self.executemany(f"{verb} INTO {table.name} VALUES ({marks}, seal('{table.name}', {marks}))", rows)
+
+    def update(self, table: Table, changes: Mapping[str, object], where: str, values: Mapping[str, object]) -> None:
+        """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
+        assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
+        sealed = ", ".join(f":new_{column}" if column in changes else column for column in table.columns)
+        self.execute(
+            f"UPDATE {table.name} SET {assignments}, seal = seal('{table.name}', {sealed}) WHERE {where}",
+            {**values, **{f"new_{column}": value for column, value in changes.items()}},
+        )
 
 
 class Database:
@@ -51,8 +61,8 @@ class Database:
             StoreError: the file was made by something else, or cannot be used.
         """
         self._path = path
-        self._lock, self._reading_lock, self._sharing_lock = threading.Lock(), threading.Lock(), threading.Lock()
-        self._waiting: deque[_Waiting] = deque()
+        self._lock, self._reading_lock = threading.Lock(), threading.Lock()
+        self._group = GroupCommit(self.transaction)
         with translate_errors(path):
             seals_file(path).unlink(missing_ok=True)  # they are of a file that nobody writes
             if exclusive:
@@ -79,7 +89,7 @@ class Database:
             seal_pages(self._path)
 
     @contextmanager
-    def transaction(self) -> Iterator[sqlite3.Connection]:
+    def transaction(self) -> Iterator[SealedConnection]:
         """Execute the block as one durable transaction."""
         with self._lock, translate_errors(self._path):
             self._connection.execute("BEGIN IMMEDIATE")
@@ -90,37 +100,11 @@ class Database:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
 
-    def share(self, work: Callable[[sqlite3.Connection], _Result]) -> _Result:
+    def share(self, work: Callable[[SealedConnection], Result]) -> Result:
         """Run ``work`` in a transaction that is shared by all threads that wait for the disk, so that one commit serves
         them all. If one work fails, none of them takes effect.
         """
-        mine = _Waiting(work)
-        self._waiting.append(mine)
-        with self._sharing_lock:
-            if not mine.is_done:
-                self._write_waiting()
-        if mine.failure is not None:
-            raise mine.failure
-        result: _Result = mine.result
-        return result
-
-    def _write_waiting(self) -> None:
-        together: list[_Waiting] = []
-        try:
-            with self.transaction() as connection:
-                together = self._taken()  # only now: with those who came while this waited for another writer
-                for one in together:
-                    one.result = one.work(connection)
-        except BaseException as error:  # an error in this thread must reach the threads that share its transaction
-            together = together or self._taken()
-            for one in together:
-                one.failure = error
-        finally:
-            for one in together:
-                one.is_done = True
-
-    def _taken(self) -> list[_Waiting]:
-        return [self._waiting.popleft() for _ in range(len(self._waiting))]
+        return self._group.share(work)
 
     def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
         """All rows that a query finds."""
@@ -153,34 +137,6 @@ class Database:
                 staging.unlink(missing_ok=True)
 
 
-class SealedTable:
-    """A table whose last column is the seal of its rows (``storage.seals``)."""
-
-    def __init__(self, name: str, *columns: str) -> None:
-        """``columns``: all but the seal, in their order."""
-        self._name, self._columns = name, columns
-        marks = ", ".join(f"?{number}" for number in range(1, len(columns) + 1))
-        self._values = f"{name} VALUES ({marks}, seal('{name}', {marks}))"
-
-    def insert(self, connection: sqlite3.Connection, row: Sequence[object], *, replaces: bool = False) -> None:
-        """Insert a row; ``replaces``: in place of one with the same key.
-
-        Values of REAL columns must be floats: the seal is of the value as it is read again.
-        """
-        connection.execute(f"INSERT {'OR REPLACE ' if replaces else ''}INTO {self._values}", row)
-
-    def update(
-        self, connection: sqlite3.Connection, changes: Mapping[str, object], where: str, values: Mapping[str, object]
-    ) -> None:
-        """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
-        assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
-        sealed = ", ".join(f":new_{column}" if column in changes else column for column in self._columns)
-        connection.execute(
-            f"UPDATE {self._name} SET {assignments}, seal = seal('{self._name}', {sealed}) WHERE {where}",
-            {**values, **{f"new_{column}": value for column, value in changes.items()}},
-        )
-
-
 def check_file(path: Path, schema: str, version: int) -> None:
     """Refuse a file of unknown origin that ``Database`` did not create; it is not changed and none of its code runs.
 
@@ -197,9 +153,11 @@ def check_file(path: Path, schema: str, version: int) -> None:
             raise StoreError(f"{path}: broken")
 
 
-def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> sqlite3.Connection:
+def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> SealedConnection:
     # This module begins transactions explicitly.
-    connection = sqlite3.connect(path, timeout=timeout_s, isolation_level=None, check_same_thread=False)
+    connection = sqlite3.connect(
+        path, timeout=timeout_s, isolation_level=None, check_same_thread=False, factory=SealedConnection
+    )
     for pragma in ("trusted_schema=OFF", f"page_size={PAGE_BYTES}", *pragmas):
         connection.execute(f"PRAGMA {pragma}")
     connection.create_function("seal", -1, seal, deterministic=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from contextvars import ContextVar
 from typing import Any
 
 from fastapi import APIRouter, FastAPI
@@ -13,6 +14,7 @@ from fcslam.service.http.event_stream import event_router
 from fcslam.service.http.limits import CONTENT
 from fcslam.service.http.local_names import LocalNames
 from fcslam.service.http.missions import file_router, mission_router
+from fcslam.service.http.named_missions import NamedMissions
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.http.robots import detector_router, robot_router
@@ -38,10 +40,14 @@ class Service(FastAPI):
         return described
 
 
-def create_app(state: ServiceState, more: Sequence[APIRouter] = (), local_names: bool = False) -> FastAPI:
+def create_app(
+    state: ServiceState, more: Sequence[APIRouter] = (), local_names: bool = False,
+    named: ContextVar[str | None] | None = None,
+) -> FastAPI:  # fmt: skip
     """The service; ``more`` routers come from rooms that this one does not know. Closes the missions at its end.
 
-    With ``local_names``, it refuses requests that do not name the machine by an address or as localhost.
+    With ``local_names``, it refuses requests that do not name the machine by an address or as localhost. With
+    ``named``, requests may name a mission (``NamedMissions``).
     """
 
     @asynccontextmanager
@@ -68,6 +74,8 @@ def create_app(state: ServiceState, more: Sequence[APIRouter] = (), local_names:
     if local_names:
         app.add_middleware(LocalNames)
     app.add_middleware(_Watch, state=state)
+    if named is not None:
+        app.add_middleware(NamedMissions, named=named)
     return app
 
 

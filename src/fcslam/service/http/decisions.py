@@ -53,10 +53,11 @@ def decision_router(state: ServiceState) -> APIRouter:
             asked = await run_in_threadpool(mission.store.finalization, number)
             if asked.failure:
                 raise HTTPException(500, asked.failure)
-            if asked.run:
+            run = await run_in_threadpool(mission.result, asked.run) if asked.run else None
+            if run is not None:
                 return Finalized(
                     number=number,
-                    run=str(mission.folder.run(asked.run).resolve()),
+                    run=str(run),
                     archive=f"/api/v1/missions/{mission.folder.name}/runs/{number}.zip",
                 )
             free = shutil.disk_usage(mission.folder.path).free

@@ -2,8 +2,9 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 WAITING = 100
 """Largest backlog of a slow subscriber, in events; it loses the oldest ones beyond."""
@@ -15,6 +16,13 @@ class Event:
 
     kind: str
     number: int
+
+
+class Watched(Protocol):
+    """Events that subscribers may follow."""
+
+    def watch(self) -> AsyncIterator[Event]:
+        """Yield the newest event of each kind, then each new event."""
 
 
 class EventStream:
@@ -46,6 +54,28 @@ class EventStream:
         finally:
             with self._lock:
                 del self._watchers[queue]
+
+
+class EventStreams:
+    """The events of several missions; a subscriber follows those of the mission that its request is about."""
+
+    def __init__(self, current: Callable[[], str]) -> None:
+        """``current``: name of the mission that the present request is about."""
+        self._current = current
+        self._lock = threading.Lock()
+        self._streams: dict[str, EventStream] = {}
+
+    def publish(self, mission: str, kind: str, number: int) -> None:
+        """Send an event of a mission to all its subscribers."""
+        self._stream(mission).publish(kind, number)
+
+    def watch(self) -> AsyncIterator[Event]:
+        """Yield the newest event of each kind, then each new event."""
+        return self._stream(self._current()).watch()
+
+    def _stream(self, mission: str) -> EventStream:
+        with self._lock:
+            return self._streams.setdefault(mission, EventStream())
 
 
 def _put(queue: asyncio.Queue[Event], event: Event) -> None:

@@ -117,8 +117,8 @@ def file_router(state: ServiceState) -> APIRouter:
     )
     async def download_run(name: Name, number: RunNumber) -> StreamingResponse:
         """A result as one file: the run folder in a ZIP archive."""
-        run = state.missions.folder(name).run(str(number))
-        if name not in state.missions.names or not run.is_dir():
+        run = state.missions.result(name, number) if name in state.missions.names else None
+        if run is None:
             raise HTTPException(404, f"mission '{name}' has no result {number}; POST /finalize makes one")
         return await _download(state, f"{name}-{number}.zip", ZIP, lambda path: _pack(run, path))
 

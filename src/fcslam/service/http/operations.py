@@ -30,10 +30,10 @@ def operations_router(state: ServiceState) -> APIRouter:
             raise HTTPException(503, "the mission cannot be read") from error
         if state.closing:
             raise HTTPException(503, "the service is stopping")
-        if state.mission.worker.pid is None:
-            raise HTTPException(503, "the service takes packets, but the worker is down")
-        if not state.mission.worker.is_ready:
-            raise HTTPException(503, "the service takes packets, but the worker is starting")
+        worker = state.mission.worker
+        if not worker.is_ready:
+            is_down = "down" if worker.pid is None else "starting"
+            raise HTTPException(503, f"the service takes packets, but the worker is {is_down}")
         return Health()
 
     @router.get("/readyz", response_model=Readiness, responses={503: {"model": Unready}})

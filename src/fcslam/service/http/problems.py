@@ -21,6 +21,7 @@ from fcslam.errors import (
     StoreError,
 )
 from fcslam.service.intake import BusyError, LeaseError, RefusedPacketError
+from fcslam.service.missions import UnknownMissionError
 
 STATUS: dict[type[FcslamError], int] = {
     BusyError: 429,
@@ -29,6 +30,7 @@ STATUS: dict[type[FcslamError], int] = {
     PacketConflictError: 409,
     PacketError: 400,
     StoreError: 507,
+    UnknownMissionError: 404,
     ServiceError: 409,
     EditError: 409,
     FeatureError: 400,

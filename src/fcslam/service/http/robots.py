@@ -84,7 +84,7 @@ def robot_router(state: ServiceState) -> APIRouter:
     def get_state(robot: Name) -> RobotState:
         """Where a robot continues after a restart, and which of its packets were refused."""
         store = state.mission.store
-        sessions = state.mission.intake.sessions(robot)
+        sessions = state.mission.sessions(robot)
         newest = sessions[-1].epoch if sessions else None
         correction = None if newest is None else store.correction(robot, newest)
         return RobotState(

@@ -14,10 +14,10 @@ from fastapi.security import HTTPBearer
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.detectors import DetectorStore
 from fcslam.service.http.authentication import Authenticator, Role
-from fcslam.service.http.events import EventStream
+from fcslam.service.http.events import Watched
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
-from fcslam.service.missions import Missions, OpenMission
+from fcslam.service.missions import OpenMission, ServedMissions
 from fcslam.service.token_buckets import TokenBuckets
 from fcslam.service.viewed_mission import ViewedMission
 
@@ -38,7 +38,7 @@ class ViewerState(Protocol):
         """The mission that viewers see."""
 
     @property
-    def events(self) -> EventStream:
+    def events(self) -> Watched:
         """Changes of it."""
 
     @property
@@ -57,10 +57,10 @@ class ViewerState(Protocol):
 class ServiceState:
     """Passed to every router."""
 
-    missions: Missions
+    missions: ServedMissions
     authenticator: Authenticator
     rate: RateLimit
-    events: EventStream
+    events: Watched
     audit: AuditLog
     learning: Path | None = None
     """Output folder of a federated training, for viewers."""

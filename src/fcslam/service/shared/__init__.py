@@ -1,0 +1,1 @@
+"""Several instances of the service over one store on a PostgreSQL server."""

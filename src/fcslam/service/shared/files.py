@@ -1,0 +1,98 @@
+"""What a worker wrote, as rows of its mission: its snapshot for the next worker, run folders for every instance."""
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Final
+
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.shared.mission_tables import Lease, check_lease
+from fcslam.service.shared.registry import note_finalized, note_live
+from fcslam.service.shared.schema import schema_of
+from fcslam.storage.database import translate_errors
+from fcslam.storage.files import replacing_folder, write_file
+from fcslam.storage.postgres import Postgres, PostgresTransaction
+
+SNAPSHOT: Final = "snapshot"
+LIVE: Final = "live"
+RESULT: Final = "result "
+"""Names of what is shared; that of a result ends with its number."""
+
+
+class SharedFiles:
+    """The files that a worker with a lease shares."""
+
+    def __init__(self, server: Postgres, lease: Lease) -> None:
+        self._server, self._lease = server, lease
+
+    def put(self, name: str, path: Path) -> None:
+        """Store a file, or a folder as one file, in place of the one of this name.
+
+        Raises:
+            StoreError: it cannot be stored.
+            LeaseLostError: another worker has the mission.
+        """
+        with translate_errors(path):
+            content = _packed(path) if path.is_dir() else path.read_bytes()
+        # Without the lock of those who store packets: this may take a while.
+        begin = f"BEGIN; SET LOCAL search_path TO {schema_of(self._lease.mission)}"
+        with self._server.connection(begin) as connection:
+            transaction = PostgresTransaction(connection)
+            check_lease(transaction, self._lease)
+            transaction.execute(
+                "INSERT INTO files VALUES (?, 1, ?) ON CONFLICT (name) DO UPDATE"
+                " SET number = files.number + 1, content = excluded.content",
+                (name, content),
+            )
+            if name == LIVE:
+                note_live(transaction, self._lease.mission)
+            elif name.startswith(RESULT):
+                note_finalized(transaction, self._lease.mission)
+            connection.execute("COMMIT")
+
+    def fetch_snapshot(self, folder: MissionFolder) -> None:
+        """Write the snapshot of the worker before into a mission's folder.
+
+        Raises:
+            StoreError: it cannot be read or written.
+        """
+        found = fetched(self._server, self._lease.mission, SNAPSHOT)
+        with translate_errors(folder.snapshot):
+            if found is None:
+                folder.snapshot.unlink(missing_ok=True)
+            else:
+                write_file(folder.snapshot, found)
+
+
+def fetched(server: Postgres, mission: int, name: str) -> bytes | None:
+    """A shared file; None if there is none.
+
+    Raises:
+        StoreError: it cannot be read.
+    """
+    rows = server.rows("SELECT content FROM files WHERE name = ?", (name,), schema_of(mission))
+    return bytes(rows[0][0]) if rows else None
+
+
+def fetch_folder(server: Postgres, mission: int, name: str, path: Path) -> bool:
+    """Write a shared run folder to ``path``; False if there is none.
+
+    Raises:
+        StoreError: it cannot be read or written.
+    """
+    content = fetched(server, mission, name)
+    if content is None:
+        return False
+    with translate_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing_folder(path) as unfinished, zipfile.ZipFile(io.BytesIO(content)) as archive:
+            archive.extractall(unfinished)
+    return True
+
+
+def _packed(folder: Path) -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for path in sorted(folder.rglob("*")):
+            archive.write(path, path.relative_to(folder))
+    return content.getvalue()

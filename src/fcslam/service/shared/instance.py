@@ -1,0 +1,180 @@
+"""One of several instances of the service: its name, its part of the workers, and what it sees of the others."""
+
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from fcslam.errors import ServiceError, StoreError
+from fcslam.service.shared.mission_tables import Lease
+from fcslam.service.shared.registry import LEASE_S, KnownMission, Registry
+from fcslam.service.supervisor import RunningWorker
+
+LOOK_S: Final = 0.5
+"""Between two renewals of the leases."""
+NAME_S: Final = LEASE_S + 2.0
+"""How long a new instance waits for its name: one that was killed loses it in this time."""
+
+_log = logging.getLogger(__name__)
+
+Launch = Callable[[KnownMission, Lease], RunningWorker]
+"""Starts the worker of a mission."""
+
+Listen = Callable[[str, str, int], None]
+"""Receives the name of a mission, an event and its number."""
+
+
+class Elsewhere(NamedTuple):
+    """The worker of a mission on another instance, as this one sees it."""
+
+    is_ready: bool
+    applied: int
+    pid: int | None = None
+    starts: int = 0
+
+    def ring(self) -> None:
+        """It looks for itself."""
+
+    def stop(self) -> None:
+        """It is stopped where it runs."""
+
+
+class Instance:
+    """Holds leases and the workers that belong to them, on a thread of its own."""
+
+    def __init__(
+        self, registry: Registry, name: str, most_missions: int, launch: Launch, listen: Listen,
+        on_taken: Callable[[], None],
+    ) -> None:  # fmt: skip
+        """Take the name.
+
+        Args:
+            registry: of all instances.
+            name: of this one.
+            most_missions: how many workers it runs.
+            launch: starts a worker.
+            listen: receives what happened to missions, whoever has their worker.
+            on_taken: called when another process has taken the name, after this one was gone for a while.
+
+        Raises:
+            ServiceError: another instance has this name.
+            StoreError: the server cannot be used.
+        """
+        self._registry, self._name, self._most, self._launch, self._listen = (
+            registry,
+            name,
+            most_missions,
+            launch,
+            listen,
+        )
+        self._on_taken = on_taken
+        self._closing = threading.Event()
+        self._take_name()
+        self._held: dict[Lease, RunningWorker] = {}
+        self._known: Mapping[str, KnownMission] = {}
+        self.look()
+        self._thread = threading.Thread(target=self._run, name=f"instance {name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to take missions."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop all workers and give up their missions, for other instances to take."""
+        self._closing.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        ending = [threading.Thread(target=self._end, args=held) for held in self._held.items()]
+        for thread in ending:
+            thread.start()
+        for thread in ending:
+            thread.join()
+        try:
+            self._registry.leave()
+        except StoreError as error:
+            _log.error("the name of this instance ends by itself: %s", error)
+
+    @property
+    def known(self) -> Mapping[str, KnownMission]:
+        """All missions by name, as they were a moment ago."""
+        return self._known
+
+    def worker(self, number: int) -> RunningWorker | None:
+        """The worker of a mission, if it is here."""
+        return next((worker for lease, worker in list(self._held.items()) if lease.mission == number), None)
+
+    def look(self) -> None:
+        """See which missions there are now."""
+        before, self._known = self._known, {mission.name: mission for mission in self._registry.missions()}
+        for name, mission in self._known.items():
+            old = before.get(name)
+            if old is not None and mission.live > old.live:
+                self._listen(name, "live", mission.live)
+            if old is not None and mission.finalized > old.finalized:
+                self._listen(name, "finalized", mission.finalized)
+
+    def _take_name(self) -> None:
+        for _ in range(round(NAME_S / LOOK_S)):
+            if self._registry.register(self._most):
+                return
+            self._closing.wait(LOOK_S)
+        raise ServiceError(
+            f"another instance is called '{self._name}'; stop it, or give this one another name: --instance NAME"
+        )
+
+    def _run(self) -> None:
+        is_gone = False
+        while not self._closing.wait(LOOK_S):
+            try:
+                self._step()
+                is_gone = False
+            except StoreError as error:
+                if not is_gone:
+                    _log.error("the store is gone, and this instance waits for it: %s", error)
+                is_gone = True
+            except Exception:
+                _log.exception("the instance failed at a look, and goes on")
+
+    def _step(self) -> None:
+        if not self._registry.register(self._most):
+            _log.error("another instance took the name '%s'; this one stops", self._name)
+            self._on_taken()
+            self._closing.set()
+            return
+        kept = self._registry.renew([(lease, worker.is_ready) for lease, worker in self._held.items()])
+        for lease in self._held.keys() - kept:
+            _log.warning("mission %d has a worker on another instance now", lease.mission)
+            threading.Thread(target=self._held.pop(lease).stop, daemon=True).start()
+        self.look()
+        self._spread()
+
+    def _spread(self) -> None:
+        """Take missions without a worker, or give one up, until each instance has its part."""
+        wanted = [mission for mission in self._known.values() if mission.is_wanted]
+        part = fair_part(len(wanted), self._registry.rooms(), self._most)
+        is_any_free = any(not mission.is_held for mission in wanted)
+        if is_any_free and len(self._held) < part:
+            for lease in self._registry.claim(part - len(self._held)):
+                mission = next(mission for mission in self._registry.missions() if mission.number == lease.mission)
+                self._held[lease] = self._launch(mission, lease)
+        elif not is_any_free and len(self._held) > part:
+            lease, worker = self._held.popitem()
+            self._end(lease, worker)
+
+    def _end(self, lease: Lease, worker: RunningWorker) -> None:
+        worker.stop()
+        try:
+            self._registry.release(lease)
+        except StoreError as error:
+            _log.error("the lease of mission %d ends by itself: %s", lease.mission, error)
+
+
+def fair_part(wanted: int, rooms: Sequence[int], own: int) -> int:
+    """How many of the ``wanted`` missions an instance with room for ``own`` shall have.
+
+    All instances get the same number, but none more than it has room for.
+    """
+    part = 0
+    while part < own and sum(min(room, part) for room in rooms) < wanted:
+        part += 1
+    return part

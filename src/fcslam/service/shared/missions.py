@@ -1,0 +1,256 @@
+"""The missions of a store, as each of its instances serves all of them."""
+
+import logging
+import shutil
+import threading
+from collections.abc import Callable
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fcslam.cloud.settings import CloudConfig
+from fcslam.errors import ServiceError
+from fcslam.service.intake import Intake, SessionState
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.mission_store import MissionStore
+from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, check_words, locked, sweep
+from fcslam.service.shared.agents import RobotLimit, SharedAgents
+from fcslam.service.shared.detectors import SharedDetectors
+from fcslam.service.shared.files import LIVE, RESULT, fetch_folder
+from fcslam.service.shared.instance import Elsewhere, Instance, Launch, Listen
+from fcslam.service.shared.mission_tables import MissionTables
+from fcslam.service.shared.registry import KnownMission, Registry
+from fcslam.service.supervisor import RunningWorker
+from fcslam.service.viewed_mission import PacketCounts
+from fcslam.storage.database import translate_errors
+from fcslam.storage.postgres import Postgres
+from fcslam.wire.checks import check_name
+
+NAMED: Final[ContextVar[str | None]] = ContextVar("named mission", default=None)
+"""The mission that the present request names; None: the open one."""
+_SEEN: Final = "seen"
+"""Folder of a mission's run folders that its workers, here or elsewhere, shared."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Admission:
+    """How much an instance takes."""
+
+    missions: int
+    """Workers that it runs at a time."""
+    robots: int
+    """Robots that send to it at a time."""
+
+
+class SharedMission(OpenMission):
+    """A mission whose worker may be on any instance."""
+
+    def __init__(
+        self, number: int, folder: MissionFolder, server: Postgres, store: MissionStore, intake: Intake,
+        instance: Instance, wall_clock: Callable[[], float],
+    ) -> None:  # fmt: skip
+        self._number, self._server, self._instance = number, server, instance
+        self._fetching = threading.Lock()
+        super().__init__(folder, store, intake, self._find_worker, wall_clock)
+
+    def _find_worker(self) -> RunningWorker:
+        here = self._instance.worker(self._number)
+        if here is not None:
+            return here
+        known = self._instance.known.get(self.name)
+        is_ready = known is not None and known.is_held and known.is_ready
+        return Elsewhere(is_ready, self.store.applied())
+
+    @property
+    def run_folder(self) -> Path | None:
+        """The newest live run folder that a worker shared; None: there is none yet."""
+        known = self._instance.known.get(self.name)
+        return None if known is None or not known.live else self._fetched(LIVE, str(known.live))
+
+    def result(self, name: str) -> Path | None:
+        """The run folder of a requested result; None if there is none."""
+        return self._fetched(f"{RESULT}{name}", f"result-{name}")
+
+    def sessions(self, robot: str | None = None) -> list[SessionState]:
+        """Sessions of one robot or of all, by robot and epoch, whoever received their packets."""
+        self.intake.follow()
+        return super().sessions(robot)
+
+    def packet_counts(self) -> PacketCounts:
+        """How far the packets of all robots are."""
+        self.intake.follow()
+        return super().packet_counts()
+
+    def close(self) -> None:
+        """Nothing: the instance stops its worker."""
+
+    def _fetched(self, name: str, local: str) -> Path | None:
+        """A shared run folder, which is fetched once."""
+        seen = self.folder.path / _SEEN
+        path = seen / local
+        with self._fetching:
+            if path.is_dir():
+                return path
+            if not fetch_folder(self._server, self._number, name, path):
+                return None
+            if name == LIVE:  # those before the last one are no longer read
+                for old in sorted(int(one.name) for one in seen.iterdir() if one.name.isdecimal())[:-2]:
+                    shutil.rmtree(seen / str(old), ignore_errors=True)
+        return path
+
+
+class SharedMissions:
+    """All missions of a store; ``Missions`` of files has the same methods."""
+
+    def __init__(
+        self, root: Path, config: CloudConfig, server: Postgres, instance: str, process: str, admission: Admission,
+        clock: Callable[[], float], wall_clock: Callable[[], float], launch: Callable[[Path], Launch], listen: Listen,
+        on_taken: Callable[[], None],
+    ) -> None:  # fmt: skip
+        """Take the instance's name, and create the first mission if there is none.
+
+        Args:
+            root: folder of this instance's own files, which can be made again from the store.
+            config: of new missions.
+            server: the store.
+            instance, process, on_taken: as of ``Instance`` and ``Registry``.
+            admission: how much the instance takes.
+            clock, wall_clock: seconds; since 1970.
+            launch: makes, with the folder of all missions' files, what starts a worker.
+            listen: receives events.
+
+        Raises:
+            ServiceError: the folder cannot be used, or another instance has the name.
+            StoreError: the store cannot be used.
+        """
+        self.root = root
+        self._config, self._server, self._clock, self._wall_clock = config, server, clock, wall_clock
+        self._lock = locked(root)
+        try:
+            sweep(root)
+            for seen in root.glob(f"missions/*/{_SEEN}"):
+                shutil.rmtree(seen, ignore_errors=True)
+            self.detectors = SharedDetectors(root / "detectors", server)
+            self._robots = RobotLimit(admission.robots, clock)
+            self._registry = Registry(server, instance, process)
+            self._opening = threading.Lock()
+            self._opened: dict[str, SharedMission] = {}
+            self._instance = Instance(self._registry, instance, admission.missions, launch(root), listen, on_taken)
+            if not self._instance.known:
+                self._create_first()
+            self._instance.start()
+        except BaseException:
+            self._lock.close()
+            raise
+
+    @property
+    def names(self) -> list[str]:
+        """All missions."""
+        self._instance.look()
+        return sorted(self._instance.known)
+
+    @property
+    def open_mission(self) -> SharedMission:
+        """The mission that the present request names, or the open one.
+
+        Raises:
+            UnknownMissionError: there is none of this name.
+        """
+        named = NAMED.get()
+        if named is None:
+            named = next((name for name, known in self._instance.known.items() if known.is_open), FIRST)
+        mission = self._opened.get(named)
+        return self._open_here(named) if mission is None else mission
+
+    def folder(self, name: str) -> MissionFolder:
+        """Local files of a mission, there or not.
+
+        Raises:
+            PacketError: it is no name.
+        """
+        check_name(name, "mission")
+        return MissionFolder(self.root / "missions" / name)
+
+    def create(self, name: str) -> None:
+        """Create a mission and open it.
+
+        Raises:
+            ServiceError: there is one of this name.
+        """
+        check_words(name, self._config.fleet)
+        self.folder(name)
+        number = self._registry.create(name)
+        MissionStore(MissionTables(self._server, number)).configure(self._config)
+        self.open(name)
+
+    def open(self, name: str) -> None:
+        """Let robots that name no mission send to this one.
+
+        Raises:
+            ServiceError: there is none of this name.
+        """
+        self._registry.open(self._known(name).number)
+        self._instance.look()
+
+    def result(self, name: str, number: int) -> Path | None:
+        """The run folder of a result of a mission; None if there is none."""
+        return self._open_here(name).result(str(number))
+
+    def export(self, name: str, path: Path) -> None:
+        """Write a mission as one new file.
+
+        Raises:
+            ServiceError: there is none of this name.
+            StoreError: it cannot be written.
+        """
+        MissionTables(self._server, self._known(name).number).export(path)
+
+    def take_in(self, name: str, path: Path) -> None:
+        """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open.
+
+        Raises:
+            ServiceError: there is one of this name.
+            StoreError: it cannot be written.
+        """
+        self.folder(name)
+        MissionTables(self._server, self._registry.create(name)).take_in(path)
+        self._instance.look()
+
+    def close(self) -> None:
+        """Give up all missions, for other instances to take, and unlock the folder."""
+        self._instance.close()
+        self._lock.close()
+
+    def _create_first(self) -> None:
+        try:
+            self.create(FIRST)
+        except ServiceError:  # another instance did, a moment ago
+            self._instance.look()
+
+    def _known(self, name: str) -> KnownMission:
+        known = self._instance.known.get(name)
+        if known is None:
+            self._instance.look()
+            known = self._instance.known.get(name)
+        if known is None:
+            raise UnknownMissionError(f"there is no mission '{name}'; there are {', '.join(self._instance.known)}")
+        return known
+
+    def _open_here(self, name: str) -> SharedMission:
+        known, folder = self._known(name), self.folder(name)
+        with self._opening:
+            if name not in self._opened:
+                with translate_errors(folder.path):
+                    folder.path.mkdir(parents=True, exist_ok=True)
+                store = MissionStore(MissionTables(self._server, known.number))
+                settings = store.configure(self._config).fleet
+                check_words(name, settings)
+                agents = SharedAgents(self._server, known.number, self._robots, self._clock)
+                intake = Intake(store, self._clock, self._wall_clock, self.detectors.announced, settings.claims, agents)
+                self._opened[name] = SharedMission(
+                    known.number, folder, self._server, store, intake, self._instance, self._wall_clock
+                )
+            return self._opened[name]

@@ -1,0 +1,122 @@
+"""The tables on a PostgreSQL server, by versions.
+
+The schema ``fcslam`` holds what all missions share; each mission has a schema of its own with the tables of a mission
+file. A migration only adds, so instances of the version before go on beside it.
+"""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from fcslam.errors import StoreError
+from fcslam.storage.postgres import Postgres
+
+MIGRATING: Final = 0x0FC51A
+"""The lock of whoever changes the tables."""
+
+
+class Migration(NamedTuple):
+    """The step from one version to the next."""
+
+    shared: str
+    """Statements for the schema ``fcslam``."""
+    mission: str
+    """Statements for the schema of each mission."""
+
+
+MIGRATIONS: Final = (
+    Migration(
+        shared="""
+CREATE TABLE missions (
+    number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    name TEXT COLLATE "C" NOT NULL UNIQUE,
+    is_open BOOLEAN NOT NULL DEFAULT false,
+    is_wanted BOOLEAN NOT NULL DEFAULT false,
+    holder TEXT, fence BIGINT NOT NULL DEFAULT 0, expires TIMESTAMPTZ NOT NULL DEFAULT '-infinity',
+    is_ready BOOLEAN NOT NULL DEFAULT false,
+    live BIGINT NOT NULL DEFAULT 0, finalized BIGINT NOT NULL DEFAULT 0
+);
+CREATE UNIQUE INDEX one_open ON missions (is_open) WHERE is_open;
+CREATE TABLE instances (
+    name TEXT COLLATE "C" PRIMARY KEY, process TEXT NOT NULL, room BIGINT NOT NULL, expires TIMESTAMPTZ NOT NULL
+);
+CREATE TABLE audit (
+    number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY, instance TEXT NOT NULL, entry TEXT NOT NULL
+);
+CREATE TABLE detectors (
+    number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    channel TEXT NOT NULL, version TEXT NOT NULL, content BYTEA NOT NULL, UNIQUE (channel, version)
+)
+""",
+        mission="""
+CREATE TABLE packets (
+    arrival BIGINT PRIMARY KEY,
+    robot TEXT COLLATE "C" NOT NULL, epoch BIGINT NOT NULL, sequence BIGINT NOT NULL,
+    received DOUBLE PRECISION NOT NULL, time DOUBLE PRECISION NOT NULL,
+    kind TEXT COLLATE "C", channel TEXT COLLATE "C", refusal TEXT, data BYTEA NOT NULL,
+    UNIQUE (robot, epoch, sequence)
+);
+CREATE INDEX refusals ON packets (robot, epoch, sequence) WHERE refusal IS NOT NULL;
+CREATE INDEX hellos ON packets (robot, epoch, sequence) WHERE kind = 'hello';
+CREATE TABLE corrections (
+    robot TEXT COLLATE "C" NOT NULL, epoch BIGINT NOT NULL, version BIGINT NOT NULL UNIQUE,
+    time DOUBLE PRECISION NOT NULL, map_index BIGINT NOT NULL,
+    x DOUBLE PRECISION NOT NULL, y DOUBLE PRECISION NOT NULL, theta DOUBLE PRECISION NOT NULL,
+    quality DOUBLE PRECISION NOT NULL,
+    PRIMARY KEY (robot, epoch)
+);
+CREATE TABLE edits (
+    number BIGINT PRIMARY KEY, author TEXT NOT NULL, time DOUBLE PRECISION NOT NULL, kind TEXT NOT NULL,
+    content TEXT NOT NULL
+);
+CREATE TABLE finalizations (
+    number BIGINT PRIMARY KEY, arrivals BIGINT NOT NULL, edits BIGINT NOT NULL, run TEXT, failure TEXT
+);
+CREATE TABLE tracks (
+    robot TEXT COLLATE "C" NOT NULL, epoch BIGINT NOT NULL,
+    stamps BYTEA NOT NULL, keyscans BYTEA NOT NULL, offsets BYTEA NOT NULL,
+    PRIMARY KEY (robot, epoch)
+);
+CREATE TABLE facts (name TEXT COLLATE "C" PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE files (name TEXT COLLATE "C" PRIMARY KEY, number BIGINT NOT NULL, content BYTEA NOT NULL);
+CREATE TABLE agents (robot TEXT COLLATE "C" PRIMARY KEY, agent TEXT NOT NULL, heard TIMESTAMPTZ NOT NULL)
+""",
+    ),
+)
+
+
+def schema_of(number: int) -> str:
+    """Name of a mission's schema."""
+    return f"fcslam_mission_{number}"
+
+
+def prepare(server: Postgres, migrations: Sequence[Migration] = MIGRATIONS) -> None:
+    """Make the tables on a server, or bring those of an earlier version to this one.
+
+    Raises:
+        StoreError: they are of a newer version, the role may not make them, or the server cannot be used.
+    """
+    with server.connection(f"BEGIN; SELECT pg_advisory_xact_lock({MIGRATING})") as connection:
+        found = connection.execute("SELECT to_regclass('fcslam.version') IS NOT NULL").fetchone()
+        if not (found and found[0]):
+            connection.execute("CREATE SCHEMA IF NOT EXISTS fcslam")
+            connection.execute("CREATE TABLE fcslam.version (number BIGINT NOT NULL)")
+            connection.execute("INSERT INTO fcslam.version VALUES (0)")
+        (version,) = connection.execute("SELECT number FROM fcslam.version").fetchone() or (0,)
+        if version > len(migrations):
+            raise StoreError(
+                f"{server.url}: a store of version {version}; this fcslam reads version {len(migrations)}; "
+                "install a newer fcslam"
+            )
+        for migration in migrations[version:]:
+            connection.execute(f"SET LOCAL search_path TO fcslam; {migration.shared}".encode())
+            for (number,) in connection.execute("SELECT number FROM missions ORDER BY number").fetchall():
+                connection.execute(f"SET LOCAL search_path TO {schema_of(number)}; {migration.mission}".encode())
+        if version < len(migrations):
+            connection.execute("UPDATE fcslam.version SET number = %s", (len(migrations),))
+        connection.execute("COMMIT")
+
+
+def mission_statements(number: int, migrations: Sequence[Migration] = MIGRATIONS) -> bytes:
+    """Statements that make the tables of a new mission."""
+    tables = "; ".join(migration.mission for migration in migrations)
+    return f"CREATE SCHEMA {schema_of(number)}; SET LOCAL search_path TO {schema_of(number)}; {tables}".encode()

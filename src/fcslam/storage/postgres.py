@@ -1,0 +1,323 @@
+"""A PostgreSQL server: connections that are shared and replaced, tables in a schema of their own, one kind of error.
+
+psycopg is an extra of its own, so it is imported when a server is used.
+"""
+
+import os
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import parse_qsl, unquote, urlencode, urlsplit, urlunsplit
+
+from fcslam.errors import StoreError
+from fcslam.storage.group_commit import GroupCommit
+from fcslam.storage.row_store import Result, Table
+
+if TYPE_CHECKING:
+    import psycopg
+
+    _Connection = psycopg.Connection[tuple[Any, ...]]
+
+RETRY_S: Final = 5.0
+"""A server that is gone is looked for this long, before anything was changed."""
+ANSWER_S: Final = 10.0
+"""A statement that takes longer fails: the server, or the way to it, is gone."""
+MOST_CONNECTIONS: Final = 8
+"""Of one process to the server."""
+_CONNECT_S: Final = 3
+_LOOK_EVERY_S: Final = 0.5
+_SCHEMES: Final = ("postgresql", "postgres")
+_MARK: Final = re.compile(r"\?|:([a-z_]+)")
+_LOCK: Final = 0x0FC51A  # of fcslam's, in case other programs lock as well
+"""First number of the locks of writers."""
+
+
+class Postgres:
+    """A server, for all threads of this process.
+
+    Raises:
+        StoreError: from every method: the server cannot be used now, and nothing has changed, or at a loss of the
+            connection in the last moment of a transaction perhaps all of it.
+    """
+
+    def __init__(self, url: str, name: str) -> None:
+        """Look for the server.
+
+        Args:
+            url: postgresql://USER@HOST:PORT/DATABASE without a password (``take_password``).
+            name: of this process, for those who look at the server.
+
+        Raises:
+            StoreError: there is no driver, or the server cannot be used.
+        """
+        self.url = _checked(url)
+        self._name = name
+        self._idle: list[_Connection] = []
+        self._places = threading.Semaphore(MOST_CONNECTIONS)
+        self._busy: dict[_Connection, float] = {}
+        """Since when each connection waits for the server."""
+        self._schemas: dict[_Connection, str] = {}
+        """The schema that statements on each connection mean."""
+        self._closing = threading.Event()
+        with self._translated(), self._connected():
+            pass
+        threading.Thread(target=self._watch, name="answers of PostgreSQL", daemon=True).start()
+
+    def close(self) -> None:
+        """Close all connections that nobody uses."""
+        self._closing.set()
+        while self._idle:
+            self._idle.pop().close()
+
+    @contextmanager
+    def connection(self, begin: str) -> Iterator["_Connection"]:
+        """Use a connection alone; what is not committed at the end of the block is undone.
+
+        Args:
+            begin: a statement that is executed first. If the connection turns out to be lost, another one is made.
+        """
+        with self._places, self._translated():
+            connection = self._retried(lambda connection: (connection, connection.execute(begin))[0])
+            try:
+                yield connection
+            finally:
+                self._give_back(connection)
+
+    def rows(
+        self, statement: str, values: Sequence[object] | Mapping[str, object] = (), schema: str = "fcslam"
+    ) -> list[tuple[Any, ...]]:
+        """All rows that a query of a schema finds. If the connection turns out to be lost, it asks again."""
+
+        def ask(connection: "_Connection") -> tuple["_Connection", list[tuple[Any, ...]]]:
+            if self._schemas.get(connection) != schema:
+                connection.execute(f"SET search_path TO {schema}".encode())
+                self._schemas[connection] = schema
+            return connection, PostgresTransaction(connection).execute(statement, values).fetchall()
+
+        with self._places, self._translated():
+            connection, found = self._retried(ask)
+            self._give_back(connection)
+        return found
+
+    def _retried(self, work: Callable[["_Connection"], Result]) -> Result:
+        """Do with a connection what changes nothing; with another one if it is lost. It stays busy if that succeeds."""
+        import psycopg
+
+        until = time.monotonic() + RETRY_S
+        while True:
+            connection = None
+            try:
+                connection = self._idle.pop() if self._idle else self._connected()
+                self._busy[connection] = time.monotonic()
+                return work(connection)
+            except BaseException as error:
+                if connection is not None:
+                    self._give_back(connection)
+                is_lost = isinstance(error, psycopg.OperationalError) and _is_lost(error)
+                if not is_lost or time.monotonic() > until:
+                    raise
+                if not self._idle:
+                    time.sleep(0.1)
+
+    def _connected(self) -> "_Connection":
+        import psycopg
+
+        return psycopg.connect(
+            self.url, autocommit=True, connect_timeout=_CONNECT_S, application_name=f"fcslam {self._name}",
+            options=f"-c statement_timeout={ANSWER_S:.0f}s -c idle_in_transaction_session_timeout={RETRY_S:.0f}s "
+            "-c client_min_messages=error",
+        )  # fmt: skip
+
+    def _give_back(self, connection: "_Connection") -> None:
+        from psycopg.pq import TransactionStatus
+
+        self._busy.pop(connection, None)
+        if not connection.closed and connection.info.transaction_status is not TransactionStatus.IDLE:
+            with suppress(Exception):  # it is closed then
+                connection.execute("ROLLBACK")
+        if connection.closed or self._closing.is_set():
+            self._schemas.pop(connection, None)
+            connection.close()
+        else:
+            self._idle.append(connection)
+
+    def _watch(self) -> None:
+        """Hang up on a server that does not answer: nothing else ends the wait for one behind a broken network."""
+        while not self._closing.wait(_LOOK_EVERY_S):
+            now = time.monotonic()
+            for connection, since in list(self._busy.items()):
+                if now > since + ANSWER_S + RETRY_S:
+                    with suppress(Exception), socket.socket(fileno=os.dup(connection.fileno())) as line:
+                        line.shutdown(socket.SHUT_RDWR)
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        """Raise errors of the driver as a ``StoreError`` of one line."""
+        import psycopg
+
+        try:
+            yield
+        except psycopg.errors.InsufficientPrivilege as error:
+            raise StoreError(
+                f"{self.url}: the role has too few rights ({_text(error)}); "
+                "GRANT CREATE ON DATABASE, or name another role"
+            ) from error
+        except psycopg.OperationalError as error:
+            raise StoreError(f"{self.url}: cannot be used ({_text(error)})") from error
+        except psycopg.Error as error:
+            raise StoreError(f"{self.url}: cannot be read or written ({_text(error)})") from error
+
+
+class PostgresTables:
+    """The tables of one schema of a server, as a ``RowStore``; writers to it wait for each other."""
+
+    def __init__(
+        self, server: Postgres, schema: str, lock: int, guard: Callable[["PostgresTransaction"], None]
+    ) -> None:
+        """Open a schema that exists.
+
+        Args:
+            server: the server.
+            schema: name of the schema.
+            lock: number of the lock that its writers share.
+            guard: called first in each transaction of a writer.
+        """
+        self.server, self._schema, self._guard = server, schema, guard
+        self._begin = f"BEGIN; SET LOCAL search_path TO {schema}; SELECT pg_advisory_xact_lock({_LOCK}, {lock})"
+        self._group = GroupCommit(self.transaction)
+
+    def close(self) -> None:
+        """The server's connections stay."""
+
+    @contextmanager
+    def transaction(self) -> Iterator["PostgresTransaction"]:
+        """Execute the block as one durable transaction."""
+        with self.server.connection(self._begin) as connection:
+            transaction = PostgresTransaction(connection)
+            self._guard(transaction)
+            yield transaction
+            connection.execute("COMMIT")
+
+    def share(self, work: Callable[["PostgresTransaction"], Result]) -> Result:
+        """Run ``work`` in a transaction that is shared by all threads that wait for one. If one work fails, none of
+        them takes effect.
+        """
+        return self._group.share(work)
+
+    def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
+        """All rows that a query finds."""
+        return self.server.rows(statement, values, self._schema)
+
+    def value(self, statement: str, values: Sequence[object] = ()) -> Any:
+        """First column of the first row that a query finds; None if it finds none."""
+        rows = self.rows(statement, values)
+        return rows[0][0] if rows else None
+
+    @contextmanager
+    def snapshot(self) -> Iterator["PostgresTransaction"]:
+        """Read several tables as they are at one moment."""
+        begin = f"BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; SET LOCAL search_path TO {self._schema}"
+        with self.server.connection(begin) as connection:
+            yield PostgresTransaction(connection)
+            connection.execute("COMMIT")
+
+
+class PostgresTransaction:
+    """A transaction that is open."""
+
+    def __init__(self, connection: "_Connection") -> None:
+        self._connection = connection
+
+    def execute(
+        self, statement: str, values: Sequence[object] | Mapping[str, object] = ()
+    ) -> "psycopg.Cursor[tuple[Any, ...]]":
+        """Execute a statement."""
+        return self._connection.execute(_translate(statement), _plain(values), binary=True)
+
+    def insert(self, table: Table, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
+        """Insert rows; ``replaces``: in place of those with the same key."""
+        marks = ", ".join("%s" for _ in table.columns)
+        statement = f"INSERT INTO {table.name} ({', '.join(table.columns)}) VALUES ({marks})"
+        if replaces:
+            changes = ", ".join(f"{name} = excluded.{name}" for name in table.columns if name not in table.key)
+            statement += f" ON CONFLICT ({', '.join(table.key)}) DO UPDATE SET {changes}"
+        with self._connection.cursor() as cursor:
+            cursor.executemany(statement, (_plain(row) for row in rows))
+
+    def update(self, table: Table, changes: Mapping[str, object], where: str, values: Mapping[str, object]) -> None:
+        """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
+        assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
+        news = {f"new_{column}": value for column, value in changes.items()}
+        self.execute(f"UPDATE {table.name} SET {assignments} WHERE {where}", {**values, **news})
+
+    def stream(self, table: Table) -> Iterator[tuple[Any, ...]]:
+        """The rows of a table by its key, a few at a time."""
+        statement = f"SELECT {', '.join(table.columns)} FROM {table.name} ORDER BY {', '.join(table.key)}"
+        with self._connection.cursor(name="rows", binary=True) as cursor:
+            cursor.itersize = 1000
+            cursor.execute(statement)
+            yield from cursor
+
+
+def is_server(store: str) -> bool:
+    """Whether the name of a store has the form of a PostgreSQL server's address."""
+    return urlsplit(store).scheme in _SCHEMES
+
+
+def take_password(url: str) -> str:
+    """The URL without its password, which goes where the driver looks for it: the environment of this process.
+
+    So neither a message nor the command line of a worker shows it.
+    """
+    parts = urlsplit(url)
+    options = dict(parse_qsl(parts.query))
+    password = options.pop("password", None if parts.password is None else unquote(parts.password))
+    if password is None:
+        return url
+    os.environ["PGPASSWORD"] = password
+    user, at, place = parts.netloc.rpartition("@")
+    return urlunsplit(parts._replace(netloc=user.partition(":")[0] + at + place, query=urlencode(options)))
+
+
+def _checked(url: str) -> str:
+    try:
+        import psycopg
+    except ImportError as error:
+        raise StoreError(f"{url}: needs psycopg; install it: pip install 'fcslam[postgres]' ({error})") from error
+    try:
+        psycopg.conninfo.conninfo_to_dict(url)
+    except psycopg.Error as error:
+        raise StoreError("the store's address cannot be read; write postgresql://USER@HOST:PORT/DATABASE") from error
+    return url
+
+
+def _is_lost(error: "psycopg.OperationalError") -> bool:
+    """Whether a server may be back soon: it was reached before, or nobody listens now."""
+    state = error.sqlstate
+    return state is None or state.startswith(("08", "57P"))
+
+
+def _text(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+@lru_cache(maxsize=1000)
+def _translate(statement: str) -> str:
+    """A statement with the driver's marks."""
+    return _MARK.sub(lambda mark: f"%({mark[1]})s" if mark[1] else "%s", statement)
+
+
+def _plain(values: Sequence[object] | Mapping[str, object]) -> Any:
+    """Values as the driver takes them: text without NUL, which the server has not, and no class of its own."""
+    if isinstance(values, Mapping):
+        return {name: _value(value) for name, value in values.items()}
+    return [_value(value) for value in values]
+
+
+def _value(value: object) -> object:
+    return str(value).replace("\0", "\N{REPLACEMENT CHARACTER}") if isinstance(value, str) else value
