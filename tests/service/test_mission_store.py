@@ -110,7 +110,7 @@ def test_another_packet_with_the_same_number_is_a_conflict_and_those_before_it_a
 
 def test_a_batch_that_fails_in_the_middle_leaves_nothing(store, monkeypatch):
     store.put([packet(sequence=0)], 0.0)
-    with pytest.raises(StoreError, match="full|null value"):
+    with pytest.raises(StoreError, match=r"full|null value"):
         store.put([packet(sequence=1), replace(packet(sequence=2), data=None)], 0.0)  # type: ignore[arg-type]
     assert [p.sequence for p in stored(store)] == [0]
     store.put([packet(sequence=1)], 0.0)

@@ -96,6 +96,11 @@ class Agents:
                 raise held_by_another(robot, heard + LEASE_S - now)
             self._held[robot] = agent, now
 
+    def note(self, robot: str, agent: str) -> None:
+        """Note that the agent of a robot sent something."""
+        with self._lock:
+            self._held[robot] = agent, self._clock()
+
     def silent_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never."""
         held = self._held.get(robot)

@@ -8,7 +8,8 @@ the next worker continues from that state, or from turn 0, and reports nothing n
     python -m fcslam.service.worker --spare
 
 A spare worker compiles its code, then waits for a line with the other arguments. A byte on stdin means that there is
-work; the end of stdin means that the service is gone. The worker prints a line when it is ready, for its progress, for every change of the live run folder and for every answered request.
+work; the end of stdin means that the service is gone. The worker prints a line when it is ready, for its progress, for
+every change of the live run folder and for every answered request.
 """
 
 import argparse

@@ -57,11 +57,12 @@ class SharedAgents(Agents):
             BusyError: this instance takes no more robots.
             StoreError: the store cannot be asked.
         """
-        super().hold(robot, agent)
         self._limit.admit(self._mission, robot)
-        now = self._clock()
-        if now < self._confirmed.get((robot, agent), -CONFIRM_S) + CONFIRM_S:
-            return
+        if self._clock() >= self._confirmed.get((robot, agent), -CONFIRM_S) + CONFIRM_S:
+            self._confirm(robot, agent)
+        self.note(robot, agent)
+
+    def _confirm(self, robot: str, agent: str) -> None:
         taken = self._server.rows(
             "INSERT INTO agents VALUES (?, ?, clock_timestamp()) ON CONFLICT (robot) DO UPDATE"
             " SET agent = excluded.agent, heard = clock_timestamp() WHERE agents.agent = excluded.agent"
@@ -70,8 +71,9 @@ class SharedAgents(Agents):
         )  # fmt: skip
         if not taken:
             raise held_by_another(robot, LEASE_S)
-        self._confirmed = {known: at for known, at in self._confirmed.items() if known[0] != robot}
-        self._confirmed[robot, agent] = now
+        with self._lock:
+            self._confirmed = {known: at for known, at in self._confirmed.items() if known[0] != robot}
+            self._confirmed[robot, agent] = self._clock()
 
     def silent_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch to this instance, or about that to another one; None: never."""

@@ -1,0 +1,200 @@
+"""Instances share the missions of a store: one worker each, by leases that the server's clock ends."""
+
+import threading
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fcslam.cloud.settings import CloudConfig
+from fcslam.errors import ServiceError
+from fcslam.service.intake import BusyError, LeaseError
+from fcslam.service.mission_store import MissionStore
+from fcslam.service.shared.agents import CONFIRM_S, RobotLimit, SharedAgents
+from fcslam.service.shared.audit_table import AuditTable
+from fcslam.service.shared.instance import Instance, fair_part
+from fcslam.service.shared.mission_tables import Lease, MissionTables
+from fcslam.service.shared.registry import LEASE_S, Registry
+
+
+class Started:
+    """A worker that only knows whether it runs."""
+
+    pid, starts, applied, is_ready = 1, 1, 0, True
+
+    def __init__(self, mission, lease):
+        self.mission, self.lease, self.is_stopped = mission, lease, False
+
+    def ring(self):
+        pass
+
+    def stop(self):
+        self.is_stopped = True
+
+
+def wanted(registry, postgres, name):
+    number = registry.create(name)
+    MissionStore(MissionTables(postgres, number)).configure(CloudConfig())
+    return number
+
+
+def instance(postgres, name, room=10):
+    workers = []
+
+    def launch(mission, lease):
+        workers.append(Started(mission, lease))
+        return workers[-1]
+
+    made = Instance(Registry(postgres, name, f"process of {name}"), name, room, launch, lambda *_: None, lambda: None)
+    return made, workers
+
+
+def until(condition, timeout_s=30.0):
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def held(registry):
+    return {mission.name: mission.holder for mission in registry.missions() if mission.is_held}
+
+
+def test_of_two_that_claim_at_once_each_mission_gets_one_worker(registry, postgres):
+    for k in range(20):
+        wanted(registry, postgres, f"m{k}")
+    claimed: list[Lease] = []
+    registries = [Registry(postgres, f"i{k}", f"p{k}") for k in range(4)]
+    threads = [threading.Thread(target=lambda one=one: claimed.extend(one.claim(20))) for one in registries]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    claimed += registry.claim(20)
+    assert len(claimed) == 20 == len({lease.mission for lease in claimed})
+
+
+def test_a_lease_ends_by_the_servers_clock_and_one_that_is_renewed_does_not(registry, postgres):
+    for name in ("kept", "lost"):
+        wanted(registry, postgres, name)
+    kept, lost = sorted(registry.claim(2))
+    other = Registry(postgres, "other", "process of other")
+    end = time.monotonic() + LEASE_S + 1.0
+    while time.monotonic() < end:
+        assert registry.renew([(kept, True)]) == {kept}
+        time.sleep(0.2)
+    (taken,) = other.claim(9)
+    assert taken == Lease(lost.mission, lost.fence + 1)
+    assert registry.renew([(kept, True), (lost, True)]) == {kept}
+
+
+def test_the_clock_of_an_instance_may_be_wrong_by_minutes(registry, postgres, monkeypatch):
+    number = wanted(registry, postgres, "timed")
+    (lease,) = registry.claim(1)
+    for wrong_s in (-600.0, 600.0):
+        now = time.time() + wrong_s
+        monkeypatch.setattr(time, "time", lambda now=now: now)
+        assert Registry(postgres, "wrong", "process of wrong").claim(9) == []
+        assert registry.renew([(lease, True)]) == {lease}
+        MissionStore(MissionTables(postgres, number, lease)).progress(1, [])
+
+
+def test_two_instances_of_one_name_are_refused(registry, postgres):
+    one, _ = instance(postgres, "same")
+    one.start()
+    again = Registry(postgres, "same", "another process")
+    with pytest.raises(ServiceError, match="another instance is called 'same'; stop it, or give this one another name"):
+        Instance(again, "same", 1, Started, lambda *_: None, lambda: None)
+    one.close()
+    Instance(again, "same", 1, Started, lambda *_: None, lambda: None).close()
+
+
+def test_the_name_of_a_killed_instance_is_free_again_in_seconds(registry, postgres):
+    assert Registry(postgres, "killed", "before").register(1)
+    began = time.monotonic()
+    Instance(Registry(postgres, "killed", "after"), "killed", 1, Started, lambda *_: None, lambda: None).close()
+    assert time.monotonic() - began < LEASE_S + 3.0
+
+
+@pytest.mark.slow
+def test_missions_are_spread_and_those_of_an_instance_that_ends_or_dies_are_taken_over(registry, postgres):
+    for k in range(6):
+        wanted(registry, postgres, f"m{k}")
+    one, of_one = instance(postgres, "one")
+    one.start()
+    until(lambda: len(held(registry)) == 6)
+    two, of_two = instance(postgres, "two")
+    two.start()
+    until(lambda: sorted(held(registry).values()).count("two") == 3 and len(held(registry)) == 6)
+    assert sum(not worker.is_stopped for worker in of_one) == 3
+    two.close()
+    assert all(worker.is_stopped for worker in of_two)
+    until(lambda: list(held(registry).values()) == ["one"] * 6)
+    one._closing.set()  # it dies: nobody renews its leases
+    three, of_three = instance(postgres, "three")
+    three.start()
+    began = time.monotonic()
+    until(lambda: list(held(registry).values()) == ["three"] * 6)
+    assert time.monotonic() - began < LEASE_S + 3.0
+    assert {worker.lease.fence for worker in of_three} >= {2}
+    three.close()
+    one._thread.join()
+
+
+def test_an_instance_takes_no_more_missions_than_it_has_room_for(registry, postgres):
+    for k in range(5):
+        wanted(registry, postgres, f"m{k}")
+    small, of_small = instance(postgres, "small", room=2)
+    small.start()
+    until(lambda: len(held(registry)) == 2)
+    time.sleep(1.5)
+    assert len(of_small) == 2
+    small.close()
+
+
+@given(wanted=st.integers(0, 60), rooms=st.lists(st.integers(0, 30), min_size=1, max_size=6))
+def test_parts_hold_all_missions_if_there_is_room_and_differ_only_where_there_is_none(wanted, rooms):
+    parts = [fair_part(wanted, rooms, room) for room in rooms]
+    assert all(part <= room for part, room in zip(parts, rooms, strict=True))
+    assert sum(parts) >= min(wanted, sum(rooms))
+    assert all(part == max(parts) for part, room in zip(parts, rooms, strict=True) if part < room)
+    assert max(parts) == 0 or sum(min(room, max(parts) - 1) for room in rooms) < wanted
+
+
+def test_another_agent_is_refused_by_every_instance(registry, postgres):
+    number = wanted(registry, postgres, "robots")
+    now = [0.0]
+    here, there = (SharedAgents(postgres, number, RobotLimit(9, lambda: now[0]), lambda: now[0]) for _ in range(2))
+    here.hold("a", "x")
+    there.hold("b", "y")
+    with pytest.raises(LeaseError, match="another agent speaks for this robot"):
+        there.hold("a", "z")
+    there.hold("a", "x")  # a robot may change the instance
+    now[0] += CONFIRM_S
+    here.hold("a", "x")
+    assert there.silent_s("a") < 5.0
+    assert there.silent_s("c") is None
+
+
+def test_a_full_instance_sends_robots_to_another_one(registry, postgres):
+    number = wanted(registry, postgres, "full")
+    now = [0.0]
+    limit = RobotLimit(2, lambda: now[0])
+    agents = SharedAgents(postgres, number, limit, lambda: now[0])
+    for robot in "aba":
+        agents.hold(robot, "x")
+    with pytest.raises(BusyError, match="takes 2 robots"):
+        agents.hold("c", "x")
+    now[0] = 31.0
+    agents.hold("c", "x")
+
+
+def test_the_audit_log_has_the_lines_of_all_instances(registry, postgres):
+    tables = [AuditTable(postgres, name) for name in ("one", "two")]
+    for k in range(4):
+        tables[k % 2].append(f'{{"line": {k}}}'.encode())
+        until(lambda k=k: tables[0].newest(1) == [f'{{"line": {k}}}'.encode()])
+    assert [line[-2:] for line in tables[1].newest(3)] == [b"1}", b"2}", b"3}"]
+    for table in tables:
+        table.close()
