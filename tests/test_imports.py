@@ -74,6 +74,7 @@ HEAVY = [
     "rospy",
     "distributed",
     "dask",
+    "psycopg",
 ]
 
 

@@ -1,7 +1,6 @@
 """`fcslam serve`: the cloud as a service over HTTP."""
 
 import ipaddress
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -115,25 +114,23 @@ def serve(
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with listen(host, port) as listening:
         authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
-        with (
-            nullcontext(_state(data, authenticator, given, learning, chosen))
-            if store is None
-            else shared_state(
-                Shared(store, instance, max_missions, max_robots), data, authenticator, given, learning, chosen
-            )
-        ) as state:
-            _reload_on_hangup(state, tokens)
-            tell_uncached(notices(quiet))
-            warm_up_decoding()
-            gc.freeze()  # collecting these objects again and again would delay packets
-            pages = (page_router(), documentation_router()) if docs else (page_router(),)
-            app = create_app(state, pages, local_names=is_open, named=None if store is None else NAMED)
-            server = _server(app, tls_certificate, tls_key, client_ca)
-            scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
-            mission = state.mission.folder.name
-            shown = f"[{address}]" if ":" in address else address
-            typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{shown}:{number}; Ctrl-C stops it")
-            server.run(sockets=[listening])
+        if store is None:
+            state = _state(data, authenticator, given, learning, chosen)
+        else:
+            shared = Shared(store, instance, max_missions, max_robots)
+            state = shared_state(shared, data, authenticator, given, learning, chosen)
+        _reload_on_hangup(state, tokens)
+        tell_uncached(notices(quiet))
+        warm_up_decoding()
+        gc.freeze()  # collecting these objects again and again would delay packets
+        pages = (page_router(), documentation_router()) if docs else (page_router(),)
+        app = create_app(state, pages, local_names=is_open, named=None if store is None else NAMED)
+        server = _server(app, tls_certificate, tls_key, client_ca)
+        scheme, (address, number) = "https" if tls_certificate else "http", listening.getsockname()[:2]
+        mission = state.mission.folder.name
+        shown = f"[{address}]" if ":" in address else address
+        typer.echo(f"fcslam serves mission '{mission}' at {scheme}://{shown}:{number}; Ctrl-C stops it")
+        server.run(sockets=[listening])
 
 
 def _server(app: "FastAPI", certificate: Path | None, key: Path | None, client_ca: Path | None) -> "uvicorn.Server":

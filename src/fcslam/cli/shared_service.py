@@ -5,8 +5,7 @@ import secrets
 import signal
 import socket
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,7 +18,6 @@ from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.state import ServiceState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.audit_table import AuditTable
-from fcslam.service.shared.instance import Launch
 from fcslam.service.shared.mission_tables import Lease
 from fcslam.service.shared.missions import Admission, SharedMissions
 from fcslam.service.shared.registry import KnownMission
@@ -42,12 +40,11 @@ class Shared(NamedTuple):
     max_robots: int
 
 
-@contextmanager
 def shared_state(
     shared: Shared, data: Path, authenticator: "Authenticator", config: CloudConfig, learning: Path | None,
     workers: Workers,
-) -> Iterator[ServiceState]:  # fmt: skip
-    """The state of an instance; who closes its missions does so before the end of the block.
+) -> ServiceState:  # fmt: skip
+    """The state of an instance; who closes its missions closes all that it holds.
 
     Raises:
         ServiceError: the store's address or the instance's name cannot be used.
@@ -57,27 +54,27 @@ def shared_state(
     if not is_server(shared.store):
         raise ServiceError("--store: this is no address of a database; write postgresql://USER@HOST:PORT/DATABASE")
     url = take_password(shared.store)
-    with closing(Postgres(url, name)) as server:
+    with ExitStack() as opened:
+        server = opened.enter_context(closing(Postgres(url, name)))
         prepare(server)
-        with closing(Spares()) as spares, closing(AuditTable(server, name)) as audit:
+        spares = opened.enter_context(closing(Spares()))
+        audit = opened.enter_context(closing(AuditTable(server, name)))
 
-            def launch(root: Path) -> Launch:
-                def start(mission: KnownMission, lease: Lease) -> RunningWorker:
-                    folder = MissionFolder(root / "missions" / mission.name)
-                    folder.path.mkdir(parents=True, exist_ok=True)
-                    options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), *workers.options())
-                    return Supervisor(folder, time.monotonic, _ignore, options, spares.start)
+        def launch(mission: KnownMission, lease: Lease) -> RunningWorker:
+            folder = MissionFolder(data / "missions" / mission.name)
+            folder.path.mkdir(parents=True, exist_ok=True)
+            options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), *workers.options())
+            return Supervisor(folder, time.monotonic, _ignore, options, spares.start)
 
-                return start
-
-            missions: SharedMissions
-            events = EventStreams(lambda: missions.open_mission.name)
-            missions = SharedMissions(
-                data, config, server, name, secrets.token_hex(8), Admission(shared.max_missions, shared.max_robots),
-                time.monotonic, time.time, launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM),
-            )  # fmt: skip
-            log = AuditLog(audit, time.time)
-            yield ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log, learning)
+        missions: SharedMissions
+        events = EventStreams(lambda: missions.open_mission.name)
+        missions = SharedMissions(
+            data, config, server, name, secrets.token_hex(8), Admission(shared.max_missions, shared.max_robots),
+            time.monotonic, time.time, launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM),
+        )  # fmt: skip
+        log = AuditLog(audit, time.time)
+        missions.closing = opened.pop_all().close
+        return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, log, learning)
 
 
 def _name(given: str | None) -> str:

@@ -24,7 +24,7 @@ from fcslam.errors import EditError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Correction, Edit, ManualClosure, Removal, Undo, frozen
 from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.storage.recovery import fault
-from fcslam.storage.row_store import RowStore, Table, Transaction
+from fcslam.storage.row_store import RowStore, StoreTable, Transaction
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Hello, PacketKind
 from fcslam.wire.packets import Label, decode
@@ -82,18 +82,18 @@ CREATE TABLE tracks (
 ) STRICT;
 CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL, seal BLOB NOT NULL) STRICT
 """
-PACKETS = Table(
+PACKETS = StoreTable(
     "packets", ("arrival",),
     ("arrival", "robot", "epoch", "sequence", "received", "time", "kind", "channel", "refusal", "data"),
 )  # fmt: skip
-CORRECTIONS = Table(
+CORRECTIONS = StoreTable(
     "corrections", ("robot", "epoch"),
     ("robot", "epoch", "version", "time", "map_index", "x", "y", "theta", "quality"),
 )  # fmt: skip
-EDITS = Table("edits", ("number",), ("number", "author", "time", "kind", "content"))
-FINALIZATIONS = Table("finalizations", ("number",), ("number", "arrivals", "edits", "run", "failure"))
-TRACKS = Table("tracks", ("robot", "epoch"), ("robot", "epoch", "stamps", "keyscans", "offsets"))
-FACTS = Table("facts", ("name",), ("name", "value"))
+EDITS = StoreTable("edits", ("number",), ("number", "author", "time", "kind", "content"))
+FINALIZATIONS = StoreTable("finalizations", ("number",), ("number", "arrivals", "edits", "run", "failure"))
+TRACKS = StoreTable("tracks", ("robot", "epoch"), ("robot", "epoch", "stamps", "keyscans", "offsets"))
+FACTS = StoreTable("facts", ("name",), ("name", "value"))
 TABLES = PACKETS, CORRECTIONS, EDITS, FINALIZATIONS, TRACKS, FACTS
 """All that a mission is, in the order of ``SCHEMA``."""
 

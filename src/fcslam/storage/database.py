@@ -10,7 +10,7 @@ from typing import Any
 
 from fcslam.errors import StoreError
 from fcslam.storage.group_commit import GroupCommit
-from fcslam.storage.row_store import Result, Table
+from fcslam.storage.row_store import Result, StoreTable
 from fcslam.storage.seals import PAGE_BYTES, seal, seal_pages, seals_file
 
 BUSY_S = 30.0
@@ -20,7 +20,7 @@ BUSY_S = 30.0
 class SealedConnection(sqlite3.Connection):
     """A connection to a database whose rows end with a seal (``storage.seals``)."""
 
-    def insert(self, table: Table, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
+    def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
         """Insert rows; ``replaces``: in place of those with the same key.
 
         Values of REAL columns must be floats: the seal is of the value as it is read again.
@@ -29,7 +29,9 @@ class SealedConnection(sqlite3.Connection):
         verb = "INSERT OR REPLACE" if replaces else "INSERT"
         self.executemany(f"{verb} INTO {table.name} VALUES ({marks}, seal('{table.name}', {marks}))", rows)
 
-    def update(self, table: Table, changes: Mapping[str, object], where: str, values: Mapping[str, object]) -> None:
+    def update(
+        self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
+    ) -> None:
         """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
         assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
         sealed = ", ".join(f":new_{column}" if column in changes else column for column in table.columns)

@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl, unquote, urlencode, urlsplit, urlunsplit
 
 from fcslam.errors import StoreError
 from fcslam.storage.group_commit import GroupCommit
-from fcslam.storage.row_store import Result, Table
+from fcslam.storage.row_store import Result, StoreTable
 
 if TYPE_CHECKING:
     import psycopg
@@ -239,7 +239,7 @@ class PostgresTransaction:
         """Execute a statement."""
         return self._connection.execute(_translate(statement), _plain(values), binary=True)
 
-    def insert(self, table: Table, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
+    def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
         """Insert rows; ``replaces``: in place of those with the same key."""
         marks = ", ".join("%s" for _ in table.columns)
         statement = f"INSERT INTO {table.name} ({', '.join(table.columns)}) VALUES ({marks})"
@@ -249,13 +249,15 @@ class PostgresTransaction:
         with self._connection.cursor() as cursor:
             cursor.executemany(statement, (_plain(row) for row in rows))
 
-    def update(self, table: Table, changes: Mapping[str, object], where: str, values: Mapping[str, object]) -> None:
+    def update(
+        self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
+    ) -> None:
         """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
         assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
         news = {f"new_{column}": value for column, value in changes.items()}
         self.execute(f"UPDATE {table.name} SET {assignments} WHERE {where}", {**values, **news})
 
-    def stream(self, table: Table) -> Iterator[tuple[Any, ...]]:
+    def stream(self, table: StoreTable) -> Iterator[tuple[Any, ...]]:
         """The rows of a table by its key, a few at a time."""
         statement = f"SELECT {', '.join(table.columns)} FROM {table.name} ORDER BY {', '.join(table.key)}"
         with self._connection.cursor(name="rows", binary=True) as cursor:
@@ -266,7 +268,11 @@ class PostgresTransaction:
 
 def is_server(store: str) -> bool:
     """Whether the name of a store has the form of a PostgreSQL server's address."""
-    return urlsplit(store).scheme in _SCHEMES
+    try:
+        parts = urlsplit(store)
+        return parts.scheme in _SCHEMES and parts.port != 0
+    except ValueError:  # of the port
+        return False
 
 
 def take_password(url: str) -> str:

@@ -1,4 +1,4 @@
-"""What a store of rows offers, whether its tables are in a SQLite file or on a PostgreSQL server.
+"""The interface of a store of rows, whose tables are in a SQLite file or on a PostgreSQL server.
 
 Statements are written for both: marks are ``?``, or ``:name`` with a mapping.
 """
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 Result = TypeVar("Result")
 
 
-class Table(NamedTuple):
+class StoreTable(NamedTuple):
     """A table as statements name it."""
 
     name: str
@@ -40,13 +40,15 @@ class Transaction(Protocol):
     def execute(self, statement: str, values: Sequence[object] = (), /) -> Found:
         """Execute a statement."""
 
-    def insert(self, table: Table, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
+    def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
         """Insert rows; ``replaces``: in place of those with the same key.
 
         Values of REAL columns must be floats.
         """
 
-    def update(self, table: Table, changes: Mapping[str, object], where: str, values: Mapping[str, object]) -> None:
+    def update(
+        self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
+    ) -> None:
         """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
 
 

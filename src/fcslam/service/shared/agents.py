@@ -1,4 +1,4 @@
-"""Who speaks for each robot, known to all instances; and how many robots one instance takes."""
+"""The agents of robots, known to all instances, and the limit of robots that send to one instance."""
 
 import threading
 from collections.abc import Callable

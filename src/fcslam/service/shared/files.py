@@ -1,4 +1,4 @@
-"""What a worker wrote, as rows of its mission: its snapshot for the next worker, run folders for every instance."""
+"""Files of a worker as rows of its mission: its snapshot for the next worker, run folders for every instance."""
 
 import io
 import zipfile

@@ -38,7 +38,7 @@ class MissionTables(PostgresTables):
         LeaseLostError: another worker has the mission.
         """
         if self._lease is None:
-            # What an instance writes, a worker has to follow.
+            # A worker has to follow the rows that an instance writes.
             transaction.execute(
                 "UPDATE fcslam.missions SET is_wanted = true WHERE number = ? AND NOT is_wanted", (self._number,)
             )
@@ -81,8 +81,7 @@ class MissionTables(PostgresTables):
 def check_lease(transaction: PostgresTransaction, lease: Lease) -> None:
     """Check that a worker still has its mission, until the end of the transaction.
 
-    Who renews a lease does not wait for the transaction; who takes it over leaves out the missions of which one is
-    open.
+    A renewal of the lease does not wait for the transaction. A claim leaves the mission out while one is open.
 
     Raises:
         LeaseLostError: it has not.

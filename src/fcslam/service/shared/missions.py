@@ -107,7 +107,7 @@ class SharedMissions:
 
     def __init__(
         self, root: Path, config: CloudConfig, server: Postgres, instance: str, process: str, admission: Admission,
-        clock: Callable[[], float], wall_clock: Callable[[], float], launch: Callable[[Path], Launch], listen: Listen,
+        clock: Callable[[], float], wall_clock: Callable[[], float], launch: Launch, listen: Listen,
         on_taken: Callable[[], None],
     ) -> None:  # fmt: skip
         """Take the instance's name, and create the first mission if there is none.
@@ -119,14 +119,15 @@ class SharedMissions:
             instance, process, on_taken: as of ``Instance`` and ``Registry``.
             admission: how much the instance takes.
             clock, wall_clock: seconds; since 1970.
-            launch: makes, with the folder of all missions' files, what starts a worker.
-            listen: receives events.
+            launch, listen: as of ``Instance``.
 
         Raises:
             ServiceError: the folder cannot be used, or another instance has the name.
             StoreError: the store cannot be used.
         """
         self.root = root
+        self.closing: Callable[[], object] = lambda: None
+        """Called after the last mission is given up."""
         self._config, self._server, self._clock, self._wall_clock = config, server, clock, wall_clock
         self._lock = locked(root)
         try:
@@ -138,7 +139,7 @@ class SharedMissions:
             self._registry = Registry(server, instance, process)
             self._opening = threading.Lock()
             self._opened: dict[str, SharedMission] = {}
-            self._instance = Instance(self._registry, instance, admission.missions, launch(root), listen, on_taken)
+            self._instance = Instance(self._registry, instance, admission.missions, launch, listen, on_taken)
             if not self._instance.known:
                 self._create_first()
             self._instance.start()
@@ -223,6 +224,7 @@ class SharedMissions:
         """Give up all missions, for other instances to take, and unlock the folder."""
         self._instance.close()
         self._lock.close()
+        self.closing()
 
     def _create_first(self) -> None:
         try:

@@ -39,10 +39,8 @@ class Spares:
         with self._lock:
             self._is_closed = True
             for spare in self._waiting:
-                spare.terminate()
-            for spare in self._waiting:
-                with spare:
-                    spare.wait()
+                spare.terminate()  # one that waits for a mission ignores it, and ends with its input
+                spare.communicate()
             self._waiting = []
 
     @staticmethod
