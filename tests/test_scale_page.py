@@ -21,7 +21,7 @@ NOT_HERE = ("pip install",)
 """Commands that change this environment."""
 SHIM = """#!/bin/sh
 # PostgreSQL refuses to run as root; its other user gets the folder.
-case "$(basename "$0")" in initdb) chown {owner} . password.txt ;; esac
+case "$(basename "$0")" in initdb) chown {owner} . password ;; esac
 touch store.log && chown {owner} store.log
 exec runuser -u {owner} -- {program} "$@"
 """
