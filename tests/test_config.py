@@ -9,6 +9,7 @@ from pydantic import Field
 
 from fcslam.config import Settings, dump, load, parse
 from fcslam.errors import ConfigError
+from fcslam.mission import MissionConfig
 
 
 class Colour(StrEnum):
@@ -53,6 +54,13 @@ def test_a_file_overrides_only_what_it_names(tmp_path):
     assert load(Outer, tmp_path / "c.yaml") == Outer(inner=Inner(reach_m=5.0))
     (tmp_path / "c.yaml").write_text("")
     assert load(Outer, tmp_path / "c.yaml") == Outer()
+
+
+def test_a_gate_keeps_the_thresholds_that_a_file_does_not_name():
+    content = {"fleet": {"matcher": {"verification": {"loose": {"count": 41}}}}}
+    gate = parse(MissionConfig, content, "robot.yaml").fleet.matcher.verification.loose
+    default = MissionConfig().fleet.matcher.verification.loose
+    assert gate == default.model_copy(update={"count": 41}) != default
 
 
 @pytest.mark.parametrize(

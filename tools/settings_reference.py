@@ -2,10 +2,11 @@
 
     make docs
 
-A row's effect is the description of the field, and its unit follows from the key's suffix. To correct the page, correct
-the description of the field in the code.
+A row's effect is the description of the field. The unit stands in brackets at the end of the description, or follows
+from the key's suffix. To correct the page, correct the description of the field in the code.
 """
 
+import re
 import sys
 import types
 from collections.abc import Callable, Iterator
@@ -30,6 +31,10 @@ FOLDER = Path(__file__).parents[1] / "docs" / "reference"
 UNITS = {
     "rad_m": "rad/m",
     "per_m": "1/m",
+    "per_s": "1/s",
+    "per_hour": "1/h",
+    "m_s": "m/s",
+    "rad_s": "rad/s",
     "m": "m",
     "rad": "rad",
     "s": "s",
@@ -62,7 +67,7 @@ fcslam map robot1.clf robot2.clf -o runs/building --config mission.yaml
 - An unknown key or a value out of range is an error. The message names the nearest known key.
 - Every run folder contains the complete configuration of the run, `config.yaml`.
 - `fcslam map --preset paper` begins with [the paper's settings](../results/paper.md) in place of the defaults. The keys
-  of `--config` count before them.
+  of `--config` override them.
 - In Python, `fcslam.map_recordings(..., config={"map": {"resolution_m": 0.1}})` takes the same keys.
 
 A key path such as `map.resolution_m` stands for nested keys:
@@ -162,8 +167,15 @@ def tables(settings: Settings, path: str = "", documented: tuple[type[Settings],
 
 def row(path: str, field: FieldInfo, value: Any) -> str:
     """One line of a table."""
-    cells = [f"`{path}`", f"`{flow(value)}`", unit(path), allowed(field), sentence(field.description)]
+    effect, stated = split_unit(sentence(field.description))
+    cells = [f"`{path}`", f"`{flow(value)}`", stated or unit(path), allowed(field), effect]
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def split_unit(effect: str) -> tuple[str, str]:
+    """A sentence without the unit in brackets at its end, and this unit; an empty one if it states none."""
+    stated = re.search(r" \[([^],]+)\]\.$", effect)
+    return (effect[: stated.start()] + ".", stated[1]) if stated else (effect, "")
 
 
 def unit(path: str) -> str:

@@ -22,7 +22,7 @@ PresetName = Annotated[
     typer.Option(
         "--preset",
         help="Named configuration. paper: FC-SLAM to the letter; words alone decide, a new vocabulary at every place, "
-        "rigid maps. Keys of --config count before it.",
+        "rigid maps. Keys of --config override it.",
         show_default="none",
     ),
 ]

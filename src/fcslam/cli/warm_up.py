@@ -59,10 +59,7 @@ def compiled(console: "Console") -> Iterator[None]:
         yield
         return
     processes = cores()
-    first_s = EVERYTHING_S if processes == 1 else FIRST_SCANS_S
-    print_line(
-        console,
-        f"compiling, first run only: about {first_s} s until the first scan, about {EVERYTHING_S} s until full speed",
-    )
+    first = "" if processes == 1 else f"about {FIRST_SCANS_S} s until the first scan, "
+    print_line(console, f"compiling, first run only: {first}about {EVERYTHING_S} s until full speed")
     with compiling(processes, (warm_up_matching,)):
         yield
