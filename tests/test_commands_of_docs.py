@@ -1,46 +1,90 @@
 """Every command that the documentation shows runs here, or tests/commands_of_docs.yaml gives the reason why not."""
 
+import datetime
 import gzip
+import json
+import os
+import re
 import shlex
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 import yaml
 
 from fcslam import open_run
 from fcslam.cli import main
 from fcslam.geometry import se2
+from fcslam.sources import open_source, write_carmen
 from tests.test_docs import COMMAND_LINE, PAGES, ROOT
 
 LISTED: dict[str, Any] = yaml.safe_load((ROOT / "tests" / "commands_of_docs.yaml").read_text(encoding="utf-8"))
+EXECUTED: dict[str, list[str]] = LISTED["executed"]
+BESIDE_A_SERVICE: dict[str, list[str]] = LISTED["beside a service"]
+OTHER_PROGRAMS: dict[str, str] = LISTED["other programs"]
+BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
+PAGES_WITH_COMMANDS = [page for page in PAGES if page.name not in {"CHANGELOG.md", "CONTRIBUTING.md", "commands.md"}]
+
 ANNA, BEN, CLEO = (ROOT / "examples" / "logs" / f"{robot}.clf.xz" for robot in ("anna", "ben", "cleo"))
 LOGS = {
-    "robot1.clf.gz": ANNA, "robot1.clf": ANNA, "building.clf.gz": ANNA, "monday.clf.gz": ANNA,
+    "robot1.clf.gz": ANNA, "robot1.clf": ANNA, "building.clf.gz": ANNA, "monday.clf.gz": ANNA, "intel.clf.xz": ANNA,
     "robot2.log": BEN, "robot2.clf": BEN, "tuesday.clf.gz": BEN,
-    "robot3.log": CLEO, "wednesday.clf.gz": CLEO, "today.clf.gz": CLEO,
+    "robot3.log": CLEO, "today.clf.gz": CLEO,
 }  # fmt: skip
 """Names that the pages use, and the sample log that stands for each."""
 BAGS = {
     "run1.bag": ANNA, "monday/run.bag": ANNA, "robot2.mcap": BEN, "run2.bag": BEN, "tuesday/run.bag": BEN,
-    "robot2.fcslam": BEN, "day.mcap": CLEO,
+    "robot2.fcslam": BEN, "robot2.bag": BEN, "day.mcap": CLEO, "today.bag": CLEO,
 }  # fmt: skip
+NEXT_YEAR = f"{datetime.datetime.now(datetime.UTC).year + 1}-01-31"
+SUBSTITUTES = {"/etc/fcslam/": "credentials/", "2027-01-31": NEXT_YEAR}
+"""Parts of commands that are those of the reader's machine, and what stands for them here."""
+PATIENCE_S = 300.0
 
 
 def shown() -> set[str]:
-    """Every command on a line of its own in the README and docs/."""
-    pages = [page for page in PAGES if page.name not in {"CHANGELOG.md", "CONTRIBUTING.md", "commands.md"}]
-    lines = (line for page in pages for line in COMMAND_LINE.findall(page.read_text(encoding="utf-8")))
+    """Every command of fcslam on a line of its own in the README and docs/."""
+    lines = (line for page in PAGES_WITH_COMMANDS for line in COMMAND_LINE.findall(page.read_text(encoding="utf-8")))
     return {line.partition(" #")[0].strip() for line in lines}
 
 
 def listed() -> list[str]:
     """Every command of the list."""
-    return [command for kind in LISTED.values() for commands in kind.values() for command in commands]
+    kinds = (EXECUTED, BESIDE_A_SERVICE, LISTED["not executed"])
+    return [command for kind in kinds for commands in kind.values() for command in commands]
 
 
 def test_every_command_shown_is_executed_or_has_a_reason():
     assert shown() == set(listed())
+
+
+def test_every_command_of_another_program_is_tested_or_has_a_reason():
+    blocks = (block for page in PAGES_WITH_COMMANDS for block in BLOCK.findall(page.read_text(encoding="utf-8")))
+    lines = [line for block in blocks for line in block.splitlines() if line and not line.startswith(("fcslam ", "#"))]
+    assert [line for line in lines if not line.startswith(tuple(OTHER_PROGRAMS))] == []
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES_WITH_COMMANDS)
+    assert [
+        beginning for beginning in OTHER_PROGRAMS if not re.search(rf"^(?: {{4}})?{re.escape(beginning)}", text, re.M)
+    ] == []
+
+
+def test_the_tests_that_reasons_name_are_there():
+    reasons = [*LISTED["not executed"], *OTHER_PROGRAMS.values()]
+    named = [name for reason in reasons for name in re.findall(r"(?:tests|tools|\.ci)/[\w/.]*\w", reason)]
+    assert len(named) > 10
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def relations(run_folder: Path) -> str:
@@ -54,32 +98,69 @@ def relations(run_folder: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
+def make_relations(run: str) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(gzip.compress(relations(path.parent / "runs" / run).encode()))
+
+
+def make_another_day(path: Path) -> None:
+    """The third sample log, two days later: then something may have changed."""
+    scans = (replace(record, stamp=record.stamp + 172_800.0) for record in open_source(CLEO).records())
+    write_carmen(path, scans)
+
+
+def make_map_of_another_program(path: Path) -> None:
+    building = path.parent / "runs" / "building" / "map.yaml"
+    path.write_text(building.read_text(encoding="utf-8").replace("map.pgm", "office.pgm"), encoding="utf-8")
+    path.with_suffix(".pgm").write_bytes(building.with_suffix(".pgm").read_bytes())
+
+
+MADE = {
+    "building.relations.gz": make_relations("in-one"),
+    "intel.relations.gz": make_relations("intel"),
+    "wednesday.clf.gz": make_another_day,
+    "office.yaml": make_map_of_another_program,
+}
+"""Other inputs of commands. Each is made when a command names it for the first time."""
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    """The folder of a reader with all logs."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    for alias, log in LOGS.items():
+        (tmp_path / alias).symlink_to(log)
+    return tmp_path
+
+
+def as_here(command: str) -> str:
+    for theirs, ours in SUBSTITUTES.items():
+        command = command.replace(theirs, ours)
+    return command
+
+
 def run(command: str) -> int:
     words = shlex.split(command.partition(">")[0])
     return main(words[1:])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LISTED["executed"])
-def test_the_commands_run_in_the_order_of_the_list(name, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
-    for alias, log in LOGS.items():
-        (tmp_path / alias).symlink_to(log)
-    if name == "bags":
-        for alias, log in BAGS.items():
-            (tmp_path / alias).parent.mkdir(exist_ok=True)
+@pytest.mark.parametrize("name", EXECUTED)
+def test_the_commands_run_in_the_order_of_the_list(name, desk, capsys):
+    for alias, log in BAGS.items():
+        if any(alias in command for command in EXECUTED[name]):
+            (desk / alias).parent.mkdir(exist_ok=True)
             assert main(["convert", str(log), alias]) == 0
-    (tmp_path / "vetoes.csv").write_text("robot_i,stamp_i,robot_j,stamp_j\nrobot1,,robot3,\n")
-    for command in LISTED["executed"][name]:
-        if "building.relations.gz" in command and not (tmp_path / "building.relations.gz").exists():
-            text = relations(tmp_path / "runs" / "in-one")
-            (tmp_path / "building.relations.gz").write_bytes(gzip.compress(text.encode()))
+    (desk / "vetoes.csv").write_text("robot_i,stamp_i,robot_j,stamp_j\nrobot1,,robot3,\n")
+    for command in map(as_here, EXECUTED[name]):
+        for made, make in MADE.items():
+            if made in command and not (desk / made).exists():
+                make(desk / made)
         capsys.readouterr()
-        again = ["--force"] if any(output in command for output in overwritten(tmp_path, command)) else []
+        again = ["--force"] if any(output in command for output in overwritten(desk, command)) else []
         assert run(" ".join([command.partition(">")[0], *again])) == 0, (command, capsys.readouterr().err)
         if ">" in command:
-            (tmp_path / command.partition(">")[2].strip()).write_text(capsys.readouterr().out)
+            (desk / command.partition(">")[2].strip()).write_text(capsys.readouterr().out)
 
 
 def overwritten(folder: Path, command: str) -> list[str]:
@@ -88,3 +169,98 @@ def overwritten(folder: Path, command: str) -> list[str]:
     outputs = [words[i + 1] for i, word in enumerate(words) if word == "-o"]
     outputs += words[-1:] if words[1] == "convert" else []
     return [output for output in outputs if (folder / output).exists()]
+
+
+def start(command: str, *more: str) -> subprocess.Popen[str]:
+    """A command in a process of its own, without a display."""
+    path = os.pathsep.join([str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    words = [sys.executable, "-m", "fcslam.cli", *shlex.split(command)[1:], *more]
+    return subprocess.Popen(
+        words, env=environment | {"PYTHONPATH": path}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def end(process: subprocess.Popen[str]) -> str:
+    """Press Ctrl-C; returns what the command printed."""
+    process.send_signal(signal.SIGINT)
+    return process.communicate(timeout=PATIENCE_S)[0]
+
+
+def answer(url: str, process: subprocess.Popen[str]) -> bytes:
+    """What the process serves at a URL, as soon as it is ready."""
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            with urllib.request.urlopen(url, timeout=10) as response:
+                content: bytes = response.read()
+                return content
+        except (urllib.error.URLError, ConnectionError, TimeoutError):
+            if time.monotonic() > until or process.poll() is not None:
+                raise
+            time.sleep(0.3)
+
+
+def downloads(port: int) -> set[tuple[str, str]]:
+    """File and address of every download that a page shows, from the service at ``port``."""
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES_WITH_COMMANDS)
+    shown_here = re.findall(r"^(?: {4})?curl -o (\S+) (http://127\.0\.0\.1:8340\S+)$", text, re.MULTILINE)
+    return {(file, url.replace("8340", str(port))) for file, url in shown_here}
+
+
+@pytest.mark.slow
+def test_two_robots_and_a_service_as_the_pages_show_them(desk):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    (serve,) = BESIDE_A_SERVICE["services"]
+    service = start(serve, "--port", str(port))
+    try:
+        assert answer(f"http://127.0.0.1:{port}/healthz", service)
+        for commands in (BESIDE_A_SERVICE["two robots at a time"], BESIDE_A_SERVICE["after the robots"]):
+            robots = [start(command.replace("8340", str(port))) for command in commands]
+            for robot in robots:
+                said = robot.communicate(timeout=PATIENCE_S)[0]
+                assert robot.returncode == 0, said
+                assert "trajectory in map" in said
+        until = time.monotonic() + PATIENCE_S
+        while json.loads(answer(f"http://127.0.0.1:{port}/api/v1/fleet", service))["maps"] > 1:
+            assert time.monotonic() < until, "the maps were not joined"
+            time.sleep(0.5)
+        assert len(downloads(port)) == 3
+        for file, url in downloads(port):
+            (desk / file).write_bytes(answer(url, service))
+        assert cv2.imread("map.png").std() > 0
+        assert cv2.imread("map.pgm").std() > 0
+    finally:
+        said = end(service)
+    assert f"http://127.0.0.1:{port}" in said
+    assert service.returncode == 130
+
+
+@pytest.mark.slow
+def test_the_pages_of_runs_are_served_until_ctrl_c(desk):
+    for command in BESIDE_A_SERVICE["pages"]:
+        run_folder = command.split()[-1]
+        assert main(["map", str(ANNA), "-o", run_folder, "--quiet"]) == 0
+        page = start(command)
+        try:
+            assert page.stdout is not None
+            address = re.search(r"http://\S+", page.stdout.readline())
+            assert address is not None
+            assert b"<title>" in answer(address[0], page)
+        finally:
+            end(page)
+        assert page.returncode in (0, 130)
+
+
+@pytest.mark.slow
+def test_the_queries_of_the_page_on_mission_files_run(desk):
+    text = (ROOT / "docs" / "reference" / "mission-file.md").read_text(encoding="utf-8")
+    queries = re.findall(r'^sqlite3 runs/building/mission.fcslam "(.*)"$', text, re.MULTILINE)
+    assert len(queries) == 2
+    assert main(["map", str(ANNA), "-o", "runs/building", "--quiet"]) == 0
+    assert main(["edit", "remove", "runs/building", "anna"]) == 0
+    with closing(sqlite3.connect("runs/building/mission.fcslam")) as mission:
+        counts, edits = (mission.execute(query).fetchall() for query in queries)
+    assert {kind for _, kind, _, _ in counts} == {"hello", "keyscan", "constraint", "place"}
+    assert [kind for _, _, kind, _ in edits] == ["removal"]
