@@ -188,7 +188,7 @@ def end(process: subprocess.Popen[str]) -> str:
 
 
 def answer(url: str, process: subprocess.Popen[str]) -> bytes:
-    """What the process serves at a URL, as soon as it is ready."""
+    """The content at a URL of the process, as soon as it is ready."""
     until = time.monotonic() + PATIENCE_S
     while True:
         try:

@@ -75,7 +75,9 @@ def undo(
 
 
 @app.command(
-    epilog=examples("fcslam edit veto runs/building anna 1010.25 ben 1010.251", "fcslam edit veto runs/building anna ben")
+    epilog=examples(
+        "fcslam edit veto runs/building anna 1010.25 ben 1010.251", "fcslam edit veto runs/building anna ben"
+    )
 )
 def veto(
     mission: Mission,
