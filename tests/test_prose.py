@@ -29,6 +29,7 @@ PAGE = "# Page\n\nAfter this page you know it.\n\n"
         ("What is a place? It is a set of keypoints.", []),
         ("A is sent. B is then drawn. C is never kept.", ["passive chains"]),
         ("A is sent. The robot waits. C is kept. D was cut.", []),
+        ("Go.\n\n| a | b |\n" + "| word | word |\n" * 400, ["long pages"]),
         ("    What is code is no prose.\n\n```sh\nWhat is a comment.\n```", []),
     ],
 )

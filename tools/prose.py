@@ -4,9 +4,9 @@
     python tools/prose.py --lower    # write lower counts into the budget
 
 Findings: sentences of more than 32 words, words of the list below, sentences that begin with "Who", "What" or "That of"
-as their subject, three passives in a row, pages of more than 25 words a sentence on average, and pages that do not
-begin with what the reader can do. The first page of the site and the README begin with what fcslam is. Generated
-pages, code and tables are left out, except that words of the list count in tables, too.
+as their subject, three passives in a row, pages of more than 25 words a sentence on average, pages of more than 2,000
+words, and pages that do not begin with what the reader can do. The first page of the site and the README begin with
+what fcslam is. Generated pages, code and tables are left out, except that words of the list count in tables, too.
 
 Of docstrings and comments in ``src``, ``tests`` and ``examples``, the first three kinds count, with "in code" in their
 names. Indented blocks of docstrings, such as formats and diagrams, are left out.
@@ -30,6 +30,8 @@ GENERATED = {"commands.md", "rest.md", "settings.md", "settings-robot.md", "sett
 
 LONGEST_SENTENCE = 32
 MEAN_SENTENCE = 25
+LONGEST_PAGE = 2000
+"""Words of a page with its tables and code."""
 WORDS = ("borne out", "anew", "alike", "told", "as it comes", "says so", "is worth")
 """Words and phrases that the project does not use."""
 OPENING = re.compile(r"(?:Who|What|That of)\b(?![^.!?]*\?)")
@@ -88,6 +90,8 @@ def findings(text: str) -> Iterator[tuple[str, str]]:
     lengths = [words_of(sentence) for sentence in all_sentences]
     if lengths and sum(lengths) > MEAN_SENTENCE * len(lengths):
         yield "pages with long sentences", f"{sum(lengths) / len(lengths):.1f} words on average"
+    if len(text.split()) > LONGEST_PAGE:
+        yield "long pages", f"{len(text.split())} words"
     if not text.startswith("# fcslam\n") and not READER.search(text[:900]):
         yield "pages that do not begin with the reader", text.partition("\n")[0]
 
