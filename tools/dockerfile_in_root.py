@@ -44,6 +44,10 @@ def make_root(root: Path, image: str) -> None:
         raise SystemExit(f"FROM {image}: this script knows Debian's slim images only")
     if not (root / "etc" / "debian_version").exists():
         subprocess.run(["debootstrap", "--variant=minbase", found[1], root], check=True)
+
+
+def connect(root: Path) -> None:
+    """Give the root this machine's name service and certificates, which a step may have replaced."""
     for file in ("/etc/resolv.conf", "/etc/hosts", "/etc/ssl/certs/ca-certificates.crt"):
         (root / file[1:]).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(file, root / file[1:])
@@ -69,6 +73,7 @@ def main(root: Path, arguments: list[str]) -> None:
             case "FROM":
                 make_root(root, rest)
             case "RUN":
+                connect(root)
                 run_in(root, ["sh", "-c", rest], image["USER"], environment, image["WORKDIR"])
             case "COPY":
                 *sources, target = rest.split()
