@@ -10,7 +10,7 @@ import fcslam
 from fcslam.cli import main
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import OutputError, SourceError
-from fcslam.mission_file import mission_bytes
+from fcslam.mission_file import as_stored, mission_bytes
 from fcslam.records import Keyscan, KeyscanId
 from fcslam.runs import Metric, Occupancy, RobotTrajectory, Run
 from fcslam.runs.map_files import parse_map
@@ -35,7 +35,7 @@ def write_run(folder, days):
             *(Keyscan(KeyscanId("anna", k.id.number), k.stamp, dequantise(quantise(k.ranges_m))) for k in keyscans),
         ]
         packets += [
-            measure(Packet("anna", epoch, number, keyscans[0].stamp + number, body))
+            as_stored(measure(Packet("anna", epoch, number, keyscans[0].stamp + number, body)))
             for number, body in enumerate(bodies)
         ]
         stamps = np.array([keyscan.stamp for keyscan in keyscans])

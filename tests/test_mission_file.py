@@ -186,7 +186,7 @@ def test_what_is_no_mission_file_is_told_in_one_line(begun, tmp_path):
 
 def test_reading_is_the_inverse_of_writing(begun, tmp_path):
     saved = read_mission(begun)
-    packets = sorted((sized for sent in saved.packets.values() for sized in sent), key=lambda s: s.packet.order)
+    packets = sorted(saved.stored, key=lambda packet: packet.order)
     path = tmp_path / "again"
     path.write_bytes(mission_bytes(saved.config, saved.edits, packets, saved.refused, saved.tracks))
     again = read_mission(path)

@@ -17,8 +17,9 @@ from pydantic import Field, model_validator
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.edits import in_force
 from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.report import Track, keyscan_track, run_of, traffic_metrics
-from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of
+from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.config import Settings, dump
 from fcslam.driving import Drive, Leg, continued, on_floor, one_by_one
@@ -26,19 +27,20 @@ from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.metrics.jumps import JumpLimits
-from fcslam.mission_file import EMPTY, SavedMission, mission_bytes, mission_state_bytes
+from fcslam.mission_file import EMPTY, SavedMission, as_stored, mission_bytes, mission_state_bytes
 from fcslam.places.matcher import MatchDecision
 from fcslam.records import Channel, Edit, Veto
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.words import Sends
 from fcslam.runs import Metric, Run, check_names
+from fcslam.service.mission_store import StoredPacket
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
 from fcslam.storage.state_file import State
 from fcslam.wire.checks import check_floor, check_name
 from fcslam.wire.ledger import Counter, Ledger, Traffic
 from fcslam.wire.messages import Packet, PacketKind
-from fcslam.wire.packets import Label, SizedPacket, measure
+from fcslam.wire.packets import Label, SizedPacket, decode, measure
 
 _log = logging.getLogger(__name__)
 
@@ -127,10 +129,10 @@ def run_mission(
     """
     onto = onto or EMPTY
     _check_robots(sources)
-    _check_vetoes(vetoes, [*onto.packets, *(source.name for source in sources)])
+    _check_vetoes(vetoes, [*onto.robots, *(source.name for source in sources)])
     _check_floors(floors, [source.name for source in sources])
     cloud = MissionCloud(config, onto, vetoes, verify_pairs)
-    meter = _Meter(watch, cloud, [*onto.packets, *(source.name for source in sources)])
+    meter = _Meter(watch, cloud, [*onto.robots, *(source.name for source in sources)])
     with drive(sources, config.robot) as robots:
         new = [
             on_floor(continued(legs, onto.epochs(source.name)), floors.get(source.name, ""))
@@ -139,8 +141,7 @@ def run_mission(
         streams = [_packets(legs, meter) for legs in new]
         first, streams = _first(streams)
         if cloud.resume(onto, first):
-            for leg in itertools.chain.from_iterable(onto.legs()):
-                meter.count(leg)
+            meter.take_over(onto)
         else:
             streams += [_packets(legs, meter) for legs in onto.legs()]
         for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
@@ -162,7 +163,7 @@ class MissionCloud:
         self._verify_pairs = verify_pairs
         self._cloud = Cloud(config.fleet, config.seed, verify_pairs)
         self._traffic = Counter()
-        self._packets: list[SizedPacket] = []
+        self._packets: list[StoredPacket] = []
         self._refused = onto.refused
         numbers = itertools.count(len(onto.edits) + 1)
         self._edits = (*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in vetoes))
@@ -185,14 +186,17 @@ class MissionCloud:
         Returns:
             Whether there is a state, no setting or edit has changed, and all new packets come later than the old ones.
         """
-        packets = onto.in_order
-        is_later = not packets or first is None or first.packet.order > packets[-1].packet.order
+        packets = sorted(onto.stored, key=lambda packet: packet.order)
+        is_later = not packets or first is None or first.packet.order > packets[-1].order
         if onto.state is None or not is_later or self._edits != onto.edits or self._settings != onto.config:
             return False
         try:
             config, state = self.config, onto.state["cloud"]
-            applied = (sent.packet for sent in packets)
-            cloud = Cloud.restored(config.fleet, config.seed, state, applied, self._verify_pairs)
+            numbered = {PacketNumber(session_name(p.robot, p.epoch), p.sequence): p for p in packets}
+            cloud = Cloud.restored(
+                config.fleet, config.seed, state, {number: packet.time for number, packet in numbered.items()},
+                lambda number: decode(numbered[number].data), self._verify_pairs,
+            )  # fmt: skip
             traffic = {
                 Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(count, size)
                 for robot, kind, channel, count, size in onto.state["traffic"]
@@ -213,7 +217,7 @@ class MissionCloud:
             replies = self._cloud.apply(sent.packet)
         except PacketError as error:
             raise FcslamError(f"{sent.packet.robot}: the cloud refused a packet: {error}") from error
-        self._packets.append(sent)
+        self._packets.append(as_stored(sent))
         for packet in (sent, *map(measure, replies)):
             self._traffic.accept(packet.label, packet.size)
         return replies
@@ -303,6 +307,12 @@ class _Meter:
         else:
             self._tracks[leg.robot] |= leg.tracks
             self._faults[leg.robot] = leg.faults
+
+    def take_over(self, onto: SavedMission) -> None:
+        """Count an earlier mission whose packets need not be applied again."""
+        for leg in onto.driven():
+            self.count(leg)
+        self.keyscans += sum(packet.kind is PacketKind.KEYSCAN for packet in onto.stored)
 
     def report(self, fusing: bool = False) -> None:
         """Report the progress now."""

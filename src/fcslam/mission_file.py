@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from hashlib import blake2b
 from itertools import chain
 from pathlib import Path
@@ -38,14 +39,14 @@ _AT_ONCE: Final = 1000
 """Packets that are read at once."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class SavedMission:
     """The content of a mission file."""
 
     config: CloudConfig
     edits: tuple[Edit, ...]
-    packets: Mapping[str, tuple[SizedPacket, ...]]
-    """By robot, in the order of their times; without refused ones."""
+    stored: tuple[StoredPacket, ...]
+    """The packets as they are stored, in the order of their arrival; without refused ones."""
     refused: tuple[StoredPacket, ...]
     """Packets without effect; their numbers are used up."""
     tracks: Mapping[str, Track]
@@ -54,25 +55,46 @@ class SavedMission:
     """The state of the cloud after all packets, if this user's program left one beside the file."""
 
     @property
+    def robots(self) -> tuple[str, ...]:
+        """Robots with a packet, in the order of their first one."""
+        return tuple(dict.fromkeys(packet.robot for packet in self.stored))
+
+    @cached_property
+    def packets(self) -> Mapping[str, tuple[SizedPacket, ...]]:
+        """The packets of each robot in the order of their times, decoded when somebody asks for them.
+
+        Raises:
+            PacketError: one cannot be read.
+        """
+        sent: dict[str, list[SizedPacket]] = {robot: [] for robot in self.robots}
+        for stored in self.stored:
+            sent[stored.robot].append(SizedPacket(decode(stored.data), stored.data))
+        return {robot: tuple(sorted(its, key=lambda sized: sized.packet.order)) for robot, its in sent.items()}
+
+    @property
     def in_order(self) -> list[SizedPacket]:
         """All packets in canonical order."""
         return sorted(chain.from_iterable(self.packets.values()), key=lambda sized: sized.packet.order)
 
     def epochs(self, robot: str) -> int:
         """How many sessions the robot had, counted with those without a packet."""
-        return 1 + max((sized.packet.epoch for sized in self.packets.get(robot, ())), default=-1)
+        return 1 + max((packet.epoch for packet in self.stored if packet.robot == robot), default=-1)
 
     def legs(self) -> list[Iterator[Leg]]:
         """Yield the legs of each robot, as ``driving`` gives them for recordings."""
-        return [iter((self._leg(robot, packets),)) for robot, packets in self.packets.items()]
+        return [iter((replace(leg, packets=self.packets[leg.robot]),)) for leg in self.driven()]
 
-    def _leg(self, robot: str, packets: tuple[SizedPacket, ...]) -> Leg:
+    def driven(self) -> list[Leg]:
+        """The way of each robot, without its packets."""
+        return [self._way(robot) for robot in self.robots]
+
+    def _way(self, robot: str) -> Leg:
         tracks = {name: track for name, track in self.tracks.items() if robot_and_epoch(name)[0] == robot}
         stamps = tuple(stamp for track in tracks.values() for stamp in track.stamps.tolist())
-        return Leg(robot, packets, stamps, tracks, Faults({}))
+        return Leg(robot, (), stamps, tracks, Faults({}))
 
 
-EMPTY: Final = SavedMission(CloudConfig(), (), {}, (), {})
+EMPTY: Final = SavedMission(CloudConfig(), (), (), (), {})
 """A mission before its first packet."""
 
 
@@ -85,7 +107,10 @@ def read_mission(path: Path) -> SavedMission:
     path = mission_path(path)
     try:
         with opened_copy(path) as store:
-            return replace(_read(store), state=_state_beside(path))
+            mission = replace(_read(store), state=_state_beside(path))
+        if mission.state is None:
+            _ = mission.packets  # beside a state that fits the file, this program has decoded them all before
+        return mission
     except PacketError as error:
         raise SourceError(f"{path}: {error}") from error
     except StoreError as error:
@@ -137,7 +162,7 @@ def _fits(mission: bytes) -> str:
 def mission_bytes(
     config: CloudConfig,
     edits: Sequence[Edit],
-    packets: Sequence[SizedPacket],
+    packets: Sequence[StoredPacket],
     refused: Sequence[StoredPacket],
     tracks: Mapping[str, Track],
 ) -> bytes:
@@ -153,7 +178,7 @@ def mission_bytes(
     with TemporaryDirectory() as place:
         with opened_copy(None) as store:
             store.configure(config)
-            store.put([*map(_stored, packets), *refused], 0.0)
+            store.put([*packets, *refused], 0.0)
             for edit in edits:
                 store.edit(edit.content, edit.author, edit.time_s)
             for name, track in tracks.items():
@@ -215,25 +240,22 @@ def _exclusively(path: Path) -> Iterator[None]:
                 return
 
 
-def _stored(sized: SizedPacket) -> StoredPacket:
+def as_stored(sized: SizedPacket) -> StoredPacket:
+    """A packet as a mission file stores it."""
     packet, label = sized.packet, sized.label
     return StoredPacket(packet.robot, packet.epoch, packet.sequence, packet.time, label.kind, label.channel, sized.data)
 
 
 def _read(store: MissionStore) -> SavedMission:
-    packets: dict[str, list[SizedPacket]] = {}
-    refused, last = [], 0
+    packets: list[StoredPacket] = []
+    last = 0
     while arrived := store.arrivals(last, _AT_ONCE):
-        for arrival, stored in arrived:
-            last = arrival
-            if stored.refusal is None:
-                packets.setdefault(stored.robot, []).append(SizedPacket(decode(stored.data), stored.data))
-            else:
-                refused.append(stored)
+        packets += (stored for _, stored in arrived)
+        last, _ = arrived[-1]
     return SavedMission(
         config=CloudConfig.model_validate_json(store.fact(CONFIG) or "{}"),
         edits=tuple(store.edits()),
-        packets={robot: tuple(sorted(sent, key=lambda sized: sized.packet.order)) for robot, sent in packets.items()},
-        refused=tuple(refused),
+        stored=tuple(packet for packet in packets if packet.refusal is None),
+        refused=tuple(packet for packet in packets if packet.refusal is not None),
         tracks={session_name(robot, epoch): track for (robot, epoch), track in store.tracks().items()},
     )

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.submap import PackedSubmap, Submap
+from fcslam.lidar.submap_bytes import submap_bytes
 from fcslam.maps.fusion import fuse
 from fcslam.metrics.grid import LabelledGrid, grid_agreement
 from fcslam.metrics.trajectory import align, position_errors
@@ -20,6 +22,7 @@ from fcslam.records import Channel, Place, Veto
 from fcslam.runs import open_run
 from fcslam.runs.map_files import Occupancy
 from fcslam.simulation.ground_truth import true_map
+from fcslam.storage.state_file import parse_state, state_bytes
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
 from tests import small_fleet
@@ -118,6 +121,27 @@ def test_packed_submaps_change_nothing_and_few_are_not_packed(forgetful, packets
     assert kinds[Submap] == len(cache._ready) == 2
     assert kinds[PackedSubmap] > 2
     assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
+
+
+def test_a_cloud_that_goes_on_from_a_state_builds_no_submap_again(packets, monkeypatch):
+    first, later = packets[: len(packets) // 2], packets[len(packets) // 2 :]
+    cloud = feed(Cloud(ONE_A_SQUARE, 0), first)
+    known = {(number.session, number.sequence): packet for number, packet in cloud._packets.items()}
+    state = parse_state(Path("state"), state_bytes("this", cloud.state()), "this")
+    restored = Cloud.restored(ONE_A_SQUARE, 0, state, {number: p.time for number, p in known.items()}, known.get)
+    before, after = (each.fleet._recognition._submaps._entries for each in (cloud, restored))
+    compared = {key: entry for key, entry in before.items() if entry.submap is not None}
+    assert compared
+    assert after.keys() == compared.keys()
+    assert all(after[key].noise == entry.noise for key, entry in compared.items())
+    monkeypatch.setattr(submaps, "build_submap", lambda scans: pytest.fail("it is in the state"))
+    (matcher,) = restored.fleet._recognition._matchers.values()
+    for identifier, channel in compared:
+        again = restored.fleet._recognition._submaps.of(matcher._places[identifier])
+        expected = cloud.fleet._recognition._submaps.of(matcher._places[identifier])
+        assert submap_bytes(again) == submap_bytes(expected), channel
+    monkeypatch.undo()
+    assert fingerprint(feed(restored, later).finalize()) == fingerprint(feed(cloud, later).finalize())
 
 
 def test_poses_and_stamps_of_all_keyscans_stay(forgetful, sessions):

@@ -7,6 +7,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Agreement, PackedSubmap, agreement, build_submap, self_violation
+from fcslam.lidar.submap_bytes import packed_bytes, read_packed
 from fcslam.lidar.verification import VerificationConfig, _information_of_inverse, _shortfall, verify
 from fcslam.records import Reason, ReasonCode
 from tests.lidar.worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
@@ -241,9 +242,11 @@ def test_information_of_the_inverse_pose(pose):
     assert np.allclose(spread, expected, rtol=0.1, atol=0.05 * np.abs(expected).max())
 
 
-def test_a_packed_submap_is_unpacked_as_it_was(same_room):
+@pytest.mark.parametrize("sent", [False, True])
+def test_a_packed_submap_is_unpacked_as_it_was(same_room, sent):
     (submap, _), (other, _) = same_room
-    unpacked = PackedSubmap(submap).unpack()
+    packed = PackedSubmap.of(submap)
+    unpacked = (read_packed(packed_bytes(packed)) if sent else packed).unpack()
     pairs = [
         *zip(submap.field.arrays, unpacked.field.arrays, strict=True),
         (submap.free.cells, unpacked.free.cells),

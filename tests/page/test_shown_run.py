@@ -18,7 +18,7 @@ from fastapi.routing import iter_route_contexts
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import EvaluationError
-from fcslam.mission_file import mission_bytes
+from fcslam.mission_file import as_stored, mission_bytes
 from fcslam.page import viewer
 from fcslam.page.report import ASKED, MOST_TILES, report_html
 from fcslam.page.routes import ASSETS
@@ -58,7 +58,7 @@ def run():
         metrics={"error": Metric("error", float("nan"), "m")},
         map_files=files("map", 160) | files("map_1", 40),
         mission=mission_bytes(
-            CloudConfig(), [Edit(1, "anna", 1e9, Veto("a", "b"))], [measure(decode(data)) for data in A], [], {}
+            CloudConfig(), [Edit(1, "anna", 1e9, Veto("a", "b"))], [as_stored(measure(decode(data))) for data in A], [], {}
         ),
     )
 

@@ -1,6 +1,6 @@
 """The cloud within one process: packets in, replies out, one map in the end."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Self
 
@@ -26,7 +26,12 @@ class Cloud:
     def __init__(self, config: FleetConfig, seed: int, verify_pairs: VerifyPairs = verify_here) -> None:
         self.fleet = Fleet(config, seed, verify_pairs)
         self._log = PacketLog()
+        self._times: dict[PacketNumber, float] = {}
+        """Of all packets."""
         self._packets: dict[PacketNumber, Packet] = {}
+        """Those that this cloud applied itself."""
+        self._read: Callable[[PacketNumber], Packet] | None = None
+        """Gives the others; None: there are none."""
         self._corrections: dict[str, SessionCorrection] = {}
         """The newest that was sent, by session."""
         self._sent = 0
@@ -36,6 +41,7 @@ class Cloud:
         """The state after the packets so far, without these; ``restored`` makes an equal cloud of it."""
         return {
             "fleet": self.fleet.state(),
+            "submaps": self.fleet.submaps(),
             "log": self._log.state(),
             "sent": self._sent,
             "corrections": {
@@ -51,13 +57,22 @@ class Cloud:
 
     @classmethod
     def restored(
-        cls, config: FleetConfig, seed: int, state: State, packets: Iterable[Packet],
-        verify_pairs: VerifyPairs = verify_here,
+        cls, config: FleetConfig, seed: int, state: State, times: Mapping[PacketNumber, float],
+        read: Callable[[PacketNumber], Packet], verify_pairs: VerifyPairs = verify_here,
     ) -> Self:  # fmt: skip
-        """The cloud of a ``state`` under the same configuration and seed; ``packets`` are those that it applied."""
+        """The cloud of a ``state``.
+
+        Args:
+            config, seed: those of the state's own cloud.
+            state: from ``state``.
+            times: of the packets that its cloud applied.
+            read: gives these packets when the cloud needs them.
+            verify_pairs: as in ``Fleet``.
+        """
         cloud = cls(config, seed, verify_pairs)
-        cloud._packets = {PacketNumber(in_session(packet).robot, packet.sequence): packet for packet in packets}
-        cloud.fleet = Fleet.restored(config, seed, state["fleet"], cloud._packets.__getitem__, verify_pairs)
+        cloud._times, cloud._read = dict(times), read
+        cloud.fleet = Fleet.restored(config, seed, state["fleet"], read, verify_pairs)
+        cloud.fleet.restore_submaps(state["submaps"])
         cloud._log = PacketLog.restored(state["log"])
         cloud._sent = state["sent"]
         for session, kept in state["corrections"].items():
@@ -84,7 +99,7 @@ class Cloud:
         """
         number = PacketNumber(in_session(packet).robot, packet.sequence)
         if number not in self._log:
-            self._packets[number] = packet
+            self._packets[number], self._times[number] = packet, packet.time
         self._log.add(number, packet.time)
         refusal = None
         for ready in self._log.ready(number.session):
@@ -92,7 +107,7 @@ class Cloud:
                 self.fleet.apply(self._packets[ready])
             except PacketError as error:
                 self._log.refuse(ready)
-                del self._packets[ready]
+                del self._packets[ready], self._times[ready]
                 refusal = error if ready == number else refusal
         if refusal is not None:
             raise refusal
@@ -104,8 +119,14 @@ class Cloud:
 
     def finalize(self) -> FleetResult:
         """The result of all packets so far; it depends on their set alone."""
-        arrived = ((packet.time, number) for number, packet in self._packets.items())
-        return self.fleet.finalize(self._log, arrived, self._packets.__getitem__)
+        arrived = ((time, number) for number, time in self._times.items())
+        return self.fleet.finalize(self._log, arrived, self._packet)
+
+    def _packet(self, number: PacketNumber) -> Packet:
+        if number in self._packets:
+            return self._packets[number]
+        assert self._read is not None, "only a restored cloud lacks packets"
+        return self._read(number)
 
     def _replies(self, packet: Packet, session: str) -> list[Packet]:
         robot, epoch = packet.robot, packet.epoch

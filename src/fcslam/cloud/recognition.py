@@ -90,8 +90,16 @@ class PlaceRecognition:
         return tuple(VocabularyState(*key, matcher.word_count, len(matcher)) for key, matcher in self._matchers.items())
 
     def state(self) -> State:
-        """The state that ``restore`` needs; submaps are built again on demand."""
+        """The state that ``restore`` needs; submaps are built again on demand, or restored from ``submaps``."""
         return {" ".join(key): matcher.state() for key, matcher in self._matchers.items()}
+
+    def submaps(self) -> State:
+        """The submaps that were compared, for ``restore_submaps``."""
+        return self._submaps.state()
+
+    def restore_submaps(self, state: State) -> None:
+        """Take over the submaps of ``submaps``, after ``restore``."""
+        self._submaps.restore(state)
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""

@@ -3,12 +3,16 @@
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import PackedSubmap, Submap, build_submap, self_violation
+from fcslam.lidar.submap_bytes import packed_bytes, read_packed
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
+from fcslam.storage.state_file import State
 
 READY: Final = 100
 """Submaps that are kept as they are; those that were used before them are packed."""
@@ -58,6 +62,25 @@ class SubmapCache:
             entry.noise = self_violation(self._scans(place))
         return entry.noise
 
+    def state(self) -> State:
+        """The submaps that were compared, so that they need not be built again; for ``restore``."""
+        built = {key: entry for key, entry in self._entries.items() if entry.submap is not None}
+        content = [packed_bytes(_packed(entry.submap)) for entry in built.values() if entry.submap is not None]
+        return {
+            "keys": [(*identifier, channel) for identifier, channel in built],
+            "noise": [entry.noise for entry in built.values()],
+            "sizes": [len(data) for data in content],
+            "content": np.frombuffer(b"".join(content), np.uint8),
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over a ``state``."""
+        content, begin = state["content"].tobytes(), 0
+        for (robot, number, channel), noise, size in zip(state["keys"], state["noise"], state["sizes"], strict=True):
+            submap = read_packed(content[begin : begin + size])
+            self._entries[KeyscanId(robot, number), Channel(channel)] = _Entry(submap, noise)
+            begin += size
+
     def drop(self, place: Place) -> None:
         """Drop the submap around a place from the cache."""
         self._drop((place.id, place.channel))
@@ -78,8 +101,8 @@ class SubmapCache:
 
     def _pack(self, key: _Key) -> None:
         entry = self._ready.pop(key)
-        assert isinstance(entry.submap, Submap), "it is ready"
-        entry.submap = PackedSubmap(entry.submap)
+        assert entry.submap is not None, "it is ready"
+        entry.submap = _packed(entry.submap)
 
     def _scans(self, place: Place) -> list[tuple[PointScan, FloatArray]]:
         """The scans around a place, and their poses (3,) in its keyscan's base."""
@@ -91,3 +114,7 @@ class SubmapCache:
             (point_scan(keyscan.ranges_m, keyscan.laser_model(lasers)), pose)
             for keyscan, pose in zip(keyscans, poses, strict=True)
         ]
+
+
+def _packed(submap: Submap | PackedSubmap) -> PackedSubmap:
+    return submap if isinstance(submap, PackedSubmap) else PackedSubmap.of(submap)

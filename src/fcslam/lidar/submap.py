@@ -4,13 +4,13 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.compiled import njit
-from fcslam.lidar.field import CELL_M, EMPTY, TILE, SurfelField, field_of, label_at
+from fcslam.lidar.field import CELL_M, EMPTY, TILE, FieldArrays, SurfelField, field_of, label_at
 from fcslam.lidar.matching import OPPOSED
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
@@ -140,33 +140,49 @@ def _spaced_rows(points: FloatArray) -> NDArray[np.int64]:
     return np.sort(first)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class PackedSubmap:
     """A submap in a third of the memory, without loss: its cells are compressed, its surface refers to the surfels."""
 
-    __slots__ = (
-        "_arrays", "_corner", "_free", "_free_shape", "_labels", "_labels_shape", "_origin", "_rows", "_solitary",
-    )  # fmt: skip
+    field: FieldArrays
+    """That of the submap, without its labels."""
+    labels: bytes
+    """The labels of the field, compressed."""
+    rows: NDArray[np.int16]
+    solitary: NDArray[np.bool_]
+    origin: FloatArray
+    """Of the surface."""
+    free: bytes
+    """The free cells as bits, compressed."""
+    free_shape: tuple[int, int]
+    corner: FloatArray
+    """Of the free cells."""
 
-    def __init__(self, submap: Submap) -> None:
-        """``submap`` comes from ``build_submap``."""
+    @classmethod
+    def of(cls, submap: Submap) -> Self:
+        """Pack a submap of ``build_submap``."""
         assert submap.rows is not None, "its surface consists of surfels"
-        arrays = submap.field.arrays
-        self._rows, self._solitary, self._origin = submap.rows, submap.surface.solitary, submap.surface.origin
-        self._corner = submap.free.corner
-        self._arrays = arrays._replace(labels=_NO_LABELS)
-        self._labels_shape, self._free_shape = arrays.labels.shape, submap.free.cells.shape
-        self._labels = zlib.compress(arrays.labels.tobytes(), _PACKING)
-        self._free = zlib.compress(np.packbits(submap.free.cells).tobytes(), _PACKING)
+        field, (rows, columns) = submap.field.arrays, submap.free.cells.shape
+        return cls(
+            field=field._replace(labels=_NO_LABELS),
+            labels=zlib.compress(field.labels.tobytes(), _PACKING),
+            rows=submap.rows,
+            solitary=submap.surface.solitary,
+            origin=submap.surface.origin,
+            free=zlib.compress(np.packbits(submap.free.cells).tobytes(), _PACKING),
+            free_shape=(rows, columns),
+            corner=submap.free.corner,
+        )
 
     def unpack(self) -> Submap:
         """The submap as it was."""
         # Copies: compiled code would be compiled once more for arrays that cannot be written.
-        labels = np.frombuffer(zlib.decompress(self._labels), np.int16).reshape(self._labels_shape).copy()
-        bits = np.frombuffer(zlib.decompress(self._free), np.uint8)
-        cells = np.unpackbits(bits, count=math.prod(self._free_shape)).view(np.bool_).reshape(self._free_shape)
-        field = SurfelField.of(self._arrays._replace(labels=labels))
-        surface = PointScan(field.points[self._rows], field.normals[self._rows], self._solitary, self._origin)
-        return Submap(field, surface, FreeSpace(cells, self._corner), self._rows)
+        labels = np.frombuffer(zlib.decompress(self.labels), np.int16).reshape(-1, TILE, TILE).copy()
+        bits = np.frombuffer(zlib.decompress(self.free), np.uint8)
+        cells = np.unpackbits(bits, count=math.prod(self.free_shape)).view(np.bool_).reshape(self.free_shape)
+        field = SurfelField.of(self.field._replace(labels=labels))
+        surface = PointScan(field.points[self.rows], field.normals[self.rows], self.solitary, self.origin)
+        return Submap(field, surface, FreeSpace(cells, self.corner), self.rows)
 
 
 _PACKING: Final = 1

@@ -114,6 +114,11 @@ class StoredPacket:
     refusal: str | None = None
     """Why it has no effect; its number is used up."""
 
+    @property
+    def order(self) -> tuple[float, str, int, int]:
+        """Key of the canonical order, as ``Packet.order``."""
+        return self.time, self.robot, self.epoch, self.sequence
+
 
 class Envelope(NamedTuple):
     """Order of a packet."""
