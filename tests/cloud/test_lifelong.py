@@ -134,7 +134,7 @@ def test_a_cloud_that_goes_on_from_a_state_builds_no_submap_again(packets, monke
     assert compared
     assert after.keys() == compared.keys()
     assert all(after[key].noise == entry.noise for key, entry in compared.items())
-    monkeypatch.setattr(submaps, "build_submap", lambda scans: pytest.fail("it is in the state"))
+    monkeypatch.setattr(submaps, "build_submap", lambda _: pytest.fail("it is in the state"))
     (matcher,) = restored.fleet._recognition._matchers.values()
     for identifier, channel in compared:
         again = restored.fleet._recognition._submaps.of(matcher._places[identifier])

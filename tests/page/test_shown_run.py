@@ -58,7 +58,11 @@ def run():
         metrics={"error": Metric("error", float("nan"), "m")},
         map_files=files("map", 160) | files("map_1", 40),
         mission=mission_bytes(
-            CloudConfig(), [Edit(1, "anna", 1e9, Veto("a", "b"))], [as_stored(measure(decode(data))) for data in A], [], {}
+            CloudConfig(),
+            [Edit(1, "anna", 1e9, Veto("a", "b"))],
+            [as_stored(measure(decode(data))) for data in A],
+            [],
+            {},
         ),
     )
 

@@ -185,7 +185,7 @@ def map_sources(
     if page is not None:
         page.finish(output)
     print_faults(console, faults)
-    _report(answers(), run, time.perf_counter() - began, output, settings)
+    _report(answers(), run, time.perf_counter() - began, output, settings, earlier)
     return run
 
 
@@ -225,10 +225,13 @@ def _speed(recorded_s: float, elapsed_s: float) -> list[str]:
     return [f"{speed:.{0 if speed >= 10.0 else 1}f} x real time"]
 
 
-def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, settings: "MissionConfig") -> None:
+def _report(
+    console: "Console", run: "Run", elapsed_s: float, output: Path, settings: "MissionConfig",
+    earlier: "SavedMission | None",
+) -> None:  # fmt: skip
     from rich.table import Table
 
-    from fcslam.cloud.sessions import robot_of
+    from fcslam.cloud.sessions import robot_and_epoch
 
     values = {name: metric.value for name, metric in run.metrics.items()}
     has_floors = any(trajectory.floor for trajectory in run.trajectories.values())
@@ -250,8 +253,8 @@ def _report(console: "Console", run: "Run", elapsed_s: float, output: Path, sett
         f"{values['inter_robot_closures_accepted']:.0f} between them",
     )
     for session in run.trajectories.values():
-        robot = robot_of(session.robot)
-        if robot != session.robot:
+        robot, epoch = robot_and_epoch(session.robot)
+        if epoch > (0 if earlier is None else earlier.epochs(robot)):  # the first session of a recording began with it
             print_line(console, f"{session.robot}: {robot} was lost; this session begins at {session.stamps[0]:.3f} s")
     _print_jumps(console, run, settings)
     maps, joined = int(values["maps"]), settings.fleet.join_maps

@@ -67,7 +67,8 @@ Localize = Annotated[
     typer.Option(
         metavar="MAP",
         help="Find the live robot in a finished map, which does not change: a run folder, a mission file, or the YAML "
-        "file of a ROS map.",
+        "file of a ROS map. With --server, MAP is a folder for a copy of the cloud's maps; the robot uses an earlier "
+        "copy if it cannot reach the cloud.",
     ),
 ]
 
@@ -192,7 +193,10 @@ def robot(
             outbox_mb=outbox_mb, config=settings, floor=floor,
         )  # fmt: skip
         if localize is not None:
-            _refuse_network(server, state)
+            if state is not None:
+                raise InputError("a robot that localises sends and keeps nothing; leave --state out")
+            if server is not None:
+                _fetch(localize, server, token, ca, own, notices(quiet))
             initial = None if initial_pose is None else pose("--initial-pose", initial_pose)
             start = partial(LocalizedRobot, map=localize, initial_pose=initial, config=settings, floor=floor)
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose) or BagOptions()
@@ -230,11 +234,15 @@ def robot(
         _report(live, state, server)
 
 
-def _refuse_network(server: str | None, state: Path | None) -> None:
-    from fcslam.errors import InputError
+def _fetch(
+    folder: Path, server: str, token: str | None, ca: Path | None, own: tuple[Path, Path] | None, console: "Console"
+) -> None:
+    """Copy the maps of the cloud to ``folder``, or say why the robot uses an earlier copy."""
+    from fcslam.live.served_map import fetch_maps
 
-    if server is not None or state is not None:
-        raise InputError("a robot that localises sends and keeps nothing; leave --server and --state out")
+    trouble = fetch_maps(folder, server, token, ca, own)
+    copied = f"copied the maps of {server} to {folder}"
+    print_line(console, f"{trouble}; the robot uses the earlier copy in {folder}" if trouble else copied)
 
 
 def _required(server: str | None, state: Path | None) -> tuple[str, Path]:

@@ -145,7 +145,7 @@ class PackedSubmap:
     """A submap in a third of the memory, without loss: its cells are compressed, its surface refers to the surfels."""
 
     field: FieldArrays
-    """That of the submap, without its labels."""
+    """The arrays of the submap's field, without its labels."""
     labels: bytes
     """The labels of the field, compressed."""
     rows: NDArray[np.int16]

@@ -95,22 +95,21 @@ class BatchTransport(Protocol):
         """
 
 
-class HttpTransport:
-    """Connection of one robot to one cloud; docs/howto/robot.md lists how it handles status codes."""
+class HttpClient:
+    """Connection to one cloud."""
 
     def __init__(
-        self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None,
-        own: tuple[Path, Path] | None = None,
+        self, url: str, token: str | None = None, ca: Path | None = None, own: tuple[Path, Path] | None = None,
+        headers: Mapping[str, str] | None = None,
     ) -> None:  # fmt: skip
         """Open a client.
 
         Args:
             url: address of the cloud.
-            robot: name of the robot.
-            agent: random identifier that distinguishes two processes of the same name.
             token: bearer token, if the cloud asks for one.
             ca: PEM file of certificate authorities; None: those of the system.
-            own: PEM files of the robot's certificate and key, in place of a token.
+            own: PEM files of the own certificate and its key, in place of a token.
+            headers: of every request.
 
         Raises:
             CloudError: ``url`` is not an address or would send the token unencrypted; ``ca`` or ``own`` cannot be read.
@@ -120,11 +119,9 @@ class HttpTransport:
         _check_url(url, token, own)
         self._url = url.rstrip("/")
         self._has_own = own is not None
-        self._robot = quote(robot, safe="")
-        headers = {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE}
         self._client = httpx.Client(
             base_url=f"{self._url}/api/v1/",
-            headers=headers | ({"Authorization": f"Bearer {token}"} if token else {}),
+            headers=dict(headers or {}) | ({"Authorization": f"Bearer {token}"} if token else {}),
             timeout=httpx.Timeout(ANSWER_TIMEOUT_S, connect=CONNECT_TIMEOUT_S),
             verify=_trust(ca, own),
             trust_env=False,
@@ -133,6 +130,59 @@ class HttpTransport:
     def close(self) -> None:
         """Close the connection."""
         self._client.close()
+
+    def _ask(
+        self, method: str, path: str, content: bytes | None = None, headers: Mapping[str, str] | None = None,
+        accept: str = MEDIA_TYPE,
+    ) -> "httpx.Response":  # fmt: skip
+        import httpx
+
+        try:
+            return self._client.request(method, path, content=content, headers={"Accept": accept, **(headers or {})})
+        except httpx.RequestError as error:
+            if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
+                raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error
+            # A cloud that rejects a certificate closes the connection; with TLS 1.3 the reason may not arrive here.
+            hint = (
+                "; if that stays, it does not trust this robot's certificate"
+                if self._has_own and isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError)
+                else ""
+            )
+            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{hint}") from error
+
+    def _require(self, response: "httpx.Response", status: int) -> None:
+        """Raise an error for any other status."""
+        code = response.status_code
+        if code == status:
+            return
+        after = response.headers.get("Retry-After", "")
+        wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
+        is_other_agent = code == 409 and "index" not in _detail(response)  # another agent may stop soon
+        if code in _LATER or is_other_agent:
+            raise UnavailableError(self._reason(response), wait_s)
+        raise (OversizeError if code == 413 else CloudError)(self._reason(response))
+
+    def _reason(self, response: "httpx.Response") -> str:
+        said = _detail(response).get("error") or response.reason_phrase
+        return f"{self._url}: {said} ({response.status_code})"
+
+
+class HttpTransport(HttpClient):
+    """Connection of one robot to one cloud; docs/howto/robot.md lists how it handles status codes."""
+
+    def __init__(
+        self, url: str, robot: str, agent: str, token: str | None = None, ca: Path | None = None,
+        own: tuple[Path, Path] | None = None,
+    ) -> None:  # fmt: skip
+        """Open a client; raises as ``HttpClient``.
+
+        Args:
+            url, token, ca, own: as in ``HttpClient``.
+            robot: name of the robot.
+            agent: random identifier that distinguishes two processes of the same name.
+        """
+        super().__init__(url, token, ca, own, {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE})
+        self._robot = quote(robot, safe="")
 
     def state(self) -> CloudState:
         """As in BatchTransport."""
@@ -174,41 +224,6 @@ class HttpTransport:
         response = self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}", accept="*/*")
         self._require(response, 200)
         return response.content
-
-    def _ask(
-        self, method: str, path: str, content: bytes | None = None, headers: Mapping[str, str] | None = None,
-        accept: str = MEDIA_TYPE,
-    ) -> "httpx.Response":  # fmt: skip
-        import httpx
-
-        try:
-            return self._client.request(method, path, content=content, headers={"Accept": accept, **(headers or {})})
-        except httpx.RequestError as error:
-            if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
-                raise CloudError(f"{self._url}: its certificate is not trusted ({error}); give --ca") from error
-            # A cloud that rejects a certificate closes the connection; with TLS 1.3 the reason may not arrive here.
-            hint = (
-                "; if that stays, it does not trust this robot's certificate"
-                if self._has_own and isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError)
-                else ""
-            )
-            raise UnavailableError(f"{self._url}: {str(error) or type(error).__name__}{hint}") from error
-
-    def _require(self, response: "httpx.Response", status: int) -> None:
-        """Raise an error for any other status."""
-        code = response.status_code
-        if code == status:
-            return
-        after = response.headers.get("Retry-After", "")
-        wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
-        is_other_agent = code == 409 and "index" not in _detail(response)  # another agent may stop soon
-        if code in _LATER or is_other_agent:
-            raise UnavailableError(self._reason(response), wait_s)
-        raise (OversizeError if code == 413 else CloudError)(self._reason(response))
-
-    def _reason(self, response: "httpx.Response") -> str:
-        said = _detail(response).get("error") or response.reason_phrase
-        return f"{self._url}: {said} ({response.status_code})"
 
 
 def _detail(response: "httpx.Response") -> dict[str, Any]:

@@ -1,0 +1,88 @@
+"""A copy of the maps of a cloud, for a robot that finds itself in them: also when the cloud cannot be reached."""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fcslam.errors import CloudError, EvaluationError, SourceError, UnavailableError
+from fcslam.records import frozen
+from fcslam.runs import RobotTrajectory, Run, prepare_output
+from fcslam.runs.folder import is_run_folder
+from fcslam.runs.map_files import area_of, map_stem, parse_map
+from fcslam.wire.map_client import MapClient, ServedMap
+
+_ATTEMPTS: Final = 3
+"""The cloud may draw its maps again while the robot reads them."""
+
+
+def fetch_maps(
+    folder: Path, server: str, token: str | None = None, ca: Path | None = None, own: tuple[Path, Path] | None = None
+) -> str | None:
+    """Copy the maps of a cloud into a run folder, whole or not at all: their files, robots and floors.
+
+    Args:
+        folder: the folder; an earlier copy in it is replaced.
+        server: address of the cloud.
+        token, ca, own: as for ``fcslam.Robot``, with the rights of a viewer.
+
+    Returns:
+        None; or why the cloud cannot be reached, if ``folder`` holds an earlier copy, which then stays as it is.
+
+    Raises:
+        CloudError: the cloud rejects the robot, or it cannot be reached and there is no earlier copy.
+        SourceError: the cloud has no map.
+        OutputError: ``folder`` is something else than a run folder, or cannot be written.
+    """
+    prepare_output(folder, force=True)
+    client = MapClient(server, token, ca, own)
+    try:
+        _read(client, server).save(folder, force=True)
+    except UnavailableError as error:
+        if not is_run_folder(folder):
+            raise CloudError(f"{error}; {folder} holds no earlier copy of the map") from error
+        return str(error)
+    finally:
+        client.close()
+    return None
+
+
+def _read(client: MapClient, server: str) -> Run:
+    """The maps of a cloud, all of one moment.
+
+    Raises:
+        UnavailableError: the cloud cannot be reached, or changes its maps all the time.
+    """
+    for _ in range(_ATTEMPTS):
+        served = [one for one in client.maps() if one.extent_m]
+        if not served:
+            raise SourceError(f"{server}: has no map yet; let a robot send its scans first")
+        files = {
+            f"{map_stem(one.number)}.{suffix}": content
+            for one in served
+            for suffix, content in (("yaml", client.description(one.number)), ("pgm", client.image(one.number)))
+        }
+        if all(_fits(one, files, server) for one in served):
+            return Run(
+                trajectories={robot: _nowhere(robot, one) for one in served for robot in one.robots}, map_files=files
+            )
+    raise UnavailableError(f"{server}: its maps change all the time")
+
+
+def _fits(served: ServedMap, files: dict[str, bytes], server: str) -> bool:
+    """Whether the image and the description of a map are of one moment: that of the list of maps."""
+    stem = map_stem(served.number)
+    image, description = files[f"{stem}.pgm"], files[f"{stem}.yaml"].decode("utf-8", errors="replace")
+    try:
+        area = area_of(stem, image, description)
+        if not np.allclose(area.extent_m, served.extent_m, rtol=0.0, atol=1e-6):
+            return False
+        parse_map(stem, image, description)
+    except EvaluationError as error:
+        raise CloudError(f"{server}: {error}") from error
+    return True
+
+
+def _nowhere(robot: str, served: ServedMap) -> RobotTrajectory:
+    """A robot of a map, without its poses: these stay in the cloud."""
+    return RobotTrajectory(robot, served.number, frozen(np.empty(0)), frozen(np.empty((0, 3))), served.floor)
