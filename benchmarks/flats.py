@@ -22,6 +22,7 @@ from pathlib import Path
 
 import common
 
+from fcslam.config import load
 from fcslam.evaluation.fleet.report import evaluate_fleet
 from fcslam.mission import MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus
@@ -47,12 +48,14 @@ def main() -> None:
     parser.add_argument("--channels", nargs="+", choices=CHANNELS, default=list(CHANNELS), help="kinds of places")
     parser.add_argument("--seeds", nargs="+", type=int, help="of the buildings, instead of those of each case")
     parser.add_argument("--work", type=Path, default=WORK, help="folder of the recordings")
+    parser.add_argument("--config", type=Path, help="settings of the missions in place of the defaults")
     chosen = parser.parse_args()
+    config = load(MissionConfig, chosen.config) if chosen.config else MissionConfig()
     report = common.Report(__file__, __doc__, chosen)
     rows = []
     for case in chosen.cases:
         for places in chosen.channels:
-            for row in case_rows(case, chosen.seeds or SEEDS[case], places, chosen.work):
+            for row in case_rows(case, chosen.seeds or SEEDS[case], places, chosen.work, config):
                 rows.append(row)
                 print(*row, flush=True)
     counts = list(summary(rows))
@@ -63,18 +66,18 @@ def main() -> None:
         sys.exit("robots were joined falsely, or too few were joined")
 
 
-def case_rows(case: str, seeds: Iterable[int], places: str, work: Path) -> Iterator[tuple]:
+def case_rows(case: str, seeds: Iterable[int], places: str, work: Path, config: MissionConfig) -> Iterator[tuple]:
     """One row for each fleet of two robots."""
     if case == "two flats":
         for a, b in combinations(seeds, 2):
             robots = [recorded("flat", a, places, work) / "robot_1", recorded("flat", b, places, work) / "robot_2"]
-            run = mapped(robots, places)
+            run = mapped(robots, places, config)
             joins = 2 - map_count(run)
             yield case, f"{a}, {b}", places, map_count(run), 0, joins, float("nan"), *closures(run)
         return
     for seed in seeds:
         folder = recorded(case, seed, places, work)
-        run = mapped([folder / "robot_1", folder / "robot_2"], places)
+        run = mapped([folder / "robot_1", folder / "robot_2"], places, config)
         with tempfile.TemporaryDirectory() as place:
             run.save(Path(place) / "run")
             found = evaluate_fleet(Path(place) / "run", folder)
@@ -90,8 +93,7 @@ def recorded(building: str, seed: int, places: str, work: Path) -> Path:
     return common.simulated(work / f"{building}-{seed}{'-lidar' if camera else ''}", *arguments)
 
 
-def mapped(robots: Iterable[Path], places: str) -> Run:
-    config = MissionConfig()
+def mapped(robots: Iterable[Path], places: str, config: MissionConfig) -> Run:
     robot = config.robot.model_copy(update={"channels": CHANNELS[places]})
     return run_mission([open_source(path) for path in robots], config.model_copy(update={"robot": robot}))
 
