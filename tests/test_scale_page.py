@@ -62,15 +62,17 @@ def run_page(folder):
     (folder / "examples").symlink_to(ROOT / "examples")
     environment = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
     script = "set -e\n" + "\n".join(commands())
-    shell = subprocess.Popen(
-        ["bash", "-c", script], cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        text=True, start_new_session=True,
-    )  # fmt: skip
+    log = folder / "shell.log"
+    with log.open("wb") as output:  # a pipe would stay open as long as Dask, which the page leaves running
+        shell = subprocess.Popen(
+            ["bash", "-c", script], cwd=folder, env=environment, stdout=output, stderr=output, start_new_session=True
+        )
     try:
-        told, _ = shell.communicate(timeout=900)
+        shell.wait(900.0)
     finally:
         with suppress(ProcessLookupError):
-            os.killpg(shell.pid, signal.SIGTERM)  # Dask, which the page leaves running
+            os.killpg(shell.pid, signal.SIGTERM)
+        told = log.read_text(encoding="utf-8")
     assert shell.returncode == 0, told
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "state" / "anna" / "trajectory.tum").exists()
