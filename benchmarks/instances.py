@@ -358,7 +358,7 @@ def quantiles(values: Sequence[float], shares: Sequence[float]) -> list[float]:
 
 def latency(place: Path, buildings: Sequence[Building], report: common.Report) -> None:
     """The same batches to both stores."""
-    server = Server(place / "server of latency")
+    server = Server(place / "server-of-latency")
     url = take_password(server.url)
     every = [packets for building in buildings for packets in building.packets.values()]
     report.table("Intake", INTAKE, intake_rows(place, url, every))
@@ -366,7 +366,7 @@ def latency(place: Path, buildings: Sequence[Building], report: common.Report) -
     stored = {"SQLite": (), "PostgreSQL": ("--store", url, "--instance", "latency")}
     servers = {
         store: Process(
-            ("serve", "--data", place / f"of {store}", "--port", port, *stored[store]), place / f"{store}.log"
+            ("serve", "--data", place / f"of-{store}", "--port", port, *stored[store]), place / f"{store}.log"
         )
         for store, port in ports.items()
     }

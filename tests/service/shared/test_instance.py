@@ -13,9 +13,10 @@ from fcslam.service.intake import BusyError, LeaseError
 from fcslam.service.mission_store import MissionStore
 from fcslam.service.shared.agents import CONFIRM_S, RobotLimit, SharedAgents
 from fcslam.service.shared.audit_table import AuditTable
-from fcslam.service.shared.instance import Instance, fair_part
+from fcslam.service.shared.instance import REST_LOOK_S, REST_S, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.registry import LEASE_S, Registry
+from tests.service.test_mission_store import packet
 
 
 class Started:
@@ -39,15 +40,15 @@ def wanted(registry, postgres, name):
     return number
 
 
-def instance(postgres, name, room=10):
+def instance(postgres, name, room=10, clock=time.monotonic):
     workers = []
 
     def launch(mission, lease):
         workers.append(Started(mission, lease))
         return workers[-1]
 
-    made = Instance(Registry(postgres, name, f"process of {name}"), name, room, launch, lambda *_: None, lambda: None)
-    return made, workers
+    registry = Registry(postgres, name, f"process of {name}")
+    return Instance(registry, name, room, launch, lambda *_: None, lambda: None, clock), workers
 
 
 def until(condition, timeout_s=30.0):
@@ -151,6 +152,45 @@ def test_an_instance_takes_no_more_missions_than_it_has_room_for(registry, postg
     time.sleep(1.5)
     assert len(of_small) == 2
     small.close()
+
+
+def test_a_mission_in_which_nothing_happens_rests_until_its_next_packet(registry, postgres):
+    number = wanted(registry, postgres, "quiet")
+    now = [0.0]
+    one, workers = instance(postgres, "one", clock=lambda: now[0])
+
+    def step():
+        now[0] += REST_LOOK_S
+        one._step()
+
+    one._step()
+    assert [worker.lease.mission for worker in workers] == [number]
+    store = MissionStore(MissionTables(postgres, number))
+    for k in range(round(REST_S / REST_LOOK_S)):
+        if k == 10:
+            store.put([packet()], 0.0)
+        step()
+    assert held(registry) == {"quiet": "one"}
+    for _ in range(14):
+        step()
+    assert held(registry) == {}
+    assert workers[0].is_stopped
+    store.put([packet(sequence=1)], 0.0)
+    one._step()
+    assert held(registry) == {"quiet": "one"}
+    assert workers[1].lease.fence == 2
+    one.close()
+
+
+def test_a_packet_in_the_last_moment_keeps_a_mission_awake(registry, postgres):
+    number = wanted(registry, postgres, "awake")
+    (lease,) = registry.claim(1)
+    before = registry.activity(lease)
+    MissionStore(MissionTables(postgres, number)).put([packet()], 0.0)
+    registry.let_rest(lease, before)
+    assert [mission.is_wanted for mission in registry.missions()] == [True]
+    registry.let_rest(lease, registry.activity(lease))
+    assert [mission.is_wanted for mission in registry.missions()] == [False]
 
 
 @given(wanted=st.integers(0, 60), rooms=st.lists(st.integers(0, 30), min_size=1, max_size=6))

@@ -2,8 +2,9 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from fcslam.errors import ServiceError, StoreError
 from fcslam.service.shared.mission_tables import Lease
@@ -12,6 +13,10 @@ from fcslam.service.supervisor import RunningWorker
 
 LOOK_S: Final = 0.5
 """Between two renewals of the leases."""
+REST_LOOK_S: Final = 60.0
+"""Between two looks which missions had nothing to do."""
+REST_S: Final = 1800.0
+"""A mission in which nothing happened for so long needs no worker."""
 NAME_S: Final = LEASE_S + 2.0
 """How long a new instance waits for its name: one that was killed loses it in this time."""
 
@@ -44,7 +49,7 @@ class Instance:
 
     def __init__(
         self, registry: Registry, name: str, most_missions: int, launch: Launch, listen: Listen,
-        on_taken: Callable[[], None],
+        on_taken: Callable[[], None], clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         """Take the name.
 
@@ -55,22 +60,20 @@ class Instance:
             launch: starts a worker.
             listen: receives what happened to missions, whoever has their worker.
             on_taken: called when another process has taken the name, after this one was gone for a while.
+            clock: seconds.
 
         Raises:
             ServiceError: another instance has this name.
             StoreError: the server cannot be used.
         """
-        self._registry, self._name, self._most, self._launch, self._listen = (
-            registry,
-            name,
-            most_missions,
-            launch,
-            listen,
-        )
-        self._on_taken = on_taken
+        self._registry, self._name, self._most, self._launch = registry, name, most_missions, launch
+        self._listen, self._on_taken, self._clock = listen, on_taken, clock
         self._closing = threading.Event()
         self._take_name()
         self._held: dict[Lease, RunningWorker] = {}
+        self._active: dict[Lease, tuple[tuple[Any, ...], float]] = {}
+        """Activity of each mission, and since when it is the same."""
+        self._rest_look_at = clock() + REST_LOOK_S
         self._known: Mapping[str, KnownMission] = {}
         self.look()
         self._thread = threading.Thread(target=self._run, name=f"instance {name}", daemon=True)
@@ -146,7 +149,25 @@ class Instance:
             _log.warning("mission %d has a worker on another instance now", lease.mission)
             threading.Thread(target=self._held.pop(lease).stop, daemon=True).start()
         self.look()
+        self._let_rest()
         self._spread()
+
+    def _let_rest(self) -> None:
+        """Find missions in which nothing happens, and end their workers."""
+        resting = {mission.number for mission in self._known.values() if not mission.is_wanted}
+        for lease in [lease for lease in self._held if lease.mission in resting]:
+            self._end(lease, self._held.pop(lease))
+        now = self._clock()
+        if now < self._rest_look_at:
+            return
+        self._rest_look_at = now + REST_LOOK_S
+        before, self._active = self._active, {}
+        for lease in self._held:
+            activity = self._registry.activity(lease)
+            known, since = before.get(lease, (activity, now))
+            self._active[lease] = activity, since if known == activity else now
+            if now >= self._active[lease][1] + REST_S:
+                self._registry.let_rest(lease, activity)
 
     def _spread(self) -> None:
         """Take missions without a worker, or give one up, until each instance has its part."""

@@ -4,11 +4,11 @@ All times are of the server's clock, so a wrong clock of an instance does no har
 """
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from fcslam.errors import ServiceError
-from fcslam.service.shared.mission_tables import Lease
-from fcslam.service.shared.schema import mission_statements
+from fcslam.service.shared.mission_tables import Lease, MissionTables
+from fcslam.service.shared.schema import mission_statements, schema_of
 from fcslam.storage.postgres import Postgres, PostgresTransaction
 
 LEASE_S: Final = 3.0
@@ -16,6 +16,11 @@ LEASE_S: Final = 3.0
 _READ: Final = """
 SELECT number, name, is_open, is_wanted, holder, expires > clock_timestamp(), is_ready, live, finalized
 FROM missions ORDER BY name
+"""
+_ACTIVITY: Final = """
+SELECT (SELECT max(arrival) FROM packets), (SELECT max(number) FROM edits), (SELECT max(number) FROM finalizations),
+       (SELECT count(*) FROM finalizations WHERE run IS NULL AND failure IS NULL),
+       (SELECT value FROM facts WHERE name = 'applied')
 """
 _EXPIRY: Final = f"clock_timestamp() + interval '{LEASE_S} seconds'"
 
@@ -134,6 +139,21 @@ class Registry:
             "UPDATE missions SET expires = '-infinity', is_ready = false WHERE number = ? AND fence = ? RETURNING 1",
             (lease.mission, lease.fence),
         )
+
+    def activity(self, lease: Lease) -> tuple[Any, ...]:
+        """What changes when a mission gets packets, edits or requests, or its worker does something about them."""
+        return self._server.rows(_ACTIVITY, (), schema_of(lease.mission))[0]
+
+    def let_rest(self, lease: Lease, activity: tuple[Any, ...]) -> None:
+        """Note that a mission needs no worker, unless something happened since ``activity``; the next packet, edit or
+        request changes that.
+
+        Raises:
+            LeaseLostError: another worker has the mission.
+        """
+        with MissionTables(self._server, lease.mission, lease).transaction() as transaction:
+            if transaction.execute(_ACTIVITY).fetchone() == activity:
+                transaction.execute("UPDATE fcslam.missions SET is_wanted = false WHERE number = ?", (lease.mission,))
 
 
 def note_live(transaction: PostgresTransaction, mission: int) -> None:
