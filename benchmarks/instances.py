@@ -83,7 +83,7 @@ def building(number: int, place: Path) -> Building:
     """Simulate, drive and map a building."""
     lidar = LidarSettings(beams=180, rate_hz=3.0)
     settings = SimulationSettings(robots=ROBOTS, path_length_m=PATH_M, lidar=lidar, camera=None)
-    place.mkdir()
+    place.mkdir(parents=True, exist_ok=True)
     logs, packets = [], {}
     for robot in simulate_fleet(settings, SEED + number).robots:
         name = f"b{number}-{robot.name}"
@@ -93,7 +93,7 @@ def building(number: int, place: Path) -> Building:
         sent = [packet for record in source.records() for packet in frontend.process(record)]
         packets[name] = [encode(packet) for packet in sent + frontend.finish()]
     reference = place / "run"
-    if fcslam(["map", *map(str, logs), "-o", str(reference), "--quiet"]):
+    if not reference.exists() and fcslam(["map", *map(str, logs), "-o", str(reference), "--quiet"]):
         sys.exit("fcslam map failed")
     return Building(packets, reference)
 
@@ -436,6 +436,7 @@ def intake_rows(place: Path, url: str, every: Sequence[Sequence[bytes]]) -> list
                     spent[name] += time.process_time() - cpu
         for store in stores.values():
             store.close()
+        server.rows("DELETE FROM missions RETURNING 1")  # no instance shall map it
     return [
         (name, len(one), *(1e3 * value for value in quantiles(one, (0.5, 0.99))), 1e3 * spent[name] / len(one))
         for name, one in taken.items()
@@ -448,6 +449,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--restarts", type=int, default=5)
     parser.add_argument("--cuts", type=int, default=1)
+    parser.add_argument("--recordings", type=Path, help="folder that keeps the recordings and their maps")
     chosen = parser.parse_args()
     if not HAS_POSTGRES:
         print("skipped: needs PostgreSQL and psycopg: make scale-test")
@@ -456,7 +458,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="fcslam-instances-") as folder:
         place = Path(folder)
         place.chmod(0o755)  # the server's user must reach its folder
-        buildings = [building(number, place / f"building{number}") for number in range(BUILDINGS)]
+        recordings = chosen.recordings or place
+        buildings = [building(number, recordings / f"building{number}") for number in range(BUILDINGS)]
         latency(place, buildings, report)
         faults(chosen, place, buildings, report)
     report.write()

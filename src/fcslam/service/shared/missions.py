@@ -140,8 +140,8 @@ class SharedMissions:
             self._opening = threading.Lock()
             self._opened: dict[str, SharedMission] = {}
             self._instance = Instance(self._registry, instance, admission.missions, launch, listen, on_taken)
-            if not self._instance.known:
-                self._create_first()
+            if not any(known.is_open for known in self._instance.known.values()):
+                self._open_first()
             self._instance.start()
         except BaseException:
             self._lock.close()
@@ -226,11 +226,11 @@ class SharedMissions:
         self._lock.close()
         self.closing()
 
-    def _create_first(self) -> None:
+    def _open_first(self) -> None:
         try:
             self.create(FIRST)
-        except ServiceError:  # another instance did, a moment ago
-            self._instance.look()
+        except ServiceError:  # it is there, perhaps from another instance a moment ago
+            self.open(FIRST)
 
     def _known(self, name: str) -> KnownMission:
         known = self._instance.known.get(name)
