@@ -461,6 +461,7 @@ def main() -> None:
         recordings = chosen.recordings or place
         buildings = [building(number, recordings / f"building{number}") for number in range(BUILDINGS)]
         latency(place, buildings, report)
+        report.write()  # the faults take long
         faults(chosen, place, buildings, report)
     report.write()
 

@@ -52,7 +52,7 @@ from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.mission_store import CONFIG, Finalization, MissionStore, StoredPacket
 from fcslam.service.shared.files import LIVE, RESULT, SNAPSHOT, SharedFiles
-from fcslam.service.shared.mission_tables import Lease, MissionTables
+from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
 from fcslam.service.supervisor import PROGRESS, READY, SPARE, STAGE_MS, STAGE_RUNS
 from fcslam.service.warmup import warm_up_fleet
 from fcslam.storage.postgres import Postgres
@@ -448,13 +448,17 @@ def main(arguments: Sequence[str]) -> int:
     chosen = _chosen(arguments)
     folder, alone = chosen.folder, _alone(chosen.folder)
     with verifying(chosen.workers, must_connect=False) as verify_pairs, _mission(chosen) as (store, share):
-        worker = Worker(folder, store, time.monotonic, _print, start_copy, verify_pairs, share)
-        _print(READY, 0)
-        while True:
-            wait_s = 0.0 if worker.step() else min(worker.wait_s(), chosen.look_s)
-            if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
-                alone.close()
-                return 0
+        try:
+            worker = Worker(folder, store, time.monotonic, _print, start_copy, verify_pairs, share)
+            _print(READY, 0)
+            while True:
+                wait_s = 0.0 if worker.step() else min(worker.wait_s(), chosen.look_s)
+                if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
+                    break
+        except LeaseLostError as error:
+            _log.warning("this worker ends: %s", error)
+        alone.close()
+        return 0
 
 
 def _told_arguments() -> list[str]:

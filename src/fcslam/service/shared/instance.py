@@ -71,6 +71,8 @@ class Instance:
         self._closing = threading.Event()
         self._take_name()
         self._held: dict[Lease, RunningWorker] = {}
+        self._ending: dict[Lease, threading.Thread] = {}
+        """Workers that do their last step; nobody else may begin before."""
         self._active: dict[Lease, tuple[tuple[Any, ...], float]] = {}
         """Activity of each mission, and since when it is the same."""
         self._rest_look_at = clock() + REST_LOOK_S
@@ -87,10 +89,9 @@ class Instance:
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join()
-        ending = [threading.Thread(target=self._end, args=held) for held in self._held.items()]
-        for thread in ending:
-            thread.start()
-        for thread in ending:
+        for lease in list(self._held):
+            self._end(lease)
+        for thread in list(self._ending.values()):
             thread.join()
         try:
             self._registry.leave()
@@ -144,7 +145,8 @@ class Instance:
             self._on_taken()
             self._closing.set()
             return
-        kept = self._registry.renew([(lease, worker.is_ready) for lease, worker in self._held.items()])
+        ending = [(lease, False) for lease in list(self._ending)]
+        kept = self._registry.renew([(lease, worker.is_ready) for lease, worker in self._held.items()] + ending)
         for lease in self._held.keys() - kept:
             _log.warning("mission %d has a worker on another instance now", lease.mission)
             threading.Thread(target=self._held.pop(lease).stop, daemon=True).start()
@@ -156,7 +158,7 @@ class Instance:
         """Find missions in which nothing happens, and end their workers."""
         resting = {mission.number for mission in self._known.values() if not mission.is_wanted}
         for lease in [lease for lease in self._held if lease.mission in resting]:
-            self._end(lease, self._held.pop(lease))
+            self._end(lease)
         now = self._clock()
         if now < self._rest_look_at:
             return
@@ -178,12 +180,18 @@ class Instance:
             for lease in self._registry.claim(part - len(self._held)):
                 mission = next(mission for mission in self._registry.missions() if mission.number == lease.mission)
                 self._held[lease] = self._launch(mission, lease)
-        elif not is_any_free and len(self._held) > part:
-            lease, worker = self._held.popitem()
-            self._end(lease, worker)
+        elif not is_any_free and not self._ending and len(self._held) > part:
+            self._end(next(reversed(self._held)))
 
-    def _end(self, lease: Lease, worker: RunningWorker) -> None:
+    def _end(self, lease: Lease) -> None:
+        """Stop a worker and give its mission up, beside the renewals: a worker's last step may take long."""
+        worker = self._held.pop(lease)
+        self._ending[lease] = threading.Thread(target=self._stop, args=(lease, worker), daemon=True)
+        self._ending[lease].start()
+
+    def _stop(self, lease: Lease, worker: RunningWorker) -> None:
         worker.stop()
+        self._ending.pop(lease, None)
         try:
             self._registry.release(lease)
         except StoreError as error:

@@ -11,7 +11,7 @@ from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.schema import mission_statements, schema_of
 from fcslam.storage.postgres import Postgres, PostgresTransaction
 
-LEASE_S: Final = 3.0
+LEASE_S: Final = 5.0
 """An instance that does not renew its leases for so long loses them."""
 _READ: Final = """
 SELECT number, name, is_open, is_wanted, holder, expires > clock_timestamp(), is_ready, live, finalized
@@ -141,7 +141,7 @@ class Registry:
         )
 
     def activity(self, lease: Lease) -> tuple[Any, ...]:
-        """What changes when a mission gets packets, edits or requests, or its worker does something about them."""
+        """Counts that change when a mission gets packets, edits or requests, or its worker answers them."""
         return self._server.rows(_ACTIVITY, (), schema_of(lease.mission))[0]
 
     def let_rest(self, lease: Lease, activity: tuple[Any, ...]) -> None:
