@@ -20,6 +20,7 @@ from pydantic.fields import FieldInfo
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import Settings
+from fcslam.federated.live_settings import FleetLearningSettings, RobotLearningSettings
 from fcslam.federated.settings import FederatedSettings
 from fcslam.learning.settings import TrainingSettings
 from fcslam.lidar.frontend import LidarConfig
@@ -118,6 +119,19 @@ FEDERATED = """\
 The federated commands read these keys from a YAML file. `training` holds the keys of [Training](#training).
 """
 
+LEARNING = """\
+## Learning while the fleet maps
+
+`fcslam serve --learn-config` reads these keys from a YAML file. `federated` holds the keys of
+[Federated training](#federated-training) with the defaults below.
+"""
+
+LEARNING_ROBOT = """\
+## A robot that learns
+
+`fcslam robot --learn-config` reads these keys from a YAML file.
+"""
+
 
 def cloud_page() -> str:
     """How to set settings, and those of the cloud and the map."""
@@ -138,7 +152,17 @@ def lidar_page() -> str:
 def training_page() -> str:
     """The settings of training."""
     federated = tables(FederatedSettings(), documented=(TrainingSettings,))
-    return "\n".join([TRAINING, *tables(TrainingSettings()), FEDERATED, *federated])
+    live = tables(FleetLearningSettings(), documented=(FederatedSettings,))
+    rounds = FleetLearningSettings().federated
+    changed = [
+        row(f"federated.{key}", field, getattr(rounds, key))
+        for key, field in type(rounds).model_fields.items()
+        if key in type(rounds).__annotations__ and not isinstance(getattr(rounds, key), Settings)
+    ]
+    head = "| key | default | unit | allowed | effect |\n|---|---|---|---|---|"
+    live_tables = [LEARNING, *live, "\n".join([head, *changed, ""])]
+    robot = [LEARNING_ROBOT, *tables(RobotLearningSettings())]
+    return "\n".join([TRAINING, *tables(TrainingSettings()), FEDERATED, *federated, *live_tables, *robot])
 
 
 PAGES: dict[Path, Callable[[], str]] = {
@@ -156,7 +180,7 @@ def tables(settings: Settings, path: str = "", documented: tuple[type[Settings],
         value = getattr(settings, key)
         if not isinstance(value, Settings):
             rows.append(row(f"{path}{key}", field, value))
-        elif type(value) not in documented:
+        elif not isinstance(value, documented):
             nested.append((key, field, value))
     if rows:
         yield "\n".join(["| key | default | unit | allowed | effect |", "|---|---|---|---|---|", *rows, ""])

@@ -1,76 +1,56 @@
-"""The demo's federated phase: each robot's images in a folder of its own, and only what is no worse is taken."""
-
-from dataclasses import dataclass
-from pathlib import Path
+"""The demo's federated stage: what it needs, and that only a version that passed the gate is taken."""
 
 import pytest
 from rich.console import Console
 
-from fcslam.cli import demo, demo_learning
+from fcslam.cli import main
 from fcslam.mission import MissionConfig
-from fcslam.records import CameraImage, CameraModel, Transform
 
-CAMERA = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+pytest.importorskip("torch", reason="needs fcslam[federated]")
+pytest.importorskip("flwr", reason="needs fcslam[federated]")
+
+from fcslam.cli import demo, demo_learning
+from fcslam.federated import job
+from fcslam.federated.client import RobotClient, seeded_noise
+from fcslam.federated.history import RoundReport
 
 
-@dataclass
 class Recorded:
-    """A source of images that differ in their bytes."""
-
-    name: str
-    images: int
-
-    def records(self):
-        return [CameraImage(k, f"{self.name} {k}".encode(), CAMERA, None) for k in range(self.images)]
-
-
-def learnt(folder, camera=True):
-    """The detector that the demo takes, and the lines that it prints."""
-    console = Console(record=True, width=200)
-    sources = [Recorded("a", 100), Recorded("b", 3)]
-    return demo._learn(sources, folder, 1, camera, console), console.export_text()
-
-
-def test_without_the_libraries_one_line_says_how_to_get_them(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo_learning, "missing_libraries", lambda: ["torch", "flwr"])
-    config, said = learnt(tmp_path / "learning")
-    assert config == MissionConfig(seed=1)
-    (line,) = said.splitlines()
-    assert "torch and flwr are not installed" in line
-    assert "pip install 'fcslam[federated]'" in line
-    assert not (tmp_path / "learning").exists()
-
-
-def test_without_a_camera_there_is_nothing_to_learn_from(tmp_path):
-    config, said = learnt(tmp_path / "learning", camera=False)
-    assert config == MissionConfig(seed=1)
-    assert "no camera" in said
+    name = "a"
 
 
 @pytest.mark.parametrize("released", [(False, False), (True, False), (False, True)])
-def test_a_detector_is_taken_if_a_round_was_no_worse(released, tmp_path, monkeypatch):
-    pytest.importorskip("torch", reason="needs fcslam[federated]")
-    pytest.importorskip("flwr", reason="needs fcslam[federated]")
-    from fcslam.features.detector import BUNDLED_NETWORK
-    from fcslam.federated import local
-    from fcslam.federated.history import RoundReport
-
-    homes = []
-
-    def federate_locally(folders, task, _pace, watches):
-        assert task.start == BUNDLED_NETWORK
-        homes.extend(folders)
-        for number, accepted in enumerate(released, start=1):
-            watches.rounds(RoundReport(number, f"light-{number}", ("a", "b"), released=accepted, bytes_down=5))
+def test_a_detector_is_taken_if_a_round_passed_the_gate(released, tmp_path, monkeypatch):
+    def run_job(task, _options, watches, _grid):
+        assert task.gate.fewest_pairs == 200
+        metrics = {"revisit_recall": 0.6, "revisit_recall_gain": 0.02, "pairs": 240.0}
+        for number, passed in enumerate(released, start=1):
+            reason = "better" if passed else "not better on held-out pairs"
+            watches.rounds(
+                RoundReport(
+                    number, f"light-{number}", ("a",), metrics=metrics, score=0.6, released=passed, reason=reason
+                )
+            )
         return [task.output / "detector.onnx"]
 
-    monkeypatch.setattr(local, "federate_locally", federate_locally)
-    config, said = learnt(tmp_path / "learning")
-    weights = config.robot.views.onnx.weights
-    assert weights == (tmp_path / "learning" / "detector.onnx" if any(released) else None)
-    assert ("the fleet takes it" in said) == any(released)
-    assert [line[:9] for line in said.splitlines() if line.startswith("round")] == ["round 1/2", "round 2/2"]
-    images = {home.name: sorted(path.read_bytes() for path in Path(home).iterdir()) for home in homes}
-    assert len(images["a"]) == demo_learning.IMAGES
-    assert {b"a 0", b"a 99"} <= set(images["a"])
-    assert images["b"] == [b"b 0", b"b 1", b"b 2"]
+    def learner(source, config, folder):
+        return RobotClient(source.name, folder, folder, seeded_noise(source.name, config.seed))
+
+    monkeypatch.setattr(job, "run_job", run_job)
+    monkeypatch.setattr(demo_learning, "_learner", learner)
+    console = Console(record=True, width=200)
+    config = MissionConfig(seed=1)
+    network = demo_learning.learn_together([Recorded()], config, tmp_path, console)
+    said = console.export_text()
+    assert network == (tmp_path / "detector.onnx" if any(released) else None)
+    assert demo._with_detector(config, network).robot.views.onnx.weights == network
+    taken = "60.0% match, +2.0 points, on 240 pairs that no robot trained on"
+    assert (taken in said) == any(released)
+    assert ("keeps the bundled detector: not better on held-out pairs" in said) == (not any(released))
+
+
+def test_without_a_camera_there_is_nothing_to_learn_from(tmp_path, capsys):
+    assert main(["demo", "--learn", "--no-camera", "--output", str(tmp_path / "demo")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "nothing to learn from" in line
+    assert not (tmp_path / "demo").exists()

@@ -8,7 +8,6 @@ import pytest
 
 from fcslam.cloud.stage_times import StageTotal
 from fcslam.service import supervisor as module
-from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import Supervisor
 
 SAYS = 'import sys; print(\'{"event": "live", "number": 7}\', flush=True);'
@@ -30,7 +29,7 @@ def supervised(tmp_path, monkeypatch):
     def start(code, command=None):
         told = []
         chosen = command or (sys.executable, "-c", code)
-        supervisor = Supervisor(MissionFolder(tmp_path), time.monotonic, lambda *event: told.append(event), chosen)
+        supervisor = Supervisor(tmp_path, time.monotonic, lambda *event: told.append(event), chosen)
         started.append(supervisor)
         return supervisor, told
 

@@ -1,8 +1,7 @@
-"""`fcslam demo`: simulate a fleet, train its detector, map it, compare the map with the truth, and draw both."""
+"""`fcslam demo`: simulate a fleet, map it, compare the map with the truth, and draw both."""
 
 import shutil
 import time
-from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,10 +18,8 @@ if TYPE_CHECKING:
 
     from fcslam.mission import MissionConfig
     from fcslam.simulation.simulated_fleet import SimulatedFleet, SimulationSettings
-    from fcslam.sources import Source
 
 RECORDINGS, LEARNING, RUN, FIGURE, TABLE = "recordings", "learning", "run", "figure.png", "evaluation.csv"
-STAGES = 5
 ABOUT = "about"
 """The file that marks a folder as the output of a demo, which the next demo may replace."""
 
@@ -37,19 +34,29 @@ def demo(
     building: BuildingKind = Building.DEFAULT,
     path_length: PathLength = 60.0,
     no_camera: NoCamera = False,
+    learn: Annotated[
+        bool,
+        typer.Option(
+            "--learn", help="First let the robots train their detector together; two to three minutes of one processor."
+        ),
+    ] = False,
     live: Live = False,
     port: Port = 0,
     open_browser: OpenBrowser = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
+    from fcslam.cli.demo_learning import learn_together
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
+    from fcslam.mission import MissionConfig
     from fcslam.simulation.recording import prepare_fleet_folder
     from fcslam.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
     from fcslam.sources import open_source
 
     began = time.perf_counter()
+    if learn:
+        _check_learning(no_camera)
     camera = None if no_camera else CameraSettings()
     settings = SimulationSettings(building=building, robots=robots, path_length_m=path_length, camera=camera)
     _check_libraries(settings)
@@ -57,14 +64,20 @@ def demo(
     _prepare(output)
     prepare_fleet_folder(output / RECORDINGS, settings, seed, resume=False)
     console = notices(quiet)
-    _announce(console, 1, f"simulate: {robots} robots drive {path_length:g} m each; their starts are unknown")
+    stages = _Stages(console, 5 if learn else 4)
+    stages.begin(f"simulate: {robots} robots drive {path_length:g} m each; their starts are unknown")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, False, console)
     sources = [open_source(place) for place in recordings]
-    config = _learn(sources, output / LEARNING, seed, camera is not None, console)
-    _announce(console, 3, "map each robot, recognise places, fuse the maps")
+    config = MissionConfig(seed=seed)
+    if learn:
+        stages.begin("learn: the robots train the detector together, and no image leaves its robot")
+        config = _with_detector(config, learn_together(sources, config, output / LEARNING, console))
+    stages.begin("map each robot, recognise places, fuse the maps")
     with live_page(output / RUN, port, open_browser) if live else nullcontext() as page:
         map_sources(sources, config, output / RUN, console, force=True, page=page)
+        stages.begin("evaluate: compare with the truth")
         _evaluate(output, console)
+        stages.begin("draw")
         _draw(output, fleet, console)
         typer.echo(f"{time.perf_counter() - began:.0f} s in all")
         for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
@@ -108,26 +121,26 @@ def _prepare(output: Path) -> None:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
 
 
-def _learn(sources: "Sequence[Source]", folder: Path, seed: int, camera: bool, console: "Console") -> "MissionConfig":
-    """Train the detector for a moment if that is possible; returns a mission that uses it if it is no worse."""
-    from fcslam.cli.demo_learning import learn_together, missing_libraries
-    from fcslam.mission import MissionConfig
+def _check_learning(no_camera: bool) -> None:
+    """Check that the robots can learn.
 
-    config, missing = MissionConfig(seed=seed), missing_libraries()
-    if not camera:
-        _announce(console, 2, "learn: left out, because there is no camera")
+    Raises:
+        InputError: they have no camera.
+        TrainingError: a library is missing.
+    """
+    from fcslam.cli.training_options import require_training_libraries
+    from fcslam.errors import InputError
+
+    if no_camera:
+        raise InputError("robots without a camera have nothing to learn from; leave out --learn or --no-camera")
+    require_training_libraries("flwr", extra="federated")
+
+
+def _with_detector(config: "MissionConfig", network: Path | None) -> "MissionConfig":
+    """The mission with a released network for camera images; None: with the bundled one."""
+    if network is None:
         return config
-    if missing:
-        names = " and ".join(missing)
-        _announce(console, 2, f"learn: left out, because {names} are not installed: pip install 'fcslam[federated]'")
-        return config
-    _announce(console, 2, "learn: the robots train the detector together, and no image leaves its robot")
-    released = learn_together(sources, folder, seed, console)
-    if released is None:
-        print_line(console, "the fleet keeps the bundled detector: no round was as good on held-out images")
-        return config
-    print_line(console, "the fleet takes it: the new detector is no worse than the bundled one on held-out images")
-    onnx = config.robot.views.onnx.model_copy(update={"weights": released})
+    onnx = config.robot.views.onnx.model_copy(update={"weights": network})
     views = config.robot.views.model_copy(update={"onnx": onnx})
     return config.model_copy(update={"robot": config.robot.model_copy(update={"views": views})})
 
@@ -139,7 +152,6 @@ def _evaluate(output: Path, console: "Console") -> None:
     from fcslam.evaluation.fleet.relations import write_metrics
     from fcslam.evaluation.fleet.report import evaluate_fleet
 
-    _announce(console, 4, "evaluate: compare with the truth")
     with ProgressDisplay(console) as display:
         display.start("evaluating")
         report = evaluate_fleet(output / RUN, output / RECORDINGS)
@@ -155,7 +167,6 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
     from fcslam.maps.fleet_figure import write_figure
     from fcslam.simulation.floorplan import PieceKind
 
-    _announce(console, 5, "draw")
     with ProgressDisplay(console) as display:
         display.start("drawing")
         solid = [piece for piece in fleet.plan.pieces if piece.kind is not PieceKind.LINTEL]
@@ -163,5 +174,12 @@ def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
         write_figure(fleet_charts(output / RUN, output / RECORDINGS, outlines), output / FIGURE)
 
 
-def _announce(console: "Console", stage: int, text: str) -> None:
-    print_line(console, f"{stage} of {STAGES} {text}")
+class _Stages:
+    """Announces the stages of the demo."""
+
+    def __init__(self, console: "Console", count: int) -> None:
+        self._console, self._count, self._begun = console, count, 0
+
+    def begin(self, text: str) -> None:
+        self._begun += 1
+        print_line(self._console, f"{self._begun} of {self._count} {text}")

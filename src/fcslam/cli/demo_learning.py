@@ -1,86 +1,104 @@
-"""The federated stage of the demo: the robots train the detector together on their own images, for a moment."""
+"""The federated stage of the demo: the robots train the detector together on what each saw again in its own map."""
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from fcslam.cli.output import print_line
-from fcslam.errors import OutputError
-from fcslam.records import CameraImage
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fcslam.federated.client import RobotClient
+    from fcslam.mission import MissionConfig
     from fcslam.sources import Source
 
-IMAGES = 24
-"""Number of images taken from each recording, evenly spaced."""
-ROUNDS, STEPS = 2, 6
-TRAINING = {"pairs": 4, "side_px": 160, "label_copies": 2}
-"""Seconds, not hours: enough to see everything happen, too little to gain much."""
-PNG = b"\x89PNG"
+ROUNDS, STEPS, JUDGED = 6, 50, 2
+"""Rounds, steps of each robot in a round, and rounds between two decisions: about two minutes of one processor."""
 
 
-def missing_libraries() -> list[str]:
-    """The libraries that this stage needs and that are not installed."""
-    return [name for name in ("torch", "flwr", "onnx") if find_spec(name) is None]
-
-
-def learn_together(sources: "Sequence[Source]", folder: Path, seed: int, console: "Console") -> Path | None:
+def learn_together(
+    sources: "Sequence[Source]", config: "MissionConfig", folder: Path, console: "Console"
+) -> Path | None:
     """Train the bundled detector further, and print a line for each round.
 
     Args:
-        sources: one recording for each robot. The images of each robot go into a folder that only this robot reads.
+        sources: one recording for each robot. The keyframes of each robot go into a folder that only this robot reads.
+        config: of the mission.
         folder: output of the training.
-        seed: of the training.
         console: for progress and the lines of the rounds.
 
     Returns:
-        The released network; None if no round was as good as the bundled one.
+        The released network; None if no round passed the gate.
 
     Raises:
-        TrainingError: the recordings have too few images to train on.
+        TrainingError: no robot saw anything again.
         OutputError: something cannot be written.
     """
     from fcslam.cli.federate.rounds import round_line
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.config import parse
     from fcslam.features.detector import BUNDLED_NETWORK
+    from fcslam.federated.client_app import build_client_app
+    from fcslam.federated.flower import Context, InProcessGrid
     from fcslam.federated.history import RoundReport
-    from fcslam.federated.job import FederatedJob, ProgressCallbacks
-    from fcslam.federated.local import federate_locally
-    from fcslam.federated.settings import FederatedSettings
+    from fcslam.federated.job import FederatedJob, ProgressCallbacks, run_job
+    from fcslam.federated.live_settings import GateSettings, LiveRounds
     from fcslam.learning.trainer import ExecutionOptions
 
-    given = {"rounds": ROUNDS, "local_steps": STEPS, "judge_every": 1, "normalisation": "frozen"}
-    settings = parse(FederatedSettings, given | {"training": TRAINING | {"seed": seed}}, "the demo")
-    folders = [_own_images(source, folder / "images" / source.name) for source in sources]
-    released = False
+    given = {"rounds": ROUNDS, "local_steps": STEPS, "judge_every": JUDGED, "minimum_robots": 1}
+    settings = parse(LiveRounds, given, "the demo")
+    training = settings.training.model_copy(update={"seed": config.seed})
+    settings = settings.model_copy(update={"training": training})
+    reports: list[RoundReport] = []
 
     def watch(report: RoundReport) -> None:
-        nonlocal released
-        released |= report.released
+        reports.append(report)
         print_line(console, round_line(report.row(), settings.rounds))
         display.show("rounds", report.round_number, settings.rounds)
 
-    job = FederatedJob(folder, settings, BUNDLED_NETWORK)
     with ProgressDisplay(console) as display:
-        display.show("rounds", 0, settings.rounds)
-        files = federate_locally(folders, job, ExecutionOptions(), ProgressCallbacks(rounds=watch))
-    return files[0] if released else None
+        clients = []
+        for number, source in enumerate(sources):
+            display.show("looking for what was seen again", number, len(sources))
+            clients.append(_learner(source, config, folder / "robots" / source.name))
+
+        def client_of(context: Context) -> "RobotClient":
+            return clients[int(context.node_config["partition-id"])]
+
+        job = FederatedJob(folder, settings, BUNDLED_NETWORK, gate=GateSettings())
+        grid = InProcessGrid(build_client_app(client_of), len(clients))
+        files = run_job(job, ExecutionOptions(), ProgressCallbacks(rounds=watch), grid)
+    best = next((report for report in reversed(reports) if report.released), None)
+    if best is None:
+        print_line(console, f"the fleet keeps the bundled detector: {reports[-1].reason}")
+        return None
+    gain, pairs = best.metrics["revisit_recall_gain"], int(best.metrics["pairs"])
+    print_line(
+        console,
+        f"the fleet takes round {best.round_number}: of the points that two images share, {best.score:.1%} match, "
+        f"{100.0 * gain:+.1f} points, on {pairs} pairs that no robot trained on",
+    )
+    return files[0]
 
 
-def _own_images(source: "Source", home: Path) -> Path:
-    """Write some images of a recording into the folder ``home``."""
-    images = [record.encoded for record in source.records() if isinstance(record, CameraImage)]
-    try:
-        home.mkdir(parents=True)
-        for number in np.unique(np.linspace(0, len(images) - 1, IMAGES).astype(int)):
-            suffix = "png" if images[number].startswith(PNG) else "jpg"
-            (home / f"{number:05d}.{suffix}").write_bytes(images[number])
-    except OSError as error:
-        raise OutputError(f"{home}: cannot be written ({error}); make room or choose another --output") from error
-    return home
+def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotClient":
+    """A robot that drove its recording, with what it saw again."""
+    from fcslam.federated.client import RobotClient, seeded_noise
+    from fcslam.federated.live_settings import RobotLearningSettings
+    from fcslam.federated.own_examples import own_examples
+    from fcslam.robot.backend import RobotBackend
+    from fcslam.robot.beside import Inline
+    from fcslam.robot.frontend import RobotFrontend
+
+    keyframes = folder / "keyframes"
+    backend = RobotBackend(source.name, config.robot, keyframes)
+    robot = RobotFrontend(source.name, config.robot, Inline(backend))
+    for record in source.records():
+        robot.process(record)
+    robot.finish()
+    examples = own_examples(keyframes, RobotLearningSettings(), (), 0)
+    noise = seeded_noise(source.name, config.seed)
+    return RobotClient(
+        source.name, keyframes, folder / "cache", noise, revisits=examples.revisits, held_out=examples.held_out
+    )

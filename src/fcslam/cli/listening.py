@@ -1,5 +1,6 @@
 """Ports on which commands listen."""
 
+import ipaddress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -21,3 +22,11 @@ def listen(host: str, port: int) -> "socket.socket":
         return socket.create_server(address[:2], family=family, backlog=512)
     except OSError as error:
         raise ServiceError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a host."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

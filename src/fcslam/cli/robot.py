@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fcslam.cli.learning_options import LearnCa, LearnConfig, LearnServer, RobotLearning
 from fcslam.cli.mission_options import ConfigFile, mission_config
 from fcslam.cli.options import Quiet, output_option
 from fcslam.cli.output import RUNS, answers, notices, print_line
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.federated.learning_beside import RobotLearningPlan
     from fcslam.live.records import RobotStatus
     from fcslam.live.robot import Robot
     from fcslam.robot.frontend import RobotConfig
-    from fcslam.sources import Survey
+    from fcslam.sources import Source, Survey
 
 
 def _explain_traffic(wanted: bool) -> None:
@@ -60,7 +62,7 @@ def _explain_traffic(wanted: bool) -> None:
     raise typer.Exit
 
 
-_NETWORK = "Network"
+_NETWORK, _LEARNING = "Network", "Learning"
 
 Localize = Annotated[
     Path | None,
@@ -164,6 +166,23 @@ def robot(
     domain: DomainId = None,
     ros_parameters: RosParameters = None,
     use_sim_time: UseSimTime = False,
+    learn: Annotated[
+        bool,
+        typer.Option(
+            "--learn",
+            rich_help_panel=_LEARNING,
+            help="After the drive, train the detector with the fleet on what the camera saw again. No image leaves.",
+        ),
+    ] = False,
+    learn_server: LearnServer = None,
+    learn_config: LearnConfig = None,
+    learn_ca: LearnCa = None,
+    learn_key: Annotated[
+        Path | None,
+        typer.Option(
+            help="The robot's private key for learning; the service has the public one.", rich_help_panel=_LEARNING
+        ),
+    ] = None,
     quiet: Quiet = False,
     _explain: ExplainTraffic = False,
 ) -> None:
@@ -173,10 +192,8 @@ def robot(
     """
     from fcslam.bridges.addresses import is_address
     from fcslam.cli.live import map_live
-    from fcslam.cli.progress import ProgressDisplay
     from fcslam.errors import InputError
     from fcslam.live.localized_robot import LocalizedRobot
-    from fcslam.live.playback import PlaybackPace, play
     from fcslam.live.robot import Playback, Robot
     from fcslam.sources import BagOptions
     from fcslam.sources.faults import Fault
@@ -187,6 +204,7 @@ def robot(
     token, own = _token(token_file), _own_certificate(certificate, key)
     if localize is None and initial_pose is not None:
         raise InputError("an initial pose is one in a finished map; give --localize, too")
+    learning = RobotLearning(learn, learn_server, learn_config, learn_ca, learn_key).checked(is_address(source))
     if is_address(source):
         start: Callable[..., Robot | LocalizedRobot] = partial(
             Robot, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
@@ -206,32 +224,45 @@ def robot(
     if localize is not None:
         raise InputError("--localize is for a live robot; `fcslam localize RECORDING --map MAP` localises a recording")
     server, state = _required(server, state)
-    pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
+    pace = _speed(speed)
     argument = source if name is None else f"{name}={source}"
     recording = open_recording(argument, bag_options(scan_topic, odom_topic, camera_topic, laser_pose))
     _check_name(recording.name)
     survey = recording.survey()
     console = notices(quiet)
     print_notes(console, survey.notes)
+    plan = learning.plan(recording.name, settings.robot, server)
     fingerprint = _fingerprint(recording.name, survey, settings.robot, budget_kbps, floor)
     live = Robot(
         recording.name, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
-        outbox_mb=outbox_mb, config=settings, own_map=False, floor=floor,
+        outbox_mb=outbox_mb, config=settings, own_map=False, floor=floor, keep_keyframes=learn,
         playback=Playback(fingerprint, resume),
     )  # fmt: skip
     with closing(live):
-        try:
-            with compiled(console), _interruptible(), ProgressDisplay(console) as display:
-                play(live, recording.records(), pace, _watch(display, console, survey.scan_count))
-        except KeyboardInterrupt:
-            left = live.status().waiting
-            print_line(
-                console,
-                f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume",
-            )
-            raise
+        _play(live, recording, survey.scan_count, pace, plan, state, console)
         print_faults(console, {recording.name: recording.faults.plus(Fault.ODOMETRY_JUMP, live.odometry_jumps)})
         _report(live, state, server)
+
+
+def _play(
+    live: "Robot", recording: "Source", scans: int, speed: float | None, plan: "RobotLearningPlan | None", state: Path,
+    console: "Console",
+) -> None:  # fmt: skip
+    """Play a recording of so many scans to its robot, which learns afterwards if there is a plan for it."""
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.live.playback import PlaybackPace, play
+
+    pace = PlaybackPace(speed, time.monotonic, time.sleep)
+    try:
+        with compiled(console), _interruptible(), ProgressDisplay(console) as display:
+            stay = None if plan is None else partial(_learn, plan, state, console, display)
+            play(live, recording.records(), pace, _watch(display, console, scans), stay)
+    except KeyboardInterrupt:
+        left = live.status().waiting
+        print_line(
+            console, f"{left.packets} packets ({left.bytes / 1e3:.0f} kB) wait in {state}; to continue, give --resume"
+        )
+        raise
 
 
 def _fetch(
@@ -243,6 +274,37 @@ def _fetch(
     trouble = fetch_maps(folder, server, token, ca, own)
     copied = f"copied the maps of {server} to {folder}"
     print_line(console, f"{trouble}; the robot uses the earlier copy in {folder}" if trouble else copied)
+
+
+def _learn(
+    plan: "RobotLearningPlan", state: Path, console: "Console", display: "ProgressDisplay", robot: "Robot"
+) -> None:
+    """Stay after the drive and learn with the fleet, until the budget is spent or Ctrl-C ends it."""
+    from fcslam.federated.learning_beside import LearningBeside
+    from fcslam.live.robot import KEYFRAMES
+
+    def tell(line: str) -> None:
+        print_line(console, line)
+
+    tell("the drive is over; the robot learns with its fleet until Ctrl-C")
+    learning = LearningBeside(plan, robot.name, state / KEYFRAMES, state / "learning", tell)
+    end_s, told = time.monotonic() + plan.settings.time_s, robot.status().notices
+    try:
+        learning.set_idle(robot.first_epoch)
+        while time.monotonic() < end_s and not learning.has_ended:
+            robot.stand_still()
+            for notice in (notices := robot.status().notices):
+                if notice not in told:
+                    tell(notice)
+            told = notices
+            display.show(
+                "learning", round(plan.settings.time_s - end_s + time.monotonic()), round(plan.settings.time_s)
+            )
+            time.sleep(0.5)
+    except KeyboardInterrupt:
+        tell("learning ends; the robot sends what is left")
+    finally:
+        learning.close()
 
 
 def _required(server: str | None, state: Path | None) -> tuple[str, Path]:

@@ -1,12 +1,13 @@
 """`fcslam serve`: the cloud as a service over HTTP."""
 
-import ipaddress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.listening import listen
+from fcslam.cli.learning_options import LearnCa, LearnConfig, LearnServer
+from fcslam.cli.listening import is_loopback, listen
 from fcslam.cli.mission_options import ConfigFile, mission_config
 from fcslam.cli.options import Quiet, WorkerCa, WorkerCertificate, WorkerKey, WorkersOption
 from fcslam.cli.output import notices
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 _TLS = "TLS"
 _INSTANCES = "Several instances"
+_LEARNING = "Learning"
 
 
 def serve(
@@ -58,6 +60,24 @@ def serve(
             help="Output folder of `fcslam federate serve` on this machine; the page shows its rounds.",
         ),
     ] = None,
+    learn: Annotated[
+        bool,
+        typer.Option(
+            "--learn",
+            rich_help_panel=_LEARNING,
+            help="Let the robots train the detector together while they map, on what they see again.",
+        ),
+    ] = False,
+    learn_server: LearnServer = None,
+    learn_config: LearnConfig = None,
+    learn_ca: LearnCa = None,
+    robot_key: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Public key of a robot that may learn: robot1.pub is that of robot1. Can be repeated.",
+            rich_help_panel=_LEARNING,
+        ),
+    ] = None,
     docs: Annotated[bool, typer.Option("--docs", help="Describe the REST interface at /docs.")] = False,
     quiet: Quiet = False,
     store: Annotated[
@@ -91,6 +111,7 @@ def serve(
     import gc
     import logging
 
+    from fcslam.cli.serve_learning import FleetLearning, learning_beside
     from fcslam.cli.shared_service import Shared, shared_state
     from fcslam.cluster.verifying import verifying
     from fcslam.cluster.workers import Workers
@@ -102,7 +123,7 @@ def serve(
     from fcslam.storage.files import keep_private
 
     is_open = tokens is None and client_ca is None and not insecure
-    if is_open and not _is_loopback(host):
+    if is_open and not is_loopback(host):
         raise ServiceError(f"everybody who reaches {host} could send and read; give --tokens FILE, or --insecure")
     _check_tls(tls_certificate, tls_key, client_ca)
     chosen = Workers(workers, workers_ca, workers_certificate, workers_key)
@@ -110,15 +131,19 @@ def serve(
     if chosen.is_cluster:
         with verifying(chosen):  # refused here, not by the worker of each mission
             pass
+    asked = FleetLearning(learn, learn_server, learn_config, learn_ca, tuple(robot_key or ()))
+    plan = asked.plan(learning or data / "learning", host, (tls_certificate, tls_key), insecure, store)
+    learning = learning if plan is None else plan.output
     keep_private()
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    with listen(host, port) as listening:
+    with ExitStack() as stack, listen(host, port) as listening:
         authenticator, given = _authenticator(tokens, client_ca), _cloud_config(config)
         if store is None:
             state = _state(data, authenticator, given, learning, chosen)
         else:
             shared = Shared(store, instance, max_missions, max_robots)
             state = shared_state(shared, data, authenticator, given, learning, chosen)
+        stack.enter_context(learning_beside(plan, state))
         _reload_on_hangup(state, tokens)
         tell_uncached(notices(quiet))
         warm_up_decoding()
@@ -207,7 +232,7 @@ def _state(
     command = (sys.executable, "-m", "fcslam.service.worker", *workers.options())
     missions = Missions(
         data, config, time.monotonic, time.time,
-        lambda folder: Supervisor(folder, time.monotonic, events.publish, command),
+        lambda folder: Supervisor(folder.path, time.monotonic, events.publish, command),
     )  # fmt: skip
     audit = AuditLog(AuditFile(data / "audit.jsonl"), time.time)
     return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit, learning)
@@ -218,13 +243,6 @@ def _cloud_config(file: Path | None) -> "CloudConfig":
 
     config = mission_config(file)
     return CloudConfig(seed=config.seed, fleet=config.fleet, map=config.map)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> None:

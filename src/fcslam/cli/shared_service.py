@@ -64,7 +64,7 @@ def shared_state(
             folder = MissionFolder(data / "missions" / mission.name)
             folder.path.mkdir(parents=True, exist_ok=True)
             options = ("--store", url, "--lease", str(lease.mission), str(lease.fence), *workers.options())
-            return Supervisor(folder, time.monotonic, _ignore, options, spares.start)
+            return Supervisor(folder.path, time.monotonic, _ignore, options, spares.start)
 
         missions: SharedMissions
         events = EventStreams(lambda: missions.open_mission.name)

@@ -18,6 +18,8 @@ DETECTOR, INT8, CARD, PICTURE = "detector.onnx", "detector-int8.onnx", "card.md"
 SHOWN_METRICS: Final = {
     "repeatability": "keypoints found again within 3 px",
     "mma_3px": "matches within 3 px, by bits",
+    "revisit_recall": "points that two images share and that match",
+    "places_found": "places found again at full precision",
 }
 SHOWN_LOSSES: Final = ("detector", "contrastive", "triplet")
 MEGABYTE: Final = 1e6
@@ -71,7 +73,7 @@ def draw_rounds(rows: Sequence[Row], path: Path) -> None:
         sent = _column(rows, name)
         traffic.plot(rounds, [sum(sent[: index + 1]) / MEGABYTE for index in range(len(sent))], label=label)
     shares.set_ylim(0.0, 1.0)
-    titles = ("losses, mean of the robots", "on held-out images; grey: released", "weights sent so far [MB]")
+    titles = ("losses, mean of the robots", "evaluation; grey: released", "weights sent so far [MB]")
     for panel, title in zip((losses, shares, traffic), titles, strict=True):
         panel.set_title(title)
         panel.set_xlabel("round")

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from fcslam.errors import TrainingError
 from fcslam.federated.client_state import legacy_weights, load_optimiser_state, save_optimiser_state
 from fcslam.federated.codec import network_to_weights, weights_to_network
 from fcslam.federated.evaluation import SCORE_METRICS
+from fcslam.federated.held_out import HeldOutPairs, Judgement, judge
 from fcslam.federated.privacy import privatise_update
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights, trained_names
@@ -57,6 +58,14 @@ class FederatedClient(Protocol):
         """Metrics of the weights by name."""
 
 
+@runtime_checkable
+class JudgingClient(Protocol):
+    """A participant that holds out pairs of keyframes."""
+
+    def judge(self, weights: Weights, settings: FederatedSettings) -> Judgement:
+        """A report on these pairs with the weights."""
+
+
 @dataclass(slots=True)
 class RobotClient:
     """A client with its own images."""
@@ -78,6 +87,8 @@ class RobotClient:
     """Points that were seen again, on which codes are trained alone."""
     inputs: CodeInputs = field(default_factory=CodeInputs)
     """Of the images of ``revisits``."""
+    held_out: HeldOutPairs = field(default_factory=HeldOutPairs)
+    """Pairs of keyframes that are never trained on."""
 
     def train(self, weights: Weights, round_number: int, run_id: str, settings: FederatedSettings) -> ClientUpdate:
         """Train from the weights. The result depends on the arguments, the cache, the images and the noise.
@@ -132,6 +143,20 @@ class RobotClient:
         found = validate(network, validation_pairs(held_out), torch.device(self.device), shifts=False)
         # A detector that finds nothing has no metrics; it counts as one that finds nothing again.
         return {name: found[name] if np.isfinite(found[name]) else 0.0 for name in SCORE_METRICS}
+
+    def judge(self, weights: Weights, settings: FederatedSettings) -> Judgement:
+        """A report on the pairs of keyframes that the robot holds out, with the weights, shape (P, 2).
+
+        Raises:
+            TrainingError: the settings ask for privacy noise, which such reports do not carry; or the weights belong to
+                another network.
+        """
+        if settings.privacy.noise_multiplier:
+            raise TrainingError(NOISE_NEEDS_PUBLIC_IMAGES)
+        device = torch.device(self.device)
+        network = weights_to_network(weights, settings.training.encoder).to(device)
+        judgement: Judgement = judge(network, self.held_out, device)
+        return judgement
 
     def _labelled_images(self, weights: Weights, settings: FederatedSettings) -> TrainingImages:
         """The images, labelled by the first weights that the robot ever received; the labels stay."""

@@ -4,10 +4,10 @@ from collections.abc import Callable
 from typing import Final
 
 from fcslam.errors import FcslamError
-from fcslam.federated.client import FederatedClient
+from fcslam.federated.client import FederatedClient, JudgingClient
 from fcslam.federated.codec import weights_to_record
 from fcslam.federated.flower import ClientApp, Context, Error, Message
-from fcslam.federated.messages import client_reply, identity_reply, read_request
+from fcslam.federated.messages import PAIRS_KEY, client_reply, identity_reply, read_request
 
 CLIENT_ERROR: Final = 1000
 """Code of an error that a client explains; Flower's own codes are smaller."""
@@ -51,5 +51,9 @@ def _train(message: Message, client: FederatedClient) -> Message:
 
 def _evaluate(message: Message, client: FederatedClient) -> Message:
     request = read_request(message.content)
+    if request.settings.trained == "codes" and isinstance(client, JudgingClient):
+        rows = client.judge(request.weights, request.settings)
+        arrays = weights_to_record({PAIRS_KEY: rows})
+        return Message(client_reply(client.name, request.version, {}, arrays), reply_to=message)
     metrics = client.evaluate(request.weights, request.settings)
     return Message(client_reply(client.name, request.version, metrics), reply_to=message)

@@ -9,13 +9,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
 from fcslam.errors import TrainingError
 from fcslam.federated.checkpoint import CHECKPOINT_FILE, CoordinatorState, read_state, run_id, write_state
-from fcslam.federated.codec import GlobalModel
+from fcslam.federated.codec import GlobalModel, record_to_weights
 from fcslam.federated.evaluation import (
     EvaluateFn,
     Evaluator,
@@ -26,8 +26,11 @@ from fcslam.federated.evaluation import (
     valid_metrics,
 )
 from fcslam.federated.flower import Message, MessageType, NodeSelection, RecordDict, RobotGrid
+from fcslam.federated.gate import decide
+from fcslam.federated.held_out import Judgement, check_judgement
 from fcslam.federated.history import ROUNDS_FILE, RoundReport, Row, read_rows, write_rows
-from fcslam.federated.messages import ARRAYS_KEY, CONFIG_KEY, reply_metrics, reply_sender, request_config
+from fcslam.federated.live_settings import GateSettings
+from fcslam.federated.messages import ARRAYS_KEY, CONFIG_KEY, PAIRS_KEY, reply_metrics, reply_sender, request_config
 from fcslam.federated.privacy import epsilon
 from fcslam.federated.registry import RobotRegistry, sample_robots
 from fcslam.federated.replies import RoundReplies, printable_line, read_replies
@@ -37,6 +40,7 @@ from fcslam.federated.strategies import Aggregator, StrategyFactory
 from fcslam.federated.weights import Weights, interpolate_weights
 from fcslam.learning.training_step import learning_rate
 
+_Answer = TypeVar("_Answer")
 _SAMPLING_SEED: Final = 77
 """Separates the drawing of robots from other uses of the training seed."""
 
@@ -53,6 +57,10 @@ class CoordinatorHooks:
     """Called after each round with its report and the best weights so far, once both are on disk."""
     wait: Callable[[str], None] | None = None
     """Called with the reason when a round cannot be completed; returns when to try again. If None, training fails."""
+    gate: GateSettings | None = None
+    """Decides on releases, by pairs that robots hold out; None: every version that is not worse is released."""
+    fallback: Callable[[str], Weights | None] = lambda _version: None
+    """Asked before each round with the version of the best weights; weights to go back to if it was taken back."""
     strategy: StrategyFactory | None = None
     """Makes the strategy; None: the one that the settings name."""
     clock: Callable[[], float] = time.monotonic
@@ -89,7 +97,7 @@ class Coordinator:
         """
         state, rows = self._resume()
         while state.rounds_done < self._settings.rounds:
-            state, report = self._round(state)
+            state, report = self._round(self._fallen_back(state))
             rows.append(report.row())
             write_rows(self._folder / ROUNDS_FILE, rows)
             write_state(self._folder / CHECKPOINT_FILE, state, self._settings)
@@ -101,11 +109,24 @@ class Coordinator:
         initial = self._initial
         state = read_state(self._folder / CHECKPOINT_FILE, self._settings, initial.weights, initial.version)
         if state is None:
-            metrics = self._measure(initial, 0)  # a version must be at least as good to be released
+            # A version must be at least as good to be released. A gate measures both versions when it decides.
+            metrics = {} if self._hooks.gate is not None else self._measure(initial, 0)
             scores = {evaluator: combined_score(found) for evaluator, found in metrics.items()}
             return CoordinatorState.at_start(initial.weights, initial.version, scores), []
         self._aggregator = Aggregator(self._settings, state.strategy_state, self._hooks.strategy)
         return state, read_rows(self._folder / ROUNDS_FILE, state.rounds_done)
+
+    def _fallen_back(self, state: CoordinatorState) -> CoordinatorState:
+        """The state, or the one from which training goes on after the released version was taken back."""
+        if state.best_round == 0:
+            return state
+        earlier = self._hooks.fallback(self._hooks.version(state.best))
+        if earlier is None:
+            return state
+        self._aggregator = Aggregator(self._settings, {}, self._hooks.strategy)
+        return replace(
+            state, weights=earlier, average=earlier, best=earlier, best_scores={}, strategy_state={}, best_round=0
+        )
 
     def _round(self, state: CoordinatorState) -> tuple[CoordinatorState, RoundReport]:
         """One round."""
@@ -129,6 +150,7 @@ class Coordinator:
             score=comparison.score,
             released=decision.released,
             returned=decision.returned,
+            reason="" if comparison.gate is None else comparison.gate.reason,
             bytes_down=(Counter(trained.times_asked) - Counter(state.times_asked)).total() * sent.size_bytes,
             bytes_up=replies.bytes_up,
             seconds=self._hooks.clock() - started,
@@ -188,6 +210,8 @@ class Coordinator:
         number = state.rounds_done + 1
         if number % self._settings.judge_every != 0 and number != self._settings.rounds:
             return VersionComparison({}, state.best_scores)
+        if self._hooks.gate is not None:
+            return self._ask_gate(self._hooks.gate, model, state, replies)
         metrics = self._measure(model, state.rounds_done)
         newcomers = metrics.keys() - state.best_scores.keys()
         best: Mapping[Evaluator, Metrics] = {}
@@ -195,16 +219,32 @@ class Coordinator:
             best = {PublicImages(): self._hooks.evaluate_fn(state.best)}
         elif newcomers:
             nodes = {robot: node for robot, node in self._robots.connected().items() if robot in newcomers}
-            best, failed = self._measure_on(nodes, self._model(state.best), state.rounds_done)
+            measured, failed = self._measure_on(nodes, self._model(state.best), state.rounds_done)
+            best = {robot: measured[robot] for robot in measured}
             replies.add_notes({f"judging by {robot}": reason for robot, reason in failed.items()})
         scores = {evaluator: combined_score(found) for evaluator, found in best.items()}
         return VersionComparison(metrics, {**state.best_scores, **scores})
+
+    def _ask_gate(
+        self, gate: GateSettings, model: GlobalModel, state: CoordinatorState, replies: RoundReplies
+    ) -> VersionComparison:
+        """Have all robots that are there judge the model and the best one on the pairs that they hold out."""
+        connected, reports = self._robots.connected(), []
+        for judged in (model, self._model(state.best)):
+            found, failed = self._ask(connected, judged, state.rounds_done, _judgement)
+            replies.add_notes({f"judging by {robot}": reason for robot, reason in failed.items()})
+            reports.append(found)
+        decision = decide(reports[0], reports[1], gate, self._settings.training.seed)
+        return VersionComparison({}, state.best_scores, decision)
 
     def _decide(self, comparison: VersionComparison, state: CoordinatorState) -> Decision:
         """Release a version that is at least as good as the best one; return to the best one after a collapse."""
         gain = comparison.gain
         if gain is None:
             return Decision(released=False, returned=False)
+        if comparison.gate is not None:
+            is_collapse = comparison.gate.pairs > 0 and gain < -self._settings.collapse
+            return Decision(comparison.gate.released, state.best_round > 0 and is_collapse)
         # Never back to the initial weights: as long as training costs something at first, nothing would be learnt.
         return Decision(released=gain >= 0.0, returned=state.best_round > 0 and gain < -self._settings.collapse)
 
@@ -240,17 +280,23 @@ class Coordinator:
         while not found:
             self._wait_or_fail(_joined(failed))
             found, failed = self._measure_on(self._connected(), model, round_number)
-        return found
+        return {robot: found[robot] for robot in found}
 
     def _measure_on(
         self, nodes: Mapping[str, int], model: GlobalModel, round_number: int
-    ) -> tuple[dict[Evaluator, Metrics], dict[str, str]]:
+    ) -> tuple[dict[str, Metrics], dict[str, str]]:
         """Metrics of the model by these robots, and the reasons why some gave none."""
+        return self._ask(nodes, model, round_number, _metrics)
+
+    def _ask(
+        self, nodes: Mapping[str, int], model: GlobalModel, round_number: int, read: Callable[[RecordDict], _Answer]
+    ) -> tuple[dict[str, _Answer], dict[str, str]]:
+        """The answers of these robots about the model, and the reasons why some gave none that can be read."""
         config = request_config(model.version, round_number, self._run_id, self._settings)
         content = RecordDict({ARRAYS_KEY: model.record, CONFIG_KEY: config})
         requests = [Message(content, node, MessageType.EVALUATE) for node in nodes.values()]
         names = {node: robot for robot, node in nodes.items()}
-        found: dict[Evaluator, Metrics] = {}
+        found: dict[str, _Answer] = {}
         failed: dict[str, str] = {}
         for reply in self._grid.send_and_receive(requests, timeout=self._settings.deadline_s):
             robot = names.get(reply.metadata.src_node_id)
@@ -259,11 +305,9 @@ class Coordinator:
             try:
                 if reply.has_error():
                     raise ValueError(reply.error.reason or f"error {reply.error.code}")
-                is_ours = reply_sender(reply.content) == (robot, model.version)
-                metrics = valid_metrics(reply_metrics(reply.content)) if is_ours else {}
-                if not metrics:
-                    raise ValueError("an answer without figures that could be")
-                found[robot] = metrics
+                if reply_sender(reply.content) != (robot, model.version):
+                    raise ValueError("an answer to another question")
+                found[robot] = read(reply.content)
             except (ValueError, KeyError, TypeError) as error:
                 failed[robot] = printable_line(str(error))
         return found, failed
@@ -281,6 +325,19 @@ class Coordinator:
 
     def _model(self, weights: Weights) -> GlobalModel:
         return GlobalModel(weights, self._hooks.version(weights))
+
+
+def _metrics(content: RecordDict) -> Metrics:
+    """The metrics of a robot's answer; ValueError: it has none that could be."""
+    metrics = valid_metrics(reply_metrics(content))
+    if not metrics:
+        raise ValueError("an answer without figures that could be")
+    return metrics
+
+
+def _judgement(content: RecordDict) -> Judgement:
+    """A robot's report on the pairs that it holds out; ValueError: it is none."""
+    return check_judgement(record_to_weights(content[ARRAYS_KEY]).get(PAIRS_KEY))
 
 
 def _joined(reasons: Mapping[str, str]) -> str:

@@ -7,6 +7,8 @@ from typing import Final
 
 import numpy as np
 
+from fcslam.federated.gate import GateDecision
+from fcslam.federated.held_out import COLUMNS
 from fcslam.federated.weights import Weights
 
 SCORE_METRICS: Final = ("repeatability", "mma_3px")
@@ -48,6 +50,8 @@ class VersionComparison:
     """Metrics of the version; empty if it was not evaluated in this round."""
     best: Mapping[Evaluator, float]
     """Scores of the best version, by everyone who ever evaluated it."""
+    gate: GateDecision | None = None
+    """The decision of the gate on pairs that robots hold out, if there is one; then nothing else was evaluated."""
 
     @property
     def scores(self) -> dict[Evaluator, float]:
@@ -56,12 +60,17 @@ class VersionComparison:
 
     @property
     def score(self) -> float:
-        """Median of the scores; NaN if the version was not evaluated."""
+        """Median of the scores, or the share of shared keypoints that match; NaN if the version was not evaluated."""
+        if self.gate is not None:
+            return self.gate.values[COLUMNS[0]]
         return float(np.median(list(self.scores.values()))) if self.by_evaluator else math.nan
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Median of each metric over the evaluators."""
+        """Median of each metric over the evaluators, or means over held-out pairs with the gains of the version."""
+        if self.gate is not None:
+            gains = {f"{name}_gain": gain.mean for name, gain in self.gate.gains.items()}
+            return {**self.gate.values, **gains, "pairs": float(self.gate.pairs)}
         rows = self.by_evaluator.values()
         names = dict.fromkeys(name for row in rows for name in row)
         return {name: float(np.median([row[name] for row in rows if name in row])) for name in names}
@@ -73,6 +82,9 @@ class VersionComparison:
         Robots hold out different images, so their scores differ in level. Only differences at the same robot are
         compared: robots that join or leave do not change the gain. The median ignores a minority of false scores.
         """
+        if self.gate is not None:
+            gain = self.gate.gains[COLUMNS[0]].mean
+            return gain if math.isfinite(gain) else None
         scores = self.scores
         gains = [score - self.best[evaluator] for evaluator, score in scores.items() if evaluator in self.best]
         return float(np.median(gains)) if gains else None

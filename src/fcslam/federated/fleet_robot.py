@@ -14,7 +14,14 @@ from typing import Final, TypeVar
 import httpx
 
 from fcslam.errors import TrainingError
-from fcslam.federated.fleet_server import ALIVE_PATH, LONG_POLL_S, NEXT_PATH, NUMBER_HEADER, REPLY_PATH
+from fcslam.federated.fleet_server import (
+    ALIVE_PATH,
+    LONG_POLL_S,
+    NEXT_PATH,
+    NUMBER_HEADER,
+    REPLY_PATH,
+    TAUGHT_PATH,
+)
 from fcslam.federated.flower import (
     FIRST_NODE,
     RUN_ID,
@@ -90,6 +97,17 @@ class RobotLink:
         """
         status, _, answer = self._post(f"{REPLY_PATH}{number}", body)
         return None if status == httpx.codes.NO_CONTENT else answer.decode(errors="replace") or f"status {status}"
+
+    def taught(self) -> bytes:
+        """A batch of packets with the codes that the fleet gives to this robot's places; empty without any.
+
+        Raises:
+            TrainingError, ConnectionError: as in ``fetch``.
+        """
+        status, _, body = self._post(TAUGHT_PATH, b"")
+        if status not in (httpx.codes.OK, httpx.codes.NO_CONTENT):
+            raise ConnectionError(f"the server answers with status {status}")
+        return body
 
     def show_alive(self) -> None:
         """Show the server that the robot is still there.

@@ -3,6 +3,7 @@
     POST /fleet/next             204, or a request with its number in a header; waits some seconds for one
     POST /fleet/alive            204; a robot at work shows that it is still there
     POST /fleet/reply/NUMBER     204; the reply to a request
+    POST /fleet/taught           204, or codes that others gave to places of this robot, as a batch of packets
 
 Whoever does not sign as a robot of the fleet gets 401 before the body is read. There is no operation that starts a
 run, adds a key or names a program: the operator does this on the server's command line.
@@ -33,6 +34,7 @@ from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 NEXT_PATH: Final = "/fleet/next"
 ALIVE_PATH: Final = "/fleet/alive"
 REPLY_PATH: Final = "/fleet/reply/"
+TAUGHT_PATH: Final = "/fleet/taught"
 NUMBER_HEADER: Final = "x-fcslam-request"
 """Number of the request in the body."""
 LONG_POLL_S: Final = 10.0
@@ -49,6 +51,13 @@ MAX_UNWANTED_BYTES: Final = 64 * 2**20
 _UNWANTED: Final = "nobody waits for this reply"
 
 OnNotice = Callable[[str], None]
+Teach = Callable[[str], bytes]
+"""Gives what a robot is taught, a batch of packets; empty: nothing."""
+
+
+def teach_nothing(_robot: str) -> bytes:
+    """Of a fleet that does not map."""
+    return b""
 
 
 class FleetApp:
@@ -58,10 +67,13 @@ class FleetApp:
         grid: holds requests and replies.
         authenticator: decides which robot a request is by.
         on_notice: called with one line for each kind of refused request; from the thread of the server.
+        teach: called with the name of a robot that asks what it is taught.
     """
 
-    def __init__(self, grid: FleetGrid, authenticator: RobotAuthenticator, on_notice: OnNotice) -> None:
-        self._grid, self._authenticator, self._on_notice = grid, authenticator, on_notice
+    def __init__(
+        self, grid: FleetGrid, authenticator: RobotAuthenticator, on_notice: OnNotice, teach: Teach = teach_nothing
+    ) -> None:
+        self._grid, self._authenticator, self._on_notice, self._teach = grid, authenticator, on_notice, teach
         self._open: Counter[str] = Counter()
         self._notices: set[str] = set()
         self._is_closing = False
@@ -76,6 +88,7 @@ class FleetApp:
             NEXT_PATH: self._next,
             ALIVE_PATH: self._alive,
             f"{REPLY_PATH}{{number:int}}": self._reply,
+            TAUGHT_PATH: self._taught,
         }
         routes = [Route(path, self._guarded(handler), methods=["POST"]) for path, handler in operations.items()]
         app = Starlette(routes=routes, exception_handlers={404: self._unknown, 405: self._unknown})
@@ -137,6 +150,11 @@ class FleetApp:
             return self._refusal(request, 413, f"{robot}: {reason}")
         is_taken = await run_in_threadpool(self._grid.store_reply, robot, number, body)
         return Response(status_code=204) if is_taken else PlainTextResponse(_UNWANTED, 409)
+
+    async def _taught(self, request: Request, robot: str) -> Response:
+        await self._body(request, 0)
+        batch = self._teach(robot)
+        return Response(batch) if batch else Response(status_code=204)
 
     async def _body(self, request: Request, limit: int) -> bytes | None:
         """The body, read no further than ``limit`` bytes; None if it is longer.

@@ -40,6 +40,8 @@ class RoundReport:
     """The version is the best so far and becomes the new detector."""
     returned: bool = False
     """The version was so bad that training returned to the best one."""
+    reason: str = ""
+    """Of the gate for releasing the version or not; empty without a gate."""
     bytes_down: int = 0
     """Size of the weights that were sent to all robots."""
     bytes_up: int = 0
@@ -57,6 +59,7 @@ class RoundReport:
             "score": f"{self.score:.6g}",
             "released": str(int(self.released)),
             "returned": str(int(self.returned)),
+            "reason": self.reason,
             "bytes_down": str(self.bytes_down),
             "bytes_up": str(self.bytes_up),
             "seconds": f"{self.seconds:.3f}",

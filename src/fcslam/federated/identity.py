@@ -16,7 +16,11 @@ from urllib.parse import quote, unquote
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import load_ssh_private_key, load_ssh_public_key
+from cryptography.hazmat.primitives.serialization import (
+    load_pem_private_key,
+    load_ssh_private_key,
+    load_ssh_public_key,
+)
 
 from fcslam.errors import TrainingError
 from fcslam.federated.messages import MAX_NAME_LENGTH
@@ -131,7 +135,9 @@ def read_private_key(file: Path) -> ec.EllipticCurvePrivateKey:
         TrainingError: the file is no private key, or is encrypted.
     """
     try:
-        key = load_ssh_private_key(file.read_bytes(), None)
+        content = file.read_bytes()
+        is_ssh = content.startswith(b"-----BEGIN OPENSSH")
+        key = load_ssh_private_key(content, None) if is_ssh else load_pem_private_key(content, None)
     except (OSError, ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise TrainingError(f"{file}: is no private key without a passphrase ({error}); {_MAKE_ONE}") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey):

@@ -15,6 +15,7 @@ from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import RobotGrid
 from fcslam.federated.history import RoundReport
 from fcslam.federated.initial_weights import prepare_initial_weights
+from fcslam.federated.live_settings import GateSettings
 from fcslam.federated.public_images import calibration_images, public_evaluation, read_public_images
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.strategies import StrategyFactory
@@ -40,6 +41,11 @@ class FederatedJob:
     strategy: StrategyFactory | None = None
     """Makes a strategy of your own; None: the one that the settings name."""
 
+    gate: GateSettings | None = None
+    """Decides on releases by pairs that robots hold out; None: every version that is not worse is released."""
+    fallback: Callable[[str], Weights | None] = lambda _version: None
+    """As in ``CoordinatorHooks``."""
+
 
 @dataclass(frozen=True, slots=True)
 class ProgressCallbacks:
@@ -51,6 +57,8 @@ class ProgressCallbacks:
     """With a robot's name and the steps that it has done in the round."""
     rounds: Callable[[RoundReport], None] = lambda _report: None
     """With the report of a round."""
+    released: Callable[[RoundReport, Weights], None] = lambda _report, _weights: None
+    """With the report of a round that released a version, and its weights; its detector is written."""
 
 
 def run_job(
@@ -86,13 +94,21 @@ def run_job(
     def on_round(report: RoundReport, best: Weights) -> None:
         if report.released:
             export_onnx(weights_to_network(best, encoder), job.output / DETECTOR)
+            callbacks.released(report, best)
         callbacks.rounds(report)
 
     version = partial(weights_version, encoder=encoder)
-    hooks = CoordinatorHooks(version, public_evaluation(images, encoder, options.device), on_round, wait, job.strategy)
+    evaluate = public_evaluation(images, encoder, options.device)
+    hooks = CoordinatorHooks(version, evaluate, on_round, wait, job.gate, job.fallback, job.strategy)
     state = Coordinator(grid, job.settings, initial, job.output, hooks).run()
     _write_config(job, job.output / CONFIG_FILE, again=True)
-    judged_on = "on pairs of public images" if images else "on pairs of images held out by the robots, their median"
+    judged_on = (
+        "on pairs of public images"
+        if images
+        else "on images of the robots, 4 % held out or one trained on; median of the robots"
+    )
+    if job.gate is not None:
+        judged_on = "on revisits that no robot trained on, mean"
     return write_federated_artifacts(state, job.output, job.settings, calibration_images(images), judged_on)
 
 

@@ -13,7 +13,7 @@ from fcslam.federated.client import RobotClient
 from fcslam.federated.client_app import build_client_app
 from fcslam.federated.fleet_grid import FleetGrid
 from fcslam.federated.fleet_robot import RobotLink, robot_context, serve_requests
-from fcslam.federated.fleet_server import FleetApp, listening
+from fcslam.federated.fleet_server import FleetApp, Teach, listening, teach_nothing
 from fcslam.federated.identity import RobotAuthenticator, RobotIdentity
 from fcslam.federated.job import FederatedJob, ProgressCallbacks, run_job
 from fcslam.federated.tls import Address, Certificates, check_own_certificate, check_server_certificate
@@ -56,19 +56,50 @@ def serve(
             failed.
         OutputError: the run folder cannot be written.
     """
-    if certificates is not None:
-        check_own_certificate(certificates, address.host)
-    _check_name(address)
-    keys = authenticator.keys
-    grid = FleetGrid(None if keys is None else tuple(keys))
+    with open_port(address, certificates, authenticator, on_notice) as grid:
+        return run_job(job, options, callbacks, grid, waiting(on_notice))
+
+
+def waiting(on_notice: OnNotice) -> Callable[[str], None]:
+    """A function that says the reason to wait, and waits."""
 
     def wait(reason: str) -> None:
         on_notice(f"waiting: {reason}")
         time.sleep(WAIT_S)
 
-    app = FleetApp(grid, authenticator, on_notice)
+    return wait
+
+
+@contextlib.contextmanager
+def open_port(
+    address: Address,
+    certificates: Certificates | None,
+    authenticator: RobotAuthenticator,
+    on_notice: OnNotice,
+    teach: Teach = teach_nothing,
+) -> Iterator[FleetGrid]:
+    """Let robots fetch requests at the address while the block runs; arguments as of ``serve`` and ``FleetApp``.
+
+    Raises:
+        TrainingError: the certificates do not fit, or the address is taken or the robots cannot reach it.
+    """
+    check_port(address, certificates)
+    keys = authenticator.keys
+    grid = FleetGrid(None if keys is None else tuple(keys))
+    app = FleetApp(grid, authenticator, on_notice, teach)
     with _bound(address) as listener, listening(app, listener, certificates):
-        return run_job(job, options, callbacks, grid, wait)
+        yield grid
+
+
+def check_port(address: Address, certificates: Certificates | None) -> None:
+    """Check an address and its certificates before anything is started.
+
+    Raises:
+        TrainingError: the certificates do not fit, or robots cannot reach the address.
+    """
+    if certificates is not None:
+        check_own_certificate(certificates, address.host)
+    _check_name(address)
 
 
 def join(address: Address, client: RobotClient, identity: RobotIdentity, ca: Path | None, on_notice: OnNotice) -> None:

@@ -12,6 +12,8 @@ from fcslam.federated.weights import Weights
 
 ARRAYS_KEY, CONFIG_KEY, METRICS_KEY = "arrays", "config", "metrics"
 """Names of the records in a message."""
+PAIRS_KEY: Final = "pairs"
+"""Name of the array in which a robot reports on the pairs that it holds out."""
 EXAMPLES_KEY: Final = "num-examples"
 """Flower's name for the weight of an update in a mean."""
 MAX_NAME_LENGTH: Final = 64

@@ -56,14 +56,15 @@ class LidarBackend:
         """``T_map_base`` of each anchor, optimised."""
         self._window: list[MappedKeyscan] = []
         """The newest keyscans, as far back as the next submaps need them."""
-        self._count = 0
+        self._T_local_base: list[FloatArray] = []
+        """Of every keyscan, as the tracker found it."""
         self._next_anchor_m = 0.0
         self._unsolved = 0
 
     def add(self, keyscan: MappedKeyscan) -> FinishedSubmap | None:
         """Add the next keyscan; returns the submap that it completes, if it completes one."""
         self._window.append(keyscan)
-        self._count += 1
+        self._T_local_base.append(keyscan.T_local_base)
         return self._finish_submap()
 
     def finish(self) -> list[FinishedSubmap]:
@@ -78,6 +79,18 @@ class LidarBackend:
         if self._closer.has_closures:
             self._poses = optimize_gnc(self._graph, self._poses, factors=self._factors).poses
         return self._poses
+
+    def keyscan_poses(self) -> FloatArray:
+        """``T_map_base`` of every keyscan so far, shape (N, 3), after a robust solve that changes nothing here."""
+        local, submaps = np.array(self._T_local_base).reshape(-1, 3), self._closer.submaps
+        if not submaps:
+            return local
+        poses = self._poses
+        if self._closer.has_closures:
+            poses = optimize_gnc(self._graph, poses, factors=self._factors).poses
+        anchors = np.array([submap.keyscan for submap in submaps])
+        before = np.maximum(np.searchsorted(anchors, np.arange(len(local)), "right") - 1, 0)
+        return se2.compose(poses[before], se2.between(local[anchors[before]], local))
 
     def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
         """Build the next submap once the robot is far enough past its anchor, and close loops to earlier ones."""
@@ -135,7 +148,7 @@ class LidarBackend:
         A recognised loop may contradict it by so much that the Cauchy loss hardly pulls; only GNC closes it.
         """
         self._unsolved += len(closures)
-        enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * self._count)
+        enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._T_local_base))
         if any(c.beyond_search for c in closures):
             self.optimized()
             self._unsolved = 0

@@ -30,8 +30,21 @@ class PlaybackPace:
         self._sleep(max(0.0, due - self._clock()))
 
 
-def play(robot: Robot, records: Iterable[SensorRecord], pace: PlaybackPace, watch: Watch) -> None:
+def play(
+    robot: Robot,
+    records: Iterable[SensorRecord],
+    pace: PlaybackPace,
+    watch: Watch,
+    stay: Callable[[Robot], None] | None = None,
+) -> None:
     """Map a whole recording and send all packets; what a resumed robot did before is not paced.
+
+    Args:
+        robot: maps.
+        records: of the recording.
+        pace: of the playback.
+        watch: called with the robot's state.
+        stay: called after the last record, before the recording ends; None: it ends at once.
 
     Raises:
         CloudError: the cloud rejects the robot; unconfirmed packets stay in the state folder.
@@ -44,4 +57,6 @@ def play(robot: Robot, records: Iterable[SensorRecord], pace: PlaybackPace, watc
         robot.add(record)
         robot.wait_for_room(watch)
         watch(robot.status())
+    if stay is not None:
+        stay(robot)
     robot.finish(watch=watch)

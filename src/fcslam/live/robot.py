@@ -5,6 +5,7 @@ beside it, which is another process, so no pose waits for it.
 """
 
 import math
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
@@ -55,6 +56,8 @@ CLOSE_S = 5.0
 """Time that a robot whose block ends without an error waits for the server."""
 POLL_INTERVAL_S = 0.1
 """Interval at which ``finish`` looks whether the server has everything."""
+KEYFRAMES = "keyframes"
+"""Below the state folder: keyframes, for a process that learns from them."""
 LARGEST_BACKLOG = 200
 """Largest number of inputs that wait for the back end, the map or the disk while a recording is played; a robot in real
 time never has as many."""
@@ -105,6 +108,7 @@ class Robot(LiveTracker):
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
         own_map: bool = True,
         floor: str = "",
+        keep_keyframes: bool = False,
         playback: Playback | None = None,
         on_event: Callable[[RobotEvent], None] | None = None,
         executor: Executor | None = None,
@@ -130,6 +134,8 @@ class Robot(LiveTracker):
             own_map: whether the robot has a map of its own; a robot with a server may do without.
             floor: floor of the building, 1 to 16 letters, digits and ``. _ + -``. Places of different floors are never
                 compared. Empty: none is named.
+            keep_keyframes: keep the keyframes of the camera in the state folder, for a process that learns from them;
+                they stay there, and the next start removes them.
             playback: the recording that is played. None: live.
             on_event: called by ``add_scan``, ``add_image`` and ``add``, in their thread, before they return.
             executor: runs the back end and the map, in its only worker. None: a process of its own, which ends with the
@@ -154,6 +160,8 @@ class Robot(LiveTracker):
         """Corrections by part: those of the robot's own map, and those of the server. After being lost, the robot goes
         on in another part."""
         self._keyscans = self._part_base = 0
+        self._is_placed = False
+        """Whether the poses of all keyframes are written."""
         self._is_online: bool | None = None
         """Whether the server can be reached; None before the first reply."""
         self._sleep = sleep
@@ -170,7 +178,9 @@ class Robot(LiveTracker):
                 http = HttpTransport(server, name, outbox.agent, token, None if ca is None else Path(ca), own)
                 transport = stack.enter_context(closing(http))
             known = 0 if outbox is None else outbox.begin(*(playback or LIVE))
-            self._start(executor, outbox if transport is None else None, own_map)
+            keyframes = _keyframe_folder(folder, playback) if keep_keyframes else None
+            self._start(executor, outbox if transport is None else None, own_map, keyframes)
+            self._outbox = outbox
             self._uplink: Uplink | None = None
             if outbox is not None and folder is not None:
                 # Not the seed of the configuration: robots must not retry at the same moments.
@@ -326,6 +336,28 @@ class Robot(LiveTracker):
         self._raise_failure()
         return not uplink.unstored and not uplink.waiting.packets
 
+    def stand_still(self) -> None:
+        """Write where the keyframes are, for a process that learns from them, and take a detector that the server
+        announced meanwhile. Call it while no scan is due.
+
+        Raises:
+            CloudError: the server rejects the robot.
+            StateError: the state folder cannot be used.
+        """
+        self._raise_failure()
+        with self._lock:
+            if not self._is_placed and not self._is_finished:
+                self._frontend.place_keyframes()
+                self._is_placed = True
+            if self._uplink is not None:
+                self._uplink.between_records()
+            self._take(self._frontend.ready())
+
+    @property
+    def first_epoch(self) -> int:
+        """Epoch of the first session of this start, as the server knows it."""
+        return 0 if self._outbox is None else self._outbox.first_epoch
+
     def wait_for_room(self, watch: Callable[[RobotStatus], None] | None = None) -> None:
         """Wait until the back end, the map, the disk and the server have caught up enough to take more, for a program
         that adds records faster than a robot.
@@ -370,13 +402,14 @@ class Robot(LiveTracker):
     def _session(self, part: int) -> str:
         return session_name(self.name, self._part_base + part)
 
-    def _start(self, executor: Executor, outbox: Outbox | None, own_map: bool) -> None:
-        """Start the back end and the robot's own map, which goes on from the earlier sessions in ``outbox``."""
+    def _start(self, executor: Executor, outbox: Outbox | None, own_map: bool, keyframes: Path | None) -> None:
+        """Start the back end, which keeps keyframes in a folder if there is one, and the robot's own map, which goes on
+        from the earlier sessions in ``outbox``."""
         robot = self._config.robot
         self._part_base = 0 if outbox is None else outbox.first_epoch
         try:
             self._own = OwnMap(self.name, self._config, executor, self._correct) if own_map else None
-            self._frontend = RobotFrontend(self.name, robot, Beside(self.name, robot, executor))
+            self._frontend = RobotFrontend(self.name, robot, Beside(self.name, robot, executor, keyframes))
         except BrokenExecutor as error:
             raise InputError(
                 f"{self.name}: the process of the back end does not start; a script that makes a Robot needs "
@@ -430,6 +463,7 @@ class Robot(LiveTracker):
             self._take(self._frontend.ready())
 
     def _processed(self, record: SensorRecord) -> list[Packet]:
+        self._is_placed = False
         if self._uplink is not None and not self._is_finished:
             self._uplink.before_record()
         return super()._processed(record)
@@ -535,6 +569,20 @@ def _checked_floor(floor: str) -> str:
 def _in_epoch(packet: Packet, epoch: int) -> Packet:
     body = replace(packet.body, epoch=epoch) if isinstance(packet.body, Hello) else packet.body
     return replace(packet, epoch=epoch, body=body)
+
+
+def _keyframe_folder(state: Path | None, playback: Playback | None) -> Path:
+    """The folder of the keyframes of this start.
+
+    Raises:
+        InputError: the robot has no state folder.
+    """
+    if state is None:
+        raise InputError("a robot that learns keeps keyframes; give --state, in Python state=")
+    folder = state / KEYFRAMES
+    if playback is None or not playback.resume:
+        shutil.rmtree(folder, ignore_errors=True)
+    return folder
 
 
 def _state_folder(given: StrPath | None, is_needed: bool, stack: ExitStack) -> Path | None:

@@ -13,8 +13,9 @@ from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeConfig
 from fcslam.lidar.backend import FinishedSubmap, LidarBackend
 from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
-from fcslam.records import CameraImage, Channel, DetectorFile, KeyscanId, LaserModel, LaserScan, Place
+from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, KeyscanId, LaserModel, LaserScan, Place
 from fcslam.robot.image_buffer import KeyframeImage
+from fcslam.robot.keyframe_folder import KeyframeFolder
 from fcslam.robot.own_places import OwnPlaces, OwnPlacesConfig
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
 from fcslam.robot.words import SendingConfig, Sends, WordSender, without_ranges
@@ -59,10 +60,15 @@ class NewImage:
 
 @dataclass(frozen=True, slots=True)
 class NewDetector:
-    """Another network for camera images, from the next keyscan on."""
+    """Another network for camera images, from now on; buffered images are described again at once."""
 
     file: DetectorFile
     path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceKeyframes:
+    """Write where the keyframes of the present session are; the robot stands still and may learn from them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,22 +76,34 @@ class SessionEnd:
     """The present session ends; the next keyscan begins another one."""
 
 
-BackendInput = NewKeyscan | NewImage | NewDetector | SessionEnd
+PLACED_AFTER, PLACED_AFTER_SHARE = 20, 0.1
+"""Keyframes after which the poses of all are written again, and as a share of those that there are."""
+
+BackendInput = NewKeyscan | NewImage | NewDetector | PlaceKeyframes | SessionEnd
 
 
 class RobotBackend:
     """Handles the inputs of one robot, session after session. The epoch is the number of the session, from 0."""
 
-    def __init__(self, robot: str, config: SessionConfig) -> None:
+    def __init__(self, robot: str, config: SessionConfig, keyframes: Path | None = None) -> None:
         """Load the detector of camera images and, if the robot sends words, their vocabulary.
 
+        Args:
+            robot: its name.
+            config: its settings.
+            keyframes: folder that keeps the keyframes, for a process that learns from them; None: they are not kept.
+
         Raises:
+            StateError: the folder cannot be written.
             FeatureError: the detector is a network whose weights cannot be used, or there are no words for it.
             InputError: the file of the vocabulary cannot be read.
         """
         self._robot = robot
         self._config = config
-        self._view_extractor = ViewExtractor(config.views)
+        self._folder = None if keyframes is None else KeyframeFolder(keyframes)
+        self._view_extractor = ViewExtractor(config.views, self._folder)
+        self._unplaced = self._placed = 0
+        """Keyframes since their poses were written last, and all until then."""
         self._words = WordSender(config.words) if config.sends is Sends.WORDS else None
         self._session = _Session(robot, 0, self._view_extractor, config)
         if self._words is not None:
@@ -114,15 +132,33 @@ class RobotBackend:
             case NewKeyscan():
                 return self._session.add(input)
             case NewImage():
-                self._session.describe(input)
+                if self._session.describe(input):
+                    self._place_sometimes()
             case NewDetector():
                 self._set_detector(input.file, input.path)
+                return self._session.announcement()
+            case PlaceKeyframes():
+                self._place()
             case SessionEnd():
                 rest = self._session.finish()
+                self._place()
+                if self._folder is not None:
+                    self._folder.part += 1
                 self._view_extractor.reset()
                 self._session = _Session(self._robot, self._session.epoch + 1, self._view_extractor, self._config)
                 return rest
         return []
+
+    def _place_sometimes(self) -> None:
+        self._unplaced += 1
+        if self._unplaced >= max(PLACED_AFTER, PLACED_AFTER_SHARE * self._placed):
+            self._place()
+
+    def _place(self) -> None:
+        """Write the poses of the keyframes, if these are kept."""
+        if self._folder is not None:
+            self._folder.place(self._session.keyscan_poses())
+        self._placed, self._unplaced = self._placed + self._unplaced, 0
 
     def _set_detector(self, file: DetectorFile, path: Path) -> None:
         if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
@@ -156,19 +192,24 @@ class _Session:
     def add(self, input: NewKeyscan) -> list[Body]:
         """Add the next keyscan; returns it with its odometry, and the submap that it completes."""
         self._lasers = input.lasers
-        bodies = [*self._announcement(), *essential(input)]
+        bodies = [*self.announcement(), *essential(input)]
         submap = self._lidar.add(input.keyscan)
         return bodies if submap is None else [*bodies, *self._submap_bodies(submap)]
 
-    def describe(self, input: NewImage) -> None:
-        """Describe an image and keep the view until the submap around it is complete."""
+    def keyscan_poses(self) -> FloatArray:
+        """Of every keyscan in the robot's own map, shape (N, 3), metres and radians."""
+        return self._lidar.keyscan_poses()
+
+    def describe(self, input: NewImage) -> bool:
+        """Describe an image and keep the view until the submap around it is complete; returns whether it is one."""
         view = self._view_extractor.describe(input.image, input.scan, input.pose, input.scans)
         if view is not None:
             self._views.append(view)
+        return view is not None
 
     def finish(self) -> list[Body]:
         """End the session; returns the open submaps."""
-        announcement, rest = self._announcement(), self._lidar.finish()
+        announcement, rest = self.announcement(), self._lidar.finish()
         last = rest[-1:]
         return [*announcement, *(body for submap in rest for body in self._submap_bodies(submap, submap in last))]
 
@@ -184,7 +225,7 @@ class _Session:
         self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
         return [*bodies, *(self._camera_place(view) for view in shown)]
 
-    def _announcement(self) -> list[Body]:
+    def announcement(self) -> list[Body]:
         """A hello at the start and if there is one more laser or another detector, then the camera places that this
         detector describes again."""
         hello, before = self._hello(), self._announced

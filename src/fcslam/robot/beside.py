@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Protocol
 
 from fcslam.errors import FeatureError
@@ -47,15 +48,16 @@ class Inline:
 class Beside:
     """Runs the back end in the only worker of an executor, which may be another process."""
 
-    def __init__(self, robot: str, config: SessionConfig, executor: Executor) -> None:
-        """Start the back end.
+    def __init__(self, robot: str, config: SessionConfig, executor: Executor, keyframes: Path | None = None) -> None:
+        """Start the back end; ``keyframes`` as in ``RobotBackend``.
 
         Raises:
+            StateError: the folder of keyframes cannot be written.
             FeatureError: the detector is a network whose weights cannot be used.
         """
         self._robot = robot
         self._executor = executor
-        executor.submit(_begin, robot, config).result()
+        executor.submit(_begin, robot, config, keyframes).result()
 
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
         """Queue the next input."""
@@ -81,8 +83,8 @@ _backends: dict[str, RobotBackend] = {}
 """The back ends that run in this worker, by robot."""
 
 
-def _begin(robot: str, config: SessionConfig) -> None:
-    _backends[robot] = RobotBackend(robot, config)
+def _begin(robot: str, config: SessionConfig, keyframes: Path | None) -> None:
+    _backends[robot] = RobotBackend(robot, config, keyframes)
 
 
 def _process(robot: str, input: BackendInput) -> list[Body]:

@@ -57,13 +57,22 @@ class DetectorUpdates:
             ) from error
         self._fetched.put(file)
 
+    @property
+    def has_news(self) -> bool:
+        """Whether a detector waits that the front end has not got."""
+        return not self._fetched.empty()
+
+    def is_due(self, record: int) -> bool:
+        """Whether an interrupted recording applied a detector before this record."""
+        return record in self._applied
+
     def apply_due(self, record: int, catching_up: bool) -> None:
         """Give the front end the detector that is due before this record, counted from 0."""
         file = self._applied.get(record)
         is_new = not catching_up and record > max(self._applied, default=-1)
         if file is None and is_new and not self._fetched.empty():
             file = self._fetched.get()
-            if file in self._applied.values():
+            if self._applied and file == self._applied[max(self._applied)]:
                 return
             self._outbox.record_detector_update(record, file)
             self._applied[record] = file

@@ -26,6 +26,7 @@ from fcslam.robot.backend import (
     NewDetector,
     NewImage,
     NewKeyscan,
+    PlaceKeyframes,
     RobotBackend,
     SessionConfig,
     SessionEnd,
@@ -169,7 +170,7 @@ class RobotFrontend:
         return packets
 
     def set_detector(self, file: DetectorFile, path: Path) -> "Future[list[Body]]":
-        """Use another network for camera images from now on; the next keyscan describes buffered images again.
+        """Use another network for camera images from now on; it describes buffered images again.
 
         Args:
             file: the detector as the cloud announced it.
@@ -179,6 +180,10 @@ class RobotFrontend:
             Done when the back end uses it, or refuses it with the ``FeatureError`` of ``RobotBackend.process``.
         """
         return self._submit(NewDetector(file, path))
+
+    def place_keyframes(self) -> None:
+        """Have the back end write where the keyframes are, if it keeps them."""
+        self._submit(PlaceKeyframes())
 
     def begin_session(self) -> None:
         """End the present session and begin another: the next scan is of another place, as after a ride in a lift."""

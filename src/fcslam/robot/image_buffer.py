@@ -41,10 +41,14 @@ class ImageBuffer:
     def __iter__(self) -> Iterator[KeyframeImage]:
         return iter(self._images.values())
 
-    def add(self, image: KeyframeImage) -> None:
-        """Add the image of a keyscan that has none; drop the oldest images if the buffer is full."""
+    def add(self, image: KeyframeImage) -> list[int]:
+        """Add the image of a keyscan that has none; drop the oldest images if the buffer is full, and return the
+        keyscans of these."""
         self._images[image.keyscan] = image
+        dropped = []
         self._bytes += len(image.encoded)
         while len(self._images) > self._config.most_images or self._bytes > 1e6 * self._config.most_megabytes:
             oldest = self._images.pop(next(iter(self._images)))
             self._bytes -= len(oldest.encoded)
+            dropped.append(oldest.keyscan)
+        return dropped

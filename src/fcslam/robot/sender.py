@@ -54,8 +54,8 @@ class Sender:
         """Largest number of packets in a batch; halved when the cloud refuses the size."""
         self._known_refusals = 0
         """Number of refused packets that the cloud has reported and this robot has read."""
-        self._known: set[DetectorFile] = set()
-        """Detectors that were downloaded, or cannot be."""
+        self._announced: list[DetectorFile] = []
+        """Detectors of the last announcement, which were downloaded or cannot be. The cloud may go back to others."""
         self._correction = -1
         self._failures = 0
         self._last_reply_s = -np.inf
@@ -181,11 +181,15 @@ class Sender:
                 case Correction() as newest if packet.epoch == self._outbox.epoch and newest.version > self._correction:
                     self._correction = newest.version
                     self._correct(packet.epoch, newest)
-                case DetectorUpdate(file=file) if file not in self._known:
-                    self._fetch(file)
+
+        announced = [packet.body.file for packet in packets if isinstance(packet.body, DetectorUpdate)]
+        for file in announced:
+            if file not in self._announced:
+                self._fetch(file)
+                self._announced.append(file)
+        self._announced = announced or self._announced
 
     def _fetch(self, file: DetectorFile) -> None:
         """Download a detector; without the file the robot keeps its present one."""
         with suppress(CloudError):
             self._keep(file, self._transport.detector(file.channel, file.version))
-        self._known.add(file)

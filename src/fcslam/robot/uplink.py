@@ -75,6 +75,12 @@ class Uplink:
         self._detector_updates.apply_due(self._records, self.is_catching_up)
         self._records += 1
 
+    def between_records(self) -> None:
+        """Give the front end a detector that came while no record does: the robot stands still."""
+        # A resumed recording takes it at the same number again.
+        if self._detector_updates.has_news or self._detector_updates.is_due(self._records):
+            self.before_record()
+
     def put(self, packets: Sequence[Packet]) -> None:
         """Store the next packets of the front end, later."""
         if packets:

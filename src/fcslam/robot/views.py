@@ -20,6 +20,7 @@ from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.scan import point_scan
 from fcslam.records import CameraImage, Codes, DetectorFile, FloatArray, LaserScan, frozen
 from fcslam.robot.image_buffer import ImageBuffer, ImageBufferConfig, KeyframeImage
+from fcslam.robot.keyframe_folder import KeyframeFolder
 
 SCAN_AGE_S = 1.0
 """Scans of several lasers that are older than the newest by more are not combined with it."""
@@ -65,8 +66,8 @@ class CameraView:
 class ViewExtractor:
     """Picks images that show something new and describes them."""
 
-    def __init__(self, config: ViewsConfig) -> None:
-        """Load the detector.
+    def __init__(self, config: ViewsConfig, folder: KeyframeFolder | None = None) -> None:
+        """Load the detector; ``folder`` keeps the keyframes that are in the image buffer.
 
         Raises:
             FeatureError: the detector is a network whose weights cannot be used.
@@ -74,6 +75,7 @@ class ViewExtractor:
         self._config = config
         self._detector = make_detector(config.detector, config.orb, config.onnx)
         self._image_buffer = ImageBuffer(config.image_buffer)
+        self._folder = folder
         self._last: tuple[int, FloatArray] | None = None
         """Keyscan and odometry of the last view."""
 
@@ -113,7 +115,9 @@ class ViewExtractor:
         keyframe = KeyframeImage(pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
         view = self._describe(keyframe, picture)
         if view is not None:
-            self._image_buffer.add(keyframe)
+            dropped = self._image_buffer.add(keyframe)
+            if self._folder is not None:
+                self._folder.drop(dropped)
         return view
 
     @property
@@ -146,6 +150,8 @@ class ViewExtractor:
         positions, placed = locate_among(pixels, image.camera, image.surroundings, ceiling_m)
         if placed.sum() < self._config.fewest_keypoints:
             return None
+        if self._folder is not None:
+            self._folder.keep(image, features, self._detector.version)
         positions[:, :2] = se2.transform(image.T_keyscan_image, positions[:, :2])
         keypoints, codes = frozen(positions[placed], np.float32), frozen(features.descriptors[placed], np.uint8)
         return CameraView(image.keyscan, keypoints, codes, self._detector.version)

@@ -12,7 +12,7 @@ ROUNDS_FILE: Final = "rounds.csv"
 """In the output folder of `fcslam federate`."""
 MOST_ROUNDS: Final = 10_000
 _LOSS = "loss_"
-_MEASURES = ("repeatability", "mma_3px")
+_MEASURES = ("repeatability", "mma_3px", "revisit_recall", "places_found")
 
 
 def read_rounds(folder: Path) -> list[LearningRound]:
@@ -42,6 +42,7 @@ def _round(row: dict[str, str]) -> LearningRound:
         released=row["released"] == "1",
         robots=[robot for robot in row["robots"].split(" | ") if robot],
         left_out=row["left_out"],
+        reason=row.get("reason") or "",
         losses={name.removeprefix(_LOSS): number for name, number in known.items() if name.startswith(_LOSS)},
         measures={name: number for name, number in known.items() if name in _MEASURES},
     )

@@ -8,10 +8,10 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from fcslam.cloud.stage_times import StageTotal
-from fcslam.service.mission_folder import MissionFolder
 
 LONGEST_PAUSE_S = 30.0
 STEADY_S = 60.0
@@ -88,11 +88,11 @@ class Supervisor:
     """One worker at a time, until ``stop``."""
 
     def __init__(
-        self, folder: MissionFolder, clock: Callable[[], float], listen: Listen,
+        self, folder: Path, clock: Callable[[], float], listen: Listen,
         command: Sequence[str] = WORKER, start: StartWorker = start_worker,
     ) -> None:  # fmt: skip
-        """``start`` makes a process of ``command``, to which the mission's folder is added."""
-        self._command, self._start = (*command, str(folder.path)), start
+        """``start`` makes a process of ``command``, to which the folder, of a mission for instance, is added."""
+        self._command, self._start = (*command, str(folder)), start
         self._clock, self._listen = clock, listen
         self._stopping = threading.Event()
         self._lock = threading.Lock()

@@ -1,4 +1,4 @@
-"""All limits of the format, versions 2 to 4. Packets beyond a limit are neither written nor read."""
+"""All limits of the format, versions 2 to 5. Packets beyond a limit are neither written nor read."""
 
 from fcslam.records import Channel
 
@@ -7,6 +7,8 @@ FLOOR_VERSION = 3
 """Of a hello that names a floor. All other packets are of version 2, which receivers without floors read."""
 WORDS_VERSION = 4
 """Of what only a robot sends that sends words in place of descriptors."""
+TAUGHT_VERSION = 5
+"""Of codes that the cloud gives to a robot that learns."""
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
@@ -31,6 +33,8 @@ BYTES_PER_AXIS = 2
 MAXIMUM_WORDS = 65536
 """Words of a vocabulary that robots and cloud share."""
 BYTES_PER_WORD = 2
+BYTES_PER_ROW = 2
+"""Of the number of a keypoint in its place."""
 
 TILE_CELLS = 256
 """Cells along each side of a map tile."""

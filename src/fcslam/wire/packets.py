@@ -23,11 +23,12 @@ from fcslam.wire.limits import (
     MAXIMUM_PACKET_BYTES,
     MAXIMUM_SEQUENCE,
     PROTOCOL_VERSION,
+    TAUGHT_VERSION,
     WORDS_VERSION,
 )
-from fcslam.wire.messages import Body, Hello, Packet, PacketKind
+from fcslam.wire.messages import Body, Hello, Packet, PacketKind, TaughtPlace
 
-_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION)
+_VERSIONS = (PROTOCOL_VERSION, FLOOR_VERSION, WORDS_VERSION, TAUGHT_VERSION)
 
 
 class Label(NamedTuple):
@@ -165,6 +166,8 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
 
 def _version(body: Body) -> int:
     match body:
+        case TaughtPlace():
+            return TAUGHT_VERSION
         case WordPlace() | MapTile():
             return WORDS_VERSION
         case Keyscan(ranges_m=ranges_m) if not len(ranges_m):

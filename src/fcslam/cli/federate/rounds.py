@@ -18,15 +18,16 @@ if TYPE_CHECKING:
 def round_line(row: Mapping[str, str], rounds: int) -> str:
     """The line of a row of ``rounds.csv``: robots, figures, traffic and whether the new detector is released."""
     released, returned, judged = row["released"] == "1", row["returned"] == "1", row["score"] != "nan"
-    outcome = "back to the best" if returned else "not released" if judged else "not judged"
+    reason = row.get("reason", "")
+    outcome = "back to the best" if returned else "not released" if judged or reason else "not judged"
     shown = {"detector": "loss_detector", "contrastive": "loss_contrastive", "repeatability": "repeatability",
-             "MMA": "mma_3px"}  # fmt: skip
+             "MMA": "mma_3px", "revisits": "revisit_recall", "places": "places_found"}  # fmt: skip
     parts = [
         f"round {row['round']}/{rounds}",
         f"{len(row['robots'].split(' | '))} robots",
         *(f"{name} {float(row[column]):.3f}" for name, column in shown.items() if row.get(column)),
         f"down {float(row['bytes_down']) / 1e6:.1f} MB, up {float(row['bytes_up']) / 1e6:.1f} MB",
-        f"released {row['version']}" if released else outcome,
+        f"released {row['version']}" if released else f"{outcome}: {reason}" if reason else outcome,
         *([f"without {row['left_out']}"] if row["left_out"] else []),
     ]
     return "  ".join(parts)

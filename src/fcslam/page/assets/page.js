@@ -337,7 +337,7 @@ async function showLearning() {
     item.append(rounds[0].losses[name] === undefined ? name.replaceAll("_", " ") : `${name}: loss, over its largest value`);
     return item;
   }));
-  at("rounds").replaceChildren(...rounds.toReversed().map((r) => row(`${r.round}${r.released ? ", released" : ""}`, r.measures.mma_3px?.toFixed(3) ?? "–", r.robots.join(", "), r.left_out)));
+  at("rounds").replaceChildren(...rounds.toReversed().map((r) => row(`${r.round}${r.released ? ", released" : ""}`, (r.measures.mma_3px ?? r.measures.revisit_recall)?.toFixed(3) ?? "–", r.robots.join(", "), [r.reason, r.left_out].filter(Boolean).join("; "))));
 }
 
 // ---- Map ----

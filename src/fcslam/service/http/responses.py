@@ -141,10 +141,9 @@ class LearningRound(Settings):
     released: bool = Field(description="whether it was the best so far, so robots get it")
     robots: list[str] = Field(description="whose updates counted")
     left_out: str = Field(description="whose did not, and why")
+    reason: str = Field(description="of the gate for releasing it or not; empty without a gate")
     losses: dict[str, float]
-    measures: dict[str, float] = Field(
-        description="on held-out images, in [0, 1]; empty if the round was not evaluated"
-    )
+    measures: dict[str, float] = Field(description="of the evaluation, in [0, 1]; empty if the round was not evaluated")
 
 
 class MapSeparation(Settings):

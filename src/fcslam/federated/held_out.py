@@ -1,0 +1,125 @@
+"""Pairs of a robot's keyframes that it never trains on, and how a version of the detector does on them.
+
+A keyframe is held out by where it is, so that a pair that is held out shares no image with one that is trained on. The
+choice is made once for each keyframe and stays, also when the map moves.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fcslam.cloud.teaching import PlacePoints
+from fcslam.features.codes import Matches, mutual_matches
+from fcslam.features.dense import sample_codes
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.revisits import Keyframe, revisits_in_map
+from fcslam.places.hypotheses import rigid_hypotheses
+from fcslam.places.motions import MotionConfig
+from fcslam.records import Codes, FloatArray
+
+COLUMNS: Final = ("revisit_recall", "places_found")
+"""Of what a robot reports about each pair: the share of the shared keypoints that match, and whether the pair is more
+similar than any two keyframes of different places."""
+APART_M: Final = 8.0
+"""Keyframes farther apart than this show different places."""
+MOST_APART: Final = 300
+"""Pairs of keyframes of different places that are compared."""
+MOST_PAIRS: Final = 1000
+"""Pairs that a robot reports on."""
+
+Judgement = NDArray[np.float32]
+"""Shape (P, 2): a row for each pair, by ``COLUMNS``; a place is found (1), not found (0), or NaN without others."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOutPairs:
+    """The pairs on which versions are compared."""
+
+    frames: Sequence[Keyframe] = field(default=())
+    revisits: Sequence[tuple[int, int, NDArray[np.int64]]] = field(default=())
+    """Numbers of two frames that show the same place, and of their keypoints that are the same points, (M, 2)."""
+    apart: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    """Numbers of two frames that show different places, shape (N, 2)."""
+
+    @classmethod
+    def of(cls, frames: Sequence[Keyframe], T_own_base: FloatArray) -> "HeldOutPairs":
+        """Of keyframes that are held out, at their estimated poses in the robot's map, shape (N, 3)."""
+        revisits = list(revisits_in_map(frames, T_own_base))
+        chosen = np.linspace(0, len(revisits) - 1, min(len(revisits), MOST_PAIRS)).astype(int)
+        first, second = np.triu_indices(len(frames), 1)
+        distances = np.hypot(*(T_own_base[first, :2] - T_own_base[second, :2]).T)
+        far = np.flatnonzero(distances > APART_M)
+        far = far[np.linspace(0, len(far) - 1, min(len(far), MOST_APART)).astype(int)]
+        return cls(frames, [revisits[k] for k in chosen], np.column_stack((first[far], second[far])))
+
+
+@torch.inference_mode()
+def judge(network: KeypointNetwork, pairs: HeldOutPairs, device: torch.device) -> Judgement:
+    """Judge the codes of a network at the keypoints that the frames have, so that versions differ in codes alone."""
+    codes = [_codes(network, frame, device) for frame in pairs.frames]
+    found = [_right(codes[i], codes[j], rows) for i, j, rows in pairs.revisits]
+    same = [_inliers(pairs, codes, i, j) for i, j, _ in pairs.revisits]
+    other = [_inliers(pairs, codes, i, j) for i, j in pairs.apart.tolist()]
+    judged = np.full((len(found), len(COLUMNS)), np.nan, np.float32)
+    judged[:, 0] = found
+    if other:
+        judged[:, 1] = np.array(same) > max(other)
+    return judged
+
+
+def check_judgement(array: object) -> Judgement:
+    """A robot's report, which comes from outside.
+
+    Raises:
+        ValueError: it is none; the text says why.
+    """
+    if not isinstance(array, np.ndarray) or array.dtype != np.float32:
+        raise ValueError("a report on pairs that is no array of float32")
+    if array.ndim != 2 or array.shape[1] != len(COLUMNS) or len(array) > MOST_PAIRS:
+        raise ValueError(f"a report on pairs of shape {array.shape}, not (P, {len(COLUMNS)}) with P up to {MOST_PAIRS}")
+    recall, found = array.T
+    if not (np.all((recall >= 0.0) & (recall <= 1.0)) and np.all(np.isnan(found) | (found == 0.0) | (found == 1.0))):
+        raise ValueError("a report on pairs with numbers that no pair can have")
+    return array
+
+
+def same_pairs(first: Mapping[str, Judgement], second: Mapping[str, Judgement]) -> dict[str, NDArray[np.float64]]:
+    """By robot, the first version's report less the second one's, of robots that reported on both in the same pairs."""
+    return {
+        robot: rows.astype(np.float64) - second[robot]
+        for robot, rows in sorted(first.items())
+        if robot in second and len(rows) == len(second[robot])
+    }
+
+
+def _codes(network: KeypointNetwork, frame: Keyframe, device: torch.device) -> Codes:
+    grey = torch.from_numpy(frame.image.astype(np.float32) / 255.0)[None, None].to(device)
+    return sample_codes(network(grey).code_logits[0].float().cpu().numpy(), frame.features.keypoints_px)
+
+
+def _right(a: Codes, b: Codes, rows: NDArray[np.int64]) -> float:
+    """Share of the shared keypoints that are each other's nearest by their codes."""
+    matched = {(i, j) for i, j in mutual_matches(a, b).pairs.tolist()}
+    return sum((i, j) in matched for i, j in rows.tolist()) / len(rows)
+
+
+def _inliers(pairs: HeldOutPairs, codes: Sequence[Codes], i: int, j: int) -> int:
+    first, second = (
+        PlacePoints(pairs.frames[k].positions[pairs.frames[k].placed], codes[k][pairs.frames[k].placed]) for k in (i, j)
+    )
+    return inliers(first, second)
+
+
+def inliers(first: PlacePoints, second: PlacePoints) -> int:
+    """Keypoints that the best motion between two places explains, as the cloud compares camera places."""
+    config = MotionConfig()
+    matches = mutual_matches(first.codes, second.codes, config.hamming_limit)
+    a, b, rows = first.positions, second.positions, matches.pairs
+    level = np.abs(a[rows[:, 0], 2] - b[rows[:, 1], 2]) <= config.level_m
+    kept = Matches(rows[level], matches.distances[level])
+    flat = a[:, :2].astype(np.float32), b[:, :2].astype(np.float32)
+    return max((each.inlier_count for each in rigid_hypotheses(*flat, kept, config.hypotheses)), default=0)

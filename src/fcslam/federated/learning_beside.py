@@ -1,0 +1,76 @@
+"""Starts and stops the process in which a robot learns beside its mapping; loads no library of training itself."""
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fcslam.federated.live_settings import RobotLearningSettings
+
+STOP_S: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class RobotLearningPlan:
+    """Where and how a robot learns."""
+
+    host: str
+    """Of the server's port of learning."""
+    port: int
+    settings: RobotLearningSettings
+    ca: Path | None = None
+    """Certificate of the authority that signed the server's; None for no encryption."""
+    robot_key: Path | None = None
+    """The robot's private key; None in a fleet without authentication."""
+
+
+class LearningBeside:
+    """The process; it ends with ``close``."""
+
+    def __init__(
+        self, plan: RobotLearningPlan, robot: str, keyframes: Path, cache: Path, on_notice: Callable[[str], None]
+    ) -> None:
+        """Start it. ``on_notice`` is called with lines for the user, in a thread of its own."""
+        files = {"--ca": plan.ca, "--robot-key": plan.robot_key}
+        options = [word for name, file in files.items() if file is not None for word in (name, str(file))]
+        words = [str(keyframes), str(cache), plan.host, str(plan.port), robot, plan.settings.model_dump_json()]
+        command = [sys.executable, "-m", "fcslam.federated.robot_learning", *words, *options]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._on_notice = on_notice
+        self._thread = threading.Thread(target=self._listen, name="learning", daemon=True)
+        self._thread.start()
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it has ended by itself."""
+        return self._process.poll() is not None
+
+    def set_idle(self, first_epoch: int | None) -> None:
+        """Say that the robot is idle, with the epoch of its first session; None: it is busy."""
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.write(b"busy\n" if first_epoch is None else f"idle {first_epoch}\n".encode())
+            self._process.stdin.flush()
+
+    def close(self) -> None:
+        """End it."""
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(STOP_S)
+        self._process.kill()
+        self._process.wait()
+        self._thread.join(STOP_S)
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout:
+            for line in self._process.stdout:
+                with suppress(ValueError, KeyError, TypeError):
+                    self._on_notice(f"learning: {json.loads(line)['notice']}")

@@ -1,0 +1,141 @@
+"""Keyframes on the robot's own disk, for the process that learns from them beside the robot. They never leave it.
+
+One file for each keyframe, written when it is described, and one for each session with the poses of its keyscans.
+"""
+
+import logging
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fcslam.errors import InputError, StateError
+from fcslam.features.detector import ImageFeatures
+from fcslam.features.lidar_depth import LidarView
+from fcslam.geometry import se2
+from fcslam.records import CameraModel, FloatArray, Transform, frozen
+from fcslam.robot.image_buffer import KeyframeImage
+from fcslam.storage.state_file import State, read_state, write_state
+
+FITS: Final = "fcslam keyframes 1"
+_POSES, _SUFFIX = "poses", ".state"
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeptKeyframe:
+    """A keyframe as the process beside the robot reads it."""
+
+    part: int
+    """Session of this start, from 0."""
+    image: KeyframeImage
+    features: ImageFeatures
+    detector_version: str
+    T_own_base: FloatArray
+    """Estimated pose at the image in the robot's own map, shape (3,), metres and radians."""
+
+
+class KeyframeFolder:
+    """Writes the keyframes of one start of a robot."""
+
+    def __init__(self, folder: Path) -> None:
+        """``folder``: created if it does not exist.
+
+        Raises:
+            StateError: it cannot be written.
+        """
+        self._folder = folder
+        self._is_failed = False
+        self.part = 0
+        """Session whose keyframes are written."""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StateError(f"{folder}: cannot keep keyframes ({error}); give another --state") from error
+
+    def keep(self, image: KeyframeImage, features: ImageFeatures, detector_version: str) -> None:
+        """Write a keyframe, or the one of this keyscan again with a newer detector."""
+        state: State = {
+            "encoded": np.frombuffer(image.encoded, np.uint8),
+            "camera": {**asdict(image.camera), "T_base_camera": np.concatenate(image.camera.T_base_camera)},
+            "surroundings": {
+                str(number): {"returns": view.returns, "origin": view.origin, "spacing_rad": float(view.spacing_rad)}
+                for number, view in enumerate(image.surroundings)
+            },
+            "T_keyscan_image": image.T_keyscan_image,
+            "keypoints_px": features.keypoints_px,
+            "scores": features.scores,
+            "descriptors": features.descriptors,
+            "detector_version": detector_version,
+        }  # fmt: skip
+        self._write(self._path(image.keyscan), state)
+
+    def drop(self, keyscans: Iterable[int]) -> None:
+        """Remove keyframes of this session."""
+        for keyscan in keyscans:
+            self._path(keyscan).unlink(missing_ok=True)
+
+    def place(self, T_own_keyscan: FloatArray) -> None:
+        """Write the poses of all keyscans of this session in the robot's own map, shape (N, 3)."""
+        self._write(self._folder / f"{self.part}-{_POSES}{_SUFFIX}", {"T_own_keyscan": T_own_keyscan})
+
+    def _path(self, keyscan: int) -> Path:
+        return self._folder / f"{self.part}-{keyscan}{_SUFFIX}"
+
+    def _write(self, path: Path, state: State) -> None:
+        """Mapping goes on without the keyframes of a full disk."""
+        if self._is_failed:
+            return
+        try:
+            write_state(path, FITS, state)
+        except OSError as error:
+            self._is_failed = True
+            _log.warning("%s: no keyframe is kept from now on (%s)", self._folder, error)
+
+
+def read_keyframes(folder: Path, most: int) -> list[KeptKeyframe]:
+    """The newest keyframes whose poses are known, by session and keyscan; a file that is damaged is left out.
+
+    Args:
+        folder: written by a ``KeyframeFolder``, perhaps at this moment.
+        most: largest number of keyframes.
+    """
+    numbers = sorted(
+        tuple(map(int, path.stem.split("-"))) for path in folder.glob(f"*{_SUFFIX}") if not path.stem.endswith(_POSES)
+    )
+    poses: dict[int, FloatArray] = {}
+    for part in {part for part, _ in numbers}:
+        state = _read(folder / f"{part}-{_POSES}{_SUFFIX}")
+        poses[part] = np.empty((0, 3)) if state is None else state["T_own_keyscan"]
+    known = [(part, keyscan) for part, keyscan in numbers if keyscan < len(poses[part])]
+    found = ((part, poses[part][keyscan], keyscan) for part, keyscan in known[-most:])
+    frames = (_keyframe(folder, part, keyscan, pose) for part, pose, keyscan in found)
+    return [frame for frame in frames if frame is not None]
+
+
+def _keyframe(folder: Path, part: int, keyscan: int, T_own_keyscan: FloatArray) -> KeptKeyframe | None:
+    state = _read(folder / f"{part}-{keyscan}{_SUFFIX}")
+    if state is None:
+        return None
+    x, y, z, *rotation = state["camera"].pop("T_base_camera").tolist()
+    camera = CameraModel(**state["camera"], T_base_camera=Transform((x, y, z), tuple(rotation)))
+    surroundings = tuple(
+        LidarView(view["returns"], view["origin"], view["spacing_rad"]) for view in state["surroundings"].values()
+    )
+    image = KeyframeImage(keyscan, state["encoded"].tobytes(), camera, surroundings, state["T_keyscan_image"])
+    features = ImageFeatures(
+        frozen(state["keypoints_px"], np.float32), frozen(state["scores"], np.float32),
+        frozen(state["descriptors"], np.uint8),
+    )  # fmt: skip
+    return KeptKeyframe(
+        part, image, features, state["detector_version"], se2.compose(T_own_keyscan, image.T_keyscan_image)
+    )
+
+
+def _read(path: Path) -> State | None:
+    try:
+        return read_state(path, FITS)
+    except InputError:
+        return None
