@@ -62,6 +62,7 @@ def learn_together(
         for number, source in enumerate(sources):
             display.show("looking for what was seen again", number, len(sources))
             clients.append(_learner(source, config, folder / "robots" / source.name))
+        display.show("looking for what was seen again", len(sources), len(sources))
 
         def client_of(context: Context) -> "RobotClient":
             return clients[int(context.node_config["partition-id"])]
