@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 ROUNDS, STEPS, JUDGED = 6, 50, 2
 """Rounds, steps of each robot in a round, and rounds between two decisions: about two minutes of one processor."""
+HELD_OUT = 3
+"""One in so many squares of each robot's map is held out: of one in four, short drives have fewer than 200 pairs."""
 
 
 def learn_together(
@@ -86,7 +88,7 @@ def learn_together(
 def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotClient":
     """A robot that drove its recording, with what it saw again."""
     from fcslam.federated.client import RobotClient, seeded_noise
-    from fcslam.federated.live_settings import RobotLearningSettings
+    from fcslam.federated.live_settings import HeldOutSettings, RobotLearningSettings
     from fcslam.federated.own_examples import own_examples
     from fcslam.robot.backend import RobotBackend
     from fcslam.robot.beside import Inline
@@ -98,7 +100,8 @@ def _learner(source: "Source", config: "MissionConfig", folder: Path) -> "RobotC
     for record in source.records():
         robot.process(record)
     robot.finish()
-    examples = own_examples(keyframes, RobotLearningSettings(), (), 0)
+    settings = RobotLearningSettings(held_out=HeldOutSettings(every=HELD_OUT))
+    examples = own_examples(keyframes, settings, (), 0)
     noise = seeded_noise(source.name, config.seed)
     return RobotClient(
         source.name, keyframes, folder / "cache", noise, revisits=examples.revisits, held_out=examples.held_out
