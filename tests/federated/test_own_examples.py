@@ -1,4 +1,4 @@
-"""What a robot learns from: its keyframes on disk, split once and for all, and taught codes at the right pixels."""
+"""Examples of a robot that learns: keyframes on disk, split once and for all, and taught codes at the right pixels."""
 
 import asyncio
 import json
