@@ -1,6 +1,6 @@
 """Three instances over one PostgreSQL server whose machines fail: real processes on loopback.
 
-    python benchmarks/instances.py [--kills 30] [--restarts 5] [--cuts 1]
+    python benchmarks/instances.py [--kills 30] [--restarts 5] [--cuts 1] [--only latency]
 
 Ten missions of five robots each send to three instances of `fcslam serve --store`. Five simulated buildings are used
 twice. Each robot sends its packets in small batches to an instance chosen at random, and to the next one when it gets
@@ -449,6 +449,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--restarts", type=int, default=5)
     parser.add_argument("--cuts", type=int, default=1)
+    parser.add_argument("--only", choices=("latency", "faults"), help="one part")
     parser.add_argument("--recordings", type=Path, help="folder that keeps the recordings and their maps")
     chosen = parser.parse_args()
     if not HAS_POSTGRES:
@@ -460,9 +461,10 @@ def main() -> None:
         place.chmod(0o755)  # the server's user must reach its folder
         recordings = chosen.recordings or place
         buildings = [building(number, recordings / f"building{number}") for number in range(BUILDINGS)]
-        latency(place, buildings, report)
-        report.write()  # the faults take long
-        faults(chosen, place, buildings, report)
+        if chosen.only != "faults":
+            latency(place, buildings, report)
+        if chosen.only != "latency":
+            faults(chosen, place, buildings, report)
     report.write()
 
 
