@@ -239,6 +239,7 @@ def test_a_truncated_mission_file_is_refused_and_stays_as_it_is(tmp_path, share)
         with pytest.raises(SourceError) as refused:
             read(cut)
         assert "\n" not in str(refused.value)
+        assert "disk full" not in str(refused.value)
     assert cut.read_bytes() == whole[: int(share * len(whole))]
 
 

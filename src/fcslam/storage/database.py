@@ -203,4 +203,6 @@ def translate_errors(path: Path) -> Iterator[None]:
     except UnicodeDecodeError as error:  # in the names of tables, which SQLite does not check
         raise StoreError(f"{path}: broken") from error
     except (OSError, sqlite3.DatabaseError) as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            raise StoreError(f"{path}: damaged or cut off ({error}); use a copy of it") from error
         raise StoreError(f"{path}: cannot be read or written ({error}); is the disk full?") from error
