@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import parse_qsl, unquote, urlencode, urlsplit, urlunsplit
 
 from fcslam.errors import StoreError
@@ -21,7 +21,7 @@ from fcslam.storage.row_store import Result, StoreTable
 if TYPE_CHECKING:
     import psycopg
 
-    _Connection = psycopg.Connection[tuple[Any, ...]]
+    _Connection: TypeAlias = psycopg.Connection[tuple[Any, ...]]
 
 RETRY_S: Final = 5.0
 """A server that is gone is looked for this long, before anything was changed."""

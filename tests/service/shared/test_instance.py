@@ -48,7 +48,7 @@ def instance(postgres, name, room=10, clock=time.monotonic):
         return workers[-1]
 
     registry = Registry(postgres, name, f"process of {name}")
-    return Instance(registry, name, room, launch, lambda *_: None, lambda: None, clock), workers
+    return Instance(registry, name, room, launch, lambda *_: None, lambda: None, lambda: None, clock), workers
 
 
 def until(condition, timeout_s=30.0):
@@ -106,15 +106,16 @@ def test_two_instances_of_one_name_are_refused(registry, postgres):
     one.start()
     again = Registry(postgres, "same", "another process")
     with pytest.raises(ServiceError, match="another instance is called 'same'; stop it, or give this one another name"):
-        Instance(again, "same", 1, Started, lambda *_: None, lambda: None)
+        Instance(again, "same", 1, Started, lambda *_: None, lambda: None, lambda: None)
     one.close()
-    Instance(again, "same", 1, Started, lambda *_: None, lambda: None).close()
+    Instance(again, "same", 1, Started, lambda *_: None, lambda: None, lambda: None).close()
 
 
 def test_the_name_of_a_killed_instance_is_free_again_in_seconds(registry, postgres):
     assert Registry(postgres, "killed", "before").register(1)
     began = time.monotonic()
-    Instance(Registry(postgres, "killed", "after"), "killed", 1, Started, lambda *_: None, lambda: None).close()
+    after = Registry(postgres, "killed", "after")
+    Instance(after, "killed", 1, Started, lambda *_: None, lambda: None, lambda: None).close()
     assert time.monotonic() - began < LEASE_S + 3.0
 
 

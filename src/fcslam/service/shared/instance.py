@@ -49,7 +49,7 @@ class Instance:
 
     def __init__(
         self, registry: Registry, name: str, most_missions: int, launch: Launch, listen: Listen,
-        on_taken: Callable[[], None], clock: Callable[[], float] = time.monotonic,
+        on_taken: Callable[[], None], follow: Callable[[], None], clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         """Take the name.
 
@@ -60,6 +60,7 @@ class Instance:
             launch: starts a worker.
             listen: receives what happened to missions, whoever has their worker.
             on_taken: called when another process has taken the name, after this one was gone for a while.
+            follow: called at each step, to take over what other instances put into the store.
             clock: seconds.
 
         Raises:
@@ -67,7 +68,7 @@ class Instance:
             StoreError: the server cannot be used.
         """
         self._registry, self._name, self._most, self._launch = registry, name, most_missions, launch
-        self._listen, self._on_taken, self._clock = listen, on_taken, clock
+        self._listen, self._on_taken, self._follow, self._clock = listen, on_taken, follow, clock
         self._closing = threading.Event()
         self._take_name()
         self._held: dict[Lease, RunningWorker] = {}
@@ -151,6 +152,7 @@ class Instance:
             _log.warning("mission %d has a worker on another instance now", lease.mission)
             threading.Thread(target=self._held.pop(lease).stop, daemon=True).start()
         self.look()
+        self._follow()
         self._let_rest()
         self._spread()
 

@@ -139,7 +139,10 @@ class SharedMissions:
             self._registry = Registry(server, instance, process)
             self._opening = threading.Lock()
             self._opened: dict[str, SharedMission] = {}
-            self._instance = Instance(self._registry, instance, admission.missions, launch, listen, on_taken)
+            self.detectors.follow()
+            self._instance = Instance(
+                self._registry, instance, admission.missions, launch, listen, on_taken, self.detectors.follow
+            )
             if not any(known.is_open for known in self._instance.known.values()):
                 self._open_first()
             self._instance.start()
