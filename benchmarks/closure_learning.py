@@ -27,9 +27,9 @@ over buildings, of the difference to the bundled detector. The table of forgetti
 places, corrected, NMS 8 px; it needs FCSLAM_DATA.
 
 All seeds were fixed before the first run. The recipe was chosen on networks that were trained in buildings 301 to 310
-and measured in 501 to 503 and 511 to 514. --keep resumes by arm, seed and building; networks and mapped drives stay in FOLDER, and
-drives are mapped again only if their file is removed. It needs a GL library, and with the default size about an hour of
-one core.
+and measured in 501 to 503 and 511 to 514. --keep resumes by arm, seed and building; networks and mapped drives stay in
+FOLDER, and drives are mapped again only if their file is removed. It needs a GL library, and with the default size some
+50 minutes of one core.
 """
 
 import pickle
