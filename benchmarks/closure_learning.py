@@ -615,7 +615,7 @@ def draw(rows: Sequence[tuple]) -> Figure:
         axes.barh(range(len(arms)), values[:, 0], xerr=errors, color="tab:blue", height=0.6, capsize=3)
         axes.axvline(0.0, color="grey", linewidth=1)
         axes.set_yticks(range(len(arms)), arms)
-        axes.set_xlabel(f"{measure}, points above the bundled detector")
+        axes.set_xlabel(f"{measure}, points above bundled")
     figure.tight_layout()
     return figure
 
