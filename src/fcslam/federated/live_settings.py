@@ -77,7 +77,7 @@ class LiveRounds(FederatedSettings):
     normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
     trained: TrainedLayers = Field(default="codes", description="robots train the layers of the codes alone")
     compatible: float = Field(
-        default=2.0,
+        default=1.0,
         ge=0.0,
         description="weight of the loss that keeps descriptors compatible with those of the initial weights; 0 for off",
     )
