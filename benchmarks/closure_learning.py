@@ -99,8 +99,6 @@ ROBOTS = ("robot_1", "robot_2", "robot_3")
 LATER = ("robot_4", "robot_5", "robot_6")
 LIGHT = (Lighting.DAY, Lighting.EVENING, Lighting.LAMP_OFF)
 LOCAL_STEPS, PARTICIPATION = 10, 1.0 / 6.0
-FLEET_RATE, SINGLE_RATE = 2e-3, 1e-3
-"""Learning rates of federated training, whose mean over robots tolerates more, and of training in one place."""
 LIAR, POISONED = "robot_3", (0, 2, 4, 5, 7, 9)
 """The robot that poisons, and the numbers of the training buildings in which it does: 6 of 30 robots."""
 CORRECT_PX = 3.0
@@ -186,7 +184,7 @@ def main() -> None:
     examples = [fleet_examples(folder, chosen.fleets) for folder in fleets]
     settings = FederatedSettings(
         rounds=chosen.rounds, local_steps=LOCAL_STEPS, participation=PARTICIPATION, normalisation="frozen",
-        compatible=1.0, trained="codes", training=TrainingSettings(learning_rate=FLEET_RATE),
+        compatible=1.0, trained="codes", training=TrainingSettings(learning_rate=1e-3),
     )  # fmt: skip
     rows: list[tuple] = []
     forgetting: list[tuple] = []
@@ -400,9 +398,9 @@ def trained(
 def trained_here(
     start: Weights, revisits: RevisitExamples, settings: FederatedSettings, seed: int, steps: int
 ) -> KeypointNetwork:
-    """Training in one place, with the losses of a robot in the fleet."""
+    """Training in one place, with the losses and the rate of a robot in the fleet."""
     state = weights_to_network(start, settings.training.encoder).state_dict()
-    training = settings.training.model_copy(update={"steps": steps, "seed": seed, "learning_rate": SINGLE_RATE})
+    training = settings.training.model_copy(update={"steps": steps, "seed": seed})
     plan = LocalTrainingPlan(0, steps, compatible=settings.compatible)
     return train_codes(state, revisits, CodeInputs(), training, plan, torch.device("cpu")).network
 
