@@ -7,6 +7,7 @@ import pytest
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fusion_strategy import FusionStrategy
+from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import InputError, PacketError
 from fcslam.places.matcher import MatchDecision, MatcherConfig
@@ -102,7 +103,9 @@ def test_a_restored_cloud_has_the_map_and_goes_on(path):
     rest = [replace(BARE, id=KeyscanId("a", 1)), motion("a", 0, 1, STEP), replace(TILE, column=1)]
     packets = [Packet("a", 0, number, 10.0, body) for number, body in enumerate([*first, *rest])]
     cloud = cloud_of(path, *first)
-    again = Cloud.restored(fleet_config(path), 0, cloud.state(), packets[: len(first)])
+    applied = {PacketNumber("a", packet.sequence): packet for packet in packets[: len(first)]}
+    times = {number: packet.time for number, packet in applied.items()}
+    again = Cloud.restored(fleet_config(path), 0, cloud.state(), times, applied.__getitem__)
     for packet in packets[len(first) :]:
         cloud.receive(encode(packet))
         again.receive(encode(packet))
