@@ -130,7 +130,6 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
         for robot in robots:
             again = places[robot, weak] & places[robot, version]
             assert len(again) >= 0.9 * len(places[robot, weak]), "old places are described again"
-        assert any("of codes" in line for line in logs[0].read_text().splitlines()), "others taught a robot"
         service.send_signal(signal.SIGINT)
         service.wait(LIMIT_S)
     finally:
