@@ -344,7 +344,7 @@ _REASON_TEXT = {
     ReasonCode.RIVAL_PLACES: "closures from {value} separate places agree, but others from {limit} contradict them",
     ReasonCode.OUTSIDE_CLUSTER: "outside the dominant cluster",
     ReasonCode.CONTRADICTS_JOINT_GRAPH: "contradicts the joint graph",
-    ReasonCode.PATHS_CONTRADICT: "the paths of the two robots contradict: mean chi-square {value}, {limit} allowed",
+    ReasonCode.PATHS_CONTRADICT: "the paths of the two robots contradict: strain {value}, {limit} allowed",
     ReasonCode.SEPARATED: "the robot has a map of its own: the paths of {value} others contradict its path",
     ReasonCode.FALSE_BRIDGE: "one robot alone joins maps that contradict each other at {value} separate places",
     ReasonCode.VETOED: "vetoed by hand",

@@ -73,7 +73,7 @@ def plays(network, scans):
 
 
 def run_until(node, count):
-    node.run(lambda scans: node.stop() if scans == count else None)
+    node.run(lambda scans, _: node.stop() if scans == count else None)
 
 
 def test_every_scan_gets_a_pose_and_the_map_is_published(network, robot, scans):

@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
-from fcslam.cli import main
+from fcslam.cli import live, main
 from fcslam.cli.progress import ProgressDisplay
 from fcslam.cli.robot import _watch
 from fcslam.live.records import RobotStatus
@@ -161,3 +163,28 @@ def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():
     text = console.file.getvalue()
     assert text.count("all scans are mapped; 7 packets wait for the server") == 1
     assert re.search(r"sending 0/7, .*offline, 7 waiting", text)
+
+
+def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives(monkeypatch):
+    """The learning process gets each change; a test of its own covers it."""
+    told = []
+
+    class Process:
+        def __init__(self, plan, robot, _notify):
+            told.append((plan, robot))
+
+        def set_idle(self, first_epoch):
+            told.append(first_epoch)
+
+        def close(self):
+            told.append("closed")
+
+    monkeypatch.setattr("fcslam.federated.learning_beside.LearningBeside", Process)
+    robot = SimpleNamespace(name="anna", first_epoch=3, stand_still=lambda: told.append("keyframes are placed"))
+    with live._learning("plan", robot, told.append) as follow:
+        watch = live._watch(told.append, follow)
+        for scan in range(1, 30):
+            x = 0.0 if scan < 20 else 1.0
+            watch(scan, SimpleNamespace(stamp=float(scan), T_odom_base=np.array((x, 0.0, 0.0)), T_map_base=np.zeros(3)))
+            watch(scan, None)  # another record, of no scan
+    assert told == [("plan", "anna"), "keyframes are placed", 3, None, "closed"]

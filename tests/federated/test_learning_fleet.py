@@ -35,7 +35,7 @@ SETTINGS = {
     "gate": {"fewest_pairs": 20, "margin": 0.5},  # far fewer than 200, which only a test may do
     "teach_every_s": 2.0,
     "federated": {
-        "rounds": 1, "local_steps": 30, "judge_every": 1, "minimum_robots": 3, "compatible": 0.0, "smoothing": 0.0,
+        "rounds": 2, "local_steps": 30, "judge_every": 1, "minimum_robots": 3, "compatible": 0.0, "smoothing": 0.0,
     },
 }  # fmt: skip
 BROKEN_LAYER, NOISE = "body.code_head.0.0.weight", 6.0
@@ -123,6 +123,7 @@ def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp
         adopted = f"detector {version} from now on"
         awaited(lambda: all(newest(log) == adopted for log in logs[1:]), everyone, logs)
         awaited(lambda: all((robot, version) in camera_places(tmp_path) for robot in robots), everyone, logs)
+        awaited(lambda: all(taught(log) for log in logs[1:]), everyone, logs)
         for process in fleet:
             process.send_signal(signal.SIGTERM)
         assert [process.wait(LIMIT_S) for process in fleet] == [0, 0, 0]
@@ -149,3 +150,9 @@ def rows(rounds):
 def newest(log):
     """The last line of a log on a detector."""
     return next((line for line in reversed(log.read_text().splitlines()) if line.startswith("detector ")), None)
+
+
+def taught(log):
+    """Whether a robot has learned from codes of others."""
+    learns = [line for line in log.read_text().splitlines() if " taught; " in line]
+    return any(", 0 taught; " not in line for line in learns)

@@ -147,8 +147,8 @@ class RobotNode:
         self._restarts = 0
         self._subscribe()
 
-    def run(self, watch: Callable[[int], None] = lambda _: None) -> None:
-        """Map until ``stop``; ``watch`` gets the number of scans so far after each.
+    def run(self, watch: "Callable[[int, RobotPose | None], None]" = lambda _scans, _pose: None) -> None:
+        """Map until ``stop``; after each record, ``watch`` gets the number of scans and the pose of the last one.
 
         Raises:
             NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
@@ -174,7 +174,7 @@ class RobotNode:
                 )
                 for record in records:
                     self._map(record)
-                    watch(self.scans)
+                    watch(self.scans, self._pose)
                 if message is not None and self._topics.kinds[message.topic] == SCAN:
                     if is_silent:
                         self._notify(f"scans arrive again after {now_s - heard_s:.0f} s")

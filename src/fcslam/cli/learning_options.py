@@ -40,8 +40,8 @@ class RobotLearning(NamedTuple):
     ca: Path | None
     key: Path | None
 
-    def checked(self, is_live: bool) -> "RobotLearning":
-        """The same options; those that need --learn are refused without it, and --learn of a live robot.
+    def checked(self, localizes: bool) -> "RobotLearning":
+        """The same options; those that need --learn are refused without it, and --learn of a robot that localises.
 
         Raises:
             InputError: there are some.
@@ -50,12 +50,16 @@ class RobotLearning(NamedTuple):
 
         if not self.learn and any(self[1:]):
             raise InputError("--learn-server, --learn-config, --learn-ca and --learn-key need --learn")
-        if self.learn and is_live:
-            raise InputError("--learn is for a recording so far; leave it out for a live robot")
+        if self.learn and localizes:
+            raise InputError("--learn is for a robot that maps; leave out --localize or --learn")
         return self
 
-    def plan(self, name: str, settings: "RobotConfig", service: str) -> "RobotLearningPlan | None":
+    def plan(
+        self, name: str, settings: "RobotConfig", service: str | None, state: Path | None
+    ) -> "RobotLearningPlan | None":
         """Where and how the robot of this name learns, with the service at this address; None: it does not.
+
+        ``state`` is its state folder.
 
         Raises:
             ConfigError: the settings cannot be used.
@@ -76,6 +80,10 @@ class RobotLearning(NamedTuple):
         from fcslam.federated.tls import Address
         from fcslam.records import Channel
 
+        if service is None or state is None:
+            raise InputError(
+                "a robot learns with the fleet of a service, from keyframes on its disk: give --server and --state"
+            )
         if Channel.CAMERA not in settings.channels or settings.views.detector is not DetectorKind.ONNX:
             raise InputError("--learn trains the camera's network; robot.channels or robot.views.detector leave it out")
         chosen = RobotLearningSettings() if self.config is None else load(RobotLearningSettings, self.config)
@@ -83,7 +91,7 @@ class RobotLearning(NamedTuple):
         host = urlsplit(service).hostname or "localhost"
         address = Address(host, PORT) if self.server is None else parse_address(self.server)
         self._check_key(name, address)
-        return RobotLearningPlan(address.host, address.port, chosen, self.ca, self.key)
+        return RobotLearningPlan(address.host, address.port, chosen, state, self.ca, self.key)
 
     def _check_key(self, name: str, address: "Address") -> None:
         from fcslam.cli.listening import is_loopback

@@ -3,8 +3,8 @@
 import logging
 import sys
 from collections import Counter
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.bridges.parameters import NodeParameters
+    from fcslam.federated.learning_beside import RobotLearningPlan
     from fcslam.live.localized_robot import LocalizedRobot
-    from fcslam.live.records import RobotEvent
+    from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
     from fcslam.sources import BagOptions
 
@@ -45,8 +46,10 @@ def map_live(
     parameters: "NodeParameters",
     output: Path | None,
     console: "Console",
+    learning: "RobotLearningPlan | None",
 ) -> None:
     """Run the robot at ``address`` until it is stopped, and write the run to ``output``; ``start`` makes the robot.
+    With a plan for ``learning``, it learns while it stands still.
 
     Raises:
         InputError: the network, its topics, the server or the output cannot be used.
@@ -86,7 +89,8 @@ def map_live(
         heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
         notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
         with stopping(node.stop):  # also while the run is written: a late SIGTERM must not lose it
-            node.run(_every(_SCANS_PER_LINE, lambda scans: notify(f"{scans} scans")))
+            with _learning(learning, robot, notify) as follow:
+                node.run(_watch(notify, follow))
             if not node.scans:
                 notify("no scan was mapped; nothing is written")
                 return
@@ -98,6 +102,46 @@ def map_live(
             run = robot.save(output)
         print_faults(console, {robot.name: node.sensors.audit.faults()})
     print_line(answers(), f"{node.scans} scans, {len(run.trajectories)} sessions: {output}")
+
+
+@contextmanager
+def _learning(
+    plan: "RobotLearningPlan | None", robot: "Robot | LocalizedRobot", notify: Callable[[str], None]
+) -> "Iterator[Callable[[RobotPose], None]]":
+    """Let the robot learn while it stands still, if there is a plan for it; gives what follows its poses."""
+    from fcslam.live.localized_robot import LocalizedRobot
+
+    if plan is None or isinstance(robot, LocalizedRobot):
+        yield lambda _pose: None
+        return
+    from fcslam.federated.learning_beside import LearningBeside
+    from fcslam.live.standstill import Standstill
+
+    with closing(LearningBeside(plan, robot.name, notify)) as learning:
+
+        def stop() -> None:
+            robot.stand_still()
+            learning.set_idle(robot.first_epoch)
+
+        yield Standstill(stop, lambda: learning.set_idle(None)).follow
+
+
+def _watch(
+    notify: Callable[[str], None], follow: "Callable[[RobotPose], None]"
+) -> "Callable[[int, RobotPose | None], None]":
+    """Follow the poses of the scans, and print a line of progress for many scans."""
+    told = 0
+
+    def watch(scans: int, pose: "RobotPose | None") -> None:
+        nonlocal told
+        if pose is None or scans == told:
+            return
+        told = scans
+        follow(pose)
+        if scans % _SCANS_PER_LINE == 0:
+            notify(f"{scans} scans")
+
+    return watch
 
 
 def record(
@@ -162,14 +206,6 @@ def _prepare(output: Path, network: str, force: bool) -> None:
         raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
     if not output.parent.is_dir():
         raise OutputError(f"{output}: there is no folder {output.parent}; make it first")
-
-
-def _every(count: int, tell: Callable[[int], None]) -> Callable[[int], None]:
-    def watch(number: int) -> None:
-        if number % count == 0:
-            tell(number)
-
-    return watch
 
 
 def _listed(counts: Counter[str]) -> str:

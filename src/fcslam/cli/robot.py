@@ -171,7 +171,8 @@ def robot(
         typer.Option(
             "--learn",
             rich_help_panel=_LEARNING,
-            help="After the drive, train the detector with the fleet on what the camera saw again. No image leaves.",
+            help="Train the detector with the fleet on what the camera saw again: after a recording, and while a live "
+            "robot stands still. No image leaves.",
         ),
     ] = False,
     learn_server: LearnServer = None,
@@ -190,7 +191,7 @@ def robot(
 
     With --localize, find a live robot in a finished map instead.
     """
-    from fcslam.bridges.addresses import is_address
+    from fcslam.bridges.addresses import is_address, parse_address
     from fcslam.cli.live import map_live
     from fcslam.errors import InputError
     from fcslam.live.localized_robot import LocalizedRobot
@@ -204,11 +205,11 @@ def robot(
     token, own = _token(token_file), _own_certificate(certificate, key)
     if localize is None and initial_pose is not None:
         raise InputError("an initial pose is one in a finished map; give --localize, too")
-    learning = RobotLearning(learn, learn_server, learn_config, learn_ca, learn_key).checked(is_address(source))
+    learning = RobotLearning(learn, learn_server, learn_config, learn_ca, learn_key).checked(localize is not None)
     if is_address(source):
         start: Callable[..., Robot | LocalizedRobot] = partial(
             Robot, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
-            outbox_mb=outbox_mb, config=settings, floor=floor,
+            outbox_mb=outbox_mb, config=settings, floor=floor, keep_keyframes=learn,
         )  # fmt: skip
         if localize is not None:
             if state is not None:
@@ -219,7 +220,8 @@ def robot(
             start = partial(LocalizedRobot, map=localize, initial_pose=initial, config=settings, floor=floor)
         options = bag_options(scan_topic, odom_topic, camera_topic, laser_pose) or BagOptions()
         parameters = node_parameters(ros_parameters, use_sim_time)
-        map_live(source, name, start, options, domain, parameters, output, notices(quiet))
+        plan = learning.plan(name or parse_address(source).robot, settings.robot, server, state)
+        map_live(source, name, start, options, domain, parameters, output, notices(quiet), plan)
         return
     if localize is not None:
         raise InputError("--localize is for a live robot; `fcslam localize RECORDING --map MAP` localises a recording")
@@ -231,7 +233,7 @@ def robot(
     survey = recording.survey()
     console = notices(quiet)
     print_notes(console, survey.notes)
-    plan = learning.plan(recording.name, settings.robot, server)
+    plan = learning.plan(recording.name, settings.robot, server, state)
     fingerprint = _fingerprint(recording.name, survey, settings.robot, budget_kbps, floor)
     live = Robot(
         recording.name, server=server, state=state, token=token, ca=ca, certificate=own, budget_kbps=budget_kbps,
@@ -255,8 +257,9 @@ def _play(
     pace = PlaybackPace(speed, time.monotonic, time.sleep)
     try:
         with compiled(console), _interruptible(), ProgressDisplay(console) as display:
-            stay = None if plan is None else partial(_learn, plan, state, console, display)
-            play(live, recording.records(), pace, _watch(display, console, scans), stay)
+            watch = _watch(display, console, scans)
+            stay = None if plan is None else partial(_learn, plan, console, display, watch)
+            play(live, recording.records(), pace, watch, stay)
     except KeyboardInterrupt:
         left = live.status().waiting
         print_line(
@@ -277,29 +280,24 @@ def _fetch(
 
 
 def _learn(
-    plan: "RobotLearningPlan", state: Path, console: "Console", display: "ProgressDisplay", robot: "Robot"
-) -> None:
+    plan: "RobotLearningPlan", console: "Console", display: "ProgressDisplay",
+    watch: "Callable[[RobotStatus], None]", robot: "Robot",
+) -> None:  # fmt: skip
     """Stay after the drive and learn with the fleet, until the budget is spent or Ctrl-C ends it."""
     from fcslam.federated.learning_beside import LearningBeside
-    from fcslam.live.robot import KEYFRAMES
 
     def tell(line: str) -> None:
         print_line(console, line)
 
     tell("the drive is over; the robot learns with its fleet until Ctrl-C")
-    learning = LearningBeside(plan, robot.name, state / KEYFRAMES, state / "learning", tell)
-    end_s, told = time.monotonic() + plan.settings.time_s, robot.status().notices
+    learning = LearningBeside(plan, robot.name, tell)
+    began_s = time.monotonic()
     try:
         learning.set_idle(robot.first_epoch)
-        while time.monotonic() < end_s and not learning.has_ended:
+        while (passed_s := time.monotonic() - began_s) < plan.settings.time_s and not learning.has_ended:
             robot.stand_still()
-            for notice in (notices := robot.status().notices):
-                if notice not in told:
-                    tell(notice)
-            told = notices
-            display.show(
-                "learning", round(plan.settings.time_s - end_s + time.monotonic()), round(plan.settings.time_s)
-            )
+            watch(robot.status())
+            display.show("learning", round(passed_s), round(plan.settings.time_s))
             time.sleep(0.5)
     except KeyboardInterrupt:
         tell("learning ends; the robot sends what is left")

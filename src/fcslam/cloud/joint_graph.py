@@ -131,7 +131,7 @@ class JointGraph:
             self.take(optimize(self.graph, start, loss=Loss.CAUCHY, kept=self._kept(), factors=self._factors).poses)
 
     def is_strained(self, limit: float) -> bool:
-        """Whether the mean chi-square of the closures between two robots is over the limit: they may contradict."""
+        """Whether closures between two robots, or the path of one, are strained by more than the limit."""
         owner = np.zeros(len(self.graph), np.int64)
         for number, variables in enumerate(self._variables.values()):
             owner[variables.values] = number

@@ -54,11 +54,11 @@ class FleetConfig(Settings):
         "beyond it are rebuilt from their keyscans",
     )
     contradiction: float = Field(
-        default=0.3,
+        default=0.06,
         gt=0,
-        description="mean chi-square of the closures between two robots above which one of the robots of their map "
-        "contradicts the others; it is about 0.05 between robots that measure correctly, because the stated noise of "
-        "closures is a bound",
+        description="strain above which one of the robots of a map contradicts the others: the chi-square that "
+        "closures between two robots, or the measurements of one, share with their neighbours along the path. It is "
+        "below 0.03 for robots that measure correctly, also with noisy scanners",
     )
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.federated.live_settings import RobotLearningSettings
+from fcslam.robot.keyframe_folder import KEYFRAMES
 
 STOP_S: Final = 5.0
 
@@ -23,6 +24,8 @@ class RobotLearningPlan:
     """Of the server's port of learning."""
     port: int
     settings: RobotLearningSettings
+    state: Path
+    """The robot's state folder, with its keyframes."""
     ca: Path | None = None
     """Certificate of the authority that signed the server's; None for no encryption."""
     robot_key: Path | None = None
@@ -32,12 +35,11 @@ class RobotLearningPlan:
 class LearningBeside:
     """The process; it ends with ``close``."""
 
-    def __init__(
-        self, plan: RobotLearningPlan, robot: str, keyframes: Path, cache: Path, on_notice: Callable[[str], None]
-    ) -> None:
+    def __init__(self, plan: RobotLearningPlan, robot: str, on_notice: Callable[[str], None]) -> None:
         """Start it. ``on_notice`` is called with lines for the user, in a thread of its own."""
         files = {"--ca": plan.ca, "--robot-key": plan.robot_key}
         options = [word for name, file in files.items() if file is not None for word in (name, str(file))]
+        keyframes, cache = plan.state / KEYFRAMES, plan.state / "learning"
         words = [str(keyframes), str(cache), plan.host, str(plan.port), robot, plan.settings.model_dump_json()]
         command = [sys.executable, "-m", "fcslam.federated.robot_learning", *words, *options]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -139,8 +139,7 @@ def solve_jointly(
         consistency: when closures are consistent, and what a cluster needs.
         gnc: settings of graduated non-convexity.
         examine: called for two robots where only the amount of evidence is open.
-        contradiction: mean chi-square of the closures between two robots above which one of the robots of their map
-            contradicts the others.
+        contradiction: strain above which one of the robots of a map contradicts the others.
         compare: called for robots of one map that only one other sender connects.
 
     Returns:

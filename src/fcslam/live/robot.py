@@ -38,6 +38,7 @@ from fcslam.records import CameraModel, Correction, FloatArray, Keyscan, SensorR
 from fcslam.robot.beside import Beside, worker_process
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
+from fcslam.robot.keyframe_folder import KEYFRAMES
 from fcslam.robot.localization import Localizer
 from fcslam.robot.outbox import Outbox, WaitingPackets
 from fcslam.robot.sender import CONNECTING
@@ -56,8 +57,6 @@ CLOSE_S = 5.0
 """Time that a robot whose block ends without an error waits for the server."""
 POLL_INTERVAL_S = 0.1
 """Interval at which ``finish`` looks whether the server has everything."""
-KEYFRAMES = "keyframes"
-"""Below the state folder: keyframes, for a process that learns from them."""
 LARGEST_BACKLOG = 200
 """Largest number of inputs that wait for the back end, the map or the disk while a recording is played; a robot in real
 time never has as many."""

@@ -19,6 +19,8 @@ from fcslam.records import CameraModel, FloatArray, Transform, frozen
 from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.storage.state_file import State, read_state, write_state
 
+KEYFRAMES: Final = "keyframes"
+"""Folder of the keyframes, below a robot's state folder."""
 FITS: Final = "fcslam keyframes 1"
 _POSES, _SUFFIX = "poses", ".state"
 _log = logging.getLogger(__name__)
