@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import ServiceError
+from fcslam.errors import ServiceError, StoreError
 from fcslam.service.intake import BusyError, LeaseError
 from fcslam.service.mission_store import MissionStore
 from fcslam.service.shared.agents import CONFIRM_S, RobotLimit, SharedAgents
 from fcslam.service.shared.audit_table import AuditTable
-from fcslam.service.shared.instance import REST_LOOK_S, REST_S, Instance, fair_part
+from fcslam.service.shared.instance import LOOK_S, REST_LOOK_S, REST_S, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.registry import LEASE_S, Registry
 from tests.service.test_mission_store import packet
@@ -99,6 +99,29 @@ def test_the_clock_of_an_instance_may_be_wrong_by_minutes(registry, postgres, mo
         assert Registry(postgres, "wrong", "process of wrong").claim(9) == []
         assert registry.renew([(lease, True)]) == {lease}
         MissionStore(MissionTables(postgres, number, lease)).progress(1, [])
+
+
+def test_after_the_store_was_gone_the_others_may_renew_before_anybody_claims(registry, postgres, monkeypatch):
+    wanted(registry, postgres, "m")
+    (lease,) = registry.claim(1)
+    other, workers = instance(postgres, "other")
+    is_gone, register = threading.Event(), Registry.register
+
+    def failing(self, room):
+        if self._instance == "other" and is_gone.is_set():
+            raise StoreError("gone")
+        return register(self, room)
+
+    monkeypatch.setattr(Registry, "register", failing)
+    is_gone.set()
+    other.start()
+    time.sleep(LEASE_S + 2 * LOOK_S)  # the lease has ended, and nobody could renew it
+    is_gone.clear()
+    time.sleep(2 * LOOK_S)
+    assert registry.renew([(lease, True)]) == {lease}
+    assert not workers
+    until(lambda: workers)  # it is not renewed any more
+    other.close()
 
 
 def test_two_instances_of_one_name_are_refused(registry, postgres):

@@ -17,6 +17,8 @@ REST_LOOK_S: Final = 60.0
 """Between two looks which missions had nothing to do."""
 REST_S: Final = 1800.0
 """A mission in which nothing happened for so long needs no worker."""
+GRACE_S: Final = 1.5
+"""After the store was gone, the others get so long to renew leases that ended meanwhile."""
 NAME_S: Final = LEASE_S + 2.0
 """How long a new instance waits for its name: one that was killed loses it in this time."""
 
@@ -77,6 +79,7 @@ class Instance:
         self._active: dict[Lease, tuple[tuple[Any, ...], float]] = {}
         """Activity of each mission, and since when it is the same."""
         self._rest_look_at = clock() + REST_LOOK_S
+        self._claims_from = clock()
         self._known: Mapping[str, KnownMission] = {}
         self.look()
         self._thread = threading.Thread(target=self._run, name=f"instance {name}", daemon=True)
@@ -137,6 +140,7 @@ class Instance:
                 if not is_gone:
                     _log.error("the store is gone, and this instance waits for it: %s", error)
                 is_gone = True
+                self._claims_from = self._clock() + GRACE_S
             except Exception:
                 _log.exception("the instance failed at a look, and goes on")
 
@@ -179,6 +183,8 @@ class Instance:
         part = fair_part(len(wanted), self._registry.rooms(), self._most)
         is_any_free = any(not mission.is_held for mission in wanted)
         if is_any_free and len(self._held) < part:
+            if self._clock() < self._claims_from:
+                return
             for lease in self._registry.claim(part - len(self._held)):
                 mission = next(mission for mission in self._registry.missions() if mission.number == lease.mission)
                 self._held[lease] = self._launch(mission, lease)

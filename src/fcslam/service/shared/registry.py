@@ -11,7 +11,7 @@ from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.schema import mission_statements, schema_of
 from fcslam.storage.postgres import Postgres, PostgresTransaction
 
-LEASE_S: Final = 5.0
+LEASE_S: Final = 3.0
 """An instance that does not renew its leases for so long loses them."""
 _READ: Final = """
 SELECT number, name, is_open, is_wanted, holder, expires > clock_timestamp(), is_ready, live, finalized
