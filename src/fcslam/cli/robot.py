@@ -399,10 +399,10 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
     trouble: str | None = "connecting"
     notices_before: tuple[str, ...] = ()
     localization, times_lost = "mapping", 0
-    waits = False
+    waits = sends = False
 
     def watch(now: "RobotStatus") -> None:
-        nonlocal trouble, notices_before, localization, times_lost, waits
+        nonlocal trouble, notices_before, localization, times_lost, waits, sends
         lines = [now.trouble or "connected"] * (now.trouble != trouble)
         if (now.localization, now.times_lost) != (localization, times_lost):
             lines.append(_localisation(now, times_lost))
@@ -420,7 +420,8 @@ def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Calla
         trouble, notices_before = now.trouble, now.notices
         details = _details(now, is_complete)
         display.show("mapping", now.scans, total, details)
-        if is_complete and now.waiting.packets:
+        sends = sends or (is_complete and now.waiting.packets > 0)
+        if sends:
             display.show("sending", now.confirmed, now.confirmed + now.waiting.packets, details)
 
     return watch
