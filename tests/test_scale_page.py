@@ -75,4 +75,4 @@ def run_page(folder):
         told = log.read_text(encoding="utf-8")
     assert shell.returncode == 0, told
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
-    assert (folder / "state" / "anna" / "trajectory.tum").exists()
+    assert all((folder / "state" / robot / "trajectory.tum").exists() for robot in ("anna", "ben", "carol"))

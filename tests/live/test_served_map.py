@@ -79,6 +79,7 @@ def test_an_earlier_copy_serves_while_the_cloud_cannot_be_reached(floors, tmp_pa
     fetch_maps(tmp_path / "copy", floors)
     before = {path: path.read_bytes() for path in (tmp_path / "copy").rglob("*") if path.is_file()}
     assert "127.0.0.1:9" in fetch_maps(tmp_path / "copy", NOBODY)
+    assert fetch_maps(tmp_path / "copy", f"{NOBODY},{floors}") is None
     assert {path: path.read_bytes() for path in (tmp_path / "copy").rglob("*") if path.is_file()} == before
 
 

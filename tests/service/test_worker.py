@@ -464,6 +464,23 @@ def test_a_worker_that_is_told_to_stop_does_so_at_once_only_while_it_compiles(cl
 
 
 @pytest.mark.slow
+def test_a_worker_whose_service_was_killed_ends_with_one_line(cloud):
+    command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        told(process, "ready")
+        process.stdout.close()
+        cloud.put(stream("a", POSES, start_s=0.0))
+        process.stdin.write("look\n")
+        process.stdin.flush()
+        assert process.wait(60) == 0
+        said = process.stderr.read()
+    assert "its service is gone" in said
+    assert "Traceback" not in said
+    assert "BrokenPipe" not in said
+
+
+@pytest.mark.slow
 def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
     cloud.put(two_robots())
     assert {t.map_index for t in cloud.finalize().trajectories.values()} == {0}

@@ -7,7 +7,7 @@ import pytest
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import Channel
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch
-from fcslam.wire.http_transport import HttpResponse, HttpTransport, Refusal
+from fcslam.wire.http_transport import HttpResponse, HttpTransport, InstancesTransport, Refusal, addresses
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode, encode
 from tests.federated.authority import certificates
@@ -126,6 +126,23 @@ def test_nobody_there_is_no_reason_to_give_up():
     with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
         away.state()
     away.close()
+
+
+def test_where_an_instance_does_not_answer_the_next_one_is_asked_and_stays(cloud):
+    nobody, somebody = (HttpTransport(url, "r", "ab" * 16) for url in addresses(f"http://127.0.0.1:9, {cloud.url}"))
+    instances = InstancesTransport([nobody, somebody])
+    with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
+        instances.state()  # the caller waits before it tries again
+    instances.send(PACKETS, -1)
+    assert instances.state().expected == {0: 2}
+    cloud.canned.append(error(503))
+    with pytest.raises(UnavailableError, match="503"):
+        instances.state()
+    with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
+        instances.state()
+    assert instances.state().expected == {0: 2}
+    for instance in (nobody, somebody):
+        instance.close()
 
 
 def test_a_network_comes_as_it_is(cloud, transport):

@@ -79,6 +79,7 @@ class RobotLearning(NamedTuple):
         from fcslam.federated.live_settings import RobotLearningSettings
         from fcslam.federated.tls import Address
         from fcslam.records import Channel
+        from fcslam.wire.http_transport import addresses
 
         if service is None or state is None:
             raise InputError(
@@ -88,7 +89,7 @@ class RobotLearning(NamedTuple):
             raise InputError("--learn trains the camera's network; robot.channels or robot.views.detector leave it out")
         chosen = RobotLearningSettings() if self.config is None else load(RobotLearningSettings, self.config)
         require_training_libraries("flwr", extra="federated")
-        host = urlsplit(service).hostname or "localhost"
+        host = urlsplit(addresses(service)[0]).hostname or "localhost"
         address = Address(host, PORT) if self.server is None else parse_address(self.server)
         self._check_key(name, address)
         return RobotLearningPlan(address.host, address.port, chosen, state, self.ca, self.key)

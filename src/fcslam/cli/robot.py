@@ -126,7 +126,8 @@ def robot(
         str | None,
         typer.Option(
             metavar="URL",
-            help="Address of the cloud, as in https://cloud.example:8443. A live robot without one maps alone.",
+            help="Address of the cloud, as in https://cloud.example:8443, or those of its instances with commas "
+            "between them. A live robot without one maps alone.",
         ),
     ] = None,
     state: Annotated[

@@ -47,7 +47,7 @@ from fcslam.robot.warmup import warm_up_tracking
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.map_files import OccupancyMap
 from fcslam.wire.checks import check_floor
-from fcslam.wire.http_transport import BatchTransport, HttpTransport
+from fcslam.wire.http_transport import BatchTransport, HttpTransport, InstancesTransport, addresses
 from fcslam.wire.messages import Hello, Packet
 
 JUMP_M, JUMP_RAD = 0.01, 0.005
@@ -120,8 +120,8 @@ class Robot(LiveTracker):
             name: of the robot; letters, digits and ``. _ -``.
             laser: its LiDAR, or several by name. None: only ``add`` is used.
             camera: its camera, if it has one.
-            server: address of an `fcslam serve` with the robot's fleet, or a transport of your own. None: the robot
-                maps alone.
+            server: address of an `fcslam serve` with the robot's fleet, or those of its instances with commas between
+                them, or a transport of your own. None: the robot maps alone.
             state: folder of this robot alone; a robot that starts again with it finds its place in its earlier map.
                 With a server it holds the packets that the server has not confirmed. None: nothing is kept.
             token: the robot's bearer token.
@@ -174,8 +174,12 @@ class Robot(LiveTracker):
                 outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, int(1e6 * outbox_mb))))
             if isinstance(server, str) and outbox is not None:
                 own = None if certificate is None else (Path(certificate[0]), Path(certificate[1]))
-                http = HttpTransport(server, name, outbox.agent, token, None if ca is None else Path(ca), own)
-                transport = stack.enter_context(closing(http))
+                ca_file = None if ca is None else Path(ca)
+                instances = [
+                    stack.enter_context(closing(HttpTransport(url, name, outbox.agent, token, ca_file, own)))
+                    for url in addresses(server)
+                ]
+                transport = InstancesTransport(instances)
             known = 0 if outbox is None else outbox.begin(*(playback or LIVE))
             keyframes = _keyframe_folder(folder, playback) if keep_keyframes else None
             self._start(executor, outbox if transport is None else None, own_map, keyframes)

@@ -1,5 +1,6 @@
 """A copy of the maps of a cloud, for a robot that finds itself in them: also when the cloud cannot be reached."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Final
 
@@ -10,6 +11,7 @@ from fcslam.records import frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import is_run_folder
 from fcslam.runs.map_files import area_of, map_stem, parse_map
+from fcslam.wire.http_transport import addresses
 from fcslam.wire.map_client import MapClient, ServedMap
 
 _ATTEMPTS: Final = 3
@@ -23,7 +25,7 @@ def fetch_maps(
 
     Args:
         folder: the folder; an earlier copy in it is replaced.
-        server: address of the cloud.
+        server: address of the cloud, or those of its instances with commas between them.
         token, ca, own: as for ``fcslam.Robot``, with the rights of a viewer.
 
     Returns:
@@ -35,16 +37,18 @@ def fetch_maps(
         OutputError: ``folder`` is something else than a run folder, or cannot be written.
     """
     prepare_output(folder, force=True)
-    client = MapClient(server, token, ca, own)
-    try:
-        _read(client, server).save(folder, force=True)
-    except UnavailableError as error:
-        if not is_run_folder(folder):
-            raise CloudError(f"{error}; {folder} holds no earlier copy of the map") from error
-        return str(error)
-    finally:
-        client.close()
-    return None
+    troubles = []
+    for address in addresses(server):
+        with closing(MapClient(address, token, ca, own)) as client:
+            try:
+                _read(client, address).save(folder, force=True)
+                return None
+            except UnavailableError as error:
+                troubles.append(str(error))
+    trouble = "; ".join(troubles)
+    if not is_run_folder(folder):
+        raise CloudError(f"{trouble}; {folder} holds no earlier copy of the map")
+    return trouble
 
 
 def _read(client: MapClient, server: str) -> Run:

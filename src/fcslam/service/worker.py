@@ -457,6 +457,9 @@ def main(arguments: Sequence[str]) -> int:
                     break
         except LeaseLostError as error:
             _log.warning("this worker ends: %s", error)
+        except BrokenPipeError:
+            _log.warning("this worker ends: its service is gone")
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to write goes nowhere
         alone.close()
         return 0
 

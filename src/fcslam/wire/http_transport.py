@@ -2,10 +2,10 @@
 
 import ipaddress
 import ssl
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from urllib.parse import quote, urlsplit
 
 from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
@@ -23,6 +23,8 @@ from fcslam.wire.keys import no_passphrase
 
 if TYPE_CHECKING:
     import httpx
+
+_T = TypeVar("_T")
 
 CONNECT_TIMEOUT_S, ANSWER_TIMEOUT_S = 5.0, 30.0
 
@@ -224,6 +226,42 @@ class HttpTransport(HttpClient):
         response = self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}", accept="*/*")
         self._require(response, 200)
         return response.content
+
+
+class InstancesTransport:
+    """Connection of one robot to several instances of one cloud: where one does not answer, the next one is asked next.
+
+    As a robot repeats what was not answered, this loses nothing.
+    """
+
+    def __init__(self, instances: Sequence[HttpTransport]) -> None:
+        """``instances``: at least one, that of the first request first."""
+        self._instances = instances
+        self._current = 0
+
+    def state(self) -> CloudState:
+        """As in BatchTransport."""
+        return self._asked(lambda instance: instance.state())
+
+    def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
+        """As in BatchTransport."""
+        return self._asked(lambda instance: instance.send(packets, correction))
+
+    def detector(self, channel: Channel, version: str) -> bytes:
+        """As in BatchTransport."""
+        return self._asked(lambda instance: instance.detector(channel, version))
+
+    def _asked(self, request: Callable[[HttpTransport], _T]) -> _T:
+        try:
+            return request(self._instances[self._current])
+        except UnavailableError:
+            self._current = (self._current + 1) % len(self._instances)
+            raise
+
+
+def addresses(given: str) -> tuple[str, ...]:
+    """The addresses of a cloud's instances, which commas separate."""
+    return tuple(address.strip() for address in given.split(",") if address.strip()) or (given,)
 
 
 def _detail(response: "httpx.Response") -> dict[str, Any]:
