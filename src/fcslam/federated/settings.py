@@ -97,8 +97,15 @@ class FederatedSettings(Settings):
         default=0.8,
         ge=0.0,
         lt=1.0,
-        description="share of earlier rounds in the moving average that is evaluated and released; "
+        description="share of earlier rounds in the moving average of which versions are made; "
         "decreases with the learning rate",
+    )
+    initial_share: float = Field(
+        default=0.0,
+        ge=0.0,
+        lt=1.0,
+        description="share of the initial weights in the mean with the trained ones that is evaluated and released; "
+        "so a version forgets less",
     )
     server_rate: float = Field(default=0.003, gt=0.0, description="server learning rate of FedAdam")
     trimmed: float = Field(
