@@ -69,7 +69,7 @@ class RobotLearningSettings(Settings):
 class LiveRounds(FederatedSettings):
     """Federated settings whose defaults are the recipe of the study of closures as teachers."""
 
-    rounds: int = Field(default=30, ge=1, description="number of rounds of local training and aggregation")
+    rounds: int = Field(default=60, ge=1, description="number of rounds of local training and aggregation")
     minimum_robots: int = Field(default=2, ge=1, description="fewest updates for which a round counts")
     deadline_s: float = Field(
         default=600.0, gt=0.0, description="time for a robot's reply [s]; later replies are left out of the round"
@@ -77,7 +77,7 @@ class LiveRounds(FederatedSettings):
     normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
     trained: TrainedLayers = Field(default="codes", description="robots train the layers of the codes alone")
     compatible: float = Field(
-        default=1.0,
+        default=2.0,
         ge=0.0,
         description="weight of the loss that keeps descriptors compatible with those of the initial weights; 0 for off",
     )
