@@ -12,7 +12,7 @@ import pytest
 
 import fcslam
 from fcslam.cloud.edits import kind_of
-from fcslam.cloud.settings import CloudConfig
+from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import EditError, SourceError
 from fcslam.mission import MissionCloud
 from fcslam.mission_file import edit_mission, mission_bytes, read_mission
@@ -210,7 +210,8 @@ def test_the_golden_mission_means_what_it_says():
     assert mission.tracks["ben"].stamps[[0, -1]].tolist() == [1000.001, 1009.001]
     assert [kind_of(edit.content) for edit in mission.edits] == ["veto", "cut", "region", "undo"]
     assert {edit.author for edit in mission.edits} == {"boss"}
-    assert mission.config == CloudConfig()
+    # A mission keeps the settings with which it began; the default was another one then.
+    assert mission.config == CloudConfig(fleet=FleetConfig(contradiction=0.3))
     assert mission.refused == ()
 
 

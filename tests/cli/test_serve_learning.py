@@ -38,12 +38,13 @@ def test_a_service_that_cannot_learn_says_why(options, reason, tmp_path, monkeyp
 
 def plan(tmp_path, config=None, **options):
     given = {"learn": True, "server": None, "config": None, "ca": None, "key": None} | options
-    return RobotLearning(**given).checked(False).plan("alice", config or RobotConfig(), "http://localhost:8340")
+    learning = RobotLearning(**given).checked(False)
+    return learning.plan("alice", config or RobotConfig(), "http://localhost:8340,http://192.0.2.1:8340", tmp_path)
 
 
 def test_a_robot_learns_at_the_service_that_maps_it(tmp_path):
     found = plan(tmp_path)
-    assert (found.host, found.port, found.ca) == ("localhost", 8341, None)
+    assert (found.host, found.port, found.ca, found.state) == ("localhost", 8341, None, tmp_path)
     assert plan(tmp_path, learn=False) is None
 
 
@@ -60,6 +61,13 @@ def test_a_robot_that_cannot_learn_says_why(options, reason, tmp_path):
         plan(tmp_path, **options)
 
 
-def test_a_live_robot_does_not_learn_yet():
-    with pytest.raises(InputError, match="for a recording so far"):
+def test_a_robot_that_localises_does_not_learn():
+    with pytest.raises(InputError, match="for a robot that maps; leave out --localize or --learn"):
         RobotLearning(True, None, None, None, None).checked(True)
+
+
+@pytest.mark.parametrize("missing", ["service", "state"])
+def test_a_live_robot_learns_with_a_service_and_a_state_folder(missing, tmp_path):
+    given = {"service": "http://localhost:8340", "state": tmp_path} | {missing: None}
+    with pytest.raises(InputError, match="give --server and --state"):
+        RobotLearning(True, None, None, None, None).plan("alice", RobotConfig(), **given)
