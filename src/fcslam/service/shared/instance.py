@@ -182,9 +182,8 @@ class Instance:
         wanted = [mission for mission in self._known.values() if mission.is_wanted]
         part = fair_part(len(wanted), self._registry.rooms(), self._most)
         is_any_free = any(not mission.is_held for mission in wanted)
-        if is_any_free and len(self._held) < part:
-            if self._clock() < self._claims_from:
-                return
+        may_claim = self._clock() >= self._claims_from
+        if is_any_free and may_claim and len(self._held) < part:
             for lease in self._registry.claim(part - len(self._held)):
                 mission = next(mission for mission in self._registry.missions() if mission.number == lease.mission)
                 self._held[lease] = self._launch(mission, lease)
