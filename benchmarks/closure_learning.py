@@ -173,10 +173,11 @@ def main() -> None:
     parser.add_argument("--test", nargs="+", type=int, default=TEST, help="seeds of the unseen buildings")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of training")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="which networks")
-    parser.add_argument("--rounds", type=int, default=30, help="of federated training")
+    parser.add_argument("--rounds", type=int, default=60, help="of federated training")
     parser.add_argument(
         "--compatible", type=float, default=1.0, help="weight of the loss that keeps codes as they were"
     )
+    parser.add_argument("--rehearsal", type=float, default=4.0, help="weight of the loss of rehearsal")
     parser.add_argument("--initial-share", type=float, default=0.0, help="of the initial weights in those released")
     parser.add_argument("--keep", type=Path, help="file that keeps finished arms; the same one resumes")
     chosen = parser.parse_args()
@@ -188,14 +189,14 @@ def main() -> None:
     examples = [fleet_examples(folder, chosen.fleets) for folder in fleets]
     settings = FederatedSettings(
         rounds=chosen.rounds, local_steps=LOCAL_STEPS, participation=PARTICIPATION, normalisation="frozen",
-        compatible=chosen.compatible, initial_share=chosen.initial_share, trained="codes",
+        compatible=chosen.compatible, rehearsal=chosen.rehearsal, initial_share=chosen.initial_share, trained="codes",
         training=TrainingSettings(learning_rate=1e-3),
     )  # fmt: skip
     rows: list[tuple] = []
     forgetting: list[tuple] = []
     for arm in (arm for arm in ARMS if arm in chosen.arms):
         for seed in chosen.seeds[: 3 if arm in REPEATED else 1]:
-            key = (arm, seed, chosen.rounds, chosen.compatible, chosen.initial_share, *chosen.train)
+            key = (arm, seed, chosen.rounds, chosen.compatible, chosen.rehearsal, chosen.initial_share, *chosen.train)
             place = chosen.fleets / "-".join(["networks", common.commit(), *map(str, key)]).replace(" ", "_")
             networks = kept_networks(place, partial(trained, arm, seed, examples, settings))
             forgetting += kept.rows((*key, "photographs"), partial(photograph_rows, arm, seed, networks))
@@ -406,7 +407,7 @@ def trained_here(
     """Training in one place, with the losses and the rate of a robot in the fleet."""
     state = weights_to_network(start, settings.training.encoder).state_dict()
     training = settings.training.model_copy(update={"steps": steps, "seed": seed})
-    plan = LocalTrainingPlan(0, steps, compatible=settings.compatible)
+    plan = LocalTrainingPlan(0, steps, compatible=settings.compatible, rehearsal=settings.rehearsal)
     return train_codes(state, revisits, CodeInputs(), training, plan, torch.device("cpu")).network
 
 

@@ -107,6 +107,18 @@ def test_earlier_codes_and_keypoints_hold_as_hard_as_asked(light):
     assert same[1] > same[0] + 0.05
 
 
+def test_rehearsal_keeps_the_codes_of_pictures_that_the_robot_does_not_see(light):
+    elsewhere = textured(9)[:SIZE, :SIZE]
+
+    def kept(rehearsal):
+        plan = LocalTrainingPlan(0, 40, rehearsal=rehearsal)
+        done = train_codes(light, OWN, CodeInputs(), SMALL, plan, CPU)
+        assert ("rehearsal" in done.losses) is (rehearsal > 0.0)
+        return np.mean(codes(done.network.state_dict(), elsewhere, POINTS) == codes(light, elsewhere, POINTS))
+
+    assert kept(20.0) > kept(0.0) + 0.03
+
+
 def test_rounds_continue_with_their_moments_and_from_where_the_first_began(light):
     inputs = CodeInputs()
     plan = LocalTrainingPlan(0, RAMP_STEPS + 1, compatible=1.0)
@@ -123,13 +135,13 @@ def test_rounds_continue_with_their_moments_and_from_where_the_first_began(light
 def test_inputs_are_computed_again_only_if_the_layers_before_changed(light):
     inputs = CodeInputs()
     network = network_from_state("light", light)
-    first = inputs.of(network, OWN, CPU)
+    first = inputs.of(network, OWN.images, 1, CPU)
     with torch.no_grad():
         network.body.code_head[-1].bias += 1.0
-    assert inputs.of(network, OWN, CPU) is first
+    assert inputs.of(network, OWN.images, 1, CPU) is first
     with torch.no_grad():
         network.body.to_half[0][0].weight += 0.1
-    assert not torch.equal(inputs.of(network, OWN, CPU), first)
+    assert not torch.equal(inputs.of(network, OWN.images, 1, CPU), first)
 
 
 def test_a_robot_that_saw_nothing_again_is_told_so(light):

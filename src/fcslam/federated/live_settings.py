@@ -81,6 +81,12 @@ class LiveRounds(FederatedSettings):
         ge=0.0,
         description="weight of the loss that keeps descriptors compatible with those of the initial weights; 0 for off",
     )
+    rehearsal: float = Field(
+        default=4.0,
+        ge=0.0,
+        description="weight of the loss that keeps descriptors of distorted views of a robot's images as the initial "
+        "weights give them, so that less is forgotten; 0 for off",
+    )
     training: TrainingSettings = Field(
         default_factory=lambda: TrainingSettings(learning_rate=1e-3),
         description="training on each robot; its steps are replaced by rounds times local_steps",

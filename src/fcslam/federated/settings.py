@@ -86,6 +86,12 @@ class FederatedSettings(Settings):
         ge=0.0,
         description="weight of the loss that keeps descriptors compatible with those of the initial weights; 0 for off",
     )
+    rehearsal: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="weight of the loss that keeps descriptors of distorted views of a robot's images as the initial "
+        "weights give them, so that less is forgotten; only with trained: codes; 0 for off",
+    )
     server_momentum: float = Field(
         default=0.5,
         ge=0.0,
@@ -150,6 +156,12 @@ class FederatedSettings(Settings):
             raise ValueError(
                 "batch statistics belong to the keypoints too; set normalisation to frozen, or trained to all"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _rehearsal_is_of_codes(self) -> Self:
+        if self.rehearsal and self.trained != "codes":
+            raise ValueError("rehearsal keeps what codes alone would forget; set trained to codes, or rehearsal to 0")
         return self
 
     def client_training(self) -> TrainingSettings:

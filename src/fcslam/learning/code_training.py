@@ -1,10 +1,11 @@
 """Training of the codes alone, on points that a robot saw again: a client's part of a federated round.
 
 Only the layers at 1/8 of the resolution are trained. The output of the layers before them is computed once for each
-image. The keypoints depend on the trained layers a little, so a loss keeps the keypoints where they were.
+image. The keypoints depend on the trained layers a little, so a loss keeps the keypoints where they were. Rehearsal
+keeps the codes of what the robot does not see.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fcslam.errors import TrainingError
+from fcslam.features.detector import GreyImage
 from fcslam.learning.local_training import (
     LocalTrainingPlan,
     LocalTrainingResult,
@@ -23,8 +25,9 @@ from fcslam.learning.local_training import (
     network_from_state,
     proximal_term,
 )
-from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.objective import revisit_objective
+from fcslam.learning.network import Description, KeypointNetwork
+from fcslam.learning.objective import rehearsal_loss, revisit_objective
+from fcslam.learning.rehearsal import draw_rehearsal, draw_views
 from fcslam.learning.revisit_batches import RevisitExamples, draw_revisits
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.training_step import descend
@@ -39,17 +42,17 @@ class CodeInputs:
     _frozen: dict[str, Tensor] = field(default_factory=dict)
     _inputs: Tensor | None = None
 
-    def of(self, network: KeypointNetwork, examples: RevisitExamples, device: torch.device) -> Tensor:
-        """Shape (K, C, H/8, W/8), float16, for the examples' K images; always of the same examples."""
+    def of(self, network: KeypointNetwork, images: Sequence[GreyImage], seed: int, device: torch.device) -> Tensor:
+        """Shape (K + V, C, H/8, W/8), float16, for K images and the V views of ``draw_views``; always of the same."""
         frozen = {name: value for name, value in network.state_dict().items() if name not in code_names(network)}
         is_same = self._frozen.keys() == frozen.keys() and all(
             torch.equal(value, self._frozen[name]) for name, value in frozen.items()
         )
         if self._inputs is None or not is_same:
             self._frozen = {name: value.clone() for name, value in frozen.items()}
-            parts = []
-            for k in range(0, len(examples.images), _IMAGES_AT_ONCE):
-                grey = np.stack(examples.images[k : k + _IMAGES_AT_ONCE]).astype(np.float32) / 255.0
+            parts, shown = [], [*images, *draw_views(images, seed)]
+            for k in range(0, len(shown), _IMAGES_AT_ONCE):
+                grey = np.stack(shown[k : k + _IMAGES_AT_ONCE]).astype(np.float32) / 255.0
                 with torch.no_grad():
                     parts.append(network.code_inputs(torch.from_numpy(grey).unsqueeze(1).to(device)).half())
             self._inputs = torch.cat(parts)
@@ -96,7 +99,8 @@ def train_codes(
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     before = network_from_state(settings.encoder, start if legacy is None else legacy).to(device)
     freeze_all_but_codes(network)
-    known = inputs.of(network, revisits, device)
+    known = inputs.of(network, revisits.images, settings.seed, device)
+    size = (revisits.images[0].shape[1], revisits.images[0].shape[0])
     proximal = proximal_term(network, plan)
     optimiser = continued_optimiser(network, optimiser_state)
     sums: dict[str, float] = {}
@@ -105,12 +109,13 @@ def train_codes(
         for group in optimiser.param_groups:
             group["lr"] = local_rate(settings, step, done, optimiser_state is None)
         batch = draw_revisits(revisits, settings.seed, step).to(device)
-        given = known[batch.images].float().contiguous(memory_format=torch.channels_last)
-        with torch.autocast(device.type, torch.bfloat16):
-            described = network.describe(given)
-            with torch.no_grad():
-                described_before = before.describe(given)
-        total, losses = revisit_objective(described, described_before, batch, settings.loss, plan.compatible)
+        described = _described(known[batch.images], network, before)
+        total, losses = revisit_objective(*described, batch, settings.loss, plan.compatible)
+        if plan.rehearsal:
+            views = draw_rehearsal(size, settings.seed, step).to(device)
+            described = _described(known[len(revisits.images) + views.numbers], network, before)
+            losses["rehearsal"] = rehearsal_loss(*described, views.points)
+            total = total + plan.rehearsal * losses["rehearsal"]
         if proximal is not None:
             total = total + proximal.loss(network)
         descend(network, optimiser, total, step)
@@ -118,6 +123,15 @@ def train_codes(
             sums[name] = sums.get(name, 0.0) + float(loss.detach())
         on_step(done)
     return local_result(network, optimiser, sums, plan)
+
+
+def _described(inputs: Tensor, network: KeypointNetwork, before: KeypointNetwork) -> tuple[Description, Description]:
+    """What both networks make of inputs of the trained layers, shape (B, C, H/8, W/8)."""
+    given = inputs.float().contiguous(memory_format=torch.channels_last)
+    with torch.autocast(given.device.type, torch.bfloat16):
+        described = network.describe(given)
+        with torch.no_grad():
+            return described, before.describe(given)
 
 
 def freeze_all_but_codes(network: KeypointNetwork) -> None:

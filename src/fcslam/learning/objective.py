@@ -133,6 +133,13 @@ def revisit_objective(
     return total, parts
 
 
+def rehearsal_loss(described: Description, before: Description, points: Tensor) -> Tensor:
+    """Cross entropy of the bits at points (R, N, 2) of views against those of the initial network."""
+    logits, wanted = (CODE_SHARPNESS * sample_codes(each.code_logits.float(), points) for each in (described, before))
+    everywhere = torch.ones(points.shape[:2], dtype=torch.bool, device=points.device)
+    return losses.distillation_loss(logits, torch.sigmoid(wanted), everywhere)
+
+
 def revisit_negatives(batch: RevisitBatch) -> Tensor:
     """Which valid points of a batch differ for certain, shape (V, V), bool.
 

@@ -107,11 +107,24 @@ def predict(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> tu
 def correspond(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> Correspondences:
     """Find the keypoints that two keyframes share, given the estimated pose of the second base in the first, (3,)."""
     pixels, shown = predict(first, second, T_first_second)
+    return correspond_predicted(first.features, second.features, pixels, shown)
+
+
+def correspond_predicted(
+    first: ImageFeatures, second: ImageFeatures, pixels: FloatArray, shown: NDArray[np.bool_]
+) -> Correspondences:
+    """Find the keypoints that two images share.
+
+    Args:
+        first, second: keypoints of both images.
+        pixels: where the second image shows the K keypoints of the first, some pixels off, shape (K, 2).
+        shown: which of them it shows, shape (K,).
+    """
     none = Correspondences(np.empty((0, 2), np.int64), np.zeros(len(shown), np.bool_))
-    asked = np.flatnonzero(shown & (len(second.features.keypoints_px) > 0))
+    asked = np.flatnonzero(shown & (len(second.keypoints_px) > 0))
     if len(asked) < FEWEST_ALIKE:
         return none
-    others = second.features.keypoints_px.astype(np.float64)
+    others = second.keypoints_px.astype(np.float64)
     offsets, sources = _offsets_of_alike(first, second, pixels, asked, others)
     if len(sources) < FEWEST_ALIKE:
         return none
@@ -148,10 +161,10 @@ def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> Itera
 
 
 def _offsets_of_alike(
-    first: Keyframe, second: Keyframe, pixels: FloatArray, asked: NDArray[np.int64], others: FloatArray
+    first: ImageFeatures, second: ImageFeatures, pixels: FloatArray, asked: NDArray[np.int64], others: FloatArray
 ) -> tuple[FloatArray, NDArray[np.int64]]:
     """Of the keypoints with a like code near their predicted pixel: how far that is off, (N, 2), and their numbers."""
-    distances = hamming_matrix(first.features.descriptors[asked], second.features.descriptors).astype(np.int64)
+    distances = hamming_matrix(first.descriptors[asked], second.descriptors).astype(np.int64)
     gaps = others[None, :] - pixels[asked, None]
     distances[np.hypot(gaps[..., 0], gaps[..., 1]) > SEARCH_PX] = ALIKE_BITS + 1
     best, back = np.argmin(distances, axis=1), np.argmin(distances, axis=0)
