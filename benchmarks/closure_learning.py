@@ -63,7 +63,7 @@ from fcslam.features.lidar_depth import LidarView
 from fcslam.federated.client import FederatedClient, RobotClient, seeded_noise
 from fcslam.federated.client_app import build_client_app
 from fcslam.federated.codec import weights_to_network, weights_version
-from fcslam.federated.coordinator import Coordinator, CoordinatorHooks, released_weights
+from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import InProcessGrid
 from fcslam.federated.initial_weights import prepare_initial_weights
 from fcslam.federated.settings import FederatedSettings
@@ -175,10 +175,8 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="which networks")
     parser.add_argument("--rounds", type=int, default=60, help="of federated training")
     parser.add_argument(
-        "--compatible", type=float, default=1.0, help="weight of the loss that keeps codes as they were"
+        "--compatible", type=float, default=4.0, help="weight of the loss that keeps codes as they were"
     )
-    parser.add_argument("--rehearsal", type=float, default=4.0, help="weight of the loss of rehearsal")
-    parser.add_argument("--initial-share", type=float, default=0.0, help="of the initial weights in those released")
     parser.add_argument("--keep", type=Path, help="file that keeps finished arms; the same one resumes")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
@@ -189,14 +187,14 @@ def main() -> None:
     examples = [fleet_examples(folder, chosen.fleets) for folder in fleets]
     settings = FederatedSettings(
         rounds=chosen.rounds, local_steps=LOCAL_STEPS, participation=PARTICIPATION, normalisation="frozen",
-        compatible=chosen.compatible, rehearsal=chosen.rehearsal, initial_share=chosen.initial_share, trained="codes",
+        compatible=chosen.compatible, trained="codes",
         training=TrainingSettings(learning_rate=1e-3),
     )  # fmt: skip
     rows: list[tuple] = []
     forgetting: list[tuple] = []
     for arm in (arm for arm in ARMS if arm in chosen.arms):
         for seed in chosen.seeds[: 3 if arm in REPEATED else 1]:
-            key = (arm, seed, chosen.rounds, chosen.compatible, chosen.rehearsal, chosen.initial_share, *chosen.train)
+            key = (arm, seed, chosen.rounds, chosen.compatible, *chosen.train)
             place = chosen.fleets / "-".join(["networks", common.commit(), *map(str, key)]).replace(" ", "_")
             networks = kept_networks(place, partial(trained, arm, seed, examples, settings))
             forgetting += kept.rows((*key, "photographs"), partial(photograph_rows, arm, seed, networks))
@@ -407,7 +405,7 @@ def trained_here(
     """Training in one place, with the losses and the rate of a robot in the fleet."""
     state = weights_to_network(start, settings.training.encoder).state_dict()
     training = settings.training.model_copy(update={"steps": steps, "seed": seed})
-    plan = LocalTrainingPlan(0, steps, compatible=settings.compatible, rehearsal=settings.rehearsal)
+    plan = LocalTrainingPlan(0, steps, compatible=settings.compatible)
     return train_codes(state, revisits, CodeInputs(), training, plan, torch.device("cpu")).network
 
 
@@ -440,7 +438,7 @@ def federated(
         build_client_app(lambda context: clients[int(context.node_config["partition-id"])]), len(clients)
     )
     state = Coordinator(grid, settings, start, folder / "rounds", hooks).run()
-    return weights_to_network(released_weights(start, state.average, settings), settings.training.encoder)
+    return weights_to_network(state.average, settings.training.encoder)
 
 
 def kept_networks(place: Path, train: Callable[[Path], list[Path | None]]) -> list[Path | None]:

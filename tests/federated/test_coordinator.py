@@ -81,19 +81,6 @@ def test_a_round_merges_as_a_hand_would(strategy, share, tmp_path):
     assert not same(state.weights, TRAINED)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.25])
-def test_a_version_keeps_its_share_of_the_initial_weights_and_training_goes_on_without(share, tmp_path):
-    chosen = settings(rounds=3, initial_share=share)
-    state, _ = run([Fake("a", 1.0)], tmp_path / "kept", chosen)
-    plain, _ = run([Fake("a", 1.0)], tmp_path / "plain", settings(rounds=3))
-    assert same(state.weights, plain.weights)
-    assert same(state.average, plain.average)
-    for name, initial in START.items():
-        wanted = share * initial + (1.0 - share) * state.average[name]
-        assert state.best[name] == pytest.approx(wanted, rel=1e-6)
-    assert same(state.best, plain.best) == (share == 0.0)
-
-
 @pytest.mark.parametrize(("robots", "most"), [(1, 0.0), (2, 0.5), (4, 0.75)])
 def test_momentum_goes_no_further_than_all_robots_one_after_another(robots, most, tmp_path):
     def end(share):

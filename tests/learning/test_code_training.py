@@ -83,7 +83,7 @@ def test_training_brings_the_codes_of_a_point_together(light):
 
     plan = LocalTrainingPlan(0, 40)
     done = train_codes(light, OWN, CodeInputs(), SMALL, plan, CPU)
-    assert {"contrastive", "balance", "keypoints", "former"} == done.losses.keys()
+    assert {"contrastive", "balance", "keypoints"} == done.losses.keys()
     assert distance(done.network.state_dict()) < 0.8 * distance(light)
 
 
@@ -110,10 +110,10 @@ def test_earlier_codes_and_keypoints_hold_as_hard_as_asked(light):
 def test_rehearsal_keeps_the_codes_of_pictures_that_the_robot_does_not_see(light):
     elsewhere = textured(9)[:SIZE, :SIZE]
 
-    def kept(rehearsal):
-        plan = LocalTrainingPlan(0, 40, rehearsal=rehearsal)
+    def kept(compatible):
+        plan = LocalTrainingPlan(0, 40, compatible=compatible)
         done = train_codes(light, OWN, CodeInputs(), SMALL, plan, CPU)
-        assert ("rehearsal" in done.losses) is (rehearsal > 0.0)
+        assert ("compatible" in done.losses) is (compatible > 0.0)
         return np.mean(codes(done.network.state_dict(), elsewhere, POINTS) == codes(light, elsewhere, POINTS))
 
     assert kept(20.0) > kept(0.0) + 0.03

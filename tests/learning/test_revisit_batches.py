@@ -13,6 +13,7 @@ from fcslam.learning.network import Description, sample_codes  # noqa: E402
 from fcslam.learning.objective import (  # noqa: E402
     MIN_NEGATIVE_DISTANCE_M,
     MIN_NEGATIVE_DISTANCE_PX,
+    rehearsal_loss,
     revisit_negatives,
     revisit_objective,
 )
@@ -90,11 +91,10 @@ def test_points_of_two_pairs_differ_if_they_are_far_apart_in_the_map_and_of_one_
     assert not revisit_negatives(unknown).numpy()[~same].any()
 
 
-def objective(code_logits, batch, context=0.0, before=None, **weights):
+def objective(code_logits, batch, context=0.0, **weights):
     still = torch.randn(len(code_logits), 16, 4, 4, generator=torch.Generator().manual_seed(1))
-    former = Description(code_logits if before is None else before, still)
-    settings = LossSettings(**weights)
-    return revisit_objective(Description(code_logits, still + context), former, batch, settings, 1.0)
+    before = Description(code_logits, still)
+    return revisit_objective(Description(code_logits, still + context), before, batch, LossSettings(**weights))
 
 
 def test_codes_that_agree_cost_least_and_equal_codes_of_all_points_do_not_pay():
@@ -111,13 +111,20 @@ def test_codes_that_agree_cost_least_and_equal_codes_of_all_points_do_not_pay():
     assert collapsed["balance"] > 0.9 > good["balance"]
 
 
-def test_keypoints_that_move_and_codes_that_leave_the_earlier_ones_cost():
+def test_keypoints_that_move_cost():
     batch = draw_revisits(RevisitExamples(IMAGES, [PAIR]), 1, 5)
     columns = torch.randn(4, 256, 12, 12, generator=torch.Generator().manual_seed(1))
     total, same = objective(columns, batch)
     moved_total, moved = objective(columns, batch, context=0.5)
-    _, left = objective(columns, batch, before=-columns)
     assert same["keypoints"] == 0.0
     assert moved["keypoints"] == pytest.approx(0.25, rel=0.1)
     assert float(moved_total - total) == pytest.approx(LossSettings().keypoints * float(moved["keypoints"]), rel=1e-3)
-    assert left["former"] > 2.0 * same["former"]
+
+
+def test_codes_that_leave_the_earlier_ones_cost_in_rehearsal():
+    points = torch.rand(2, 5, 2, generator=torch.Generator().manual_seed(1)) * (SIZE - 8.0) + 4.0
+    columns = torch.randn(2, 256, 12, 12, generator=torch.Generator().manual_seed(2))
+    former = Description(columns, columns[:, :16])
+    same = rehearsal_loss(former, former, points)
+    opposite = rehearsal_loss(Description(-columns, columns[:, :16]), former, points)
+    assert opposite > 2.0 * same

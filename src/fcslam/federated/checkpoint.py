@@ -33,7 +33,7 @@ class CoordinatorState:
     weights: Weights
     """The next round starts from these."""
     average: Weights
-    """Moving average of the rounds' weights, of which versions are made."""
+    """Moving average of the rounds' weights; it is evaluated and released."""
     best: Weights
     """The released weights."""
     best_scores: Mapping[Evaluator, float]

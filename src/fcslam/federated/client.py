@@ -110,7 +110,6 @@ class RobotClient:
             steps=settings.local_steps,
             proximal=settings.proximal if settings.strategy == "fedprox" else 0.0,
             compatible=settings.compatible,
-            rehearsal=settings.rehearsal,
             frozen_statistics=frozen,
         )
         only_codes = settings.trained == "codes"

@@ -67,14 +67,6 @@ class CoordinatorHooks:
     """Seconds since any fixed moment."""
 
 
-def released_weights(initial: Weights, average: Weights, settings: FederatedSettings) -> Weights:
-    """The weights of a version: a mean of the initial and the trained ones.
-
-    Source: Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022.
-    """
-    return interpolate_weights(initial, average, settings.initial_share)
-
-
 class Decision(NamedTuple):
     """Decision on the version that a round has made."""
 
@@ -142,12 +134,11 @@ class Coordinator:
 
         replies, trained = self._train(sent, state)
         weights = self._aggregate(replies, state)
-        average = self._average(weights, state)
-        candidate = self._model(released_weights(self._initial.weights, average, self._settings))
+        candidate = self._model(self._average(weights, state))
         comparison = self._evaluate(candidate, state, replies)
         decision = self._decide(comparison, state)
 
-        following = self._next_state(trained, weights, average, candidate.weights, comparison, decision)
+        following = self._next_state(trained, weights, candidate.weights, comparison, decision)
         privacy = self._settings.privacy
         report = RoundReport(
             round_number=following.rounds_done,
@@ -204,7 +195,7 @@ class Coordinator:
         return self._aggregator.aggregate(state.rounds_done + 1, updates, state.weights)
 
     def _average(self, weights: Weights, state: CoordinatorState) -> Weights:
-        """The moving average of the rounds' weights, of which versions are made.
+        """The moving average of the rounds' weights, which is evaluated and released.
 
         It smooths the noise of training. The lower the learning rate, the less noise there is, so the less is kept of
         the earlier average. Early averages forget the initial weights, which training leaves behind quickly.
@@ -262,7 +253,6 @@ class Coordinator:
         state: CoordinatorState,
         weights: Weights,
         average: Weights,
-        candidate: Weights,
         comparison: VersionComparison,
         decision: Decision,
     ) -> CoordinatorState:
@@ -274,7 +264,7 @@ class Coordinator:
             rounds_done=number,
             weights=state.best if decision.returned else weights,
             average=state.best if decision.returned else average,
-            best=candidate if decision.released else state.best,
+            best=average if decision.released else state.best,
             best_scores=comparison.scores if decision.released else comparison.best,
             best_round=number if decision.released else state.best_round,
             strategy_state=self._aggregator.state,

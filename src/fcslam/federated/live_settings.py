@@ -77,15 +77,10 @@ class LiveRounds(FederatedSettings):
     normalisation: Normalisation = Field(default="frozen", description="batch statistics stay at their initial values")
     trained: TrainedLayers = Field(default="codes", description="robots train the layers of the codes alone")
     compatible: float = Field(
-        default=2.0,
-        ge=0.0,
-        description="weight of the loss that keeps descriptors compatible with those of the initial weights; 0 for off",
-    )
-    rehearsal: float = Field(
         default=4.0,
         ge=0.0,
         description="weight of the loss that keeps descriptors of distorted views of a robot's images as the initial "
-        "weights give them, so that less is forgotten; 0 for off",
+        "weights give them, so that they stay compatible and less is forgotten; 0 for off",
     )
     training: TrainingSettings = Field(
         default_factory=lambda: TrainingSettings(learning_rate=1e-3),

@@ -84,13 +84,8 @@ class FederatedSettings(Settings):
     compatible: float = Field(
         default=0.0,
         ge=0.0,
-        description="weight of the loss that keeps descriptors compatible with those of the initial weights; 0 for off",
-    )
-    rehearsal: float = Field(
-        default=0.0,
-        ge=0.0,
         description="weight of the loss that keeps descriptors of distorted views of a robot's images as the initial "
-        "weights give them, so that less is forgotten; only with trained: codes; 0 for off",
+        "weights give them, so that they stay compatible and less is forgotten; 0 for off",
     )
     server_momentum: float = Field(
         default=0.5,
@@ -105,13 +100,6 @@ class FederatedSettings(Settings):
         lt=1.0,
         description="share of earlier rounds in the moving average of which versions are made; "
         "decreases with the learning rate",
-    )
-    initial_share: float = Field(
-        default=0.0,
-        ge=0.0,
-        lt=1.0,
-        description="share of the initial weights in the mean with the trained ones that is evaluated and released; "
-        "so a version forgets less",
     )
     server_rate: float = Field(default=0.003, gt=0.0, description="server learning rate of FedAdam")
     trimmed: float = Field(
@@ -156,12 +144,6 @@ class FederatedSettings(Settings):
             raise ValueError(
                 "batch statistics belong to the keypoints too; set normalisation to frozen, or trained to all"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _rehearsal_is_of_codes(self) -> Self:
-        if self.rehearsal and self.trained != "codes":
-            raise ValueError("rehearsal keeps what codes alone would forget; set trained to codes, or rehearsal to 0")
         return self
 
     def client_training(self) -> TrainingSettings:

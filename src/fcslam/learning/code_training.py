@@ -110,12 +110,12 @@ def train_codes(
             group["lr"] = local_rate(settings, step, done, optimiser_state is None)
         batch = draw_revisits(revisits, settings.seed, step).to(device)
         described = _described(known[batch.images], network, before)
-        total, losses = revisit_objective(*described, batch, settings.loss, plan.compatible)
-        if plan.rehearsal:
+        total, losses = revisit_objective(*described, batch, settings.loss)
+        if plan.compatible:
             views = draw_rehearsal(size, settings.seed, step).to(device)
             described = _described(known[len(revisits.images) + views.numbers], network, before)
-            losses["rehearsal"] = rehearsal_loss(*described, views.points)
-            total = total + plan.rehearsal * losses["rehearsal"]
+            losses["compatible"] = rehearsal_loss(*described, views.points)
+            total = total + plan.compatible * losses["compatible"]
         if proximal is not None:
             total = total + proximal.loss(network)
         descend(network, optimiser, total, step)

@@ -37,8 +37,6 @@ class LocalTrainingPlan:
     """Strength of FedProx's proximal term; 0 for none."""
     compatible: float = 0.0
     """Weight of the loss that keeps codes compatible with those of a legacy detector; 0 for none."""
-    rehearsal: float = 0.0
-    """Weight of the loss that does so in views of the robot's images, while codes alone are trained; 0 for none."""
     frozen_statistics: bool = False
     """Batch normalisation uses the means and variances that it has, and does not change them."""
 

@@ -92,7 +92,7 @@ def objective(
 
 
 def revisit_objective(
-    described: Description, before: Description, batch: RevisitBatch, weights: LossSettings, compatible: float
+    described: Description, before: Description, batch: RevisitBatch, weights: LossSettings
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise for points that were seen again, and the losses in it by name.
 
@@ -105,13 +105,11 @@ def revisit_objective(
         before: by the network that training started from.
         batch: points and codes.
         weights: of the losses.
-        compatible: weight of the loss that keeps codes as they were.
     """
     count, fixed = len(batch.valid), len(batch.codes)
     places = batch.points[: 2 * count - fixed]
     seen = torch.cat((batch.valid, batch.valid[: count - fixed]))
     logits = sample_codes(described.code_logits.float(), places)
-    wanted = torch.sigmoid(CODE_SHARPNESS * sample_codes(before.code_logits.float(), places))
     # The second views of pairs follow all first views; fixed codes stand behind them.
     soft = torch.cat((torch.tanh(logits), batch.codes))
     first, second = (side[batch.valid] for side in soft.chunk(2))
@@ -121,15 +119,8 @@ def revisit_objective(
         "contrastive": losses.contrastive_loss(first, second, revisit_negatives(batch), every, weights.temperature),
         "balance": losses.balance_loss(torch.tanh(logits), seen),
         "keypoints": moved / before.context.float().var().clamp(min=_STILL),
-        "former": losses.distillation_loss(CODE_SHARPNESS * logits, wanted, seen),
     }
-    factors = {
-        "contrastive": weights.contrastive,
-        "balance": weights.balance,
-        "keypoints": weights.keypoints,
-        "former": compatible,
-    }
-    total = sum((factors[name] * part for name, part in parts.items()), start=torch.zeros_like(moved))
+    total = sum((getattr(weights, name) * part for name, part in parts.items()), start=torch.zeros_like(moved))
     return total, parts
 
 

@@ -13,7 +13,7 @@ from fcslam.evaluation.federated.poison import Poison, PoisonedClient
 from fcslam.federated.client import FederatedClient, RobotClient, seeded_noise
 from fcslam.federated.client_app import build_client_app
 from fcslam.federated.codec import weights_to_network, weights_version
-from fcslam.federated.coordinator import Coordinator, CoordinatorHooks, released_weights
+from fcslam.federated.coordinator import Coordinator, CoordinatorHooks
 from fcslam.federated.flower import Context, InProcessGrid
 from fcslam.federated.settings import FederatedSettings
 from fcslam.federated.weights import Weights
@@ -114,8 +114,7 @@ def train_arm(context: SeedContext, name: str, arm: Arm) -> list[KeypointNetwork
     )
     grid = InProcessGrid(build_client_app(client_of), len(clients))
     state = Coordinator(grid, settings, context.start, folder, hooks).run()
-    version = released_weights(context.start, state.average, settings)
-    return [weights_to_network(version, settings.training.encoder)]
+    return [weights_to_network(state.average, settings.training.encoder)]
 
 
 def _all_examples(context: SeedContext) -> list[TrainingExample]:
